@@ -68,8 +68,8 @@ def test_further_columns_of_recordings_are_ignored(folder):
 
 
 def test_arcs_are_hinges_and_lines_are_drawers():
-    assert classify_recording(LabelledRecording("an arc", "revolute", arc(0.4, 1.5, 20))).right
-    assert classify_recording(LabelledRecording("a line", "prismatic", line(0.45, 20))).right
+    assert classify_recording(LabelledRecording("an arc", "revolute", arc(0.4, 1.5, 20))).is_correct
+    assert classify_recording(LabelledRecording("a line", "prismatic", line(0.45, 20))).is_correct
 
 
 def test_misclassified_recordings_are_named_and_drawn(tmp_path):

@@ -87,12 +87,12 @@ def _ours(parents: Array, children: Array) -> Iterator[Contender]:
         identifier = Identifier(noise=noise)
         for parent, child in zip(a, b, strict=True):
             identifier.add(parent, child)
-        assert identifier.found
+        assert identifier.result
         return identifier
 
     def one_more(identifier: Identifier) -> None:
         identifier.add(parents[_COUNT], children[_COUNT])
-        assert identifier.found
+        assert identifier.result
 
     yield Contender(ONE, time_calls(one_more, prepare=known))
 

@@ -201,7 +201,7 @@ def fit_joint(
     covariance = make_covariance(noise.position, noise.orientation)
     seen = check_observations(pair.parent_poses, pair.child_poses, covariance, covariance)
     fit = complete_fit(
-        found.best, seen, judged, outliers=Outliers(), stated=noise.given, ordered=pair.is_timed
+        found.best, seen, judged, outliers=Outliers(), stated=noise.given, sequential=pair.is_timed
     )
     return LearnedJoint(found, noise, count, fit)
 
@@ -231,7 +231,7 @@ def identify_joint(
         noise=covariance,
         families=chosen,
         outliers=True,
-        ordered=pair.is_timed,
+        sequential=pair.is_timed,
     )
     position, orientation = stated or (found.noise_scale * one for one in UNKNOWN_NOISE)
     return found, ObservationNoise(
@@ -256,11 +256,13 @@ def count_independent(found: IdentificationResult, pair: RecordedPair) -> int:
     if fit is None:
         return count
     # As many more as are wrong and tell nothing.
-    right = len(fit.right)
-    judged = min(count, round(effective_sample_size(fit.residuals[fit.right]) * count / right))
+    right = len(fit.inliers)
+    judged = min(count, round(effective_sample_size(fit.residuals[fit.inliers]) * count / right))
     # And enough to count turns.
     while (
-        pair.is_timed and judged < count and fit.at(spaced_indices(count, judged)).turned > MAX_ROTATION_STEP
+        pair.is_timed
+        and judged < count
+        and fit.select(spaced_indices(count, judged)).largest_turn > MAX_ROTATION_STEP
     ):
         judged += 1
     return judged
@@ -279,5 +281,5 @@ def write_results(arguments: argparse.Namespace, pair: RecordedPair, learned: Le
     if arguments.document:
         from kineverse.cli.fit_output import make_joint_model
 
-        make_joint_model(pair.select(fit.right), fit).save(arguments.document)
+        make_joint_model(pair.select(fit.inliers), fit).save(arguments.document)
     return {"picture": arguments.picture, "document": arguments.document}

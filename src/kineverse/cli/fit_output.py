@@ -128,17 +128,17 @@ def _revolution_warning(fit: Fit, pair: RecordedPair) -> list[str]:
     """Return that turns may have been counted wrongly."""
     from kineverse.cli.fit import MAX_ROTATION_STEP
 
-    if not pair.is_timed or fit.turned < MAX_ROTATION_STEP:
+    if not pair.is_timed or fit.largest_turn < MAX_ROTATION_STEP:
         return []
-    most = format_number(math.degrees(fit.turned), 3)
+    most = format_number(math.degrees(fit.largest_turn), 3)
     return [f"  from one to the next it turns by up to {most} deg: it may be more turns, or fewer"]
 
 
 def joint_ranges(fit: Fit) -> list[tuple[float, float, float, bool]]:
     """Return of each joint value the least and the largest seen, their deviation, and if it is an angle."""
     found = []
-    for k, component in enumerate(fit.motion.freedom.joints):
-        values, deviations = fit.joint_values[fit.right, k], fit.deviations[fit.right, k]
+    for k, component in enumerate(fit.motion.parametrisation.joints):
+        values, deviations = fit.joint_values[fit.inliers, k], fit.deviations[fit.inliers, k]
         ends = [int(np.argmin(values)), int(np.argmax(values))]
         spread = float(deviations[ends].max())
         found.append((float(values[ends[0]]), float(values[ends[1]]), spread, component >= 3))
@@ -174,7 +174,7 @@ def _fit_to_json(fit: Fit) -> dict[str, Any]:
         "family": fit.family,
         "probability": fit.probability,
         "log_evidence": fit.log_evidence,
-        "told": fit.told,
+        "told": fit.is_determined,
         "reason": fit.reason,
         "parameters": {name: np.asarray(value).tolist() for name, value in fit.parameters.items()},
         "deviations": {name: fit.deviation(name) for name in fit.coordinates},

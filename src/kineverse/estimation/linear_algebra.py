@@ -1,4 +1,4 @@
-"""Inverses, products and determinants of small matrices and of stacks of them."""
+"""Inverses, products, determinants and squared norms of stacks of small matrices."""
 
 from __future__ import annotations
 
@@ -54,3 +54,10 @@ def inverse_spd(matrix: Array) -> Array:
             "Some directions are known so much better than others that floating point cannot hold both: a "
             "covariance that was handed in is far too small, or an uncertainty far too large."
         ) from None
+
+
+def squared_errors(errors: Array, covariances: Array) -> Array:
+    """Return the squared Mahalanobis norms eᵀ S⁻¹ e, (N,), of errors (N, m) with covariances S (N, m, m)."""
+    weighted = np.linalg.solve(covariances, errors[:, :, None])[:, :, 0]
+    squares: Array = np.sum(errors * weighted, axis=1)
+    return squares

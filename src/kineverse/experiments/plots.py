@@ -54,11 +54,11 @@ class FitProjection:
     def at(fit: Fit, relative: Array) -> FitProjection:
         """Return a fit with the poses (N, 4, 4) or positions (N, 3) of the child that it was made of."""
         seen = relative[:, :3, 3] if relative.ndim == 3 else relative
-        fitted = fit.motion.at(fit.joint_values).pose[:, :3, 3]
+        fitted = fit.motion.linearise(fit.joint_values).pose[:, :3, 3]
         way = fitted
         if fit.joint_values.shape[1] == 1:
             low, high = fit.range[0]
-            way = fit.motion.at(np.linspace(low, high, 200)[:, None]).pose[:, :3, 3]
+            way = fit.motion.linearise(np.linspace(low, high, 200)[:, None]).pose[:, :3, 3]
         origin, axes = _frame(fit, fitted)
         return FitProjection(fit, origin, axes, *((points - origin) @ axes for points in (seen, fitted, way)))
 
@@ -151,9 +151,9 @@ def draw_side_view(axes: Axes, looked: FitProjection) -> None:
 
 def draw_joint_values(axes: Axes, fit: Fit) -> None:
     """Draw joint values over the observations that are right, with their standard deviations."""
-    number = fit.right
+    number = fit.inliers
     # A family of one's own does not say which of its joint values are angles.
-    freedom = getattr(fit.motion, "freedom", None)
+    freedom = getattr(fit.motion, "parametrisation", None)
     turning = [j >= 3 for j in freedom.joints] if freedom else [False] * fit.joint_values.shape[1]
     units = {"[deg]" if turns else "[m]" for turns in turning} if freedom else {"its own units"}
     for k, turns in enumerate(turning):
@@ -167,7 +167,7 @@ def draw_joint_values(axes: Axes, fit: Fit) -> None:
 
 def draw_residuals(axes: Axes, fit: Fit) -> None:
     """Draw what the fit leaves of each observation, and a line for those that do not fit."""
-    number = fit.right
+    number = fit.inliers
     residuals = fit.residuals[number]
     for outlier in fit.outliers:
         axes.axvline(outlier, color=AXIS, linewidth=0.8, linestyle=":")

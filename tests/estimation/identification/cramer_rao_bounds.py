@@ -1,4 +1,4 @@
-"""How well a joint can be known, independently of the estimator: from differences of what would be seen.
+"""Cramér-Rao bounds of joint parameters by finite differences, independent of the estimator.
 
 Seen are both poses. Unknown are the axis and its place, the child's pose, and for each observation the parent's true
 pose (6) and the joint value (1), last. With joint values as unknowns of their own this is the Cramér-Rao bound. Where

@@ -1,4 +1,4 @@
-"""Recordings of two parts made up: how they move is known, and so is the noise."""
+"""Synthetic recordings of two parts with known motion and noise."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ PITCH = 0.06
 
 @dataclass(frozen=True)
 class Recording:
-    """Poses of two parts as observed, how they truly were, and the joint between them."""
+    """Observed and true poses of two parts, and the joint between them."""
 
     parent: Array
     child: Array
@@ -58,7 +58,7 @@ def recording(
     extent: float | None = None,
     radius: float = 0.5,
 ) -> Recording:
-    """Return a joint somewhere, moved at random, seen from a parent that is somewhere else every time."""
+    """Draw a random joint, random joint values and random parent poses, and observe them with noise."""
     random = np.random.default_rng(seed)
     joints = JOINTS[family]
     values = np.zeros((count, 6))
@@ -84,7 +84,7 @@ def recording(
 
 
 def transform(rotation: Rotation, place: npt.ArrayLike) -> Array:
-    """Return 4×4 transforms."""
+    """Return transforms (..., 4, 4)."""
     matrices = rotation.as_matrix()
     result = np.zeros((*matrices.shape[:-2], 4, 4))
     result[..., :3, :3], result[..., :3, 3], result[..., 3, 3] = matrices, place, 1.0
@@ -101,11 +101,11 @@ def noisy(poses: Array, position: float, orientation: float, random: np.random.G
 
 
 def angle_between(a: Array, b: Array) -> float:
-    """Return the angle between two axes, whatever their signs [rad]."""
+    """Return the angle between two axes regardless of sign [rad]."""
     return float(np.arctan2(np.linalg.norm(np.cross(a, b)), abs(a @ b)))
 
 
 def off_axis(point: Array, axis: Array, from_point: Array) -> float:
-    """Return how far a point is from an axis [m]."""
+    """Return the distance of a point from an axis [m]."""
     way = from_point - point
     return float(np.linalg.norm(way - axis * (axis @ way)))

@@ -1,4 +1,4 @@
-"""Families of one's own are found beside the others, and their parameters with them."""
+"""Custom families: model selection and estimated parameters."""
 
 from __future__ import annotations
 
@@ -34,37 +34,39 @@ def found() -> IdentificationResult:
     return identify(None, poses, noise=pose_covariance(0.01, 0.02), families=["revolute", "planar", garage()])
 
 
-def test_a_garage_door_is_told_from_a_hinge(found: IdentificationResult) -> None:
+def test_identify_selects_a_custom_family_over_a_hinge(found: IdentificationResult) -> None:
     assert found.best.family == "garage"
     assert not found.is_ambiguous
-    assert found.best.told
+    assert found.best.is_determined
 
 
-def test_its_length_is_found(found: IdentificationResult) -> None:
+def test_a_custom_familys_parameter_is_estimated(found: IdentificationResult) -> None:
     fit = found["garage"]
     deviation = fit.deviation("length")
     assert 0.001 < deviation < 0.01
     assert abs(fit.parameters["length"] - LENGTH) < 4 * deviation
 
 
-def test_joint_values_and_limits_are_those_seen(found: IdentificationResult) -> None:
+def test_joint_values_and_limits_of_a_custom_family_are_the_observed_ones(
+    found: IdentificationResult,
+) -> None:
     values, _ = seen_doors(20, 0.01, 0.02)
     np.testing.assert_allclose(found["garage"].joint_values[:, 0], values, atol=0.05)
 
 
-def test_it_is_an_operation(found: IdentificationResult) -> None:
+def test_operation_of_a_custom_family_moves_as_its_fit(found: IdentificationResult) -> None:
     model = kv.Model()
     with model.edit() as edit:
         edit.apply(found.best.operation("door", "world", "panel"), tag="learned")
     pose = model.fk("panel")({"door": 0.5})
-    expected = found.best.motion.at(np.array([[0.5]])).pose[0]
+    expected = found.best.motion.linearise(np.array([[0.5]])).pose[0]
     np.testing.assert_allclose(pose, expected, atol=1e-12)
     assert model.violations({"door": 3.0})
     copy = kv.formats.from_bytes(kv.formats.to_bytes(model))
     np.testing.assert_allclose(copy.fk("panel")({"door": 0.5}), expected, atol=1e-12)
 
 
-def test_what_is_no_family_is_refused() -> None:
+def test_an_invalid_family_is_refused() -> None:
     a, b = kv.position("a"), kv.position("b")
     with pytest.raises(kv.errors.UnknownNameError, match="depends on b"):
         Family("odd", kv.translation(a, b, 0), {a: (0, 1)})

@@ -1,4 +1,4 @@
-"""What moves nothing makes no matrix singular: points on a line, all in one place, or two of them only."""
+"""Degenerate observations: points on a line, identical points, or only two of them."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ def poses(positions):
 
 @pytest.mark.parametrize("where", POSITIONS)
 @pytest.mark.parametrize("whole", [True, False], ids=["poses", "positions"])
-def test_everything_stays_finite(where, whole):
+def test_identify_of_degenerate_positions_is_finite(where, whole):
     seen = poses(POSITIONS[where]) if whole else POSITIONS[where]
     found = identify(None, seen, noise=pose_covariance(0.01, 0.09))
     for fit in found:
@@ -43,7 +43,7 @@ def test_everything_stays_finite(where, whole):
 
 
 @pytest.mark.parametrize("family", ["revolute", "screw"])
-def test_steps_of_three_positions_may_lead_anywhere(family):
+def test_marginal_likelihood_of_three_positions_is_finite(family):
     seen = recording("spherical", count=3, position=0.1, orientation=0.02, seed=3)
     problem = check_observations(seen.parent, seen.child[:, :3, 3], seen.covariance, seen.covariance)
     likeliest = maximum_likelihood.maximum_likelihood(

@@ -1,4 +1,4 @@
-"""What is found does not depend on where in the parts their frames are."""
+"""Invariance of the evidence to the frames of the parts."""
 
 from __future__ import annotations
 
@@ -39,7 +39,7 @@ def elsewhere(seen: Recording, of_parent: Array, of_child: Array) -> Identificat
 
 
 @pytest.mark.parametrize(("family", "radius"), CASES)
-def test_families_are_as_probable_wherever_frames_are(family: str, radius: float) -> None:
+def test_evidence_does_not_depend_on_the_frames_of_the_parts(family: str, radius: float) -> None:
     seen = recording(family, count=20, position=0.01, orientation=0.02, seed=4, radius=radius)
     before = elsewhere(seen, np.eye(4), np.eye(4))
     assert before.best.family == family
@@ -54,7 +54,7 @@ def test_families_are_as_probable_wherever_frames_are(family: str, radius: float
                 assert now == pytest.approx(behind, abs=CHANGE), fit.family
 
 
-def test_a_hinge_through_the_origin_of_the_child_is_no_plane() -> None:
+def test_a_hinge_through_the_childs_origin_is_not_taken_for_planar() -> None:
     """As every joint of a description has it: what slides by nothing in a plane has to say about which point."""
     seen = recording("revolute", count=40, position=0.01, orientation=0.02, seed=1, radius=0.0)
     found = identify(seen.parent, seen.child, noise=seen.covariance)
@@ -63,7 +63,7 @@ def test_a_hinge_through_the_origin_of_the_child_is_no_plane() -> None:
 
 
 @pytest.mark.parametrize("family", ["planar", "free"])
-def test_slides_are_those_of_the_origin_of_the_child(family: str) -> None:
+def test_translations_of_a_fit_are_those_of_the_childs_origin(family: str) -> None:
     """Whichever point makes them probable: poses at joint values are those that were seen."""
     seen = recording(family, count=30, position=1e-3, orientation=1e-3, seed=2)
     fit = identify(seen.parent, seen.child, noise=seen.covariance)[family]

@@ -1,4 +1,4 @@
-"""What is no recording is refused with what is wrong, and what says nothing is called so."""
+"""Invalid and uninformative input of identification."""
 
 from __future__ import annotations
 
@@ -45,12 +45,14 @@ def with_entry(poses: np.ndarray, value: float) -> np.ndarray:
         (SEEN.parent, SEEN.child, 1e-18 * NOISE, "known to 1e-11"),
     ],
 )
-def test_bad_input_is_refused(parent: object, child: object, noise: np.ndarray, message: str) -> None:
+def test_identify_refuses_invalid_poses(
+    parent: object, child: object, noise: np.ndarray, message: str
+) -> None:
     with pytest.raises(kv.KineverseError, match=message):
         identify(parent, child, noise=noise)
 
 
-def test_covariances_and_families_have_to_make_sense() -> None:
+def test_identify_refuses_invalid_covariances_and_families() -> None:
     with pytest.raises(kv.errors.InvalidValueError, match="One part has a covariance"):
         identify(SEEN.parent, SEEN.child, parent_covariance=NOISE)
     with pytest.raises(kv.errors.UnknownNameError, match="revolute"):
@@ -62,22 +64,22 @@ def test_covariances_and_families_have_to_make_sense() -> None:
 
 
 @pytest.mark.parametrize("count", [2, 3, 10])
-def test_identical_poses_do_not_say_how_something_moves(count: int) -> None:
+def test_identical_poses_are_rigid_and_determine_no_axis(count: int) -> None:
     found = identify(
         np.tile(SEEN.parent[0], (count, 1, 1)), np.tile(SEEN.child[0], (count, 1, 1)), noise=NOISE
     )
     assert found.best.family == "rigid"
-    assert not found["revolute"].told
+    assert not found["revolute"].is_determined
     assert all(np.isfinite(fit.log_evidence) for fit in found)
 
 
-def test_two_poses_of_something_that_moved() -> None:
+def test_two_poses_leave_doubt() -> None:
     found = identify(SEEN.parent[:2], SEEN.child[:2], noise=NOISE)
     assert found.is_ambiguous or found.best.probability < 1.0
     assert str(found)
 
 
-def test_positions_alone_tell_a_circle_from_a_line() -> None:
+def test_positions_distinguish_a_circle_from_a_line() -> None:
     for family in ("revolute", "prismatic"):
         seen = recording(family, count=25, position=0.003, orientation=0.003, seed=2)
         found = identify(seen.parent, seen.child[:, :3, 3], noise=seen.covariance)
@@ -86,17 +88,17 @@ def test_positions_alone_tell_a_circle_from_a_line() -> None:
             found.best.operation("door", "body")
 
 
-def test_a_parent_that_is_the_world() -> None:
+def test_identify_without_parent_poses_has_the_world_as_parent() -> None:
     seen = recording("revolute", count=15, position=0.005, orientation=0.01, seed=5)
     known = np.linalg.inv(seen.true_parent) @ seen.child
     found = identify(None, known, noise=seen.covariance)
     assert found.best.family == "revolute"
 
 
-def test_an_identifier_keeps_what_it_has_when_a_pose_is_refused() -> None:
+def test_a_refused_pose_leaves_an_identifier_unchanged() -> None:
     identifier = Identifier(noise=NOISE)
     with pytest.raises(kv.errors.InvalidValueError, match="0 poses so far"):
-        _ = identifier.found
+        _ = identifier.result
     identifier.add(SEEN.parent[0], SEEN.child[0])
     with pytest.raises(kv.errors.InvalidValueError, match="not finite"):
         identifier.add(SEEN.parent[1], np.nan * SEEN.child[1])
@@ -104,13 +106,13 @@ def test_an_identifier_keeps_what_it_has_when_a_pose_is_refused() -> None:
         identifier.add(SEEN.parent[1], SEEN.child[1, :3, 3])
     identifier.add(SEEN.parent[1], SEEN.child[1])
     assert len(identifier) == 2
-    assert identifier.found.fits
+    assert identifier.result.fits
 
 
 @pytest.mark.parametrize("count", [2, 3])
-def test_what_always_fits_is_not_told(count: int) -> None:
+def test_a_fit_with_as_many_unknowns_as_measurements_is_not_determined(count: int) -> None:
     """Two positions are on a line and three on a circle, however the part moves."""
     seen = recording("free", count=count, position=0.003, orientation=0.003, seed=2)
     found = identify(None, seen.true_relative[:, :3, 3], noise=seen.covariance)
     assert found.is_ambiguous
-    assert not found["prismatic" if count == 2 else "revolute"].told
+    assert not found["prismatic" if count == 2 else "revolute"].is_determined

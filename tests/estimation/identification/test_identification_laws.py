@@ -1,4 +1,4 @@
-"""What holds for every recording: frames do not matter, nor does the order; parent and child can be exchanged."""
+"""Invariances of identification: frames, order of poses, exchange of parent and child."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ def some_pose(seed: int) -> np.ndarray:
 
 @settings(max_examples=6)
 @given(st.integers(0, 10**6), st.sampled_from(MOVING))
-def test_the_observer_may_stand_anywhere(seed: int, family: str) -> None:
+def test_identify_is_invariant_to_the_observers_pose(seed: int, family: str) -> None:
     seen = seeded(family, seed)
     before = found_in(seen)
     elsewhere = some_pose(seed + 1)
@@ -49,7 +49,7 @@ def test_the_observer_may_stand_anywhere(seed: int, family: str) -> None:
 
 @settings(max_examples=6)
 @given(st.integers(0, 10**6), st.sampled_from(MOVING))
-def test_the_frame_of_the_child_turns_with_it(seed: int, family: str) -> None:
+def test_identify_is_equivariant_to_the_childs_frame(seed: int, family: str) -> None:
     seen = seeded(family, seed)
     change = np.eye(4)
     change[:3, :3] = some_pose(seed)[:3, :3]
@@ -63,7 +63,7 @@ def test_the_frame_of_the_child_turns_with_it(seed: int, family: str) -> None:
 
 @settings(max_examples=6)
 @given(st.integers(0, 10**6), st.sampled_from(MOVING))
-def test_the_order_of_poses_does_not_matter(seed: int, family: str) -> None:
+def test_identify_is_invariant_to_the_order_of_poses(seed: int, family: str) -> None:
     seen = seeded(family, seed)
     order = np.random.default_rng(seed).permutation(len(seen.parent))
     before = found_in(seen)
@@ -94,7 +94,7 @@ def test_exchanging_parent_and_child_inverts_the_model(family: str) -> None:
 
 
 @pytest.mark.parametrize("family", MOVING)
-def test_the_likelihood_is_that_of_all_true_poses_as_unknowns(family: str) -> None:
+def test_the_likelihood_has_all_true_poses_as_unknowns(family: str) -> None:
     seen = seeded(family, 9, count=5)
     covariance = seen.covariance
     ours = solve_families(check_observations(seen.parent, seen.child, covariance, covariance), [family])[
@@ -137,28 +137,28 @@ def test_the_likelihood_is_that_of_all_true_poses_as_unknowns(family: str) -> No
 
 
 @pytest.mark.parametrize("family", MOVING)
-def test_one_by_one_is_as_all_at_once(family: str) -> None:
+def test_identifier_agrees_with_identify(family: str) -> None:
     seen = seeded(family, 2, count=14)
     identifier = Identifier(noise=seen.covariance, families=FAMILIES)
     for a, b in zip(seen.parent, seen.child, strict=True):
         identifier.add(a, b)
         if len(identifier) > 4:
-            assert identifier.found.best.probability > 0.0
+            assert identifier.result.best.probability > 0.0
     whole = found_in(seen)
-    one, other = identifier.found[family], whole[family]
+    one, other = identifier.result[family], whole[family]
     assert one.log_evidence == pytest.approx(other.log_evidence, abs=0.02)
     assert angle_between(one.parameters["axis"], other.parameters["axis"]) < 0.05 * other.deviation("axis.x")
 
 
-def test_going_on_for_long_does_not_drift() -> None:
+def test_identifier_does_not_drift_over_many_warm_starts() -> None:
     seen = recording("revolute", count=127, position=0.02, orientation=0.03, seed=3)
     identifier = Identifier(noise=seen.covariance, families=["revolute"])
     for a, b in zip(seen.parent, seen.child, strict=True):
         identifier.add(a, b)
         if len(identifier) >= 64:
-            assert identifier.found
+            assert identifier.result
     one, other = (
-        identifier.found["revolute"],
+        identifier.result["revolute"],
         identify(seen.parent, seen.child, noise=seen.covariance)["revolute"],
     )
     assert angle_between(one.parameters["axis"], other.parameters["axis"]) < 0.05 * other.deviation("axis.x")

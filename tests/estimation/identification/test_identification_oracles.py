@@ -1,4 +1,4 @@
-"""What is identified, beside scipy on the same residuals, and beside what others were found to reach."""
+"""Identification compared with scipy on the same residuals and with published results."""
 
 from __future__ import annotations
 
@@ -46,7 +46,7 @@ def four_bar() -> tuple[Family, dict[str, float], Array]:
 
 
 @pytest.mark.parametrize("make", [garage, four_bar])
-def test_unknown_parameters_are_those_of_least_squares(
+def test_custom_parameters_agree_with_scipys_least_squares(
     make: Callable[[], tuple[Family, dict[str, float], Array]],
 ) -> None:
     position, orientation = 0.002, 0.005
@@ -88,7 +88,7 @@ POSITION, ORIENTATION = 0.03, math.radians(3.0)
 HINGE = Cell("revolute", POSITION, ORIENTATION, count=20, range=math.pi / 2)
 
 
-def test_a_hinge_is_that_of_maximum_likelihood() -> None:
+def test_hinge_agrees_with_scipys_maximum_likelihood() -> None:
     """Beside scipy with all true poses as unknowns: 152 of them, and 240 numbers that were seen."""
     samples = draw_samples(HINGE, 1, np.random.default_rng(1))
     noise = pose_covariance(POSITION, ORIENTATION)
@@ -157,7 +157,7 @@ def turned_by(axis: Array, other: Array) -> float:
 
 
 @pytest.mark.compiler
-def test_a_hinge_is_as_good_as_others_found_maximum_likelihood_to_be() -> None:
+def test_hinge_errors_agree_with_published_maximum_likelihood() -> None:
     """Means of 1.74° and of 13 mm between the axes, with one of both poses known exactly.
 
     Of 3000 samples ours are 1.67 ± .02° and 13.1 ± .2 mm. Of 400 the means scatter by .044° and .5 mm, so a
@@ -177,7 +177,7 @@ def test_a_hinge_is_as_good_as_others_found_maximum_likelihood_to_be() -> None:
 
 
 @pytest.mark.compiler
-def test_a_hinge_between_noisy_poses_is_at_the_bound() -> None:
+def test_hinge_between_noisy_poses_reaches_the_bound() -> None:
     """The squares of 300 errors in two directions are known to 6 %, so their root is to 3 %: 5 % is 95 %."""
     solver.prepare(wait=True)
     samples = draw_samples(HINGE, 300, np.random.default_rng(1))

@@ -1,4 +1,4 @@
-"""How good estimates are: beside the Cramér-Rao bound, their own covariance, and an integral."""
+"""Accuracy of identification: Cramér-Rao bound, covariance and evidence."""
 
 from __future__ import annotations
 
@@ -61,7 +61,7 @@ def stated(fits: list[Fit], coordinate: str) -> float:
 
 
 @pytest.mark.parametrize("case", CLEAR)
-def test_the_bound_is_reached_and_the_covariance_is_true(case: tuple) -> None:
+def test_errors_reach_the_bound_and_match_the_covariance(case: tuple) -> None:
     turned, shifted, plain, _, fits = errors(*case)
     # The root mean square of so many two-dimensional errors is known to 8 % or so.
     assert 0.8 * plain < rms(turned) < 1.2 * plain
@@ -71,14 +71,14 @@ def test_the_bound_is_reached_and_the_covariance_is_true(case: tuple) -> None:
 
 
 @pytest.mark.parametrize("case", SHORT)
-def test_short_motions_are_estimated_as_well_as_joint_values_allow(case: tuple) -> None:
+def test_errors_of_short_motions_reach_the_attainable_bound(case: tuple) -> None:
     turned, _, plain, reachable, fits = errors(*case)
     assert reachable > 1.15 * plain  # which is why the plain bound says nothing here
     assert rms(turned) < 1.25 * reachable
     assert rms(turned) == pytest.approx(math.sqrt(2) * stated(fits, "axis"), rel=0.3)
 
 
-def test_a_motion_within_the_noise_is_no_motion() -> None:
+def test_a_motion_within_the_noise_is_rigid_or_ambiguous() -> None:
     """A criterion that counts joint values as parameters would say something else, with ever more poses."""
     for seed in range(3):
         seen = recording("rigid", count=80, position=0.03, orientation=0.05, seed=seed)
@@ -87,10 +87,10 @@ def test_a_motion_within_the_noise_is_no_motion() -> None:
         short = recording("prismatic", count=80, position=0.03, orientation=0.02, seed=seed, extent=0.004)
         found = identify(short.parent, short.child, noise=short.covariance)
         assert found.is_ambiguous or found.best.family in ("rigid", "prismatic")
-        assert not found["prismatic"].told
+        assert not found["prismatic"].is_determined
 
 
-def test_types_are_told_apart() -> None:
+def test_families_are_distinguished() -> None:
     wrong = 0
     for seed in range(20):
         for family, extent in (("revolute", math.pi / 4), ("prismatic", 0.4)):
@@ -99,7 +99,7 @@ def test_types_are_told_apart() -> None:
     assert wrong == 0
 
 
-def test_the_evidence_of_rigid_parts_is_an_integral() -> None:
+def test_rigid_evidence_agrees_with_the_integral() -> None:
     """Positions of a child that does not move, of a world that is known: a Gaussian integral in each direction."""
     random = np.random.default_rng(0)
     count, sigma = 7, 0.02
@@ -116,7 +116,7 @@ def test_the_evidence_of_rigid_parts_is_an_integral() -> None:
     assert found == pytest.approx(expected, abs=1e-6)
 
 
-def test_the_width_of_a_motion_is_integrated_out() -> None:
+def test_range_evidence_agrees_with_the_integral_over_the_width() -> None:
     random = np.random.default_rng(1)
     values, noise = random.normal(0.0, 0.1, 30), 0.05
     motion = GroupMotion(JOINT_FAMILIES["prismatic"], 6, np.eye(4), np.eye(4))
@@ -136,7 +136,7 @@ def log_integral(values: np.ndarray, noise: float) -> float:
     return float(np.log(np.mean(np.trapezoid(np.exp(logs), means, axis=1))))
 
 
-def test_unknown_noise_is_estimated() -> None:
+def test_noise_scale_is_estimated_without_a_stated_covariance() -> None:
     seen = recording("revolute", count=60, position=0.02, orientation=math.radians(4.0), seed=3)
     found = identify(seen.parent, seen.child)
     assert found.best.family == "revolute"

@@ -1,4 +1,4 @@
-"""Every family is found from what it makes, and is an operation that makes it again."""
+"""Identification of every joint family, and the operations of the fits."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ COVARIANCE = pose_covariance(0.002, 0.01)
 
 
 @pytest.mark.parametrize("family", [*JOINTS])
-def test_a_family_is_recognised(family: str) -> None:
+def test_identify_selects_the_true_family(family: str) -> None:
     seen = recording(family, count=30, position=0.002, orientation=0.01, seed=3)
     found = identify(seen.parent, seen.child, noise=COVARIANCE)
     assert found.best.family == family
@@ -22,7 +22,7 @@ def test_a_family_is_recognised(family: str) -> None:
 
 
 @pytest.mark.parametrize("family", [*JOINTS])
-def test_the_operation_moves_as_the_fit_does(family: str) -> None:
+def test_operation_moves_as_its_fit(family: str) -> None:
     seen = recording(family, count=30, position=0.002, orientation=0.01, seed=4)
     fit = identify(seen.parent, seen.child, noise=COVARIANCE)[family]
     model = kv.Model()
@@ -40,7 +40,7 @@ def test_the_operation_moves_as_the_fit_does(family: str) -> None:
             assert not model.violations(values)
 
 
-def test_fits_are_made_once_and_in_the_order_of_their_probabilities() -> None:
+def test_fits_are_computed_once_and_sorted_by_probability() -> None:
     seen = recording("revolute", count=12, position=0.02, orientation=0.05, seed=5)
     found = identify(seen.parent, seen.child, noise=seen.covariance)
     assert [fit.family for fit in found] == [*found.probabilities]
@@ -50,7 +50,7 @@ def test_fits_are_made_once_and_in_the_order_of_their_probabilities() -> None:
 
 
 @pytest.mark.parametrize("pitch", [0.01, -0.03])
-def test_a_screw_is_one_after_several_turns(pitch: float) -> None:
+def test_a_screw_of_several_revolutions_is_identified(pitch: float) -> None:
     turn = kv.position("turn")
     nut = kv.translation(0.3, 0.1, 0.0) @ kv.translation(0, 0, pitch * turn) @ kv.rotation_z(turn)
     pose = kv.compile([nut @ kv.translation(0.1, 0.0, 0.0)])

@@ -1,4 +1,4 @@
-"""Which part hangs on which: parts of models that are known, seen by noisy eyes."""
+"""Kinematic graphs of known models from noisy poses."""
 
 from __future__ import annotations
 
@@ -63,7 +63,7 @@ def poses(cart: kv.Model) -> dict[str, Array]:
     return seen(cart, PARTS, 40, 0)
 
 
-def test_the_tree_of_a_cart(poses: dict[str, Array]) -> None:
+def test_identify_graph_finds_the_tree_of_a_cart(poses: dict[str, Array]) -> None:
     counted: list[tuple[int, int]] = []
     graph = identify_graph(
         poses, noise=NOISE, families=SOME, progress=lambda done, total: counted.append((done, total))
@@ -83,7 +83,7 @@ def test_the_tree_of_a_cart(poses: dict[str, Array]) -> None:
     assert all(e.fit.covariance.shape == (len(e.fit.coordinates),) * 2 for e in graph.edges)
 
 
-def test_the_model_moves_as_what_was_seen(cart: kv.Model, poses: dict[str, Array]) -> None:
+def test_model_of_a_graph_moves_as_the_true_model(cart: kv.Model, poses: dict[str, Array]) -> None:
     graph = identify_graph(poses, noise=NOISE, families=SOME, world=False)
     # Two joints each are at the door and at the cart; the door comes first.
     assert graph.roots == ("door",)
@@ -123,7 +123,7 @@ def linkage() -> kv.Model:
     return model
 
 
-def test_a_linkage_is_a_loop() -> None:
+def test_identify_graph_finds_the_loop_of_a_linkage() -> None:
     poses = seen(linkage(), ["crank", "coupler", "rocker"], 40, 1, reach=2.0)
     graph = identify_graph(poses, noise=NOISE, families=SOME)
     connected = {frozenset((e.parent, e.child)) for e in (*graph.edges, *graph.loops)}
@@ -134,7 +134,7 @@ def test_a_linkage_is_a_loop() -> None:
 
 
 @pytest.mark.parametrize("seed", range(3))
-def test_a_telescope_hangs_by_its_smaller_motions_and_few_poses_leave_doubt(seed: int) -> None:
+def test_a_telescope_is_connected_by_small_motions_and_few_poses_are_ambiguous(seed: int) -> None:
     model = kv.Model()
     with model.edit() as edit:
         edit.apply(kv.Prismatic(name="inner", parent="world", child="inner", axis=(1, 0, 0)))
@@ -152,11 +152,11 @@ def test_a_telescope_hangs_by_its_smaller_motions_and_few_poses_leave_doubt(seed
         assert list(graph.connections.values()) == sorted(graph.connections.values(), reverse=True)
     for edge in unsure.edges:
         assert graph.connections[edge.parent, edge.child] == edge.probability
-        assert edge.probability + sum(edge.others.values()) > 0.9
-        assert all(f"or {a} -> {b}" in str(edge) for a, b in edge.others)
+        assert edge.probability + sum(edge.alternatives.values()) > 0.9
+        assert all(f"or {a} -> {b}" in str(edge) for a, b in edge.alternatives)
 
 
-def test_drawers_and_doors_beside_each_other_are_no_loop() -> None:
+def test_independent_drawers_and_doors_close_no_loop() -> None:
     kitchen = kv.load("kitchen")
     frames = ["kitchen/fridge_door_handle", "kitchen/oven_left_drawer", "kitchen/oven_right_drawer"]
     graph = identify_graph(seen(kitchen, frames, 40, 2, reach=0.4), noise=NOISE, families=SOME)
@@ -164,7 +164,7 @@ def test_drawers_and_doors_beside_each_other_are_no_loop() -> None:
     assert graph.loops == ()
 
 
-def test_what_was_never_seen_together_is_not_connected(poses: dict[str, Array]) -> None:
+def test_parts_never_observed_together_are_not_connected(poses: dict[str, Array]) -> None:
     some = {part: poses[part].copy() for part in ("cart", "drawer", "handle", "door")}
     for part in ("cart", "drawer"):
         some[part][:20] = np.nan
@@ -180,7 +180,7 @@ def test_what_was_never_seen_together_is_not_connected(poses: dict[str, Array]) 
     assert set(graph.model().frames) == set(some)
 
 
-def test_parts_that_were_seen_as_points_hang_on_others(cart: kv.Model, poses: dict[str, Array]) -> None:
+def test_points_are_children_of_other_parts(cart: kv.Model, poses: dict[str, Array]) -> None:
     some = {part: poses[part] for part in ("cart", "door")}
     some |= {part: poses[part][:, :3, 3].copy() for part in ("drawer", "sticker", "handle")}
     some["drawer"][[3, 8]] = np.nan
@@ -204,7 +204,7 @@ def test_parts_that_were_seen_as_points_hang_on_others(cart: kv.Model, poses: di
             assert np.allclose(model.fk(part, "cart")[:3, 3](kv.State(values)), position, atol=0.02)
 
 
-def test_points_that_nothing_holds_slide() -> None:
+def test_a_free_point_is_a_sliding_point() -> None:
     random = np.random.default_rng(0)
     places = {"fly": random.uniform(-1.0, 1.0, (30, 3)), "ant": random.uniform(-1.0, 1.0, (30, 3))}
     places["ant"][:, 2] = 0.3
@@ -224,7 +224,7 @@ def test_points_that_nothing_holds_slide() -> None:
         assert not model.violations(everywhere)
 
 
-def test_points_alone_are_refused(poses: dict[str, Array]) -> None:
+def test_identify_graph_refuses_points_only(poses: dict[str, Array]) -> None:
     points = {part: poses[part][:, :3, 3] for part in ("cart", "door")}
     with pytest.raises(kv.errors.InvalidValueError, match="Only positions were seen"):
         identify_graph(points, noise=NOISE, world=False)
@@ -238,7 +238,7 @@ def test_points_alone_are_refused(poses: dict[str, Array]) -> None:
     assert graph.edges == ()
 
 
-def test_the_order_of_parts_and_of_times_does_not_matter(poses: dict[str, Array]) -> None:
+def test_identify_graph_is_invariant_to_the_order_of_parts_and_times(poses: dict[str, Array]) -> None:
     parts = ["cart", "drawer", "door"]
     first = identify_graph({p: poses[p] for p in parts}, noise=NOISE, families=SOME)
     order = np.random.default_rng(3).permutation(40)
@@ -248,7 +248,7 @@ def test_the_order_of_parts_and_of_times_does_not_matter(poses: dict[str, Array]
     assert np.allclose(*axes, atol=1e-5)
 
 
-def test_bad_input_is_refused(poses: dict[str, Array]) -> None:
+def test_identify_graph_refuses_invalid_input(poses: dict[str, Array]) -> None:
     with pytest.raises(kv.errors.InvalidValueError, match="at least two"):
         identify_graph({"cart": poses["cart"]}, noise=NOISE, world=False)
     with pytest.raises(kv.errors.InvalidValueError, match="at least two"):

@@ -1,4 +1,4 @@
-"""Loops that were seen, closed in the model of what was seen: linkages that are known, through noise."""
+"""Loop closures of known linkages from noisy poses."""
 
 from __future__ import annotations
 
@@ -146,14 +146,14 @@ def two_cylinders() -> kv.Model:
     return model
 
 
-def test_a_four_bar_is_closed_and_documents_have_it(tmp_path: Path) -> None:
+def test_a_four_bar_is_closed_and_saved(tmp_path: Path) -> None:
     truth = four_bar()
     values = np.random.default_rng(0).uniform(0.0, 2.5, (40, 1))
     poses = seen(truth, ["crank", "coupler", "rocker"], values, 1)
     graph = identify_graph(poses, noise=NOISE, families=SOME)
     assert connected(graph) == ring("world", "crank", "coupler", "rocker")
     # What closes the loop stands beside the tree, and leaves no doubt about it.
-    assert all(edge.probability > 0.99 and not edge.others for edge in graph.edges)
+    assert all(edge.probability > 0.99 and not edge.alternatives for edge in graph.edges)
     model = kv.Model()
     with model.edit() as edit:
         for operation in graph.operations("seen"):
@@ -167,7 +167,7 @@ def test_a_four_bar_is_closed_and_documents_have_it(tmp_path: Path) -> None:
     assert np.array_equal(again.fk("seen/coupler")(q), model.fk("seen/coupler")(q))
 
 
-def test_a_crank_that_goes_round_and_what_it_pushes_are_closed() -> None:
+def test_a_slider_crank_is_closed() -> None:
     values = np.random.default_rng(1).uniform(-3.1, 3.1, (40, 1))
     poses = seen(slider_crank(), ["crank", "rod", "slider"], values, 2)
     graph = identify_graph(poses, noise=NOISE, families=SOME)
@@ -177,7 +177,7 @@ def test_a_crank_that_goes_round_and_what_it_pushes_are_closed() -> None:
     assert 0.7 < left(model, poses) < 1.3
 
 
-def test_it_does_not_matter_which_joint_closes_a_loop() -> None:
+def test_a_loop_can_be_closed_at_each_of_its_joints() -> None:
     """Here it is a slider, which holds other components than a hinge, in axes that are turned to suit."""
     values = np.random.default_rng(1).uniform(-1.2, 1.2, (40, 1))
     poses = seen(slider_crank(), ["crank", "rod", "slider"], values, 2)
@@ -194,14 +194,14 @@ def test_it_does_not_matter_which_joint_closes_a_loop() -> None:
     model = kv.Model()
     with model.edit() as edit:
         for joint in tree.values():
-            edit.apply(joint.found.best.operation(joint.child, joint.parent))
+            edit.apply(joint.result.best.operation(joint.child, joint.parent))
         for operation in plan.operations(str):
             edit.apply(operation)
     assert len(model.degrees_of_freedom) == 1
     assert 0.7 < left(model, poses) < 1.3
 
 
-def test_loops_that_share_a_crank_are_closed_one_after_the_other() -> None:
+def test_loops_with_a_common_crank_are_both_closed() -> None:
     truth = two_cylinders()
     values = np.random.default_rng(2).uniform(0.7, 2.6, (50, 1))
     poses = seen(truth, ["crank", "left_rod", "left", "right_rod", "right"], values, 3)
@@ -215,17 +215,17 @@ def test_loops_that_share_a_crank_are_closed_one_after_the_other() -> None:
 
 
 @pytest.mark.parametrize("family", sorted(CONSTRAINED_COMPONENTS))
-def test_what_a_joint_holds_is_what_its_motion_leaves(family: str) -> None:
+def test_constrained_components_are_those_without_motion(family: str) -> None:
     random = np.random.default_rng(0)
     motion = GroupMotion(JOINT_FAMILIES[family], 6, np.eye(4), np.eye(4))
-    poses = motion.at(random.normal(0.0, 0.5, (50, motion.joints))).pose
+    poses = motion.linearise(random.normal(0.0, 0.5, (50, motion.joints))).pose
     turned = 0.5 * (poses - np.swapaxes(poses, 1, 2))
     components = [*poses[:, :3, 3].T, turned[:, 2, 1], turned[:, 0, 2], turned[:, 1, 0]]
     still = tuple(k for k, component in enumerate(components) if np.allclose(component, 0.0))
     assert still == CONSTRAINED_COMPONENTS[family]
 
 
-def test_a_loop_of_balls_is_stated_and_left_open() -> None:
+def test_a_loop_of_balls_is_reported_and_left_open() -> None:
     truth = kv.Model()
     with truth.edit() as edit:
         bar(edit, "crank", "world", 0.0, 0.2)
@@ -246,7 +246,7 @@ def test_a_loop_of_balls_is_stated_and_left_open() -> None:
     assert {"crank", "rod", "rocker"} == set(graph.model(close=False).frames)
 
 
-def test_what_follows_a_follower_follows_its_leaders() -> None:
+def test_dependent_coordinates_are_resolved_transitively() -> None:
     random = np.random.default_rng(0)
     times = np.arange(7)
     twists = Twists(("a", "b", "c", "d"), times, random.normal(size=(7, 6, 4)))
@@ -259,7 +259,7 @@ def test_what_follows_a_follower_follows_its_leaders() -> None:
     some = times[2:]
     motion = Twists(("d", "c", "a"), some, np.zeros((5, 6, 3)))
     followers.add(motion, [1], np.stack([c_by_d, c_by_a], axis=1)[2:, None])
-    found = followers.resolved(twists)
+    found = followers.resolve(twists)
     assert np.array_equal(found.times, some)
     a, b, c, d = np.moveaxis(twists.twists, 2, 0)
     by_a = a + b * (b_by_a + b_by_c * c_by_a)[:, None] + c * c_by_a[:, None]

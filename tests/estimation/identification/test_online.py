@@ -1,4 +1,4 @@
-"""Poses one by one: what is found is what all of them together tell."""
+"""Online identification compared with identification of all poses."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from kineverse.estimation.identification.solver import solver
 
 
 @pytest.mark.parametrize("family", ["prismatic", "revolute", "planar"])
-def test_found_is_that_of_all_poses_at_every_step(family: str) -> None:
+def test_identifier_result_agrees_with_identify_at_every_step(family: str) -> None:
     seen = recording(family, count=48, position=0.02, orientation=0.03, seed=2)
     solver.prepare(wait=True)
     identifier = Identifier(noise=seen.covariance)
@@ -22,7 +22,7 @@ def test_found_is_that_of_all_poses_at_every_step(family: str) -> None:
         identifier.add(a, b)
         if k < 12:
             continue
-        found = identifier.found
+        found = identifier.result
         if k % 6:
             continue
         whole = identify(seen.parent[:k], seen.child[:k], noise=seen.covariance)
@@ -36,22 +36,22 @@ def test_found_is_that_of_all_poses_at_every_step(family: str) -> None:
                 assert fit.log_evidence == pytest.approx(whole[fit.family].log_evidence, abs=0.1)
 
 
-def test_a_surprise_has_all_families_looked_at() -> None:
+def test_a_surprising_pose_updates_all_families() -> None:
     seen = recording("revolute", count=41, position=0.005, orientation=0.01, seed=4)
     identifier = Identifier(noise=seen.covariance, families=["rigid", "revolute", "cylindrical"])
     for a, b in zip(seen.parent[:40], seen.child[:40], strict=True):
         identifier.add(a, b)
         if len(identifier) > 20:
-            assert identifier.found.best.family == "revolute"
-    assert 1e-6 < identifier.found.probabilities["cylindrical"] < 0.01
+            assert identifier.result.best.family == "revolute"
+    assert 1e-6 < identifier.result.probabilities["cylindrical"] < 0.01
     along = np.eye(4)
     along[2, 3] = 0.1
     there = seen.left @ along @ np.linalg.inv(seen.left) @ seen.true_relative[40]
     identifier.add(seen.true_parent[40], seen.true_parent[40] @ there)
-    assert identifier.found.best.family == "cylindrical"
+    assert identifier.result.best.family == "cylindrical"
 
 
-def test_what_was_handed_out_stays_as_it_was() -> None:
+def test_an_earlier_result_stays_unchanged() -> None:
     seen = recording("revolute", count=9, position=0.02, orientation=0.03, seed=2)
     c, gathered = seen.covariance, ObservationBuffer()
     for k in range(9):

@@ -1,4 +1,4 @@
-"""Some of what was seen is wrong altogether, and what moves is found all the same."""
+"""Outlier rejection in identification."""
 
 from __future__ import annotations
 
@@ -35,7 +35,9 @@ CASES = [(0.05, 2, 8), (0.2, 7, 28), (0.4, 3, 11)]
 
 
 @pytest.mark.parametrize(("fraction", "repeats", "least"), CASES)
-def test_what_moves_is_told_as_if_nothing_were_wrong(fraction: float, repeats: int, least: int) -> None:
+def test_identify_with_outliers_agrees_with_the_inliers_alone(
+    fraction: float, repeats: int, least: int
+) -> None:
     right, off, off_without = 0, [], []
     for family in TOLD:
         for seed in range(repeats):
@@ -56,7 +58,7 @@ def test_what_moves_is_told_as_if_nothing_were_wrong(fraction: float, repeats: i
 
 
 @pytest.mark.parametrize("family", [*JOINTS])
-def test_nothing_changes_where_nothing_is_wrong(family: str) -> None:
+def test_outliers_option_changes_nothing_without_outliers(family: str) -> None:
     seen = seen_as(family, 3)
     before = identify(seen.parent, seen.child, noise=seen.covariance)
     after = identify(seen.parent, seen.child, noise=seen.covariance, outliers=True)
@@ -77,29 +79,31 @@ def hinge() -> tuple[Recording, Array, Array, IdentificationResult]:
     return seen, child, wrong, identify(seen.parent, child, noise=seen.covariance, outliers=True)
 
 
-def test_what_is_wrong_is_said_and_does_not_count(hinge) -> None:
+def test_outliers_are_listed_and_ignored(hinge) -> None:
     seen, child, wrong, found = hinge
     fit = found.best
     assert fit.outliers == tuple(wrong)
-    np.testing.assert_array_equal(fit.right, np.setdiff1d(np.arange(20), wrong))
-    without = identify(seen.parent[fit.right], child[fit.right], noise=seen.covariance).best
+    np.testing.assert_array_equal(fit.inliers, np.setdiff1d(np.arange(20), wrong))
+    without = identify(seen.parent[fit.inliers], child[fit.inliers], noise=seen.covariance).best
     np.testing.assert_allclose(fit.range, without.range, atol=1e-3)
     np.testing.assert_allclose(fit.rms, without.rms, rtol=1e-3)
     np.testing.assert_allclose(fit.covariance, without.covariance, rtol=0.02, atol=1e-9)
     # What is wrong has the nearest place on the joint.
     assert fit.joint_values.shape == fit.deviations.shape == (20, 1)
     assert np.linalg.norm(fit.residuals[wrong], axis=1).min() > 0.2
-    assert np.linalg.norm(fit.residuals[fit.right], axis=1).max() < 0.2
+    assert np.linalg.norm(fit.residuals[fit.inliers], axis=1).max() < 0.2
     assert (fit.deviations > 0.0).all()
 
 
-def test_families_are_weighed_by_the_same_observations(hinge) -> None:
+def test_evidence_includes_the_density_of_the_outliers(hinge) -> None:
     seen, child, _, found = hinge
     fit = found.best
-    without = identify(seen.parent[fit.right], child[fit.right], noise=seen.covariance)
+    without = identify(seen.parent[fit.inliers], child[fit.inliers], noise=seen.covariance)
     usual = Outliers()
-    belief = 16 * math.log(1 - usual.fraction) + 4 * (math.log(usual.fraction) + usual.log_uniform_density)
-    assert fit.log_evidence == pytest.approx(without["revolute"].log_evidence + belief, abs=0.01)
+    joint_prior = 16 * math.log(1 - usual.fraction) + 4 * (
+        math.log(usual.fraction) + usual.log_uniform_density
+    )
+    assert fit.log_evidence == pytest.approx(without["revolute"].log_evidence + joint_prior, abs=0.01)
     # What moves freely explains everything, and what does not move cannot call almost everything wrong.
     assert found["free"].outliers == found["rigid"].outliers == ()
     assert found["free"].log_evidence < fit.log_evidence - 100
@@ -107,7 +111,7 @@ def test_families_are_weighed_by_the_same_observations(hinge) -> None:
 
 
 @pytest.mark.parametrize("family", ["revolute", "prismatic", "rigid"])
-def test_positions_alone(family: str) -> None:
+def test_outliers_among_positions_are_found(family: str) -> None:
     for seed in range(3):
         seen = seen_as(family, seed, noise=(0.005, 0.03))
         child, wrong = with_wrong(seen, 0.2, seed)
@@ -120,7 +124,7 @@ def test_positions_alone(family: str) -> None:
 
 
 @pytest.mark.parametrize("family", TOLD)
-def test_noise_that_nobody_knows(family: str) -> None:
+def test_outliers_are_found_with_unknown_noise(family: str) -> None:
     seen = seen_as(family, 2)
     child, wrong = with_wrong(seen, 0.2, 2)
     found = identify(seen.parent, child, outliers=True)
@@ -129,7 +133,7 @@ def test_noise_that_nobody_knows(family: str) -> None:
     assert found.noise_scale == pytest.approx(2.0, rel=0.5)
 
 
-def test_millimetres() -> None:
+def test_outliers_are_found_in_millimetres() -> None:
     seen = seen_as("revolute", 4)
     child, wrong = with_wrong(seen, 0.2, 4)
     parent = seen.parent.copy()
@@ -140,7 +144,7 @@ def test_millimetres() -> None:
         assert (found.best.family, found.best.outliers) == ("revolute", tuple(wrong))
 
 
-def test_half_of_it_wrong_is_no_explanation() -> None:
+def test_half_of_the_observations_as_outliers_is_no_explanation() -> None:
     """What goes round four axes in turn is no hinge of which most was seen wrong."""
     several = [seen_as("revolute", seed, count=5) for seed in range(4)]
     parent, child = (np.concatenate([getattr(s, part) for s in several]) for part in ("parent", "child"))
@@ -149,14 +153,14 @@ def test_half_of_it_wrong_is_no_explanation() -> None:
     assert found.best.family == "free"
 
 
-def test_one_by_one() -> None:
+def test_identifier_finds_outliers() -> None:
     seen = seen_as("revolute", 5, count=30)
     child, wrong = with_wrong(seen, 0.2, 5)
     identifier = Identifier(noise=seen.covariance, outliers=True)
     for a, b in zip(seen.parent, child, strict=True):
         identifier.add(a, b)
         if len(identifier) >= 16 and len(identifier) % 3 == 0:
-            found = identifier.found
+            found = identifier.result
             assert found.best.family == "revolute"
     whole = identify(seen.parent, child, noise=seen.covariance, outliers=True).best
     assert found.best.outliers == whole.outliers == tuple(wrong)
@@ -165,7 +169,7 @@ def test_one_by_one() -> None:
     )
 
 
-def test_what_outliers_are_is_checked() -> None:
+def test_invalid_outlier_models_are_refused() -> None:
     seen = seen_as("rigid", 0)
     with pytest.raises(InvalidValueError, match="Outliers are True, False or Outliers"):
         identify(seen.parent, seen.child, noise=seen.covariance, outliers=0.2)  # type: ignore[arg-type]

@@ -1,4 +1,4 @@
-"""Cranes and millimetres: what is found does not depend on how large it is, or on the unit it is said in."""
+"""Length scale: cranes, and poses in millimetres."""
 
 from __future__ import annotations
 
@@ -34,13 +34,13 @@ def found_of(seen: Recording, factor: float, families: object = None) -> Identif
 
 
 @pytest.mark.parametrize("family", [*JOINTS])
-def test_the_same_is_found_in_millimetres(family: str) -> None:
+def test_identify_is_invariant_to_millimetres(family: str) -> None:
     seen = recording(family, count=20, position=0.002, orientation=0.01, seed=3)
     assert found_of(seen, 1000.0).best.family == family
 
 
 @pytest.mark.parametrize("family", ["prismatic", "revolute", "screw", "planar"])
-def test_everything_grows_with_what_was_seen(family: str) -> None:
+def test_lengths_of_a_fit_scale_with_the_poses(family: str) -> None:
     seen = recording(family, count=20, position=0.002, orientation=0.01, seed=3)
     small, factor = found_of(seen, LARGE), 40.0
     large = found_of(seen, factor * LARGE)
@@ -62,7 +62,7 @@ def test_everything_grows_with_what_was_seen(family: str) -> None:
     np.testing.assert_allclose(other.rms, np.multiply(one.rms, [factor, 1.0]), rtol=1e-3)
 
 
-def test_a_crane_is_a_hinge() -> None:
+def test_a_crane_is_identified_as_a_hinge() -> None:
     random = np.random.default_rng(5)
     q = kv.position("q")
     boom = kv.compile([kv.translation(3, 1, 20) @ kv.rotation_z(q) @ kv.translation(40, 0, 0)])
@@ -75,13 +75,13 @@ def test_a_crane_is_a_hinge() -> None:
     for pose in seen:
         one_by_one.add(None, pose)
         if len(one_by_one) % 6 == 0:
-            assert len(one_by_one.found)
-    fit = one_by_one.found.best
+            assert len(one_by_one.result)
+    fit = one_by_one.result.best
     assert fit.family == "revolute"
     assert np.linalg.norm(fit.parameters["point"][:2] - [3, 1]) < 4 * fit.deviation("point.x")
 
 
-def test_a_family_of_ones_own_keeps_its_metres() -> None:
+def test_a_custom_family_keeps_its_metres() -> None:
     random = np.random.default_rng(2)
     a, length = kv.position("a"), kv.parameter("length", 20.0)
     panel = kv.translation(0, 0, length * np.cos(a)) @ kv.rotation_y(a)

@@ -1,4 +1,4 @@
-"""Stages in C are those in numpy."""
+"""C stages of identification compared with numpy."""
 
 from __future__ import annotations
 
@@ -57,13 +57,13 @@ def same(slow: Scored, fast: Scored, atol: float = 1e-4, log: float = 0.05) -> N
     # Steps end where they promise little, which is not the same place to the last digit.
     assert fast.log_evidence == pytest.approx(slow.log_evidence, abs=log)
     assert other.cost == pytest.approx(one.cost, abs=log)
-    assert other.belief.marginal == one.belief.marginal
-    np.testing.assert_allclose(other.belief.precision, one.belief.precision, rtol=0.05)
+    assert other.joint_prior.marginal == one.joint_prior.marginal
+    np.testing.assert_allclose(other.joint_prior.precision, one.joint_prior.precision, rtol=0.05)
     seen = slice(None) if one.motion.rows == 6 else 3  # of the pose of what was seen as a position
     np.testing.assert_allclose(other.linear.pose[:, :3, seen], one.linear.pose[:, :3, seen], atol=atol)
     np.testing.assert_allclose(other.residuals, one.residuals, atol=atol)
     # All of it belongs together.
-    for a, b in zip(other.linear, other.motion.at(other.values), strict=True):
+    for a, b in zip(other.linear, other.motion.linearise(other.values), strict=True):
         np.testing.assert_allclose(a, b, atol=1e-12)
 
 
@@ -75,14 +75,14 @@ def compiled() -> None:
 @pytest.mark.compiler
 @pytest.mark.parametrize("family", [*JOINTS])
 @pytest.mark.parametrize("how", HOW)
-def test_c_and_numpy_agree(family: str, how: str) -> None:
+def test_levenberg_marquardt_in_c_agrees_with_numpy(family: str, how: str) -> None:
     seen = seen_as(how, family)
     start = next(initial_guesses(family, MotionStatistics(seen)))
     slow = levenberg_marquardt(seen, *start)
-    fast = solver.solve(seen, start, seen.parent, slow.belief)
+    fast = solver.solve(seen, start, seen.parent, slow.joint_prior)
     assert fast.cost == pytest.approx(slow.cost, rel=1e-6, abs=1e-6)
     if slow.converged and fast.converged:
-        for a, b in zip(slow.motion.at(slow.values), fast.motion.at(fast.values), strict=True):
+        for a, b in zip(slow.motion.linearise(slow.values), fast.motion.linearise(fast.values), strict=True):
             np.testing.assert_allclose(a, b, atol=1e-4)
         np.testing.assert_allclose(slow.residuals, fast.residuals, atol=1e-4)
 
@@ -90,14 +90,16 @@ def test_c_and_numpy_agree(family: str, how: str) -> None:
 @pytest.mark.compiler
 @pytest.mark.parametrize("family", MOVING)
 @pytest.mark.parametrize("how", HOW)
-def test_steps_with_joint_values_integrated_out_agree(family: str, how: str) -> None:
+def test_marginal_steps_in_c_agree_with_numpy(family: str, how: str) -> None:
     seen = seen_as(how, family)
     start = next(initial_guesses(family, MotionStatistics(seen)))
     near = levenberg_marquardt(seen, start.motion, start.values)
     # C has derivatives in closed form, and numpy takes differences.
-    belief = JointValuePrior(near.values.mean(axis=0), np.full(near.motion.joints, 0.3**-2), marginal=True)
-    slow = levenberg_marquardt(seen, near.motion, near.values, near.parent, belief, steps=1)
-    fast = solver.solve(seen, InitialGuess(near.motion, near.values), near.parent, belief, steps=1)
+    joint_prior = JointValuePrior(
+        near.values.mean(axis=0), np.full(near.motion.joints, 0.3**-2), marginal=True
+    )
+    slow = levenberg_marquardt(seen, near.motion, near.values, near.parent, joint_prior, steps=1)
+    fast = solver.solve(seen, InitialGuess(near.motion, near.values), near.parent, joint_prior, steps=1)
     assert fast.cost == pytest.approx(slow.cost, rel=1e-6, abs=1e-6)
     np.testing.assert_allclose(fast.linear.pose, slow.linear.pose, atol=1e-6)
 
@@ -105,11 +107,11 @@ def test_steps_with_joint_values_integrated_out_agree(family: str, how: str) -> 
 @pytest.mark.compiler
 @pytest.mark.parametrize("family", [*JOINTS])
 @pytest.mark.parametrize("how", HOW)
-def test_poses_agree(family: str, how: str) -> None:
+def test_linearised_poses_in_c_agree_with_numpy(family: str, how: str) -> None:
     start = next(initial_guesses(family, MotionStatistics(seen_as(how, family))))
     assert isinstance(start.motion, GroupMotion)
     for slow, fast in zip(
-        start.motion.at(start.values, native=False), start.motion.at(start.values), strict=True
+        start.motion.linearise(start.values, native=False), start.motion.linearise(start.values), strict=True
     ):
         np.testing.assert_allclose(slow, fast, atol=1e-13)
 
@@ -117,45 +119,48 @@ def test_poses_agree(family: str, how: str) -> None:
 @pytest.mark.compiler
 @pytest.mark.parametrize("family", [*JOINTS])
 @pytest.mark.parametrize("how", HOW)
-def test_the_likeliest_member_is_the_same(family: str, how: str) -> None:
+def test_maximum_likelihood_in_c_agrees_with_numpy(family: str, how: str) -> None:
     seen = seen_as(how, family)
     begin = [*initial_guesses(family, MotionStatistics(seen))]
-    same(maximum_likelihood.maximum_likelihood(seen, begin), solver.likeliest(seen, begin))
+    same(maximum_likelihood.maximum_likelihood(seen, begin), solver.maximum_likelihood(seen, begin))
 
 
 @pytest.mark.compiler
 @pytest.mark.parametrize("family", MOVING)
 @pytest.mark.parametrize("how", ["both noisy", "parent known"])
-def test_integrating_joint_values_out_is_the_same(family: str, how: str) -> None:
+def test_marginal_likelihood_in_c_agrees_with_numpy(family: str, how: str) -> None:
     seen = seen_as(how, family)
     near = solve_from_best_start(seen, [*initial_guesses(family, MotionStatistics(seen))])
-    slow, fast = maximum_likelihood.maximise_marginal_likelihood(seen, near), solver.refined(seen, near)
-    assert slow.solution.belief.marginal
+    slow, fast = (
+        maximum_likelihood.maximise_marginal_likelihood(seen, near),
+        solver.maximise_marginal_likelihood(seen, near),
+    )
+    assert slow.solution.joint_prior.marginal
     same(slow, fast, atol=0.02)
     # One more observation, and the first ones are where they were.
-    part = seen.at(slice(0, 10))
+    part = seen.select(slice(0, 10))
     before = maximum_likelihood.maximise_marginal_likelihood(
         part, solve_from_best_start(part, [*initial_guesses(family, MotionStatistics(part))])
     ).solution
     start = InitialGuess(before.motion, np.concatenate([before.values, slow.solution.values[10:]]))
     parent = np.concatenate([before.parent, seen.parent[10:]])
-    given = seen, start, parent, before.belief, 10
-    same(maximum_likelihood.continue_from(*given), solver.continued(*given), atol=0.02)
+    given = seen, start, parent, before.joint_prior, 10
+    same(maximum_likelihood.continue_from(*given), solver.continue_from(*given), atol=0.02)
 
 
 @pytest.mark.compiler
 @pytest.mark.parametrize(
     ("family", "whole"), [("prismatic", True), ("revolute", True), ("spherical", True), ("revolute", False)]
 )
-def test_precise_positions_are_the_same(family: str, whole: bool) -> None:
+def test_precise_positions_in_c_agree_with_numpy(family: str, whole: bool) -> None:
     seen = precise(family, whole)
     begin = [*initial_guesses(family, MotionStatistics(seen))]
-    slow, fast = maximum_likelihood.maximum_likelihood(seen, begin), solver.likeliest(seen, begin)
+    slow, fast = maximum_likelihood.maximum_likelihood(seen, begin), solver.maximum_likelihood(seen, begin)
     same(slow, fast, atol=0.02)
     near = slow.solution
     same(
         maximum_likelihood.maximise_marginal_likelihood(seen, near),
-        solver.refined(seen, near),
+        solver.maximise_marginal_likelihood(seen, near),
         atol=0.02,
         log=0.2,
     )
@@ -164,20 +169,18 @@ def test_precise_positions_are_the_same(family: str, whole: bool) -> None:
 @pytest.mark.compiler
 @pytest.mark.parametrize("family", [*JOINTS])
 @pytest.mark.parametrize("how", [*HOW, "precise"])
-def test_c_stays_within_the_memory_it_asks_for(
-    family: str, how: str, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_c_stays_within_its_work_memory(family: str, how: str, monkeypatch: pytest.MonkeyPatch) -> None:
     lent = []
 
     def lend(size: int) -> np.ndarray:
         lent.append(np.full(size + 64, 12345.0))
         return lent[-1][:size]
 
-    monkeypatch.setattr(native._memory, "of", lend)
+    monkeypatch.setattr(native._memory, "reserve", lend)
     seen = precise(family, True) if how == "precise" else seen_as(how, family)
-    found = solver.likeliest(seen, [*initial_guesses(family, MotionStatistics(seen))]).solution
-    found = solver.refined(seen, found).solution
-    solver.continued(seen, InitialGuess(found.motion, found.values), found.parent, found.belief, 2)
+    found = solver.maximum_likelihood(seen, [*initial_guesses(family, MotionStatistics(seen))]).solution
+    found = solver.maximise_marginal_likelihood(seen, found).solution
+    solver.continue_from(seen, InitialGuess(found.motion, found.values), found.parent, found.joint_prior, 2)
     solver.evidence(found)
     assert len(lent) == 4
     assert all((memory[-64:] == 12345.0).all() for memory in lent)
@@ -186,9 +189,9 @@ def test_c_stays_within_the_memory_it_asks_for(
 @pytest.mark.compiler
 @pytest.mark.parametrize("family", [*JOINTS])
 @pytest.mark.parametrize("how", HOW)
-def test_evidence_agrees(family: str, how: str) -> None:
+def test_evidence_in_c_agrees_with_numpy(family: str, how: str) -> None:
     seen = seen_as(how, family)
-    solution = solver.likeliest(seen, [*initial_guesses(family, MotionStatistics(seen))]).solution
+    solution = solver.maximum_likelihood(seen, [*initial_guesses(family, MotionStatistics(seen))]).solution
     for scale in (1.0, 3.0):
         slow, fast = laplace_evidence(solution.scaled(scale)), solver.evidence(solution, scale)
         assert fast.log_evidence == pytest.approx(slow.log_evidence, rel=1e-9)
@@ -200,13 +203,16 @@ def test_evidence_agrees(family: str, how: str) -> None:
 
 @pytest.mark.compiler
 @pytest.mark.parametrize("family", ["revolute", "planar"])
-def test_what_steps_have_not_reached_does_not_count_in_c_either(family: str) -> None:
+def test_evidence_of_an_unconverged_solution_is_reduced_in_c(family: str) -> None:
     seen = seen_as("both noisy", family)
-    near = solver.likeliest(seen, [*initial_guesses(family, MotionStatistics(seen))])
-    reached = solver.refined(seen, near.solution)
+    near = solver.maximum_likelihood(seen, [*initial_guesses(family, MotionStatistics(seen))])
+    reached = solver.maximise_marginal_likelihood(seen, near.solution)
     early = replace(reached.solution, converged=False, cost=reached.solution.cost + 20.0)
     # Its widths have settled, so no step is taken.
-    slow, fast = maximum_likelihood.maximise_marginal_likelihood(seen, early), solver.refined(seen, early)
+    slow, fast = (
+        maximum_likelihood.maximise_marginal_likelihood(seen, early),
+        solver.maximise_marginal_likelihood(seen, early),
+    )
     assert evidence_excess(early) == pytest.approx(10.0, abs=0.5)
     assert fast.log_evidence == pytest.approx(slow.log_evidence, abs=1e-6)
     assert fast.log_evidence == pytest.approx(reached.log_evidence - evidence_excess(early), abs=1e-3)
@@ -217,19 +223,19 @@ class Pinned(GroupMotion):
     """A hinge of which only the axis is unknown."""
 
     @property
-    def freedom(self) -> Parametrisation:
+    def parametrisation(self) -> Parametrisation:
         return Parametrisation((5,), (3, 4), ())
 
 
 @pytest.mark.compiler
-def test_c_has_nothing_to_do_with_motions_that_are_not_what_their_group_says() -> None:
+def test_a_subclass_of_a_motion_is_solved_in_numpy() -> None:
     seen = seen_as("both noisy", "revolute")
     start = next(initial_guesses("revolute", MotionStatistics(seen)))
     pinned = Pinned(JOINT_FAMILIES["revolute"], 6, start.motion.left, start.motion.right)
     begin = InitialGuess(pinned, start.values)
     assert not pinned.is_plain
-    assert pinned.at(start.values).by_parameters.shape == (12, 6, 2)
-    found = solver.likeliest(seen, [begin]).solution
+    assert pinned.linearise(start.values).by_parameters.shape == (12, 6, 2)
+    found = solver.maximum_likelihood(seen, [begin]).solution
     assert found.cost == pytest.approx(levenberg_marquardt(seen, *begin).cost)
     assert solver.evidence(found).covariance.shape == (2, 2)
 
@@ -244,22 +250,22 @@ def test_c_has_nothing_to_do_with_motions_that_are_not_what_their_group_says() -
     ],
     ids=["too many", "more than there are", "no such component"],
 )
-def test_c_refuses_groups_it_has_no_room_for(freedom: Parametrisation) -> None:
+def test_a_family_too_large_for_the_kernel_is_not_accepted(freedom: Parametrisation) -> None:
     group = replace(JOINT_FAMILIES["revolute"], poses=freedom, positions=freedom)
     assert not GroupMotion(group, 6, np.eye(4), np.eye(4)).is_plain
     assert GroupMotion(JOINT_FAMILIES["revolute"], 6, np.eye(4), np.eye(4)).is_plain
 
 
 @pytest.mark.compiler
-def test_joint_values_of_another_shape_are_refused() -> None:
+def test_linearise_refuses_joint_values_of_another_shape() -> None:
     motion = GroupMotion(JOINT_FAMILIES["revolute"], 6, np.eye(4), np.eye(4))
     with pytest.raises(ShapeError, match=r"\(N, 1\), not \(4, 2\)"):
-        motion.at(np.zeros((4, 2)))
+        motion.linearise(np.zeros((4, 2)))
 
 
 @pytest.mark.compiler
 @pytest.mark.parametrize("family", ["prismatic", "revolute", "planar"])
-def test_without_a_compiler_the_same_is_found(family: str, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_identify_without_a_compiler_agrees(family: str, monkeypatch: pytest.MonkeyPatch) -> None:
     seen = recording(family, count=12, position=0.02, orientation=0.05, seed=1)
     fast = identify(seen.parent, seen.child, noise=seen.covariance)
     with monkeypatch.context() as patched:

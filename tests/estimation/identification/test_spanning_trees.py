@@ -1,4 +1,4 @@
-"""Trees of connections, and how probable each connection is: beside scipy, and beside all trees there are."""
+"""Spanning trees compared with scipy, and edge probabilities with the sum over all trees."""
 
 from __future__ import annotations
 
@@ -41,7 +41,7 @@ def all_trees(gains: Gains) -> dict[tuple[frozenset[int], ...], float]:
 
 
 @pytest.mark.parametrize("seed", range(4))
-def test_the_spanning_tree_is_that_of_scipy(seed: int) -> None:
+def test_spanning_tree_agrees_with_scipy(seed: int) -> None:
     random = np.random.default_rng(seed)
     nodes = list(range(7))
     gains = {frozenset(pair): float(random.uniform(1.0, 9.0)) for pair in combinations(nodes, 2)}
@@ -61,7 +61,7 @@ def test_the_spanning_tree_is_that_of_scipy(seed: int) -> None:
 
 @pytest.mark.parametrize("count", [2, 3, 4, 5])
 @pytest.mark.parametrize("spread", [0.1, 3.0, 3000.0])
-def test_probabilities_of_connections_are_those_of_all_trees(count: int, spread: float) -> None:
+def test_edge_probabilities_agree_with_the_sum_over_all_trees(count: int, spread: float) -> None:
     gains = all_gains(count, spread, seed=count, missing=count // 4)
     trees = all_trees(gains)
     total = logsumexp(list(trees.values()))
@@ -72,14 +72,14 @@ def test_probabilities_of_connections_are_those_of_all_trees(count: int, spread:
         assert probability == pytest.approx(np.exp(logsumexp(logs) - total), rel=1e-9, abs=1e-300)
 
 
-def test_small_probabilities_keep_their_digits() -> None:
+def test_small_edge_probabilities_are_accurate() -> None:
     # A determinant of the Laplacian would have lost them: what is left of 1 is 1e-130.
     gains = {frozenset("ab"): 300.0, frozenset("bc"): 300.0, frozenset("ac"): 0.0}
     found = edge_probabilities("abc", gains)
     assert found[frozenset("ac")] == pytest.approx(2.0 * np.exp(-300.0), rel=1e-12)
 
 
-def test_parts_that_nothing_connects_make_a_forest() -> None:
+def test_spanning_tree_of_an_unconnected_graph_is_a_forest() -> None:
     gains = {frozenset("ab"): -5.0, frozenset("cd"): 1.0, frozenset("de"): 1.0, frozenset("ce"): 1.0}
     found = edge_probabilities("abcdef", gains)
     assert found[frozenset("ab")] == 1.0
@@ -89,7 +89,7 @@ def test_parts_that_nothing_connects_make_a_forest() -> None:
 
 
 @pytest.mark.parametrize("seed", range(5))
-def test_what_is_there_instead_is_counted_in_trees_without(seed: int) -> None:
+def test_replacement_probabilities_agree_with_the_sum_over_all_trees(seed: int) -> None:
     gains = all_gains(5, 1.0, seed)
     trees = all_trees(gains)
     total = logsumexp(list(trees.values()))
@@ -128,7 +128,7 @@ def test_leaves_have_one_connection(seed: int) -> None:
             assert probability == pytest.approx(np.exp(logsumexp(logs) - total))
 
 
-def test_roots_come_first_and_parents_before_children() -> None:
+def test_orient_tree_lists_parents_before_children() -> None:
     tree = [frozenset("ab"), frozenset("bc"), frozenset("de")]
     roots, directed = orient_tree("bdac", "abcde", tree)
     assert roots == ("b", "d")

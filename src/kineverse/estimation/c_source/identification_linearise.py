@@ -4,8 +4,8 @@ With T = S + J_a P⁻¹ J_aᵀ for an observation, Π = T⁻¹ and the gains G =
 
     d log |T| = tr(Π dS) + 2 tr(G dJ_a)
 
-S changes with the lever h of the parent alone, by d log |T| = 2 q·dh. A turn of the joint's frame turns the
-columns of J_a, a lever of the joint changes what its turns make of it, and joint values follow the
+S depends on the lever h of the parent alone, with d log |T| = 2 q·dh. A rotation of the joint's frame rotates
+the columns of J_a, a lever of the joint changes the effect of its rotations, and the joint values follow the
 parameters.
 """
 

@@ -1,7 +1,7 @@
 """C text of the iterated MAP update of tracking.
 
-It does what :mod:`.solving` does, in the same order, after the texts of :mod:`.native_quadratic`,
-:mod:`.native_motion` and :mod:`.native_residual`. It says so when it cannot; the belief is as it was then.
+The algorithm is that of :mod:`kineverse.estimation.tracking.map_update`, in the same order. The text follows
+those of :mod:`.tracking_primitives`. On failure it returns an error code and leaves the state unchanged.
 """
 
 MAP_UPDATE = r"""

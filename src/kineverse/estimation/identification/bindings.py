@@ -1,6 +1,6 @@
 """Data structures and functions of the C kernels.
 
-Until then, and without a compiler, numpy does the same.
+The kernels are compiled in the background. Until then, and without a compiler, numpy computes the same.
 """
 
 from __future__ import annotations
@@ -16,22 +16,22 @@ from kineverse.compile.c_library import SourceLibrary
 from kineverse.compile.toolchain import NO_UNDEFINED_FLAGS
 from kineverse.errors import ShapeError
 from kineverse.estimation.c_source.identification_stages import IDENTIFICATION_SOURCE
-from kineverse.lie import Stack, transform
+from kineverse.lie import Array, transform
 
 from .motion_model import LinearisedPoses
 
 if TYPE_CHECKING:
     from .families import GroupMotion, JointFamily
 
-# Numbers of its own, that need not agree with those of an interpreter to the last bit.
+# No other path has to agree with these numbers to the last bit, so contraction is allowed.
 _FLAGS = ("-O3", "-ffp-contract=fast", "-fno-rounding-math", "-lm", *NO_UNDEFINED_FLAGS)
 _FAMILY = ("rows", "joints", "lefts", "rights", "pitches", "pitched", "reach", "slides")
 _SCALES = ("reach_scale", "pitch_scale", "close", "little", "narrowest", "settled", "better", "slid")
 _COUNTS = ("steps", "first_steps", "turns", "sliding_turns", "mirrored_turns", "mirrored_steps", "widths")
-# So many parameters C has room for, and so many unknowns of a family altogether.
+# Largest number of parameters, and of all unknowns, of a family in C.
 _PARAMETERS, _UNKNOWNS = 12, 16
 MOTION_SIZE = 25
-"""How many numbers C has for a member of a family."""
+"""Size of the C structure of a motion, in doubles."""
 
 
 class _Belief(ctypes.Structure):
@@ -46,7 +46,7 @@ class _Noise(ctypes.Structure):
 
 
 class Given(ctypes.Structure):
-    """What was observed, as C has it."""
+    """C structure of observations."""
 
     _fields_ = (
         *((name, ctypes.c_int64) for name in ("count", "known", "fresh", "softer")),
@@ -56,7 +56,7 @@ class Given(ctypes.Structure):
 
 
 class Problem(ctypes.Structure):
-    """What is to be solved, as C has it: a family, what was observed, and room for what C works with."""
+    """C structure of a problem: family, observations, constants and work fields."""
 
     _fields_ = (
         *((name, ctypes.c_int64) for name in _FAMILY),
@@ -85,13 +85,13 @@ def _declare(code: Any) -> None:
 
 
 library = SourceLibrary(IDENTIFICATION_SOURCE, _declare, _FLAGS)
-"""The compiled functions, once there are any; for the whole process."""
+"""Compiled functions, shared by the whole process."""
 
 
 @functools.cache
 def fits_kernel(group: JointFamily, rows: int) -> bool:
-    """Return whether C has room for a family."""
-    freedom = group.freedom(rows)
+    """Return True if the C structures have room for a family."""
+    freedom = group.parametrisation(rows)
     left, right, joints = (len(part) for part in (freedom.left, freedom.right, freedom.joints))
     return (
         {*freedom.left, *freedom.right, *freedom.joints} <= {*range(6)}
@@ -104,8 +104,8 @@ def fits_kernel(group: JointFamily, rows: int) -> bool:
 
 @functools.cache
 def problem_of(group: JointFamily, rows: int) -> Problem:
-    """Return the problem with what a family says, and nothing else. It is shared: copy it."""
-    freedom, problem = group.freedom(rows), Problem()
+    """Return a problem with the fields of a family only. It is cached, so callers copy it."""
+    freedom, problem = group.parametrisation(rows), Problem()
     problem.rows, problem.joints = rows, len(freedom.joints)
     problem.lefts, problem.rights = len(freedom.left), len(freedom.right)
     problem.pitches = problem.pitched = group.pitch
@@ -117,8 +117,8 @@ def problem_of(group: JointFamily, rows: int) -> Problem:
     return problem
 
 
-def pack_motion(motion: GroupMotion) -> Stack:
-    """Return what C knows of a member: rotation and place of both sides, and the pitch."""
+def pack_motion(motion: GroupMotion) -> Array:
+    """Return the C structure of a motion: rotation and position of both sides, and the pitch."""
     result = np.empty(MOTION_SIZE)
     for at, side in ((0, motion.left), (12, motion.right)):
         result[at : at + 9].reshape(3, 3)[:] = side[:3, :3]
@@ -127,14 +127,16 @@ def pack_motion(motion: GroupMotion) -> Stack:
     return result
 
 
-def unpack_motion(motion: GroupMotion, packed: Stack) -> GroupMotion:
-    """Return the member that C calls so."""
+def unpack_motion(motion: GroupMotion, packed: Array) -> GroupMotion:
+    """Return a motion with the parameters of a C structure."""
     left, right = (transform(packed[at : at + 9].reshape(3, 3), packed[at + 9 : at + 12]) for at in (0, 12))
     return replace(motion, left=left, right=right, pitch=float(packed[24]))
 
 
-def evaluate_poses(motion: GroupMotion, values: Stack) -> LinearisedPoses:
-    """Return the poses at joint values (N, k), as :meth:`.groups.GroupMotion.at` does.
+def evaluate_poses(motion: GroupMotion, values: Array) -> LinearisedPoses:
+    """Return the poses at joint values (N, k) and their derivatives, in C.
+
+    It is the kernel of :meth:`.families.GroupMotion.linearise`.
 
     Raises
     ------

@@ -15,31 +15,31 @@ from kineverse.compile import CompiledFunction
 from kineverse.compile import compile as compiled
 from kineverse.errors import InvalidValueError, ShapeError, UnknownNameError
 from kineverse.expressions.expression import Expression
-from kineverse.lie import Stack, log_so3
+from kineverse.lie import Array, log_so3
 from kineverse.symbols import Symbol
 
 from .families import REACH
 from .motion_model import LinearisedPoses, ParameterPrior
 from .observations import Observations
 
-# Joint values that are tried for each observation, for each joint alone, and members that are tried besides.
+# Candidate values of a single joint for each observation, and number of random initial members.
 _TRIED = 41
 _MEMBERS = 8
-# What is believed of the mean of a joint value beforehand [m] or [rad].
+# Prior standard deviation of the mean of a joint value [m] or [rad].
 _MEAN_SPREAD = 3.0
 
 
 class FamilyParameter(NamedTuple):
-    """What is known of a parameter beforehand.
+    """Prior and bounds of an unknown parameter of a family.
 
     Attributes
     ----------
     start
-        Its most probable value.
+        Mean of the prior.
     deviation
-        How far it may well be off that, its standard deviation.
+        Standard deviation of the prior.
     lower, upper
-        What it cannot pass.
+        Bounds.
     """
 
     start: float
@@ -50,28 +50,26 @@ class FamilyParameter(NamedTuple):
 
 @dataclass(frozen=True, eq=False)
 class Family:
-    """A family of motions that is said by an expression.
+    """Joint family defined by an expression.
 
     Attributes
     ----------
     name
-        As in ``found["garage"]``.
+        Name of the family, as in ``result["garage"]``.
     transform
-        The pose of the child in the parent, (4, 4), of joints and parameters.
+        Pose of the child in the parent, (4, 4), as an expression of joints and parameters.
     joints
-        The symbols that have a value of their own in each observation, and the range in which they are
-        looked for.
+        Symbols with a value for each observation, and the search range of each.
     parameters
-        The symbols that have one unknown value, and what is known of it: an :class:`FamilyParameter` or its first two
-        numbers.
+        Symbols with one unknown value, and its prior: a :class:`FamilyParameter` or its first two numbers.
     weight
-        How probable the family is beforehand, beside 1 for a hinge.
+        Prior weight of the family. That of a revolute joint is 1.
 
     Raises
     ------
     ShapeError, UnknownNameError, InvalidValueError
-        For what is no transform, symbols that are neither joints nor parameters, deviations that are not
-        positive, and empty ranges.
+        If the transform is not (4, 4), has symbols that are neither joints nor parameters, a deviation is not
+        positive, or a range is empty.
     """
 
     name: str
@@ -103,12 +101,12 @@ class Family:
 
     @property
     def unknowns(self) -> Mapping[Symbol, FamilyParameter]:
-        """What is known of the parameters."""
+        """Priors of the parameters."""
         return self.parameters  # type: ignore[return-value]
 
     @cached_property
     def function(self) -> CompiledFunction:
-        """The transform and its derivatives by parameters and joints, of joints and parameters."""
+        """Compiled function of joints and parameters: the transform and its derivatives by both."""
         joints, parameters = list(self.joints), list(self.parameters)
         outputs = [self.transform]
         outputs += [self.transform.partial(symbols) for symbols in (parameters, joints) if symbols]
@@ -117,16 +115,16 @@ class Family:
 
 @dataclass(frozen=True, eq=False)
 class FamilyMotion:
-    """A member of a family of one's own; lengths of poses are in a unit [m], see :mod:`.lengths`."""
+    """Member of a custom family. Lengths of its poses are in a unit [m], see :mod:`.scale`."""
 
     family: Family
     rows: int
-    parameters: Stack
+    parameters: Array
     unit: float = 1.0
 
     @property
     def name(self) -> str:
-        """That of the family."""
+        """Name of the family."""
         return self.family.name
 
     @property
@@ -141,11 +139,11 @@ class FamilyMotion:
 
     @property
     def kinds(self) -> tuple[int, ...]:
-        """Each joint value has a width of its own."""
+        """Kind of each joint value: each has a range of its own."""
         return tuple(range(self.joints))
 
-    def at(self, values: Stack) -> LinearisedPoses:
-        """Return the poses at joint values (N, k)."""
+    def linearise(self, values: Array) -> LinearisedPoses:
+        """Return the poses at joint values (N, k) and their derivatives."""
         count, rows = len(values), self.rows
         inputs = np.concatenate([values, np.tile(self.parameters, (count, 1))], axis=1)
         poses, *derivatives = (np.array(a) for a in self.family.function.batch(inputs))
@@ -156,36 +154,36 @@ class FamilyMotion:
         by_joints = _twists(poses, next(blocks))[:, :rows] if self.joints else np.zeros((count, rows, 0))
         return LinearisedPoses(poses, by_parameters, by_joints)
 
-    def moved(self, step: Stack) -> Self:
-        """Return the member that a step leads to, kept within the bounds of the parameters."""
+    def retract(self, step: Array) -> Self:
+        """Return the member after a step, clipped to the bounds of the parameters."""
         bounds = np.array([(u.lower, u.upper) for u in self.family.unknowns.values()]).reshape(-1, 2)
         return replace(self, parameters=np.clip(self.parameters + step, bounds[:, 0], bounds[:, 1]))
 
-    def bounded(self, values: Stack, step: Stack) -> Stack:
-        """Return joint values after a step, within the range in which they are looked for."""
+    def retract_joints(self, values: Array, step: Array) -> Array:
+        """Return joint values after a step of at most a quarter of the search range, clipped to the range."""
         ranges = np.array([*self.family.joints.values()]).reshape(-1, 2)
         most = 0.25 * (ranges[:, 1] - ranges[:, 0])
         return np.asarray(np.clip(values + np.clip(step, -most, most), ranges[:, 0], ranges[:, 1]))
 
     def prior(self) -> ParameterPrior:
-        """Return that parameters are near their starts."""
-        start, deviation = self._beliefs()
+        """Return the Gaussian prior of the parameters."""
+        start, deviation = self._prior_moments()
         return ParameterPrior((self.parameters - start) / deviation, np.diag(1.0 / deviation))
 
-    def beforehand(self, mean: Stack) -> tuple[float, Stack]:
-        """Return the density of parameters and of the mean joint values, and what keeps them finite.
+    def log_prior(self, mean: Array) -> tuple[float, Array]:
+        """Return the log prior of the parameters and of the mean joint values, and its precision.
 
-        The joints of :mod:`.groups` have a mean pose besides, with the density 1. Here it is part of the
-        parameters, so what a pose within reach would have is left out.
+        The joints of :mod:`.families` also have a mean pose with the density 1. Here the parameters determine
+        the mean pose, so the density of a pose within reach is divided out.
         """
-        _, deviation = self._beliefs()
+        _, deviation = self._prior_moments()
         off = self.prior().residuals
         log = -0.5 * float(off @ off) - float(np.sum(np.log(math.sqrt(math.tau) * deviation)))
         log += 1.5 * math.log(math.tau * REACH**2) + (math.log(8.0 * math.pi**2) if self.rows == 6 else 0.0)
         log -= self.joints * math.log(math.sqrt(math.tau) * _MEAN_SPREAD)
         return log, np.concatenate([np.zeros(self.size), np.full(self.joints, _MEAN_SPREAD**-2)])
 
-    def named(self) -> dict[str, Stack | float]:
+    def named_parameters(self) -> dict[str, Array | float]:
         """Return the parameters by name."""
         return dict(zip(self.coordinates(), self.parameters.tolist(), strict=True))
 
@@ -194,43 +192,47 @@ class FamilyMotion:
         return tuple(str(s) for s in self.family.parameters)
 
     def expression(self, joints: Sequence[Expression]) -> Expression:
-        """Return the pose of the child in the parent by other symbols for the joint values."""
+        """Return the pose of the child in the parent as an expression of other joint symbols."""
         values = dict(zip(self.family.parameters, self.parameters.tolist(), strict=True))
         return self.family.transform.substitute(
             {**dict(zip(self.family.joints, joints, strict=True)), **values}
         )
 
-    def _beliefs(self) -> tuple[Stack, Stack]:
+    def _prior_moments(self) -> tuple[Array, Array]:
         unknowns = self.family.unknowns.values()
         return np.array([u.start for u in unknowns]), np.array([u.deviation for u in unknowns])
 
 
-def family_starts(family: Family, seen: Observations, unit: float) -> Iterator[tuple[FamilyMotion, Stack]]:
-    """Yield members of a family, at its start and around, with the joint values that come nearest."""
-    motion = FamilyMotion(family, seen.rows, np.array([u.start for u in family.unknowns.values()]), unit)
-    # Always the same ones, so that the same poses give the same answer.
+def family_starts(
+    family: Family, observations: Observations, unit: float
+) -> Iterator[tuple[FamilyMotion, Array]]:
+    """Yield initial members of a family, at its start and around it, with the nearest joint values."""
+    motion = FamilyMotion(
+        family, observations.rows, np.array([u.start for u in family.unknowns.values()]), unit
+    )
+    # A fixed seed makes the result reproducible.
     random = np.random.default_rng(0)
-    _, deviation = motion._beliefs()
+    _, deviation = motion._prior_moments()
     for k in range(_MEMBERS if motion.size else 1):
-        member = motion.moved(random.normal(0.0, deviation)) if k else motion
-        yield member, _nearest(member, seen)
+        member = motion.retract(random.normal(0.0, deviation)) if k else motion
+        yield member, _nearest(member, observations)
 
 
-def _nearest(motion: FamilyMotion, seen: Observations) -> Stack:
+def _nearest(motion: FamilyMotion, observations: Observations) -> Array:
     each = max(3, round(_TRIED ** (1.0 / max(1, motion.joints)) * (1 if motion.joints < 2 else 3)))
     ranges = motion.family.joints.values()
-    tried = np.array([*product(*(np.linspace(low, high, each) for low, high in ranges))])
-    poses = motion.at(tried.reshape(-1, motion.joints)).pose
-    apart = np.sum((seen.relative[:, None, :3, 3] - poses[None, :, :3, 3]) ** 2, axis=-1)
-    if seen.rows == 6:
-        turns = np.swapaxes(seen.relative[:, None, :3, :3], -1, -2) @ poses[None, :, :3, :3]
-        lever = float(np.mean(np.einsum("nii->ni", seen.child_covariance)[:, :3]))
-        angle = float(np.mean(np.einsum("nii->ni", seen.child_covariance)[:, 3:]))
-        apart = apart + lever / angle * np.sum(log_so3(turns) ** 2, axis=-1)
-    return np.asarray(tried.reshape(-1, motion.joints)[np.argmin(apart, axis=1)])
+    candidates = np.array([*product(*(np.linspace(low, high, each) for low, high in ranges))])
+    poses = motion.linearise(candidates.reshape(-1, motion.joints)).pose
+    distances = np.sum((observations.relative[:, None, :3, 3] - poses[None, :, :3, 3]) ** 2, axis=-1)
+    if observations.rows == 6:
+        turns = np.swapaxes(observations.relative[:, None, :3, :3], -1, -2) @ poses[None, :, :3, :3]
+        lever = float(np.mean(np.einsum("nii->ni", observations.child_covariance)[:, :3]))
+        angle = float(np.mean(np.einsum("nii->ni", observations.child_covariance)[:, 3:]))
+        distances = distances + lever / angle * np.sum(log_so3(turns) ** 2, axis=-1)
+    return np.asarray(candidates.reshape(-1, motion.joints)[np.argmin(distances, axis=1)])
 
 
-def _twists(poses: Stack, derivatives: Stack) -> Stack:
+def _twists(poses: Array, derivatives: Array) -> Array:
     """Return twists of the child in the parent's axes, (N, 6, n), from derivatives (N, 4, 4, n)."""
     turning = np.einsum("nijk,nlj->nilk", derivatives[:, :3, :3], poses[:, :3, :3])
     omega = np.stack([turning[:, 2, 1], turning[:, 0, 2], turning[:, 1, 0]], axis=1)

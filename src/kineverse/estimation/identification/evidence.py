@@ -1,15 +1,15 @@
 """Marginal likelihood of a joint family (Laplace approximation).
 
-Joint values are drawn from a Gaussian whose width s is that of the motion, see :mod:`.fit_joint_ranges`. They
-contribute
+Joint values have a Gaussian prior whose width s is that of the motion, see :mod:`.range_prior`. Each
+observation contributes
 
     ∫ N(â_k; a, C_k) N(a; μ, s²) da = N(â_k; μ, s² + C_k)
 
-so a motion that is short beside the noise costs next to nothing, and one that is long pays for every joint
-value by how much better than s it is known. The mean μ and the parameters follow by Laplace's method. All
-families have a mean pose, of which nothing is known beforehand, and it is measured alike in all of them; what
-a family has beyond that has a proper prior: directions are anywhere on the sphere, levers within reach. So
-does the point of the child whose slides are meant, see :mod:`.sliding`.
+A motion that is short compared with the noise costs next to nothing. A longer one pays for every joint value
+that is known better than s. The mean μ and the parameters are integrated by Laplace's method. All families
+have a mean pose with the same improper uniform prior. The other parameters have proper priors: directions are
+uniform on the sphere, levers are Gaussian. The sliding point of the child has a proper prior, too, see
+:mod:`.ambiguities`.
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from kineverse.estimation.linear_algebra import invert_matrices, multiply_vectors, sum_log_determinants
-from kineverse.lie import Stack
+from kineverse.lie import Array
 
 from .ambiguities import sliding_point_twists
 from .motion_model import FamilyMember
@@ -30,85 +30,91 @@ from .range_prior import JointRanges, PerObservation, fit_joint_ranges, solve_pe
 
 @dataclass(frozen=True)
 class Evidence:
-    """What integrating over everything gives.
+    """Evidence of a family and the posterior of its unknowns.
 
     Attributes
     ----------
     log_evidence
-        Natural logarithm of the density of the observed relative poses; its unit is common to all families.
+        Natural logarithm of the density of the observed relative poses, in a unit common to all families.
     covariance
-        Of the parameters, (n, n).
+        Posterior covariance of the parameters, (n, n).
     joint_values, joint_covariances
-        As the observations and the width of the motion tell together, (N, k) and (N, k, k).
+        Posterior joint values and their covariances, (N, k) and (N, k, k).
     """
 
     log_evidence: float
-    covariance: Stack
-    joint_values: Stack
-    joint_covariances: Stack
+    covariance: Array
+    joint_values: Array
+    joint_covariances: Array
 
     @staticmethod
-    def of(log: float, information: Stack, size: int, values: Stack, covariances: Stack) -> Evidence:
-        """Return it with the covariance of the first unknowns, which are the parameters."""
+    def from_information(
+        log: float, information: Array, size: int, values: Array, covariances: Array
+    ) -> Evidence:
+        """Return the evidence from the information matrix of all unknowns, the parameters first."""
         return Evidence(log, invert_matrices(information)[:size, :size], values, covariances)
 
 
 def laplace_evidence(solution: Solution[FamilyMember]) -> Evidence:
-    """Return the evidence of a family of joints around its most likely member."""
+    """Return the evidence of a family, by the quadratic approximation around its most likely member."""
     motion, size = solution.motion, solution.motion.size
-    seen = solve_per_observation(solution)
-    width = fit_joint_ranges(motion, seen) if motion.joints else JointRanges(np.zeros(0), np.zeros(0), 0.0)
-    values, covariances = _together(seen, width)
-    information = _information(solution, width, values)
+    per_observation = solve_per_observation(solution)
+    ranges = (
+        fit_joint_ranges(motion, per_observation)
+        if motion.joints
+        else JointRanges(np.zeros(0), np.zeros(0), 0.0)
+    )
+    values, covariances = _posterior_joint_values(per_observation, ranges)
+    information = _information(solution, ranges, values)
     prior = motion.prior().by_parameters
     information[:size, :size] += prior.T @ prior
-    beforehand, precision = motion.beforehand(width.mean)
+    log_prior, precision = motion.log_prior(ranges.mean)
     information[np.diag_indices_from(information)] += precision
-    log = seen.log_likelihood + width.log_density + beforehand
+    log = per_observation.log_likelihood + ranges.log_density + log_prior
     log += 0.5 * len(information) * math.log(math.tau) - 0.5 * float(np.linalg.slogdet(information)[1])
-    return Evidence.of(log, information, size, values, covariances)
+    return Evidence.from_information(log, information, size, values, covariances)
 
 
 def evidence_excess(solution: Solution[FamilyMember]) -> float:
-    """Return by how much the quadratic promises more, as a logarithm, than is there where steps ended early.
+    """Return the excess of the Laplace evidence over the value reached, if the steps did not converge.
 
-    Evidence takes the quadratic at its word. Where it has not been followed to its end, what was reached is
-    what counts.
+    The quadratic approximation assumes a maximum. Without convergence it predicts a higher likelihood than
+    was reached, and the difference of the logarithms is the correction.
     """
-    belief = solution.belief
-    if solution.converged or not belief.marginal:
+    joint_prior = solution.joint_prior
+    if solution.converged or not joint_prior.marginal:
         return 0.0
-    seen = solve_per_observation(solution)
-    total = seen.covariances + np.diag(1.0 / belief.precision)
-    off = seen.values - belief.mean
-    promised = -0.5 * float(
+    per_observation = solve_per_observation(solution)
+    total = per_observation.covariances + np.diag(1.0 / joint_prior.precision)
+    off = per_observation.values - joint_prior.mean
+    predicted = -0.5 * float(
         np.sum(off * multiply_vectors(invert_matrices(total), off))
     ) - 0.5 * sum_log_determinants(math.tau * total)
     prior = solution.motion.prior().residuals
     reached = -0.5 * (solution.cost - float(prior @ prior)) - 0.5 * solution.residuals.size * math.log(
         math.tau
     )
-    return max(0.0, promised + seen.log_likelihood - reached)
+    return max(0.0, predicted + per_observation.log_likelihood - reached)
 
 
-def _together(seen: PerObservation, width: JointRanges) -> tuple[Stack, Stack]:
-    """Return joint values and their covariances if they are also believed within the width."""
-    if not len(width.mean):
-        return seen.values, seen.covariances
-    variance = np.diag(width.deviations**2)
-    shrink = variance @ invert_matrices(seen.covariances + variance)
-    values: Stack = width.mean + (shrink @ (seen.values - width.mean)[:, :, None])[:, :, 0]
-    return values, shrink @ seen.covariances
+def _posterior_joint_values(per_observation: PerObservation, ranges: JointRanges) -> tuple[Array, Array]:
+    """Return the posterior joint values and their covariances under the range prior."""
+    if not len(ranges.mean):
+        return per_observation.values, per_observation.covariances
+    variance = np.diag(ranges.deviations**2)
+    shrink = variance @ invert_matrices(per_observation.covariances + variance)
+    values: Array = ranges.mean + (shrink @ (per_observation.values - ranges.mean)[:, :, None])[:, :, 0]
+    return values, shrink @ per_observation.covariances
 
 
-def _information(solution: Solution[FamilyMember], width: JointRanges, values: Stack) -> Stack:
-    """Return the information about parameters, μ and the point that slides."""
-    linear = solution.motion.at(values)
+def _information(solution: Solution[FamilyMember], ranges: JointRanges, values: Array) -> Array:
+    """Return the information matrix of the parameters, μ and the sliding point."""
+    linear = solution.motion.linearise(values)
     by_joints = linear.by_joints
-    moved = (by_joints * width.deviations**2) @ np.swapaxes(by_joints, 1, 2)
+    moved = (by_joints * ranges.deviations**2) @ np.swapaxes(by_joints, 1, 2)
     weights = invert_matrices(solution.covariance + moved)
     both = np.concatenate(
         [linear.by_parameters, by_joints, sliding_point_twists(solution.motion, values)], axis=2
     )
-    result: Stack = (np.swapaxes(both, 1, 2) @ weights @ both).sum(axis=0)
+    result: Array = (np.swapaxes(both, 1, 2) @ weights @ both).sum(axis=0)
     return result

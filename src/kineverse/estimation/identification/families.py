@@ -2,10 +2,10 @@
 
     parent_T_child = L · g(a) · R,        g(a) = translation(v(a)) · Exp(ω(a))
 
-A joint value is one of the six components of (v, ω), and the subgroup is said by which of them there are; for
-a screw v_z is the pitch times ω_z besides. So a hinge turns about the z axis of L, and a slider moves along
-it. Of the twelve parameters of L and R those stay that are no gauge: what commutes with the subgroup can be
-moved from L to R, and what is in it is a shift of joint values.
+Each joint value is one of the six components of (v, ω). The set of components defines the subgroup. For a
+screw, v_z also gets the pitch times ω_z. So a revolute joint rotates about the z axis of L, and a prismatic
+joint translates along it. L and R have twelve parameters. Those without a gauge freedom remain: a motion that
+commutes with the subgroup can move from L to R, and a motion in the subgroup is a shift of joint values.
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ from typing import Self
 
 import numpy as np
 
-from kineverse.lie import Stack, exp_so3, orthonormalize, right_jacobian, skew, transform
+from kineverse.lie import Array, exp_so3, orthonormalize, right_jacobian, skew, transform
 
 from .bindings import evaluate_poses, fits_kernel, library
 from .motion_model import LinearisedPoses, ParameterPrior
@@ -28,16 +28,16 @@ VX, VY, VZ, WX, WY, WZ = range(6)
 
 @dataclass(frozen=True, slots=True)
 class Parametrisation:
-    """Which components are joint values and parameters.
+    """Components of the joint values and of the parameters.
 
     Attributes
     ----------
     joints
         Components of (v, ω) that are joint values.
     left
-        Components of the twist that moves L, in L.
+        Components of the twist that moves L, in the axes of L.
     right
-        Components of the twist that moves R, in front of it.
+        Components of the twist that moves R, applied on its left.
     """
 
     joints: tuple[int, ...]
@@ -47,24 +47,24 @@ class Parametrisation:
 
 @dataclass(frozen=True, slots=True)
 class JointFamily:
-    """A family of joints.
+    """Joint family.
 
     Attributes
     ----------
     name
-        As in ``found["revolute"]``.
+        Name of the family, as in ``result["revolute"]``.
     poses
-        Its freedom if poses of the child are seen.
+        Parametrisation for observed poses of the child.
     positions
-        Its freedom if only positions are: how the child is turned is no parameter then.
+        Parametrisation for observed positions only. The orientation of the child is no parameter then.
     pitch
-        Whether it moves along z by a pitch [m/rad] as it turns.
+        True if the joint translates along z by a pitch [m/rad] as it rotates.
     reach
-        How many components of the child's place in the joint's frame are a lever: beforehand they are
-        believed to be within reach.
+        Number of components of the child's position in the joint's frame that are a lever. They have a
+        Gaussian prior of width :data:`REACH`.
     slides
-        How many directions it slides in and turns besides, so that it matters whose slides they are, see
-        :mod:`.sliding`.
+        Number of translations of a joint that also rotates, so that the translated point matters, see
+        :mod:`.ambiguities`.
     """
 
     name: str
@@ -74,8 +74,8 @@ class JointFamily:
     reach: int = 0
     slides: int = 0
 
-    def freedom(self, rows: int) -> Parametrisation:
-        """Return the freedom for poses (6) or positions (3)."""
+    def parametrisation(self, rows: int) -> Parametrisation:
+        """Return the parametrisation for poses (6 rows) or positions (3 rows)."""
         return self.poses if rows == 6 else self.positions
 
 
@@ -134,18 +134,18 @@ JOINT_FAMILIES: Mapping[str, JointFamily] = MappingProxyType(
         )
     }
 )
-"""The families by name. ``rigid`` has no joint values, and ``free`` has nothing else."""
+"""Families by name. ``rigid`` has no joint values, and ``free`` has no parameters."""
 
 PITCHES = 0.1
-"""The standard deviation of a pitch, beforehand [m/rad]."""
+"""Prior standard deviation of a pitch [m/rad]."""
 
 REACH = 1.0
-"""The standard deviation of each component of a lever, beforehand [m]."""
+"""Prior standard deviation of each component of a lever [m]."""
 
 
 @dataclass(frozen=True, slots=True)
 class GroupMotion:
-    """A member of a group, see the module.
+    """Member of a joint family, parent_T_child = L · g(a) · R.
 
     Attributes
     ----------
@@ -154,48 +154,48 @@ class GroupMotion:
     rows
         6, or 3 for positions only.
     left, right
-        L and R, 4×4.
+        L and R, (4, 4).
     pitch
-        [m/rad]; 0 for what has none.
+        Pitch [m/rad]; 0 for families without one.
     """
 
     group: JointFamily
     rows: int
-    left: Stack
-    right: Stack
+    left: Array
+    right: Array
     pitch: float = 0.0
 
     @property
-    def freedom(self) -> Parametrisation:
-        """Which components are joint values and parameters."""
-        return self.group.freedom(self.rows)
+    def parametrisation(self) -> Parametrisation:
+        """Components of the joint values and of the parameters."""
+        return self.group.parametrisation(self.rows)
 
     @property
     def size(self) -> int:
         """Number of parameters."""
-        freedom = self.freedom
+        freedom = self.parametrisation
         return len(freedom.left) + len(freedom.right) + self.group.pitch
 
     @property
     def joints(self) -> int:
         """Number of joint values."""
-        return len(self.freedom.joints)
+        return len(self.parametrisation.joints)
 
     @property
     def slides(self) -> int:
-        """Number of components of the sliding point that are unknown, see :mod:`.sliding`."""
+        """Number of unknown components of the sliding point, see :mod:`.ambiguities`."""
         return self.group.slides if self.rows == 6 else 0
 
     @property
     def is_plain(self) -> bool:
-        """Whether it is what its group says and nothing else, so that C knows all of it."""
+        """True if the motion is no subclass and its family fits the C kernels."""
         return type(self) is GroupMotion and fits_kernel(self.group, self.rows)
 
-    def at(self, values: Stack, native: bool = True) -> LinearisedPoses:
-        """Return the poses at joint values (N, k); it is done in C where it can be and ``native`` is true."""
+    def linearise(self, values: Array, native: bool = True) -> LinearisedPoses:
+        """Return the poses at joint values (N, k) and their derivatives, in C if possible and ``native``."""
         if native and library.is_native and self.is_plain:
             return evaluate_poses(self, values)
-        freedom = self.freedom
+        freedom = self.parametrisation
         twist = np.zeros((len(values), 6))
         twist[:, freedom.joints] = values
         if self.group.pitch:
@@ -217,12 +217,12 @@ class GroupMotion:
         rows = self.rows
         return LinearisedPoses(parent_T_child, np.concatenate(blocks, axis=2)[:, :rows], by_joints[:, :rows])
 
-    def _by_joints(self, moved: Stack, twist: Stack) -> Stack:
+    def _by_joints(self, moved: Array, twist: Array) -> Array:
         result = np.empty_like(moved)
-        # Slides come before the turn, so they are along the axes of L.
+        # Translations come before the rotation, so they are along the axes of L.
         result[:, :3, :3] = self.left[:3, :3]
         result[:, 3:, :3] = 0.0
-        joints = self.freedom.joints
+        joints = self.parametrisation.joints
         if WX in joints or WY in joints:
             result[:, :, 3:] = moved[:, :, 3:] @ right_jacobian(twist[:, 3:])
         else:
@@ -231,9 +231,9 @@ class GroupMotion:
             result[:, :3, WZ] += self.pitch * self.left[:3, 2]
         return result
 
-    def moved(self, step: Stack) -> Self:
-        """Return the member that a step in the parameters leads to."""
-        freedom = self.freedom
+    def retract(self, step: Array) -> Self:
+        """Return the motion after a step in the parameters."""
+        freedom = self.parametrisation
         left, right = np.zeros(6), np.zeros(6)
         ends = len(freedom.left), len(freedom.left) + len(freedom.right)
         left[list(freedom.left)] = step[: ends[0]]
@@ -241,35 +241,35 @@ class GroupMotion:
         l_T_l = transform(exp_so3(left[3:]), left[:3])
         r_T_r = transform(exp_so3(right[3:]), right[:3])
         pitch = self.pitch + (float(step[-1]) if self.group.pitch else 0.0)
-        # Rotations that are multiplied without end would drift.
+        # Rotations drift under repeated multiplication.
         left_moved, right_moved = orthonormalize(self.left @ l_T_l), orthonormalize(r_T_r @ self.right)
         return replace(self, left=left_moved, right=right_moved, pitch=pitch)
 
-    def bounded(self, values: Stack, step: Stack) -> Stack:
-        """Return joint values after a step: at most half a radian at once."""
-        turning = [j >= WX for j in self.freedom.joints]
+    def retract_joints(self, values: Array, step: Array) -> Array:
+        """Return joint values after a step of at most half a radian in each angle."""
+        turning = [j >= WX for j in self.parametrisation.joints]
         step = step.copy()
         step[:, turning] = np.clip(step[:, turning], -0.5, 0.5)
-        result: Stack = values + step
+        result: Array = values + step
         return result
 
     @property
     def name(self) -> str:
-        """That of the group."""
+        """Name of the family."""
         return self.group.name
 
     @property
     def kinds(self) -> tuple[int, ...]:
-        """Slides share a width, and so do turns."""
-        return tuple(int(j >= WX) for j in self.freedom.joints)
+        """Kind of each joint value: 0 for translations, 1 for rotations."""
+        return tuple(int(j >= WX) for j in self.parametrisation.joints)
 
-    def beforehand(self, mean: Stack) -> tuple[float, Stack]:
-        """Return the density of what the family has beyond a mean pose, and what keeps it finite.
+    def log_prior(self, mean: Array) -> tuple[float, Array]:
+        """Return the log prior of the parameters beyond a mean pose, and its precision.
 
-        A lever is within reach, and a direction anywhere on half the sphere, as an axis has no sign. The mean
-        pose has the density 1 / (m³ rad³) everywhere, which is no density but is the same for all.
+        A lever is Gaussian. A direction is uniform on half the sphere, because an axis has no sign. The mean
+        pose has the improper density 1 / (m³ rad³), which is the same for all families.
         """
-        freedom, reach = self.freedom, self.group.reach
+        freedom, reach = self.parametrisation, self.group.reach
         log = 0.0
         if WX in freedom.left:
             log -= math.log(math.tau)
@@ -281,24 +281,24 @@ class GroupMotion:
             log -= 0.5 * float(place @ place) + 0.5 * self.slides * math.log(math.tau * REACH**2)
         if self.group.pitch:
             log -= 0.5 * (self.pitch / PITCHES) ** 2 + 0.5 * math.log(math.tau * PITCHES**2)
-        # The volume of mean poses per unit of the parameters that move it.
-        linear = self.at(mean[None, :])
+        # Volume of mean poses per unit of the parameters and joint values that move them.
+        linear = self.linearise(mean[None, :])
         right = slice(len(freedom.left), len(freedom.left) + len(freedom.right))
         matrix = np.concatenate([linear.by_parameters[0, :, right], linear.by_joints[0]], axis=1)
-        # A lever of nothing has no volume at all; the size of an atom is as good.
+        # A lever of length zero has no volume. The bound has the size of an atom [m].
         log += float(np.sum(np.log(np.maximum(np.linalg.svd(matrix, compute_uv=False), 1e-10))))
-        # As wide as half a sphere is, and with its density: a direction that nothing tells stays finite. So
-        # does the middle of a turn, which moves nothing where the lever is nothing.
+        # A precision of 1 rad⁻² has the width and the density of half a sphere. It keeps unobservable
+        # directions finite, and the mean angle of a rotation without a lever.
         precision = np.zeros(self.size + self.joints + self.slides)
         precision[: len(freedom.left)] = [j >= WX for j in freedom.left]
         precision[self.size : self.size + self.joints] = [j >= WX for j in freedom.joints]
         precision[self.size + self.joints :] = REACH**-2
         return log, precision
 
-    def named(self) -> dict[str, Stack | float]:
-        """Return what a member of a family is, by name."""
+    def named_parameters(self) -> dict[str, Array | float]:
+        """Return the parameters by name."""
         name = self.name
-        result: dict[str, Stack | float] = {}
+        result: dict[str, Array | float] = {}
         axis, point = self.left[:3, 2].copy(), self.left[:3, 3].copy()
         if name == "planar":
             result["normal"] = axis
@@ -316,13 +316,18 @@ class GroupMotion:
     def coordinates(self) -> tuple[str, ...]:
         """Return the names of the parameters, in their order."""
         letters = "xyz"
-        left = [f"point.{letters[j]}" if j < WX else f"axis.{letters[j - WX]}" for j in self.freedom.left]
-        right = [f"child.{letters[j]}" if j < WX else f"child.r{letters[j - WX]}" for j in self.freedom.right]
+        left = [
+            f"point.{letters[j]}" if j < WX else f"axis.{letters[j - WX]}" for j in self.parametrisation.left
+        ]
+        right = [
+            f"child.{letters[j]}" if j < WX else f"child.r{letters[j - WX]}"
+            for j in self.parametrisation.right
+        ]
         return (*left, *right, *(["pitch"] if self.group.pitch else []))
 
     def prior(self) -> ParameterPrior:
-        """Return that levers are within reach, and pitches ordinary."""
-        reach, freedom = self.group.reach, self.freedom
+        """Return the Gaussian prior of levers and pitch."""
+        reach, freedom = self.group.reach, self.parametrisation
         r_p = self.right[:3, 3]
         moves = np.concatenate([np.eye(3), -skew(r_p)], axis=1)[:reach, freedom.right]
         derivatives = np.zeros((reach, self.size))
@@ -336,8 +341,8 @@ class GroupMotion:
         return ParameterPrior(residuals, np.concatenate([derivatives / REACH, steep]))
 
 
-def _columns(parent_R_frame: Stack, lever: Stack) -> Stack:
-    """Return twists of the child, about its origin, per unit twist of a frame that carries it by a lever."""
+def _columns(parent_R_frame: Array, lever: Array) -> Array:
+    """Return twists of the child about its origin, per unit twist of a frame at the end of a lever."""
     result = np.zeros((len(lever), 6, 6))
     result[:, :3, :3] = result[:, 3:, 3:] = parent_R_frame
     result[:, :3, 3:] = -skew(lever) @ parent_R_frame

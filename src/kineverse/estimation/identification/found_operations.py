@@ -1,7 +1,7 @@
 """Operations that write identified joints.
 
-A joint of :mod:`kineverse.articulations` carries its child frame on the axis. A part that was observed has
-its frame somewhere else, so the joints here have a mount: joint_T_child = motion(q) · mount.
+A joint of :mod:`kineverse.articulations` has its child frame on the axis. The frame of an observed part is
+elsewhere, so the joints of this module have a mount: joint_T_child = motion(q) · mount.
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ from kineverse.articulations import (
     Revolute,
     Screw,
 )
-from kineverse.lie import Stack, mean_rotation
+from kineverse.lie import Array, mean_rotation
 from kineverse.model.body import Pose
 from kineverse.model.constraint import Constraint
 from kineverse.model.operation import Operation, Writes
@@ -42,23 +42,23 @@ _Z = (0.0, 0.0, 1.0)
 
 @dataclass(frozen=True, kw_only=True)
 class Mounted(Joint):
-    """Base of joints whose child frame is not on the axis.
+    """Base class of joints with a child frame off the axis.
 
     Attributes
     ----------
     mount
-        joint_T_child at coordinate 0.
+        joint_T_child at joint value 0.
     """
 
     mount: Pose = Pose()
 
     @property
     def kind(self) -> str:
-        """The kind of the joint, as without a mount."""
+        """Kind of the joint without its mount."""
         return re.sub("^mounted", "", super().kind)
 
     def apply(self, model: ReadRecorder) -> Writes:
-        """Write the child frame and what the joint writes."""
+        """Write the effects of the joint, with the mount in the pose of the child."""
         effects = super().apply(model)  # type: ignore[safe-super]
         parent, factors = effects.frames[self.child]  # type: ignore[misc]
         frames = {**effects.frames, self.child: (parent, (*factors, self.mount))}  # type: ignore[misc]
@@ -67,40 +67,40 @@ class Mounted(Joint):
 
 @dataclass(frozen=True, kw_only=True)
 class MountedRevolute(Mounted, Revolute, document_kind="MountedRevolute"):
-    """A hinge and a part on it: parent_T_child = origin · rotation(axis, q) · mount."""
+    """Revolute joint with a mount: parent_T_child = origin · rotation(axis, q) · mount."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class MountedScrew(Mounted, Screw, document_kind="MountedScrew"):
-    """A thread and a part on it: parent_T_child = origin · screw(axis, q) · mount."""
+    """Screw joint with a mount: parent_T_child = origin · screw(axis, q) · mount."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class MountedCylindrical(Mounted, Cylindrical, document_kind="MountedCylindrical"):
-    """A rod in a sleeve and a part on it: parent_T_child = origin · cylindrical(axis, s, φ) · mount."""
+    """Cylindrical joint with a mount: parent_T_child = origin · cylindrical(axis, s, φ) · mount."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class MountedBall(Mounted, Ball, document_kind="MountedBall"):
-    """A ball in a socket and a part on it: parent_T_child = origin · rotation(quaternion) · mount."""
+    """Spherical joint with a mount: parent_T_child = origin · rotation(quaternion) · mount."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class SlidingPoint(Joint, document_kind="SlidingPoint"):
-    """A point in a plane, or anywhere: parent_T_child = origin · translation(x, y, z).
+    """Translation of a point in a plane or in space: parent_T_child = origin · translation(x, y, z).
 
-    Coordinates are ``name/x``, ``name/y`` and, anywhere, ``name/z`` [m].
+    Coordinates are ``name/x``, ``name/y`` and, in space, ``name/z`` [m].
 
     Attributes
     ----------
     ranges
-        The limits of each.
+        Limits of each coordinate [m].
     """
 
     ranges: tuple[tuple[float, float], ...]
 
     def apply(self, model: ReadRecorder) -> Writes:
-        """Write the child frame and the limits."""
+        """Write the child frame, the coordinates and their limits."""
         self.check_free(model)
         names = [f"{self.name}/{axis}" for axis, _ in zip("xyz", self.ranges, strict=False)]
         q = tuple(position(name) for name in names)
@@ -118,23 +118,23 @@ class SlidingPoint(Joint, document_kind="SlidingPoint"):
 
 @dataclass(frozen=True, kw_only=True)
 class FamilyJoint(Joint, document_kind="FamilyJoint"):
-    """A joint of a family of one's own: parent_T_child = origin · transform.
+    """Joint of a custom family: parent_T_child = origin · transform.
 
-    Its coordinate is ``name``; of several, each is called like the joint of the family, below the name.
+    A single coordinate is ``name``. Several are named like the joints of the family, below ``name``.
 
     Attributes
     ----------
     motion
-        The member of the family.
+        Member of the family.
     ranges
-        The limits of its joint values.
+        Limits of its joint values.
     """
 
     motion: FamilyMotion
     ranges: tuple[tuple[float, float], ...]
 
     def apply(self, model: ReadRecorder) -> Writes:
-        """Write the child frame and the limits."""
+        """Write the child frame, the coordinates and their limits."""
         self.check_free(model)
         names = family_coordinates(self.motion, self.name)
         q = tuple(position(name) for name in names)
@@ -150,7 +150,7 @@ class FamilyJoint(Joint, document_kind="FamilyJoint"):
 
 
 def family_coordinates(motion: FamilyMotion, name: str) -> tuple[str, ...]:
-    """Return the coordinates of a joint of a family of one's own, in the order of its joint values."""
+    """Return the coordinates of a joint of a custom family, in the order of its joint values."""
     symbols = list(motion.family.joints)
     return (name,) if len(symbols) == 1 else tuple(f"{name}/{s}" for s in symbols)
 
@@ -158,7 +158,7 @@ def family_coordinates(motion: FamilyMotion, name: str) -> tuple[str, ...]:
 def joint_operation(
     motion: FamilyMember, limits: Sequence[tuple[float, float]], name: str, parent: str, child: str
 ) -> Operation:
-    """Return a member of a family as an operation, with limits for its joint values."""
+    """Return the operation that writes a member of a family, with limits of its joint values."""
     names: dict[str, Any] = {"name": name, "parent": parent, "child": child}
     if isinstance(motion, FamilyMotion):
         return FamilyJoint(**names, motion=motion, ranges=tuple(limits))
@@ -171,7 +171,7 @@ def joint_operation(
         return SlidingPoint(**names, origin=rigid_pose(place), ranges=tuple(limits))
     origin, mount = rigid_pose(motion.left), rigid_pose(motion.right)
     whole = rigid_pose(motion.left @ motion.right)
-    # A direction of L in the child, where nothing turns.
+    # The z axis of L in the axes of the child, at joint value 0.
     x, y, z = (float(c) for c in motion.right[2, :3])
     axis = x, y, z
     if family == "rigid":
@@ -197,8 +197,8 @@ def joint_operation(
     return Floating(**names, origin=whole)
 
 
-def rigid_pose(matrix: Stack) -> Pose:
-    """Return a pose whose rotation is one to the last digits, after all steps that made it."""
+def rigid_pose(matrix: Array) -> Pose:
+    """Return a pose with its rotation orthonormalised to double precision."""
     exact = matrix.copy()
     exact[:3, :3] = mean_rotation(matrix[None, :3, :3])
     return Pose.of(exact)

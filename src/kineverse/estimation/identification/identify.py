@@ -15,7 +15,7 @@ import numpy.typing as npt
 from kineverse.errors import InvalidValueError, UnknownNameError, suggest
 from kineverse.estimation.noise import pose_covariance
 from kineverse.estimation.robust import Outliers, as_outliers
-from kineverse.lie import Stack
+from kineverse.lie import Array
 
 from .custom_family import Family, family_starts
 from .gauge import fix_gauge
@@ -31,7 +31,7 @@ from .solver import solver
 from .unwrapping import log_unwrapping_gain, unwrap_screw, unwrap_solution
 
 Families: TypeAlias = "Iterable[str | Family] | Mapping[str | Family, float] | str | Family | None"
-"""Families by name or of one's own; a mapping says how probable they are beforehand."""
+"""Names of families, or custom families. A mapping assigns prior weights."""
 
 WEIGHTS: Mapping[str, float] = MappingProxyType(
     {
@@ -45,67 +45,74 @@ WEIGHTS: Mapping[str, float] = MappingProxyType(
         "free": 0.0001,
     }
 )
-"""How probable families are beforehand, beside each other. What slides by nothing and turns is a ball in its
-socket too, and a free one is rarer."""
+"""Prior weights of the families. A screw, cylindrical, spherical or planar joint contains simpler joints as
+special cases and is rarer; a free one is rarer still."""
 
 UNKNOWN_NOISE = (0.005, math.radians(1.0))
-"""What is scaled where no noise is stated: standard deviations of positions [m] and orientations [rad]."""
+"""Standard deviations of positions [m] and orientations [rad] that are scaled where no noise is stated."""
 
-# What is less probable than the best by this, as a logarithm, is not refined. Where noise is large beside the
-# motion and a lever bends it, what each observation says is not known better than this before.
-_CHANCE, _CHANCE_EACH = 15.0, 0.5
-# By what the unknown noise is multiplied, and how that is believed to be spread: a factor of 5 either way.
+# A family is not refined if its log evidence is below that of the best by more than a constant and a term for
+# each observation. With noise that is large beside the motion, the unrefined evidence is this inaccurate.
+_NEGLIGIBLE, _NEGLIGIBLE_EACH = 15.0, 0.5
+# Candidate scales of the unknown noise, and the standard deviation of their log-normal prior: a factor of 5.
 _SCALES = np.geomspace(0.01, 100.0, 33)
 _SCALE_SPREAD = math.log(5.0)
 
 
 def identify(
-    a: npt.ArrayLike | None,
-    b: npt.ArrayLike,
+    parent_poses: npt.ArrayLike | None,
+    child_poses: npt.ArrayLike,
     *,
     parent_covariance: npt.ArrayLike | None = None,
     child_covariance: npt.ArrayLike | None = None,
     families: Families = None,
     noise: npt.ArrayLike | None = None,
     outliers: Outliers | bool | None = None,
-    ordered: bool = False,
+    sequential: bool = False,
 ) -> IdentificationResult:
-    """Return how part b moves against part a, judged by poses of both that were observed with noise.
+    """Identify the joint between a parent and a child from noisy poses of both.
 
     Parameters
     ----------
-    a
-        Poses of the parent, (N, 4, 4), in any frame, such as a camera's; None if the parent is that frame.
-    b
+    parent_poses
+        Poses of the parent, (N, 4, 4), in any common frame, such as a camera's. None if the parent is that
+        frame.
+    child_poses
         Poses of the child in the same frame, (N, 4, 4), or only its positions, (N, 3) [m].
-    covariance_a, covariance_b
-        Covariances of their errors, (6, 6) for all or (N, 6, 6) for each, see
-        :mod:`kineverse.estimation.noise`; (3, 3) or (N, 3, 3) for positions.
+    parent_covariance, child_covariance
+        Covariances of their errors, one (6, 6) or one for each pose (N, 6, 6), see
+        :mod:`kineverse.estimation.noise`. For positions (3, 3) or (N, 3, 3).
     families
-        Which families are tried, all of :data:`WEIGHTS` if None; a mapping also says how probable they are
-        beforehand.
+        Families to compare; None for all of :data:`WEIGHTS`. A mapping also assigns prior weights.
     noise
-        The covariance for whichever of both has none of its own. If there is none at all, the size of the
-        noise is estimated, up to the ratio of 5 mm to 1°.
+        Covariance of the parts that have none of their own. If no covariance is given at all, the size of
+        the noise is estimated, at a ratio of 5 mm to 1°.
     outliers
-        Whether some observations may be wrong altogether: True for the usual :class:`.Outliers`, of which as
-        many may be wrong as are not quite half.
-    ordered
-        Whether observations are in the order in which they were seen, with less than half a turn from one to
-        the next: then turns are counted, see :mod:`.turning`.
+        Outlier model, or True for the default :class:`.Outliers`. Fewer than half of the observations may be
+        outliers.
+    sequential
+        True if the observations are in temporal order, with less than half a revolution from one to the
+        next. Revolutions are counted then, see :mod:`.unwrapping`.
+
+    Returns
+    -------
+    result
+        A fit of every family, the most probable first.
 
     Raises
     ------
     ShapeError, InvalidValueError
-        For poses or covariances that are none, see :func:`.observations.check_observations`.
+        For invalid poses or covariances, see :func:`.observations.check_observations`.
     UnknownNameError
-        For a family that does not exist.
+        For an unknown family.
     """
     weights = family_weights(families)
-    of_a, of_b, stated = resolve_noise(a is not None, parent_covariance, child_covariance, noise)
-    seen = check_observations(a, b, of_a, of_b)
-    sight = prepare_data(seen, stated, as_outliers(outliers), ordered)
-    return weigh_families(sight, solve_with_inliers(sight, weights), weights)
+    parent_covariance, child_covariance, stated = resolve_noise(
+        parent_poses is not None, parent_covariance, child_covariance, noise
+    )
+    observations = check_observations(parent_poses, child_poses, parent_covariance, child_covariance)
+    data = prepare_data(observations, stated, as_outliers(outliers), sequential)
+    return weigh_families(data, solve_with_inliers(data, weights), weights)
 
 
 def resolve_noise(
@@ -114,19 +121,19 @@ def resolve_noise(
     child_covariance: npt.ArrayLike | None,
     noise: npt.ArrayLike | None,
 ) -> tuple[npt.ArrayLike, npt.ArrayLike, bool]:
-    """Return the covariances of parent and child, and whether they were stated at all.
+    """Return the covariances of parent and child, and True if they were stated.
 
     Raises
     ------
     InvalidValueError
-        If only one of them is.
+        If only one of the two is stated.
     """
     if noise is not None or (
         child_covariance is not None and (parent_covariance is not None or not has_parent)
     ):
         missing: npt.ArrayLike = np.eye(6) if noise is None else noise
-        of_a, of_b = (missing if c is None else c for c in (parent_covariance, child_covariance))
-        return of_a, of_b, True
+        parent, child = (missing if c is None else c for c in (parent_covariance, child_covariance))
+        return parent, child, True
     if parent_covariance is not None or child_covariance is not None:
         raise InvalidValueError(
             "One part has a covariance and the other has none. Give both, or the same for both as noise."
@@ -136,12 +143,12 @@ def resolve_noise(
 
 
 def family_weights(families: Families) -> dict[str | Family, float]:
-    """Return the families that are tried and how probable they are beforehand.
+    """Return the families to compare and their prior weights.
 
     Raises
     ------
     UnknownNameError
-        For a family that does not exist.
+        For an unknown family.
     InvalidValueError
         For a weight that is not positive, or if there is no family.
     """
@@ -166,173 +173,208 @@ def family_weights(families: Families) -> dict[str | Family, float]:
 
 @dataclass(frozen=True)
 class IdentificationData:
-    """What was seen, as families are compared by it.
+    """Observations and the assumptions under which families are compared.
 
     Attributes
     ----------
-    seen
+    observations
         The observations, with lengths in the unit.
     unit
-        See :mod:`.lengths` [m].
+        The length scale [m], see :mod:`.scale`.
     stated
-        Whether the size of the noise is known.
+        True if the size of the noise is known.
     outliers
-        How often observations are wrong, and where they are then, with lengths in the unit; None if never.
-    ordered
-        Whether they are in the order in which they were seen.
+        Outlier model, with lengths in the unit; None if all observations are inliers.
+    sequential
+        True if the observations are in temporal order.
     """
 
-    seen: Observations
+    observations: Observations
     unit: float
     stated: bool
     outliers: Outliers | None
-    ordered: bool
+    sequential: bool
 
 
 @dataclass(frozen=True)
 class FamilySolution:
-    """What a family makes of what was seen.
+    """Solution of a family by its inliers.
 
     Attributes
     ----------
-    known
-        Its solution by the observations that are right, and how probable these are then.
-    right, count
-        Their numbers, and the number of all.
-    log_belief
-        What is added to the logarithm of the evidence: the probability that these are right, the density of
-        the others, and that turns were counted.
+    scored
+        The solution and the logarithm of its evidence.
+    inliers
+        Indices of the inliers.
+    count
+        Number of all observations.
+    log_prior
+        Sum of the log probability of these inliers, the log density of the outliers, and the gain by counted
+        revolutions. It is added to the log evidence.
     """
 
-    known: Scored
-    right: RowIndices
+    scored: Scored
+    inliers: RowIndices
     count: int
-    log_belief: float
+    log_prior: float
 
 
 def prepare_data(
-    seen: Observations, stated: bool, outliers: Outliers | None, ordered: bool, unit: float | None = None
+    observations: Observations,
+    stated: bool,
+    outliers: Outliers | None,
+    sequential: bool,
+    unit: float | None = None,
 ) -> IdentificationData:
-    """Return observations in a unit of length [m]; the ordinary one of these if None."""
-    unit = length_scale(seen) if unit is None else unit
+    """Return observations in a unit of length [m], by default their own length scale."""
+    unit = length_scale(observations) if unit is None else unit
     if outliers is not None and outliers != Outliers():
         outliers = replace(outliers, reach=outliers.reach / unit)
-    return IdentificationData(in_units(seen, unit), unit, stated, outliers, ordered)
+    return IdentificationData(in_units(observations, unit), unit, stated, outliers, sequential)
 
 
 def solve_with_inliers(
-    sight: IdentificationData, weights: Mapping[str | Family, float]
+    data: IdentificationData, weights: Mapping[str | Family, float]
 ) -> dict[str | Family, FamilySolution]:
-    """Return what all families make of what was seen."""
-    seen, unit, count = sight.seen, sight.unit, len(sight.seen)
-    found = solve_families(seen, weights, unit)
-    right = dict.fromkeys(found, np.arange(count))
-    if sight.outliers is not None:
+    """Return the solution of each family by its inliers."""
+    observations, unit, count = data.observations, data.unit, len(data.observations)
+    solutions = solve_families(observations, weights, unit)
+    inliers = dict.fromkeys(solutions, np.arange(count))
+    if data.outliers is not None:
 
-        def by(some: Observations, name: str | Family) -> Scored:
+        def solve(some: Observations, name: str | Family) -> Scored:
             return solve_families(some, [name], unit)[name]
 
-        right = find_inliers(seen, found, sight.outliers, sight.stated, by)
-        some = {name: rows for name, rows in right.items() if len(rows) < count}
-        found |= {name: by(seen.at(rows), name) for name, rows in some.items()}
-    if sight.ordered:
-        found = {name: _counted(seen.at(right[name]), known) for name, known in found.items()}
-    return score_solutions(sight, found, right, weights)
+        inliers = find_inliers(observations, solutions, data.outliers, data.stated, solve)
+        some = {name: rows for name, rows in inliers.items() if len(rows) < count}
+        solutions |= {name: solve(observations.select(rows), name) for name, rows in some.items()}
+    if data.sequential:
+        solutions = {
+            name: _unwrap(observations.select(inliers[name]), scored) for name, scored in solutions.items()
+        }
+    return score_solutions(data, solutions, inliers, weights)
 
 
 def score_solutions(
-    sight: IdentificationData,
-    found: Mapping[str | Family, Scored],
-    right: Mapping[str | Family, RowIndices],
+    data: IdentificationData,
+    solutions: Mapping[str | Family, Scored],
+    inliers: Mapping[str | Family, RowIndices],
     weights: Mapping[str | Family, float],
 ) -> dict[str | Family, FamilySolution]:
-    """Return what families make of what was seen, from what was found by what is right."""
-    seen, outliers, count = sight.seen, sight.outliers, len(sight.seen)
-    by = {name: seen if len(rows) == count else seen.at(rows) for name, rows in right.items()}
-    beliefs = dict.fromkeys(found, 0.0)
+    """Return the solutions of families, scored against each other, from solutions of their inliers."""
+    observations, outliers, count = data.observations, data.outliers, len(data.observations)
+    observations_of = {
+        name: observations if len(rows) == count else observations.select(rows)
+        for name, rows in inliers.items()
+    }
+    log_priors = dict.fromkeys(solutions, 0.0)
     if outliers is not None:
-        beliefs = {name: log_inlier_prior(outliers, count, len(some), seen.rows) for name, some in by.items()}
-    if sight.ordered:
-        beliefs = {name: beliefs[name] + log_unwrapping_gain(known.solution) for name, known in found.items()}
-    known = compare_families(by, found, {name: math.log(weights[name]) + beliefs[name] for name in found})
-    return {name: FamilySolution(one, right[name], count, beliefs[name]) for name, one in known.items()}
+        log_priors = {
+            name: log_inlier_prior(outliers, count, len(some), observations.rows)
+            for name, some in observations_of.items()
+        }
+    if data.sequential:
+        log_priors = {
+            name: log_priors[name] + log_unwrapping_gain(scored.solution)
+            for name, scored in solutions.items()
+        }
+    compared = compare_families(
+        observations_of, solutions, {name: math.log(weights[name]) + log_priors[name] for name in solutions}
+    )
+    return {
+        name: FamilySolution(one, inliers[name], count, log_priors[name]) for name, one in compared.items()
+    }
 
 
-def _counted(seen: Observations, known: Scored) -> Scored:
-    """Return what was found, a screw as one that goes round as often as the observations do."""
-    start = unwrap_screw(seen, known.solution)
-    return known if start is None else solver.likeliest(seen, [start])
+def _unwrap(observations: Observations, scored: Scored) -> Scored:
+    """Return the solution; a screw is solved again with the revolutions of the observations."""
+    start = unwrap_screw(observations, scored.solution)
+    return scored if start is None else solver.maximum_likelihood(observations, [start])
 
 
 def solve_families(
-    seen: Observations, families: Iterable[str | Family], unit: float = 1.0
+    observations: Observations, families: Iterable[str | Family], unit: float = 1.0
 ) -> dict[str | Family, Scored]:
     """Return the most likely member of each family, for observations in a unit of length [m]."""
     solver.prepare()
-    overview = MotionStatistics(seen)
-    return {name: solver.likeliest(seen, _starts(seen, name, overview, unit)) for name in families}
+    statistics = MotionStatistics(observations)
+    return {
+        name: solver.maximum_likelihood(observations, _starts(observations, name, statistics, unit))
+        for name in families
+    }
 
 
 def _starts(
-    seen: Observations, family: str | Family, overview: MotionStatistics, unit: float
+    observations: Observations, family: str | Family, statistics: MotionStatistics, unit: float
 ) -> list[InitialGuess]:
     if isinstance(family, Family):
-        return [InitialGuess(motion, values) for motion, values in family_starts(family, seen, unit)]
-    return list(initial_guesses(family, overview))
+        return [InitialGuess(motion, values) for motion, values in family_starts(family, observations, unit)]
+    return list(initial_guesses(family, statistics))
 
 
 def compare_families(
-    seen: Mapping[str | Family, Observations],
-    found: Mapping[str | Family, Scored],
-    beliefs: Mapping[str | Family, float],
+    observations: Mapping[str | Family, Observations],
+    solutions: Mapping[str | Family, Scored],
+    log_priors: Mapping[str | Family, float],
 ) -> dict[str | Family, Scored]:
-    """Return what was found, and with joint values integrated out what has a chance.
+    """Return the solutions, those of competitive families with their joint values integrated out.
 
-    Each family is by observations of its own, and has a belief beforehand, as a logarithm.
+    Each family has its own observations and a log prior.
     """
-    logs = {name: known.log_evidence + beliefs[name] for name, known in found.items()}
-    least = max(logs.values()) - _CHANCE - _CHANCE_EACH * max(len(some) for some in seen.values())
-    rough = [name for name, known in found.items() if logs[name] >= least and _is_rough(known)]
-    return {**found, **{name: solver.refined(seen[name], found[name].solution) for name in rough}}
+    logs = {name: scored.log_evidence + log_priors[name] for name, scored in solutions.items()}
+    threshold = (
+        max(logs.values()) - _NEGLIGIBLE - _NEGLIGIBLE_EACH * max(len(some) for some in observations.values())
+    )
+    rough = [name for name, scored in solutions.items() if logs[name] >= threshold and _is_rough(scored)]
+    return {
+        **solutions,
+        **{
+            name: solver.maximise_marginal_likelihood(observations[name], solutions[name].solution)
+            for name in rough
+        },
+    }
 
 
-def _is_rough(known: Scored) -> bool:
-    """Return whether there are joint values to be integrated out, and they are not."""
-    solution = known.solution
-    return bool(solution.motion.joints and solution.motion.size) and not solution.belief.marginal
+def _is_rough(scored: Scored) -> bool:
+    """Return True if there are joint values that are not integrated out yet."""
+    solution = scored.solution
+    return bool(solution.motion.joints and solution.motion.size) and not solution.joint_prior.marginal
 
 
 def weigh_families(
-    sight: IdentificationData,
-    found: Mapping[str | Family, FamilySolution],
+    data: IdentificationData,
+    solutions: Mapping[str | Family, FamilySolution],
     weights: Mapping[str | Family, float],
 ) -> IdentificationResult:
-    """Return the fits of all families, weighed by their evidence."""
-    beforehand = {name: math.log(weights[name]) + one.log_belief for name, one in found.items()}
-    if sight.stated:
-        logs = {name: one.known.log_evidence for name, one in found.items()}
+    """Return the fits of all families with their posterior probabilities."""
+    log_priors = {name: math.log(weights[name]) + one.log_prior for name, one in solutions.items()}
+    if data.stated:
+        logs = {name: one.scored.log_evidence for name, one in solutions.items()}
         scale = 1.0
     else:
         spread = -0.5 * (np.log(_SCALES) / _SCALE_SPREAD) ** 2
         spread -= np.logaddexp.reduce(spread)
         joint = {
-            name: spread + solver.log_evidences(one.known.solution, _SCALES) for name, one in found.items()
+            name: spread + solver.log_evidences(one.scored.solution, _SCALES)
+            for name, one in solutions.items()
         }
         logs = {name: float(np.logaddexp.reduce(j)) for name, j in joint.items()}
-        best = max(logs, key=lambda name: logs[name] + beforehand[name])
+        best = max(logs, key=lambda name: logs[name] + log_priors[name])
         scale = float(_SCALES[int(np.argmax(joint[best]))])
-    total: Stack = np.array([logs[name] + beforehand[name] for name in found])
+    total: Array = np.array([logs[name] + log_priors[name] for name in solutions])
     probabilities = np.exp(total - np.logaddexp.reduce(total)).tolist()
-    offers = []
-    for (name, one), p in zip(found.items(), probabilities, strict=True):
-        log = logs[name] + one.log_belief + log_density(len(sight.seen), sight.unit)
-        offers.append(LazyFit(one.known.solution.motion.name, p, partial(_fit, sight, one, scale, log, p)))
-    return IdentificationResult(tuple(sorted(offers, key=lambda offer: -offer.probability)), scale)
+    lazy_fits = []
+    for (name, one), p in zip(solutions.items(), probabilities, strict=True):
+        log = logs[name] + one.log_prior + log_density(len(data.observations), data.unit)
+        lazy_fits.append(LazyFit(one.scored.solution.motion.name, p, partial(_fit, data, one, scale, log, p)))
+    return IdentificationResult(tuple(sorted(lazy_fits, key=lambda lazy_fit: -lazy_fit.probability)), scale)
 
 
 def _fit(
-    sight: IdentificationData, one: FamilySolution, scale: float, log_evidence: float, probability: float
+    data: IdentificationData, one: FamilySolution, scale: float, log_evidence: float, probability: float
 ) -> Fit:
-    solution = fix_gauge(unwrap_solution(one.known.solution) if sight.ordered else one.known.solution)
+    solution = fix_gauge(unwrap_solution(one.scored.solution) if data.sequential else one.scored.solution)
     fit = build_fit(solution, solver.evidence(solution, scale), log_evidence, probability)
-    return in_metres(complete_fit(fit, sight.seen, one.right, scale, ordered=sight.ordered), sight.unit)
+    return in_metres(
+        complete_fit(fit, data.observations, one.inliers, scale, sequential=data.sequential), data.unit
+    )

@@ -10,7 +10,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from kineverse.lie import Stack, inverse, log_so3, mean_rotation, rotation_along_z, transform
+from kineverse.lie import Array, inverse, log_so3, mean_rotation, rotation_along_z, transform
 
 from .families import JOINT_FAMILIES, GroupMotion, JointFamily
 from .observations import Observations
@@ -18,163 +18,163 @@ from .optimise import InitialGuess
 
 
 class MotionStatistics:
-    """What relative poses look like as a whole."""
+    """Mean, principal directions and rotations of the observed relative poses."""
 
-    def __init__(self, seen: Observations) -> None:
-        self.rows = seen.rows
-        self.poses = seen.relative
+    def __init__(self, observations: Observations) -> None:
+        self.rows = observations.rows
+        self.poses = observations.relative
         self.positions = self.poses[:, :3, 3]
 
     @cached_property
-    def mean(self) -> Stack:
-        """A pose in the middle."""
+    def mean(self) -> Array:
+        """Mean pose, (4, 4)."""
         rotation = mean_rotation(self.poses[:, :3, :3]) if self.rows == 6 else np.eye(3)
         return transform(rotation, self.positions.mean(axis=0))
 
     @cached_property
-    def spread(self) -> Stack:
-        """Directions in which positions differ, as rows, the most first."""
-        return _directions(self.positions - self.mean[:3, 3])
+    def spread(self) -> Array:
+        """Principal directions of the positions, as rows, the largest spread first."""
+        return _principal_directions(self.positions - self.mean[:3, 3])
 
     @cached_property
-    def turns(self) -> Stack:
-        """Rotation vectors from the middle, in the parent's axes, (N, 3)."""
+    def turns(self) -> Array:
+        """Rotation vectors from the mean orientation, in the parent's axes, (N, 3)."""
         return log_so3(self.poses[:, :3, :3] @ self.mean[:3, :3].T)
 
     @cached_property
-    def axes(self) -> list[Stack]:
-        """Directions about which the child may turn."""
+    def axes(self) -> list[Array]:
+        """Candidate directions of the rotation axis."""
         normal = self.spread[2]
-        return [_directions(self.turns)[0], normal] if self.rows == 6 else [normal]
+        return [_principal_directions(self.turns)[0], normal] if self.rows == 6 else [normal]
 
     @cached_property
-    def turnings(self) -> list[_Turning]:
-        """Turns about any of them; what hinges, screws and cylinders begin with."""
-        return [turning for plane in self.planes for turning in _turnings(self, *plane)]
+    def axis_rotations(self) -> list[_AxisRotation]:
+        """Rotations about the candidate axes, the starts of revolute, screw and cylindrical joints."""
+        return [rotation_guess for plane in self.planes for rotation_guess in _find_rotations(self, *plane)]
 
     @cached_property
-    def planes(self) -> list[tuple[Stack, Stack]]:
-        """Frames whose last column any of them is, and positions in them from the middle."""
+    def planes(self) -> list[tuple[Array, Array]]:
+        """Frames with a candidate axis as z axis, and positions relative to the mean in each."""
         frames = [rotation_along_z(axis) for axis in self.axes]
         return [(frame, (self.positions - self.mean[:3, 3]) @ frame) for frame in frames]
 
 
-def initial_guesses(name: str, overview: MotionStatistics) -> Iterator[InitialGuess]:
-    """Yield starts for a family of joints."""
-    mean, rows = overview.mean, overview.rows
+def initial_guesses(name: str, statistics: MotionStatistics) -> Iterator[InitialGuess]:
+    """Yield initial guesses for a joint family."""
+    mean, rows = statistics.mean, statistics.rows
     group = JOINT_FAMILIES[name]
-    count = len(overview.poses)
+    count = len(statistics.poses)
 
-    def start(rotation: Stack, centre: Stack, values: Stack) -> InitialGuess:
+    def start(rotation: Array, centre: Array, values: Array) -> InitialGuess:
         left = transform(rotation, centre)
         return InitialGuess(GroupMotion(group, rows, left, inverse(left) @ mean), values)
 
     if name == "rigid":
         yield start(np.eye(3), np.zeros(3), np.zeros((count, 0)))
     elif name == "free":
-        moved = mean[:3, :3].T @ (overview.positions - mean[:3, 3])[:, :, None]
+        moved = mean[:3, :3].T @ (statistics.positions - mean[:3, 3])[:, :, None]
         parts = [moved[:, :, 0]]
         if rows == 6:
-            parts.append(log_so3(mean[:3, :3].T @ overview.poses[:, :3, :3]))
+            parts.append(log_so3(mean[:3, :3].T @ statistics.poses[:, :3, :3]))
         yield start(mean[:3, :3], mean[:3, 3], np.concatenate(parts, axis=1))
     elif name == "prismatic":
-        along = rotation_along_z(overview.spread[0])
-        yield start(along, mean[:3, 3], ((overview.positions - mean[:3, 3]) @ along[:, 2])[:, None])
+        along = rotation_along_z(statistics.spread[0])
+        yield start(along, mean[:3, 3], ((statistics.positions - mean[:3, 3]) @ along[:, 2])[:, None])
     elif name == "planar":
-        for frame, places in overview.planes:
+        for frame, places in statistics.planes:
             values = places.copy()
             if rows == 6:
-                values[:, 2] = overview.turns @ frame[:, 2]
-            yield start(frame, mean[:3, 3], values[:, : len(group.freedom(rows).joints)])
+                values[:, 2] = statistics.turns @ frame[:, 2]
+            yield start(frame, mean[:3, 3], values[:, : len(group.parametrisation(rows).joints)])
     elif name == "spherical":
-        yield from _about_a_point(overview, group.freedom(rows).joints, start)
+        yield from _guess_about_point(statistics, group.parametrisation(rows).joints, start)
     else:
-        yield from _about_an_axis(group, overview)
+        yield from _guess_about_axis(group, statistics)
 
 
-class _Turning(NamedTuple):
-    """Turns about an axis that fit what was seen: what hinges, screws and cylinders have in common.
+class _AxisRotation(NamedTuple):
+    """Rotation about a fixed axis, the common part of revolute, screw and cylindrical joints.
 
     Attributes
     ----------
     left, right
-        Frames on both sides, (4, 4); the axis is the z axis of the first.
+        Frames on both sides of the joint, (4, 4). The axis is the z axis of ``left``.
     angles, along
-        How far it turned and slid in each observation, (N,).
+        Angle and displacement along the axis of each observation, (N,).
     slope
-        Slides by turns.
+        Slope of the displacement over the angle.
     """
 
-    left: Stack
-    right: Stack
-    angles: Stack
-    along: Stack
+    left: Array
+    right: Array
+    angles: Array
+    along: Array
     slope: float
 
 
-def _turnings(overview: MotionStatistics, frame: Stack, places: Stack) -> Iterator[_Turning]:
-    flat, along, centre = places[:, :2], places[:, 2], overview.mean[:3, 3]
-    if overview.rows == 6:
-        angles = overview.turns @ frame[:, 2]
-        for place in (_sphere(flat), _pivot(flat, angles)):
+def _find_rotations(statistics: MotionStatistics, frame: Array, places: Array) -> Iterator[_AxisRotation]:
+    flat, along, centre = places[:, :2], places[:, 2], statistics.mean[:3, 3]
+    if statistics.rows == 6:
+        angles = statistics.turns @ frame[:, 2]
+        for place in (_fit_centre(flat), _fit_pivot(flat, angles)):
             left = transform(frame, centre + frame[:, :2] @ place)
-            yield _Turning(left, inverse(left) @ overview.mean, angles, along, _slope(angles, along))
+            yield _AxisRotation(left, inverse(left) @ statistics.mean, angles, along, _slope(angles, along))
         return
-    place = _sphere(flat)
+    place = _fit_centre(flat)
     lever = flat - place
-    # The child's place at 0 is along x: L is turned until it is.
+    # At joint value 0 the child lies on the x axis of L.
     middle = _mean_direction(lever)
     turned = np.column_stack([middle, [-middle[1], middle[0]]])
     x, y = (lever @ turned).T
     left = transform(np.column_stack([frame[:, :2] @ turned, frame[:, 2]]), centre + frame[:, :2] @ place)
     right = transform(np.eye(3), np.array([float(np.mean(np.hypot(x, y))), 0.0, 0.0]))
     angles = np.arctan2(y, x)
-    yield _Turning(left, right, angles, along, _slope(angles, along))
+    yield _AxisRotation(left, right, angles, along, _slope(angles, along))
 
 
-def _slope(angles: Stack, along: Stack) -> float:
+def _slope(angles: Array, along: Array) -> float:
     off = angles - angles.mean()
     variance = float(off @ off)
     return float(off @ along) / variance if variance > 0.0 else 0.0
 
 
-def _about_an_axis(group: JointFamily, overview: MotionStatistics) -> Iterator[InitialGuess]:
-    rows = overview.rows
-    for turning in overview.turnings:
-        left, right, angles, along, slope = turning
-        if group.name == "screw" and rows == 6 and (many := _in_several_turns(group, turning)):
+def _guess_about_axis(group: JointFamily, statistics: MotionStatistics) -> Iterator[InitialGuess]:
+    rows = statistics.rows
+    for rotation_guess in statistics.axis_rotations:
+        left, right, angles, along, slope = rotation_guess
+        if group.name == "screw" and rows == 6 and (many := _guess_screw_revolutions(group, rotation_guess)):
             yield many
         values = angles[:, None] if group.name != "cylindrical" else np.column_stack([along, angles])
         yield InitialGuess(GroupMotion(group, rows, left, right, slope if group.pitch else 0.0), values)
 
 
-def _in_several_turns(group: JointFamily, turning: _Turning) -> InitialGuess | None:
-    """Return the screw whose turns are counted by how far it has moved, if it made more than one."""
-    order = np.argsort(turning.along, kind="stable")
-    angles = turning.angles[order]
+def _guess_screw_revolutions(group: JointFamily, rotation_guess: _AxisRotation) -> InitialGuess | None:
+    """Return a screw whose revolutions are counted along its displacement, or None for less than one."""
+    order = np.argsort(rotation_guess.along, kind="stable")
+    angles = rotation_guess.angles[order]
     if np.abs(np.diff(angles)).max() <= math.pi:
         return None
     unwrapped = np.empty_like(angles)
     unwrapped[order] = np.unwrap(angles)
     if np.ptp(unwrapped) <= math.tau:
         return None
-    slope, offset = np.polyfit(unwrapped, turning.along, 1)
-    right = turning.right.copy()
+    slope, offset = np.polyfit(unwrapped, rotation_guess.along, 1)
+    right = rotation_guess.right.copy()
     right[2, 3] += offset
-    return InitialGuess(GroupMotion(group, 6, turning.left, right, float(slope)), unwrapped[:, None])
+    return InitialGuess(GroupMotion(group, 6, rotation_guess.left, right, float(slope)), unwrapped[:, None])
 
 
-def _about_a_point(overview, joints, start) -> Iterator[InitialGuess]:  # type: ignore[no-untyped-def]
-    count = len(overview.poses)
-    p, mean = overview.positions, overview.mean
-    if overview.rows == 6:
+def _guess_about_point(statistics, joints, start) -> Iterator[InitialGuess]:  # type: ignore[no-untyped-def]
+    count = len(statistics.poses)
+    p, mean = statistics.positions, statistics.mean
+    if statistics.rows == 6:
         # p = c + R q, linear in the centre c and the lever q.
-        rotations = overview.poses[:, :3, :3]
+        rotations = statistics.poses[:, :3, :3]
         matrix = np.concatenate([np.tile(np.eye(3), (count, 1, 1)), rotations], axis=2).reshape(-1, 6)
-        centre = _nearest(matrix, (p - mean[:3, 3]).ravel())[:3] + mean[:3, 3]
-        yield start(np.eye(3), centre, overview.turns)
+        centre = _solve_ridge(matrix, (p - mean[:3, 3]).ravel())[:3] + mean[:3, 3]
+        yield start(np.eye(3), centre, statistics.turns)
         return
-    centre = _sphere(p - mean[:3, 3]) + mean[:3, 3]
+    centre = _fit_centre(p - mean[:3, 3]) + mean[:3, 3]
     lever = p - centre
     radius = float(np.mean(np.linalg.norm(lever, axis=1)))
     middle = lever.mean(axis=0)
@@ -189,39 +189,39 @@ def _about_a_point(overview, joints, start) -> Iterator[InitialGuess]:  # type: 
     yield InitialGuess(replace(result.motion, right=right), result.values)
 
 
-def _directions(centred: Stack) -> Stack:
-    """Return principal directions (3, 3) by rows, that of the largest spread first."""
-    result: Stack = np.linalg.eigh(centred.T @ centred)[1][:, ::-1].T
+def _principal_directions(centred: Array) -> Array:
+    """Return the principal directions (3, 3) as rows, the largest spread first."""
+    result: Array = np.linalg.eigh(centred.T @ centred)[1][:, ::-1].T
     return result
 
 
-def _mean_direction(lever: Stack) -> Stack:
+def _mean_direction(lever: Array) -> Array:
     middle = lever.mean(axis=0)
     length = np.linalg.norm(middle)
     return middle / length if length > 0 else np.array([1.0, 0.0])
 
 
-def _sphere(points: Stack) -> Stack:
-    """Return the centre of the circle or sphere through points: |p|² = 2 c·p + const, kept within reach."""
+def _fit_centre(points: Array) -> Array:
+    """Return the centre of the circle or sphere through points, from |p|² = 2 c·p + const (regularised)."""
     size = math.sqrt(float(np.mean(np.sum(points**2, axis=1)))) or 1.0
     scaled = points / size
-    # Points on a line have no centre: this keeps it within some hundred times their extent.
+    # Points on a line have no centre. The scale and the regularisation bound it by some hundred extents.
     matrix = np.column_stack([2.0 * scaled, np.ones(len(points))])
-    return _nearest(matrix, np.sum(scaled**2, axis=1))[:-1] * size
+    return _solve_ridge(matrix, np.sum(scaled**2, axis=1))[:-1] * size
 
 
-def _pivot(flat: Stack, angles: Stack) -> Stack:
-    """Return the fixed point of turns by known angles: p = c + rotation(angle) q, linear in c and q."""
+def _fit_pivot(flat: Array, angles: Array) -> Array:
+    """Return the fixed point of rotations by known angles, from p = c + rotation(angle) q."""
     matrix = np.zeros((len(flat), 2, 4))
     matrix[:, 0, 0] = matrix[:, 1, 1] = 1.0
     matrix[:, 0, 2] = matrix[:, 1, 3] = np.cos(angles)
     matrix[:, 1, 2] = np.sin(angles)
     matrix[:, 0, 3] = -matrix[:, 1, 2]
-    return _nearest(matrix.reshape(-1, 4), flat.ravel())[:2]
+    return _solve_ridge(matrix.reshape(-1, 4), flat.ravel())[:2]
 
 
-def _nearest(matrix: Stack, target: Stack) -> Stack:
-    """Return x with A x nearest to b, and a touch nearer to nothing: what A does not tell stays small."""
+def _solve_ridge(matrix: Array, target: Array) -> Array:
+    """Return the least-squares solution x of A x = b, with a small ridge term."""
     normal = matrix.T @ matrix
     normal.flat[:: len(normal) + 1] += 1e-6
     return np.asarray(np.linalg.solve(normal, matrix.T @ target), dtype=np.float64)

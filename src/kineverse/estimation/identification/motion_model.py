@@ -2,13 +2,16 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from typing import NamedTuple, Protocol, Self
 
-from kineverse.lie import Stack
+import numpy as np
+
+from kineverse.lie import Array
 
 
 class LinearisedPoses(NamedTuple):
-    """Relative poses and what changes them.
+    """Relative poses and their derivatives.
 
     Attributes
     ----------
@@ -21,20 +24,20 @@ class LinearisedPoses(NamedTuple):
         The same per unit of each joint value, (N, 6, k).
     """
 
-    pose: Stack
-    by_parameters: Stack
-    by_joints: Stack
+    pose: Array
+    by_parameters: Array
+    by_joints: Array
 
 
 class ParameterPrior(NamedTuple):
-    """What is believed of parameters beforehand, as whitened residuals (m,) and their derivatives (m, n)."""
+    """Gaussian prior of the parameters: whitened residuals (m,) and their derivatives (m, n)."""
 
-    residuals: Stack
-    by_parameters: Stack
+    residuals: Array
+    by_parameters: Array
 
 
 class MotionModel(Protocol):
-    """A member of a family: its n parameters have values, its k joint values are still free."""
+    """Motion with values for its n parameters and k free joint values."""
 
     @property
     def size(self) -> int:
@@ -46,53 +49,85 @@ class MotionModel(Protocol):
         """Number of joint values."""
         ...
 
-    def at(self, values: Stack) -> LinearisedPoses:
-        """Return the poses at joint values (N, k)."""
+    def linearise(self, values: Array) -> LinearisedPoses:
+        """Return the poses at joint values (N, k) and their derivatives."""
         ...
 
-    def moved(self, step: Stack) -> Self:
-        """Return the member that a step (n,) in the parameters leads to."""
+    def retract(self, step: Array) -> Self:
+        """Return the motion after a step (n,) in the parameters."""
         ...
 
-    def bounded(self, values: Stack, step: Stack) -> Stack:
-        """Return joint values (N, k) after a step, kept where they mean something."""
+    def retract_joints(self, values: Array, step: Array) -> Array:
+        """Return joint values (N, k) after a step (N, k), limited in size and to their domain."""
         ...
 
     def prior(self) -> ParameterPrior:
-        """Return what is believed of the parameters."""
+        """Return the prior of the parameters."""
         ...
 
 
 class FamilyMember(MotionModel, Protocol):
-    """A member of a family that is weighed against others."""
+    """Member of a joint family that is compared with other families."""
 
     @property
     def name(self) -> str:
-        """That of the family."""
+        """Name of the family."""
         ...
 
     @property
     def rows(self) -> int:
-        """6, or 3 for positions only."""
+        """6 for poses, 3 for positions."""
         ...
 
     @property
     def kinds(self) -> tuple[int, ...]:
-        """What kind of joint value each is: those of one kind share a width."""
+        """Kind of each joint value. Joint values of one kind share the width of their range."""
         ...
 
-    def beforehand(self, mean: Stack) -> tuple[float, Stack]:
-        """Return what is believed of parameters and of the mean of the joint values, for the evidence.
+    def log_prior(self, mean: Array) -> tuple[float, Array]:
+        """Return the prior of the parameters and of the mean joint values, for the evidence.
 
-        That is the logarithm of its density here, and the precision (n + k,) beside that of :meth:`prior`
-        that keeps directions finite which nothing tells; also (n + k + c,) where a point of the child slides.
+        The first result is the logarithm of its density at this member. The second is a precision (n + k,)
+        that is added to the one of :meth:`prior`. It keeps directions finite on which there is no data. With
+        c sliding components it has the length n + k + c.
         """
         ...
 
-    def named(self) -> dict[str, Stack | float]:
-        """Return the parameters by name, for people."""
+    def named_parameters(self) -> dict[str, Array | float]:
+        """Return the parameters by name, for display."""
         ...
 
     def coordinates(self) -> tuple[str, ...]:
         """Return the names of the n parameters."""
         ...
+
+
+@dataclass(frozen=True)
+class FixedMotion:
+    """Motion with fixed parameters. Only its joint values are unknown."""
+
+    motion: MotionModel
+
+    size = 0
+
+    @property
+    def joints(self) -> int:
+        """Number of joint values."""
+        return self.motion.joints
+
+    def linearise(self, values: Array) -> LinearisedPoses:
+        """Return the poses at joint values (N, k) and their derivatives."""
+        linear = self.motion.linearise(values)
+        return linear._replace(by_parameters=linear.by_parameters[:, :, :0])
+
+    def retract(self, step: Array) -> Self:
+        """Return the motion itself: it has no parameters."""
+        return self
+
+    def retract_joints(self, values: Array, step: Array) -> Array:
+        """Return joint values (N, k) after a step."""
+        return self.motion.retract_joints(values, step)
+
+    def prior(self) -> ParameterPrior:
+        """Return the empty prior."""
+        return ParameterPrior(np.zeros(0), np.zeros((0, 0)))

@@ -13,12 +13,12 @@ import numpy as np
 import numpy.typing as npt
 
 from kineverse.errors import InvalidValueError, ShapeError
-from kineverse.lie import Stack, inverse
+from kineverse.lie import Array, inverse
 
 _RIGID = 1e-4
-# Beyond these a double has not enough digits for what is computed.
+# Largest number and smallest standard deviation that double precision can handle.
 _LARGEST, _SMALLEST = 1e9, 1e-7
-# How much of a step the width of a valley makes.
+# Factor between successive levels of the continuation.
 _THIN = 4.0
 
 
@@ -31,54 +31,54 @@ class Observations:
     parent
         world_T_parent, (N, 4, 4); identities if the parent is the world.
     child
-        world_T_child, (N, 4, 4); if only positions were seen, with rotations that mean nothing.
+        world_T_child, (N, 4, 4). If only positions were observed, the rotations are arbitrary.
     parent_covariance
-        (N, 6, 6), see :mod:`kineverse.estimation.noise`; None if the parent's pose is exactly known.
+        (N, 6, 6), see :mod:`kineverse.estimation.noise`; None if the parent's pose is exact.
     child_covariance
-        (N, m, m) with m = 6, or m = 3 if only positions were seen.
+        (N, m, m) with m = 6, or m = 3 if only positions were observed.
     """
 
-    parent: Stack
-    child: Stack
-    parent_covariance: Stack | None
-    child_covariance: Stack
+    parent: Array
+    child: Array
+    parent_covariance: Array | None
+    child_covariance: Array
 
     def __len__(self) -> int:
         return len(self.child)
 
     @property
     def rows(self) -> int:
-        """6, or 3 if only positions of the child were seen."""
+        """6, or 3 if only positions of the child were observed."""
         return int(self.child_covariance.shape[-1])
 
     @cached_property
-    def relative(self) -> Stack:
-        """parent_T_child as observed, (N, 4, 4)."""
+    def relative(self) -> Array:
+        """Observed parent_T_child, (N, 4, 4)."""
         return inverse(self.parent) @ self.child
 
-    def at(self, rows: slice | npt.NDArray[np.int_]) -> Observations:
-        """Return some of them."""
+    def select(self, rows: slice | npt.NDArray[np.int_]) -> Observations:
+        """Return the observations of some rows."""
         of_parent = None if self.parent_covariance is None else self.parent_covariance[rows]
         return Observations(self.parent[rows], self.child[rows], of_parent, self.child_covariance[rows])
 
     def softened(self) -> tuple[Observations, ...]:
         """Return the same observations with less precise positions, the least precise first.
 
-        Where positions are known much better than what a lever makes of the errors of orientations, the
-        likelihood is a thin and curved valley. Steps find into it if it narrows by and by.
+        They are the levels of a continuation. If positions are much more precise than orientation errors
+        times the lever, the likelihood is a narrow and curved valley, which Gauss-Newton steps do not enter.
         """
         return self._softened
 
     @cached_property
     def softness(self) -> tuple[float, ...]:
-        """By how much errors of positions are larger in each of :meth:`softened`."""
+        """Factors on the position errors of each level of :meth:`softened`."""
         if self.parent_covariance is None:
             return ()
         lever = float(np.sqrt(np.mean(np.sum(self.relative[:, :3, 3] ** 2, axis=1))))
         turned = lever * float(np.sqrt(np.mean(np.einsum("nii->ni", self.parent_covariance)[:, 3:])))
         place = float(np.sqrt(np.mean(np.einsum("nii->ni", self.child_covariance)[:, :3])))
         factors, factor = [], 0.5 * turned / place
-        # What was softened by one step less is not softened again because of how numbers are rounded.
+        # The margin keeps rounding from adding a level to observations that are softened already.
         while factor > _THIN * (1.0 + 1e-9):
             factors.append(factor)
             factor /= _THIN
@@ -103,16 +103,16 @@ def check_observations(
     child_covariance: npt.ArrayLike,
     fewest: int = 2,
 ) -> Observations:
-    """Return observations, checked.
+    """Check poses and covariances and return them as observations.
 
     Raises
     ------
     ShapeError
-        For arrays of other shapes than (N, 4, 4), or (N, 3) for positions of the child, and for numbers of
-        poses that differ.
+        For arrays of other shapes than (N, 4, 4), or (N, 3) for positions of the child, and for different
+        numbers of poses.
     InvalidValueError
-        For fewer than two poses, NaN, matrices that are not rigid, and covariances that are not positive
-        definite.
+        For fewer than ``fewest`` poses, NaN, matrices that are not rigid, and covariances that are not
+        positive definite.
     """
     b = _numbers(child, "The poses of the child")
     positions = b.ndim == 2 and b.shape[1:] == (3,)
@@ -156,13 +156,13 @@ def check_observations(
     return Observations(a, b, of_parent, covariances(given, len(b), rows, "child"))
 
 
-def check_rigid(poses: Stack, part: str) -> None:
-    """Look whether matrices (N, 4, 4) are rigid transforms.
+def check_rigid(poses: Array, part: str) -> None:
+    """Check that matrices (N, 4, 4) are rigid transforms.
 
     Raises
     ------
     InvalidValueError
-        Naming the first that is not, and by how much.
+        With the first that is not, and its error.
     """
     _check_finite(poses.reshape(len(poses), -1), part)
     rotations = poses[:, :3, :3]
@@ -179,13 +179,13 @@ def check_rigid(poses: Stack, part: str) -> None:
         )
 
 
-def covariances(given: npt.ArrayLike, count: int, rows: int, part: str) -> Stack:
-    """Return covariances (N, m, m) of one for all, or of one for each pose.
+def covariances(given: npt.ArrayLike, count: int, rows: int, part: str) -> Array:
+    """Return covariances (N, m, m) from a common one (m, m) or from one for each pose.
 
     Raises
     ------
     ShapeError, InvalidValueError
-        If they are something else, or not symmetric and positive definite.
+        For other shapes, and for matrices that are not symmetric and positive definite.
     """
     matrices = _numbers(given, f"The covariance of the {part}")
     if matrices.shape not in ((rows, rows), (count, rows, rows)):
@@ -202,11 +202,11 @@ def covariances(given: npt.ArrayLike, count: int, rows: int, part: str) -> Stack
 
 @functools.lru_cache(maxsize=64)
 def _check_one_covariance(numbers: bytes, rows: int, part: str) -> None:
-    """Check a covariance; the same ones are stated over and over."""
+    """Check a common covariance. The result is cached, because callers repeat the same one."""
     _check_covariances(np.frombuffer(numbers).reshape(1, rows, rows), part)
 
 
-def _check_covariances(each: Stack, part: str) -> None:
+def _check_covariances(each: Array, part: str) -> None:
     _check_finite(each.reshape(len(each), -1), part, "Covariance")
     scale = np.sqrt(np.abs(np.einsum("nii->ni", each)))
     scale[scale == 0.0] = 1.0
@@ -229,7 +229,7 @@ def _check_covariances(each: Stack, part: str) -> None:
         )
 
 
-def _numbers(given: npt.ArrayLike, what: str) -> Stack:
+def _numbers(given: npt.ArrayLike, what: str) -> Array:
     try:
         if np.iscomplexobj(given):
             raise TypeError
@@ -238,7 +238,7 @@ def _numbers(given: npt.ArrayLike, what: str) -> Stack:
         raise ShapeError(f"{what} are no array of numbers.") from None
 
 
-def _check_finite(rows: Stack, part: str, what: str = "Pose") -> None:
+def _check_finite(rows: Array, part: str, what: str = "Pose") -> None:
     wrong = np.flatnonzero(~np.isfinite(rows).all(axis=1))
     if len(wrong):
         raise InvalidValueError(
@@ -254,53 +254,52 @@ def _check_finite(rows: Stack, part: str, what: str = "Pose") -> None:
 
 
 PosesLike: TypeAlias = "npt.ArrayLike | tuple[npt.ArrayLike, npt.ArrayLike]"
-"""Poses (N, 4, 4), or a pair of them and their covariance: (6, 6), or (N, 6, 6) with one for each pose. Where
-points are welcome, positions (N, 3) with (3, 3) or (N, 3, 3)."""
+"""Poses (N, 4, 4), or a pair of poses and covariance: (6, 6), or (N, 6, 6) with one for each pose. Where
+points are accepted, positions (N, 3) with (3, 3) or (N, 3, 3)."""
 
 
 @dataclass(frozen=True)
 class PoseTrack:
-    """The poses of one frame over time.
+    """Poses of one frame over time.
 
     Attributes
     ----------
     poses
-        (N, 4, 4); of a point, with rotations that mean nothing.
+        (N, 4, 4). The rotations of a point are arbitrary.
     covariances
-        (N, 6, 6), or (N, 3, 3) of a point; None if they are exact.
+        (N, 6, 6), or (N, 3, 3) of a point; None for exact poses.
     seen
-        When it was seen, (N,).
+        Mask of the times with an observation, (N,).
     """
 
-    poses: Stack
-    covariances: Stack | None
+    poses: Array
+    covariances: Array | None
     seen: npt.NDArray[np.bool_]
 
     @property
     def is_point(self) -> bool:
-        """Whether only positions were seen."""
+        """True if only positions were observed."""
         return self.covariances is not None and self.covariances.shape[-1] == 3
 
 
 def check_tracks(
     observations: Mapping[str, PosesLike], noise: npt.ArrayLike | None, points: bool = False
 ) -> dict[str, PoseTrack]:
-    """Return what was seen, checked.
+    """Check the observations of frames over time and return them as tracks.
 
     Parameters
     ----------
     observations
-        By the name of the frame: poses, or pairs of poses and covariance. A pose that is NaN throughout was
-        not seen.
+        Poses, or pairs of poses and covariance, by name of the frame. A pose of NaN only is a gap.
     noise
-        The covariance of those that come with none.
+        Covariance of frames that have none of their own.
     points
-        Whether positions, (N, 3), do as well.
+        True if positions, (N, 3), are accepted.
 
     Raises
     ------
     ShapeError, InvalidValueError
-        For poses or covariances that are none, numbers of poses that differ, and a frame without covariance.
+        For invalid poses or covariances, different numbers of poses, and a frame without covariance.
     """
     if not isinstance(observations, Mapping):
         raise ShapeError("Observations are a mapping from names of frames to poses of shape (N, 4, 4).")
@@ -351,12 +350,12 @@ def _track(name: str, given: Any, noise: npt.ArrayLike | None, points: bool) -> 
 
 
 def exact_track(count: int) -> PoseTrack:
-    """Return the track of the frame in which everything was seen."""
+    """Return the exact track of the observer's own frame."""
     return PoseTrack(np.tile(np.eye(4), (count, 1, 1)), None, np.ones(count, dtype=bool))
 
 
 def pair_tracks(parent: PoseTrack, child: PoseTrack, rows: npt.NDArray[Any]) -> Observations:
-    """Return the poses of two frames at some times."""
+    """Return the observations of two frames at some times."""
     return Observations(
         parent.poses[rows],
         child.poses[rows],
@@ -365,13 +364,13 @@ def pair_tracks(parent: PoseTrack, child: PoseTrack, rows: npt.NDArray[Any]) -> 
     )
 
 
-def _given(track: PoseTrack) -> Stack:
-    assert track.covariances is not None  # only the observer is exact, and it is no child
+def _given(track: PoseTrack) -> Array:
+    assert track.covariances is not None  # only the observer is exact, and it is never a child
     return track.covariances
 
 
 def concatenate_tracks(parts: Sequence[PoseTrack]) -> PoseTrack:
-    """Return tracks one after the other."""
+    """Return tracks joined in time."""
     return PoseTrack(
         np.concatenate([part.poses for part in parts]),
         None

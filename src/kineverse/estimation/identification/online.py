@@ -12,8 +12,9 @@ import numpy as np
 import numpy.typing as npt
 
 from kineverse.errors import InvalidValueError, ShapeError
+from kineverse.estimation.linear_algebra import squared_errors
 from kineverse.estimation.robust import Outliers, as_outliers
-from kineverse.lie import Stack
+from kineverse.lie import Array
 
 from .custom_family import Family
 from .identify import (
@@ -40,22 +41,22 @@ from .unwrapping import is_screw
 
 
 class ObservationBuffer:
-    """Observations that came one by one, in arrays that grow by doubling."""
+    """Growing buffer of observations. Its arrays double in size when they are full."""
 
     def __init__(self) -> None:
-        self._arrays: list[Stack | None] = []
+        self._arrays: list[Array | None] = []
         self._count = 0
 
     def __len__(self) -> int:
         return self._count
 
     def add(self, one: Observations) -> None:
-        """Take one more.
+        """Append an observation.
 
         Raises
         ------
         ShapeError
-            If it is of another kind than those before.
+            If it has other shapes than the observations before.
         """
         new = [one.parent, one.child, one.parent_covariance, one.child_covariance]
         if not self._arrays:
@@ -66,129 +67,140 @@ class ObservationBuffer:
             if old is None or array is None:
                 continue
             if len(old) == self._count:
-                # What was handed out keeps the old array.
+                # Observations that were returned earlier keep the old array.
                 self._arrays[k] = old = np.concatenate([old, np.empty_like(old)])
             old[self._count] = array[0]
         self._count += 1
 
     @property
     def all(self) -> Observations:
-        """All of them."""
+        """All observations so far."""
         parent, child, of_parent, of_child = (
             None if array is None else array[: self._count] for array in self._arrays
         )
         assert parent is not None
         assert child is not None
-        assert of_child is not None  # as only that of the parent may be missing
+        assert of_child is not None  # only the covariance of the parent may be None
         return Observations(parent, child, of_parent, of_child)
 
 
-def _entry_shape(array: Stack | None) -> tuple[int, ...] | None:
+def _entry_shape(array: Array | None) -> tuple[int, ...] | None:
     return None if array is None else array.shape[1:]
 
 
 def warm_start(
-    sight: IdentificationData,
+    data: IdentificationData,
     known: Mapping[str | Family, FamilySolution],
     scale: float,
     weights: Mapping[str | Family, float],
 ) -> dict[str | Family, FamilySolution]:
-    """Return what families make of all that was seen, each from where it was.
+    """Return the solutions of families for all observations, starting from earlier solutions.
 
     Parameters
     ----------
-    sight
-        What was seen.
+    data
+        All observations, the earlier ones first.
     known
-        What they made of the first observations.
+        Solutions of the earlier observations.
     scale
-        By how much standard deviations of the noise were scaled.
+        Factor on the standard deviations of the noise.
     weights
-        How probable families are beforehand.
+        Prior weights of the families.
     """
-    right = {name: _predict_inliers(sight, one, scale) for name, one in known.items()}
-    most_alike = functools.cache(_most_alike)  # most families are by the same ones
+    inliers = {name: _predict_inliers(data, one, scale) for name, one in known.items()}
+    nearest_of = functools.cache(_nearest_observations)  # most families have the same inliers
     found = {}
     for name, one in known.items():
-        seen = sight.seen if len(right[name]) == len(sight.seen) else sight.seen.at(right[name])
-        found[name] = _continued(seen, one.known.solution, most_alike(seen, len(one.right)), sight.ordered)
-    return score_solutions(sight, found, right, weights)
+        observations = (
+            data.observations
+            if len(inliers[name]) == len(data.observations)
+            else data.observations.select(inliers[name])
+        )
+        found[name] = _continue_family(
+            observations, one.scored.solution, nearest_of(observations, len(one.inliers)), data.sequential
+        )
+    return score_solutions(data, found, inliers, weights)
 
 
-def is_surprised(sight: IdentificationData, one: FamilySolution, count: int) -> bool:
-    """Return whether a family finds observations from a number on wrong, or improbable by their size."""
-    new = len(sight.seen) - count
-    if np.count_nonzero(one.right >= count) < new:
+def is_surprised(data: IdentificationData, one: FamilySolution, count: int) -> bool:
+    """Return True if new observations contain outliers of a family, or have a χ² that is too large for noise.
+
+    The observations from index ``count`` on are new.
+    """
+    new = len(data.observations) - count
+    if np.count_nonzero(one.inliers >= count) < new:
         return True
-    solution = one.known.solution
+    solution = one.scored.solution
     residuals, covariance = solution.residuals[-new:], solution.covariance[-new:]
-    squares = float(np.sum(residuals * np.linalg.solve(covariance, residuals[:, :, None])[:, :, 0]))
+    squares = float(squared_errors(residuals, covariance).sum())
     return squares > residuals.size + SURPRISE_DEVIATIONS * math.sqrt(2.0 * residuals.size)
 
 
-def _continued(
-    seen: Observations, before: Solution[FamilyMember], alike: RowIndices, ordered: bool
+def _continue_family(
+    observations: Observations, before: Solution[FamilyMember], nearest: RowIndices, sequential: bool
 ) -> Scored:
-    """Return the solution of a family for more observations than it was found from."""
+    """Return the solution of a family for more observations than before."""
     known = len(before.values)
-    # What looks alike has joint values that are near.
-    values = np.concatenate([before.values, before.values[alike]])
-    if ordered and is_screw(before.motion):
+    # Similar relative poses have similar joint values.
+    values = np.concatenate([before.values, before.values[nearest]])
+    if sequential and is_screw(before.motion):
         for k in range(known, len(values)):
             values[k] += math.tau * np.round((values[k - 1] - values[k]) / math.tau)
-    parent = np.concatenate([before.parent, seen.parent[known:]])
-    return solver.continued(seen, InitialGuess(before.motion, values), parent, before.belief, known)
+    parent = np.concatenate([before.parent, observations.parent[known:]])
+    return solver.continue_from(
+        observations, InitialGuess(before.motion, values), parent, before.joint_prior, known
+    )
 
 
-def _most_alike(seen: Observations, known: int) -> RowIndices:
-    """Return which of the first observations looks most like each of the others."""
-    old, new = seen.relative[None, :known], seen.relative[known:, None]
-    alike: RowIndices = np.argmin(np.sum((old - new) ** 2, axis=(2, 3)), axis=1)
-    return alike
+def _nearest_observations(observations: Observations, known: int) -> RowIndices:
+    """Return the index of the nearest of the first ``known`` relative poses, for each of the others."""
+    old, new = observations.relative[None, :known], observations.relative[known:, None]
+    nearest: RowIndices = np.argmin(np.sum((old - new) ** 2, axis=(2, 3)), axis=1)
+    return nearest
 
 
-def _predict_inliers(sight: IdentificationData, one: FamilySolution, scale: float) -> RowIndices:
-    """Return the numbers of what is right: of what was, and of what came and is where it may be expected."""
-    new, solution = np.arange(one.count, len(sight.seen)), one.known.solution
-    if sight.outliers is None or solution.motion.joints == sight.seen.rows:
-        return np.concatenate([one.right, new])
-    came = project_observations(solution.motion, solution.values, sight.seen.at(new))
-    by_parameters = solution.motion.at(came.values).by_parameters
-    # What is not known of the joint yet is no error of what was seen.
+def _predict_inliers(data: IdentificationData, one: FamilySolution, scale: float) -> RowIndices:
+    """Return the indices of the inliers so far and of the new observations that match the prediction."""
+    new, solution = np.arange(one.count, len(data.observations)), one.scored.solution
+    if data.outliers is None or solution.motion.joints == data.observations.rows:
+        return np.concatenate([one.inliers, new])
+    predicted = project_observations(solution.motion, solution.values, data.observations.select(new))
+    by_parameters = solution.motion.linearise(predicted.values).by_parameters
+    # The prediction is uncertain by the parameters, too.
     unknown = solver.evidence(solution).covariance
-    covariance = came.covariance + by_parameters @ unknown @ np.swapaxes(by_parameters, 1, 2)
-    came_right = classify_inliers(came.residuals, scale**2 * covariance, sight.outliers, sight.stated)
-    return np.concatenate([one.right, new[came_right]])
+    covariance = predicted.covariance + by_parameters @ unknown @ np.swapaxes(by_parameters, 1, 2)
+    new_inliers = classify_inliers(predicted.residuals, scale**2 * covariance, data.outliers, data.stated)
+    return np.concatenate([one.inliers, new[new_inliers]])
 
 
-# A family that is less probable than this rests until there are twice as many observations.
-_NO_CHANCE = 1e-6
-# One that is less probable than this is looked at when there are more observations by this part.
+# A family with a smaller probability is not updated until the number of observations has doubled.
+_NEGLIGIBLE = 1e-6
+# A family with a smaller probability than the first is updated after this relative increase of observations.
 _UNLIKELY, _MORE = 0.01, 0.125
 
 
 class Identifier:
-    """How a part moves against another, learned while it moves.
+    """Online identification of the joint between two parts.
 
-    It gives what :func:`.identify.identify` gives of all poses so far, at a fraction of the cost: each family
-    goes on from where it was. A family below 1 % is compared with the others again when there are an eighth
-    more observations, or when a pose is a surprise to the best one; its fit is always by all poses. One that
-    has no chance rests until there are twice as many, and is not among what was found meanwhile.
+    The result is that of :func:`.identify.identify` for all poses so far, at a fraction of the cost: each
+    family starts from its previous solution. A family below 1 % is updated after an eighth more observations,
+    or when a new pose is improbable under the best family; its fit uses all poses in any case. A family below
+    one in a million is left out of the result until the number of observations has doubled.
 
     Parameters
     ----------
-    covariance_a, covariance_b
-        Covariances of the errors of all poses that come without their own, (6, 6).
+    parent_covariance, child_covariance
+        Covariances of the errors of poses that have none of their own, (6, 6).
     families, noise, outliers
-        As for :func:`.identify.identify`. A pose is taken for wrong as it comes, and perhaps for right when
-        there are twice as many.
-    ordered
-        Whether poses come in the order in which they were seen, see :func:`.identify.identify`.
+        As for :func:`.identify.identify`. A new pose is classified when it arrives. All poses are classified
+        again when their number has doubled.
+    sequential
+        True if the poses arrive in temporal order, see :func:`.identify.identify`.
 
     Raises
     ------
     UnknownNameError
-        For a family that does not exist.
+        For an unknown family.
     """
 
     def __init__(
@@ -199,133 +211,144 @@ class Identifier:
         families: Families = None,
         noise: npt.ArrayLike | None = None,
         outliers: Outliers | bool | None = None,
-        ordered: bool = True,
+        sequential: bool = True,
     ) -> None:
-        self._ordered = ordered
+        self._sequential = sequential
         self._outliers = as_outliers(outliers)
         self._weights = family_weights(families)
         self._noise = parent_covariance, child_covariance, noise
         self._stated = True
-        self._seen = ObservationBuffer()
-        self._known: dict[str | Family, FamilySolution] = {}
-        # By the family, the logarithm of how probable it was beside the best one when it was looked at.
+        self._buffer = ObservationBuffer()
+        self._solutions: dict[str | Family, FamilySolution] = {}
+        # Log odds of each family against the best one at its last update.
         self._odds: dict[str | Family, float] = {}
-        self._found: IdentificationResult | None = None
-        self._whole, self._count, self._unit, self._scale = 0, 0, 1.0, 1.0
+        self._result: IdentificationResult | None = None
+        self._full_count, self._count, self._unit, self._scale = 0, 0, 1.0, 1.0
 
     def __len__(self) -> int:
-        return len(self._seen)
+        return len(self._buffer)
 
     def add(
         self,
-        a: npt.ArrayLike | None,
-        b: npt.ArrayLike,
+        parent_pose: npt.ArrayLike | None,
+        child_pose: npt.ArrayLike,
         parent_covariance: npt.ArrayLike | None = None,
         child_covariance: npt.ArrayLike | None = None,
     ) -> None:
-        """Take notice of a pose of each part, (4, 4); of the child perhaps only its position, (3,).
+        """Add a pose of each part, (4, 4). The child may have only a position, (3,).
 
         Raises
         ------
         ShapeError, InvalidValueError
-            For poses or covariances that are none, or of another kind than those before; nothing has changed
-            then.
+            For invalid poses or covariances, and for shapes that differ from those before. The observations
+            stay as they were.
         """
-        of_a, of_b, noise = self._noise
-        of_a, of_b, stated = resolve_noise(
-            a is not None,
-            of_a if parent_covariance is None else parent_covariance,
-            of_b if child_covariance is None else child_covariance,
+        default_parent, default_child, noise = self._noise
+        of_parent, of_child, stated = resolve_noise(
+            parent_pose is not None,
+            default_parent if parent_covariance is None else parent_covariance,
+            default_child if child_covariance is None else child_covariance,
             noise,
         )
         one = check_observations(
-            None if a is None else np.asarray(a)[None], np.asarray(b)[None], of_a, of_b, fewest=1
+            None if parent_pose is None else np.asarray(parent_pose)[None],
+            np.asarray(child_pose)[None],
+            of_parent,
+            of_child,
+            fewest=1,
         )
-        self._seen.add(one)
+        self._buffer.add(one)
         self._stated = stated
-        self._found = None
+        self._result = None
 
     @property
-    def found(self) -> IdentificationResult:
-        """What all poses so far tell.
+    def result(self) -> IdentificationResult:
+        """Result of all poses so far.
 
         Raises
         ------
         InvalidValueError
             For fewer than two poses.
         """
-        if len(self._seen) < 2:
+        if len(self._buffer) < 2:
             raise InvalidValueError(
-                f"There are {len(self._seen)} poses so far. How something moves takes at least two to see."
+                f"There are {len(self._buffer)} poses so far. How something moves takes at least two to see."
             )
-        if self._found is None:
-            self._found = self._find()
-        return self._found
+        if self._result is None:
+            self._result = self._identify()
+        return self._result
 
-    def _find(self) -> IdentificationResult:
-        seen = self._seen.all
-        resting: dict[str | Family, FamilySolution] = {}
-        if len(seen) >= 2 * self._whole:
-            self._whole = len(seen)
-            sight = prepare_data(seen, self._stated, self._outliers, self._ordered)
-            self._unit = sight.unit
-            known = solve_with_inliers(sight, self._weights)
+    def _identify(self) -> IdentificationResult:
+        observations = self._buffer.all
+        deferred: dict[str | Family, FamilySolution] = {}
+        if len(observations) >= 2 * self._full_count:
+            self._full_count = len(observations)
+            data = prepare_data(observations, self._stated, self._outliers, self._sequential)
+            self._unit = data.unit
+            known = solve_with_inliers(data, self._weights)
         else:
-            sight = prepare_data(seen, self._stated, self._outliers, self._ordered, self._unit)
-            known, resting = self._looked_at(sight)
-        found = weigh_families(sight, known | resting, self._weights)
-        self._scale, self._count = found.noise_scale, len(seen)
-        likely = {name: p for name, p in found.probabilities.items() if p > _NO_CHANCE}
+            data = prepare_data(observations, self._stated, self._outliers, self._sequential, self._unit)
+            known, deferred = self._update_families(data)
+        found = weigh_families(data, known | deferred, self._weights)
+        self._scale, self._count = found.noise_scale, len(observations)
+        likely = {name: p for name, p in found.probabilities.items() if p > _NEGLIGIBLE}
         best = max(likely.values())
-        self._known, self._odds = {}, {}
-        for name, one in (known | resting).items():
-            if (p := likely.get(one.known.solution.motion.name)) is not None:
-                self._known[name], self._odds[name] = one, math.log(p / best)
-        late = {
-            one.known.solution.motion.name: partial(_late, sight, name, one, self._scale, self._weights)
-            for name, one in resting.items()
+        self._solutions, self._odds = {}, {}
+        for name, one in (known | deferred).items():
+            if (p := likely.get(one.scored.solution.motion.name)) is not None:
+                self._solutions[name], self._odds[name] = one, math.log(p / best)
+        deferred_fits = {
+            one.scored.solution.motion.name: partial(
+                _deferred_fit, data, name, one, self._scale, self._weights
+            )
+            for name, one in deferred.items()
         }
-        return replace(found, offers=tuple(_offered(offer, late) for offer in found.offers))
+        return replace(
+            found,
+            lazy_fits=tuple(_with_deferred_fit(lazy_fit, deferred_fits) for lazy_fit in found.lazy_fits),
+        )
 
-    def _looked_at(
-        self, sight: IdentificationData
+    def _update_families(
+        self, data: IdentificationData
     ) -> tuple[dict[str | Family, FamilySolution], dict[str | Family, FamilySolution]]:
-        """Return what families make of all that was seen, and what those made of less that may rest."""
+        """Return the updated solutions, and the older ones of families whose update is deferred."""
         best = max(self._odds, key=self._odds.__getitem__)
-        rest = {name: one for name, one in self._known.items() if sight.stated and self._may_rest(name, one)}
-        due = {name: one for name, one in self._known.items() if name not in rest}
-        known = warm_start(sight, due, self._scale, self._weights)
-        leading = max(known, key=lambda name: self._log(name, known[name]))
-        if rest and (leading != best or is_surprised(sight, known[best], self._count)):
-            return known | warm_start(sight, rest, self._scale, self._weights), {}
-        # Beside the best one they are as probable as they were.
-        top = self._log(leading, known[leading])
-        for name, one in rest.items():
-            more = top + self._odds[name] - self._log(name, one)
-            rated = one.known._replace(log_evidence=one.known.log_evidence + more)
-            rest[name] = replace(one, known=rated)
-        return known, rest
+        deferred = {
+            name: one for name, one in self._solutions.items() if data.stated and self._is_deferred(name, one)
+        }
+        due = {name: one for name, one in self._solutions.items() if name not in deferred}
+        known = warm_start(data, due, self._scale, self._weights)
+        leading = max(known, key=lambda name: self._log_posterior(name, known[name]))
+        if deferred and (leading != best or is_surprised(data, known[best], self._count)):
+            return known | warm_start(data, deferred, self._scale, self._weights), {}
+        # Their odds against the best family stay as they were.
+        top = self._log_posterior(leading, known[leading])
+        for name, one in deferred.items():
+            more = top + self._odds[name] - self._log_posterior(name, one)
+            scored = one.scored._replace(log_evidence=one.scored.log_evidence + more)
+            deferred[name] = replace(one, scored=scored)
+        return known, deferred
 
-    def _may_rest(self, name: str | Family, one: FamilySolution) -> bool:
-        return self._odds[name] < math.log(_UNLIKELY) and len(self._seen) < (1.0 + _MORE) * one.count
+    def _is_deferred(self, name: str | Family, one: FamilySolution) -> bool:
+        return self._odds[name] < math.log(_UNLIKELY) and len(self._buffer) < (1.0 + _MORE) * one.count
 
-    def _log(self, name: str | Family, one: FamilySolution) -> float:
-        return one.known.log_evidence + one.log_belief + math.log(self._weights[name])
-
-
-def _offered(offer: LazyFit, late: Mapping[str, Callable[[float], Fit]]) -> LazyFit:
-    make = late.get(offer.family)
-    return offer if make is None else offer._replace(make=partial(make, offer.probability))
+    def _log_posterior(self, name: str | Family, one: FamilySolution) -> float:
+        return one.scored.log_evidence + one.log_prior + math.log(self._weights[name])
 
 
-def _late(
-    sight: IdentificationData,
+def _with_deferred_fit(lazy_fit: LazyFit, deferred_fits: Mapping[str, Callable[[float], Fit]]) -> LazyFit:
+    compute = deferred_fits.get(lazy_fit.family)
+    return lazy_fit if compute is None else lazy_fit._replace(compute=partial(compute, lazy_fit.probability))
+
+
+def _deferred_fit(
+    data: IdentificationData,
     name: str | Family,
     one: FamilySolution,
     scale: float,
     weights: Mapping[str | Family, float],
     probability: float,
 ) -> Fit:
-    """Return the fit of a family that rested, by all that was seen."""
-    fit = weigh_families(sight, warm_start(sight, {name: one}, scale, weights), weights).best
+    """Return the fit of a family whose update was deferred, by all observations."""
+    fit = weigh_families(data, warm_start(data, {name: one}, scale, weights), weights).best
     return replace(fit, probability=probability)

@@ -4,11 +4,10 @@ With the true poses Â_k of the parent as unknowns too, the errors of an observa
 
     e_A = (Â⁻¹A),      e_B = (Â⁻¹B) against H(θ, a)
 
-and to first order a step (ε, δθ, δa) leaves e_A - ε and e_B - M ε - J_θ δθ - J_a δa, where M carries ε over
-the lever between the parts. Eliminating ε leaves e_B - M e_A with the covariance S = Σ_B + M Σ_A Mᵀ;
-eliminating δa by its Schur complement leaves a system in θ alone. As Â_k is moved after every step, the
-linearisation is that at the estimate, and what is found is the maximum of the full likelihood, with all true
-poses as unknowns.
+To first order, after a step (ε, δθ, δa) they are e_A - ε and e_B - M ε - J_θ δθ - J_a δa, where M transports
+ε over the lever between the parts. Elimination of ε leaves e_B - M e_A with covariance S = Σ_B + M Σ_A Mᵀ.
+Elimination of δa by its Schur complement leaves a system in θ alone. Â_k is updated after every step, so the
+linearisation is at the estimate. The result maximises the full likelihood with all true poses as unknowns.
 """
 
 from __future__ import annotations
@@ -19,8 +18,13 @@ from typing import Generic, NamedTuple, Self, TypeVar
 
 import numpy as np
 
-from kineverse.estimation.linear_algebra import invert_matrices, multiply_vectors, sum_log_determinants
-from kineverse.lie import Stack, exp_so3, log_so3, skew, transform
+from kineverse.estimation.linear_algebra import (
+    invert_matrices,
+    multiply_vectors,
+    squared_errors,
+    sum_log_determinants,
+)
+from kineverse.lie import Array, exp_so3, log_so3, skew, transform
 
 from .motion_model import FamilyMember, LinearisedPoses, MotionModel, ParameterPrior
 from .observations import Observations
@@ -29,80 +33,79 @@ M = TypeVar("M", bound=MotionModel)
 M_co = TypeVar("M_co", bound=MotionModel, covariant=True)
 
 STEPS = 40
-# Of each of several starts, before the best of them goes on.
+# Steps of each of several starts, before the best of them continues.
 FIRST_STEPS = 2
-# What one more step would reduce the cost by: a hundredth of a standard deviation is as near as widths are
-# known. Steps promise less by a factor each time, which is known after two of them.
+# Predicted decrease of the cost at convergence: a hundredth of a standard deviation. Convergence is linear,
+# so two successive decreases also predict the next one.
 CLOSE = 1e-4
 _DIFFERENCE = 1e-5
 
 
 @dataclass(frozen=True)
 class JointValuePrior:
-    """What is believed of joint values beforehand: independent Gaussians.
+    """Prior of the joint values: independent Gaussians.
 
     Attributes
     ----------
     mean, precision
-        For each joint value, (k,).
+        Mean and precision of each joint value, (k,).
     marginal
-        Whether joint values are integrated out: the cost then has log |S + J_a P⁻¹ J_aᵀ| of each observation
-        too. Without, directions are preferred in which little is seen, as soon as the noise is as large as
-        the motion.
+        True if the joint values are integrated out. The cost then includes log |S + J_a P⁻¹ J_aᵀ| of each
+        observation. Without that term, the estimate is biased towards directions with little observed
+        motion, as soon as the noise is as large as the motion.
     """
 
-    mean: Stack
-    precision: Stack
+    mean: Array
+    precision: Array
     marginal: bool = False
 
     @staticmethod
     def vague(joints: int) -> JointValuePrior:
-        """Return the belief that keeps joint values finite where nothing tells them, and nothing else."""
+        """Return a prior so weak that it only keeps unobservable joint values finite."""
         return JointValuePrior(np.zeros(joints), np.full(joints, 1e-4))
 
 
 class InitialGuess(NamedTuple):
-    """A member of a family and joint values (N, k)."""
+    """Initial member of a family and joint values (N, k)."""
 
     motion: FamilyMember
-    values: Stack
+    values: Array
 
 
 @dataclass(frozen=True)
 class Solution(Generic[M_co]):
-    """What maximises the likelihood, and the quadratic around it.
+    """Maximum of the likelihood and the quadratic approximation around it.
 
     Attributes
     ----------
     motion
-        The member of the family.
+        The motion with its parameters.
     values
-        The joint values, (N, k).
+        Joint values, (N, k).
     cost
         Twice the negative logarithm of likelihood and prior, without constants.
     residuals
-        Of the child's pose in the parent, in the parent's axes, (N, m): what neither the motion nor the
-        parent's errors explain to first order, with covariance ``covariance``.
+        Residuals e_B - M e_A of the child's pose in the parent, in the parent's axes, (N, m).
     covariance
-        S, (N, m, m).
+        Their covariance S, (N, m, m).
     linear
         Derivatives at the solution.
     parent
-        The most likely true poses of the parent, (N, 4, 4).
-    belief
-        What was believed of joint values.
+        Most likely true poses of the parent, (N, 4, 4).
+    joint_prior
+        Prior of the joint values.
     converged
-        Whether steps became small; else the best that was found.
+        True if the steps became small. Else the solution is the best one so far.
     """
 
     motion: M_co
-    values: Stack
+    values: Array
     cost: float
-    residuals: Stack
-    covariance: Stack
+    residuals: Array
+    covariance: Array
     linear: LinearisedPoses
-    parent: Stack
-    belief: JointValuePrior
+    parent: Array
+    joint_prior: JointValuePrior
     converged: bool
 
     def scaled(self, factor: float) -> Self:
@@ -112,50 +115,52 @@ class Solution(Generic[M_co]):
 
 @dataclass(frozen=True)
 class _Point(Generic[M_co]):
-    """A place in the space of all unknowns, linearised."""
+    """Linearisation at a point in the space of all unknowns."""
 
     motion: M_co
-    values: Stack
-    parent: Stack
+    values: Array
+    parent: Array
     linear: LinearisedPoses
     prior: ParameterPrior
-    own: Stack
-    residuals: Stack
-    lever: Stack
-    parent_covariance: Stack | None
-    weights: Stack
-    covariance: Stack
+    own: Array
+    residuals: Array
+    lever: Array
+    parent_covariance: Array | None
+    weights: Array
+    covariance: Array
     cost: float
 
 
 def levenberg_marquardt(
-    seen: Observations,
+    observations: Observations,
     motion: M,
-    values: Stack,
-    parent: Stack | None = None,
-    belief: JointValuePrior | None = None,
+    values: Array,
+    parent: Array | None = None,
+    joint_prior: JointValuePrior | None = None,
     steps: int = STEPS,
 ) -> Solution[M]:
-    """Return the most likely member of a family, from a start.
+    """Return the maximum of the likelihood, from a start.
 
     Parameters
     ----------
-    seen
-        What was observed.
+    observations
+        The N observations.
     motion, values
-        Where to start: a member, and joint values (N, k).
+        Initial motion and joint values (N, k).
     parent
-        True poses of the parent to start from, (N, 4, 4); those observed if None.
-    belief
-        What is believed of joint values; next to nothing if None.
+        Initial true poses of the parent, (N, 4, 4); None for the observed poses.
+    joint_prior
+        Prior of the joint values; None for a vague one.
     steps
-        After so many the best so far is returned.
+        Largest number of steps.
     """
-    belief = belief or JointValuePrior.vague(motion.joints)
-    point = _point(seen, motion, values, seen.parent if parent is None else parent, belief)
+    joint_prior = joint_prior or JointValuePrior.vague(motion.joints)
+    point = _linearise(
+        observations, motion, values, observations.parent if parent is None else parent, joint_prior
+    )
     damping, converged, before = 0.0, False, 0.0
     for _ in range(steps):
-        reduced = _step(seen, point, damping, belief)
+        reduced = _step(observations, point, damping, joint_prior)
         if reduced is None:
             damping = max(10.0 * damping, 1e-6)
             if damping > 1e8:
@@ -182,66 +187,72 @@ def levenberg_marquardt(
         point.covariance,
         point.linear,
         point.parent,
-        belief,
+        joint_prior,
         converged,
     )
 
 
-def solve_from_best_start(seen: Observations, starts: Sequence[InitialGuess]) -> Solution[FamilyMember]:
-    """Return the most likely member of a family, from the best of several starts after few steps."""
+def solve_from_best_start(
+    observations: Observations, starts: Sequence[InitialGuess]
+) -> Solution[FamilyMember]:
+    """Return the maximum of the likelihood, from the start that is best after a few steps."""
     if len(starts) == 1:
-        return levenberg_marquardt(seen, *starts[0])
-    begun = [levenberg_marquardt(seen, *start, steps=FIRST_STEPS) for start in starts]
+        return levenberg_marquardt(observations, *starts[0])
+    begun = [levenberg_marquardt(observations, *start, steps=FIRST_STEPS) for start in starts]
     best = min(begun, key=lambda solution: solution.cost)
-    return best if best.converged else levenberg_marquardt(seen, best.motion, best.values, best.parent)
+    return (
+        best if best.converged else levenberg_marquardt(observations, best.motion, best.values, best.parent)
+    )
 
 
-def _point(seen: Observations, motion: M, values: Stack, parent: Stack, belief: JointValuePrior) -> _Point[M]:
-    linear = motion.at(values)
+def _linearise(
+    observations: Observations, motion: M, values: Array, parent: Array, joint_prior: JointValuePrior
+) -> _Point[M]:
+    linear = motion.linearise(values)
     prior = motion.prior()
-    rows = seen.rows
+    rows = observations.rows
     p_R_w = np.swapaxes(parent[:, :3, :3], 1, 2)
     by_child = linear.pose[:, :3, :3]
-    offset = (p_R_w @ (seen.child[:, :3, 3] - parent[:, :3, 3])[:, :, None])[:, :, 0]
+    offset = (p_R_w @ (observations.child[:, :3, 3] - parent[:, :3, 3])[:, :, None])[:, :, 0]
     error = offset - linear.pose[:, :3, 3]
     if rows == 6:
-        turned = log_so3(p_R_w @ seen.child[:, :3, :3] @ np.swapaxes(by_child, 1, 2))
+        turned = log_so3(p_R_w @ observations.child[:, :3, :3] @ np.swapaxes(by_child, 1, 2))
         error = np.concatenate([error, turned], axis=1)
-    covariance = _turned(seen.child_covariance, p_R_w)
-    cost = _squared(error, covariance)
-    own, of_parent = np.zeros((len(seen), 6)), None
+    covariance = _rotate_covariances(observations.child_covariance, p_R_w)
+    cost = float(squared_errors(error, covariance).sum())
+    own, of_parent = np.zeros((len(observations), 6)), None
     lever = _lever(linear.pose[:, :3, 3], rows)
     residuals = error
-    if seen.parent_covariance is not None:
-        moved = (p_R_w @ (seen.parent[:, :3, 3] - parent[:, :3, 3])[:, :, None])[:, :, 0]
-        own = np.concatenate([moved, log_so3(p_R_w @ seen.parent[:, :3, :3])], axis=1)
-        of_parent = _turned(seen.parent_covariance, p_R_w)
-        cost += _squared(own, of_parent)
+    if observations.parent_covariance is not None:
+        moved = (p_R_w @ (observations.parent[:, :3, 3] - parent[:, :3, 3])[:, :, None])[:, :, 0]
+        own = np.concatenate([moved, log_so3(p_R_w @ observations.parent[:, :3, :3])], axis=1)
+        of_parent = _rotate_covariances(observations.parent_covariance, p_R_w)
+        cost += float(squared_errors(own, of_parent).sum())
         residuals = error - multiply_vectors(lever, own)
         covariance = covariance + lever @ of_parent @ np.swapaxes(lever, 1, 2)
     weights = invert_matrices(covariance)
     cost += float(prior.residuals @ prior.residuals)
-    cost += float(np.sum(belief.precision * (values - belief.mean) ** 2))
-    if belief.marginal:
-        cost += _spread(covariance, linear, belief)
+    cost += float(np.sum(joint_prior.precision * (values - joint_prior.mean) ** 2))
+    if joint_prior.marginal:
+        cost += _log_determinants(covariance, linear, joint_prior)
     return _Point(
         motion, values, parent, linear, prior, own, residuals, lever, of_parent, weights, covariance, cost
     )
 
 
 def _step(
-    seen: Observations, point: _Point[M], damping: float, belief: JointValuePrior
+    observations: Observations, point: _Point[M], damping: float, joint_prior: JointValuePrior
 ) -> tuple[_Point[M], float] | None:
-    """Return where a step leads, and by how much it promises to reduce the cost; None if there is no step."""
+    """Return the point after a step and the predicted decrease of the cost; None if the step fails."""
     by_parameters, by_joints = point.linear.by_parameters, point.linear.by_joints
     projected = point.weights
     moving = by_joints.shape[2] > 0
     if moving:
-        pulled = belief.precision * (belief.mean - point.values)
+        pulled = joint_prior.precision * (joint_prior.mean - point.values)
         weighted = np.swapaxes(by_joints, 1, 2) @ point.weights
         curvature = weighted @ by_joints
         diagonal = np.einsum("nii->ni", curvature)
-        diagonal += belief.precision + damping * diagonal
+        diagonal += joint_prior.precision + damping * diagonal
         slope = multiply_vectors(weighted, point.residuals) + pulled
         inverse = invert_matrices(curvature)
         projected = point.weights - np.swapaxes(weighted, 1, 2) @ inverse @ weighted
@@ -250,11 +261,11 @@ def _step(
     normal = np.einsum("nir,nrj->ij", rotated, by_parameters) + prior.by_parameters.T @ prior.by_parameters
     right = np.einsum("nir,nr->i", rotated, point.residuals) - prior.by_parameters.T @ prior.residuals
     if moving:
-        # What the prior of joint values adds, carried to the parameters.
+        # The gradient of the prior of joint values, transformed to the parameters.
         pull = multiply_vectors(inverse, pulled)
         right -= np.einsum("nrj,nrk,nk->j", by_parameters, np.swapaxes(weighted, 1, 2), pull)
-        if belief.marginal:
-            right -= 0.5 * _widening(point, inverse @ weighted, belief)
+        if joint_prior.marginal:
+            right -= 0.5 * _log_determinant_gradient(point, inverse @ weighted, joint_prior)
     normal[np.diag_indices_from(normal)] *= 1.0 + damping
     try:
         step = np.linalg.solve(normal, right) if len(right) else right
@@ -268,7 +279,7 @@ def _step(
         change = multiply_vectors(inverse, back)
         gain += float(np.sum(slope * multiply_vectors(inverse, slope)))
         left = left + multiply_vectors(by_joints, change)
-        values = point.motion.bounded(values, change)
+        values = point.motion.retract_joints(values, change)
     parent = point.parent
     if point.parent_covariance is not None:
         rest = point.weights @ (point.residuals - left)[:, :, None]
@@ -279,58 +290,55 @@ def _step(
     if not (np.isfinite(step).all() and np.isfinite(values).all() and np.isfinite(parent).all()):
         return None
     try:
-        trial = _point(seen, point.motion.moved(step), values, parent, belief)
-    except np.linalg.LinAlgError:  # so far away that the lever is all there is
+        trial = _linearise(observations, point.motion.retract(step), values, parent, joint_prior)
+    except np.linalg.LinAlgError:  # the lever is so long that S is singular in double precision
         return None
     return (trial, gain) if np.isfinite(trial.cost) else None
 
 
-def _spread(covariance: Stack, linear: LinearisedPoses, belief: JointValuePrior) -> float:
+def _log_determinants(covariance: Array, linear: LinearisedPoses, joint_prior: JointValuePrior) -> float:
     """Return the sum of log |S + J_a P⁻¹ J_aᵀ|."""
     by_joints = linear.by_joints
-    return sum_log_determinants(covariance + (by_joints / belief.precision) @ np.swapaxes(by_joints, 1, 2))
+    return sum_log_determinants(
+        covariance + (by_joints / joint_prior.precision) @ np.swapaxes(by_joints, 1, 2)
+    )
 
 
-def _widening(point: _Point[M], gains: Stack, belief: JointValuePrior) -> Stack:
-    """Return the derivatives of the spread by each parameter, with joint values following."""
+def _log_determinant_gradient(point: _Point[M], gains: Array, joint_prior: JointValuePrior) -> Array:
+    """Return the derivatives of Σ log |S + J_a P⁻¹ J_aᵀ| by the parameters, at optimal joint values."""
     size = point.motion.size
     result = np.zeros(size)
-    before = _spread(point.covariance, point.linear, belief)
-    own = point.covariance - _carried(point.lever, point.parent_covariance)
+    before = _log_determinants(point.covariance, point.linear, joint_prior)
+    own = point.covariance - _lever_covariance(point.lever, point.parent_covariance)
     for i in range(size):
         step = np.zeros(size)
         step[i] = _DIFFERENCE
         values = point.values - _DIFFERENCE * multiply_vectors(gains, point.linear.by_parameters[:, :, i])
-        linear = point.motion.moved(step).at(values)
+        linear = point.motion.retract(step).linearise(values)
         lever = _lever(linear.pose[:, :3, 3], point.residuals.shape[1])
-        covariance = own + _carried(lever, point.parent_covariance)
-        result[i] = (_spread(covariance, linear, belief) - before) / _DIFFERENCE
+        covariance = own + _lever_covariance(lever, point.parent_covariance)
+        result[i] = (_log_determinants(covariance, linear, joint_prior) - before) / _DIFFERENCE
     return result
 
 
-def _carried(lever: Stack, covariance: Stack | None) -> Stack | float:
+def _lever_covariance(lever: Array, covariance: Array | None) -> Array | float:
     """Return M Σ_A Mᵀ."""
     return 0.0 if covariance is None else lever @ covariance @ np.swapaxes(lever, 1, 2)
 
 
-def _lever(offset: Stack, rows: int) -> Stack:
-    """Return M: how the child moves with an error of the parent."""
+def _lever(offset: Array, rows: int) -> Array:
+    """Return M, the displacement of the child by an error of the parent, (N, m, 6)."""
     result = np.zeros((len(offset), rows, 6))
     result[:, :, :rows] = np.eye(rows)
     result[:, :3, 3:] = -skew(offset)
     return result
 
 
-def _turned(covariance: Stack, rotation: Stack) -> Stack:
-    """Return covariances in other axes."""
+def _rotate_covariances(covariance: Array, rotation: Array) -> Array:
+    """Return covariances in rotated axes."""
     turned = np.empty_like(covariance) if covariance.flags.writeable else np.empty(covariance.shape)
     back = np.swapaxes(rotation, 1, 2)
     for i in range(0, covariance.shape[1], 3):
         for j in range(0, covariance.shape[2], 3):
             turned[:, i : i + 3, j : j + 3] = rotation @ covariance[:, i : i + 3, j : j + 3] @ back
     return turned
-
-
-def _squared(errors: Stack, covariance: Stack) -> float:
-    solved = np.linalg.solve(covariance, errors[:, :, None])
-    return float(np.sum(errors * solved[:, :, 0]))

@@ -1,8 +1,8 @@
 """Empirical prior of the range of joint values.
 
-Joint values are drawn from Gaussians of a mean μ and a width s of their own, one width for all slides and one
-for all turns. With the maximum â_k of the likelihood of each observation and its covariance C_k, which know
-nothing of each other, â_k is from N(μ, s² + C_k).
+Joint values are Gaussian with a mean μ and a width s, one width for all translations and one for all
+rotations. Let â_k be the maximum of the likelihood of observation k alone and C_k its covariance. Then â_k is
+distributed as N(μ, s² + C_k).
 """
 
 from __future__ import annotations
@@ -13,12 +13,12 @@ from dataclasses import dataclass
 import numpy as np
 
 from kineverse.estimation.linear_algebra import invert_matrices, multiply_vectors, sum_log_determinants
-from kineverse.lie import Stack
+from kineverse.lie import Array
 
 from .motion_model import FamilyMember
 from .optimise import Solution
 
-# From hardly anything to more than there is [m], [rad].
+# Candidate widths [m], [rad].
 GRID = np.geomspace(1e-5, 10.0, 61)
 LITTLE = 1e-6
 _STEP = math.log(float(GRID[1] / GRID[0]))
@@ -26,27 +26,27 @@ _STEP = math.log(float(GRID[1] / GRID[0]))
 
 @dataclass(frozen=True)
 class PerObservation:
-    """Joint values of each observation by itself, whatever was believed of them when they were found.
+    """Joint values of each observation by itself, without their prior.
 
     Attributes
     ----------
     values, covariances
-        (N, k) and (N, k, k).
+        Joint values and their covariances, (N, k) and (N, k, k).
     log_likelihood
-        Of all observations, with the joint values integrated over all there is.
+        Log likelihood of all observations, with the joint values integrated out under a uniform prior.
     """
 
-    values: Stack
-    covariances: Stack
+    values: Array
+    covariances: Array
     log_likelihood: float
 
 
 def solve_per_observation(solution: Solution[FamilyMember]) -> PerObservation:
-    """Return joint values by the observations alone, by the quadratic at the solution."""
+    """Return the joint values by the observations alone, from the quadratic at the solution."""
     by_joints = solution.linear.by_joints
     weights = invert_matrices(solution.covariance)
     weighted = np.swapaxes(by_joints, 1, 2) @ weights
-    # A turn that moves nothing is known as little as can be, and so little that it does not matter.
+    # The small term keeps an angle without effect on the pose finite, and is too small to matter otherwise.
     covariances = invert_matrices(weighted @ by_joints + LITTLE * np.eye(by_joints.shape[2]))
     change = multiply_vectors(covariances, multiply_vectors(weighted, solution.residuals))
     left = solution.residuals - multiply_vectors(by_joints, change)
@@ -62,48 +62,50 @@ def solve_per_observation(solution: Solution[FamilyMember]) -> PerObservation:
 
 @dataclass(frozen=True)
 class JointRanges:
-    """How wide a motion is.
+    """Width and mean of the range of joint values.
 
     Attributes
     ----------
     deviations, mean
-        s and μ for each joint value, (k,).
+        s and μ of each joint value, (k,).
     log_density
-        log ∫ Π N(â_k; μ, s² + C_k) ds at this μ, with s anywhere between hardly anything and metres or whole
-        turns, all orders of magnitude alike.
+        log ∫ Π N(â_k; μ, s² + C_k) p(s) ds at this μ. The prior p(s) is uniform in log s between 10⁻⁵ and 10
+        [m], [rad].
     """
 
-    deviations: Stack
-    mean: Stack
+    deviations: Array
+    mean: Array
     log_density: float
 
 
-def fit_joint_ranges(motion: FamilyMember, seen: PerObservation) -> JointRanges:
-    """Return the most likely widths of the motion."""
+def fit_joint_ranges(motion: FamilyMember, per_observation: PerObservation) -> JointRanges:
+    """Return the most likely widths and means of the joint values."""
     kinds = np.array(motion.kinds)
     deviations, occam = np.zeros(len(kinds)), 0.0
-    variances = np.einsum("nii->ni", seen.covariances)
+    variances = np.einsum("nii->ni", per_observation.covariances)
     for kind in sorted(set(motion.kinds)):
         block = kinds == kind
-        deviations[block], part = _width(seen.values[:, block], variances[:, block])
+        deviations[block], part = _width(per_observation.values[:, block], variances[:, block])
         occam += part
-    total = seen.covariances + np.diag(deviations**2)
+    total = per_observation.covariances + np.diag(deviations**2)
     weights = invert_matrices(total)
-    mean: Stack = np.linalg.solve(weights.sum(axis=0), multiply_vectors(weights, seen.values).sum(axis=0))
-    off = seen.values - mean
+    mean: Array = np.linalg.solve(
+        weights.sum(axis=0), multiply_vectors(weights, per_observation.values).sum(axis=0)
+    )
+    off = per_observation.values - mean
     log = -0.5 * float(np.sum(off * multiply_vectors(weights, off))) - 0.5 * sum_log_determinants(
         math.tau * total
     )
     return JointRanges(deviations, mean, log + occam)
 
 
-def _width(values: Stack, variances: Stack) -> tuple[float, float]:
-    """Return the best s, and the logarithm of the mean over all s relative to the best."""
+def _width(values: Array, variances: Array) -> tuple[float, float]:
+    """Return the best s, and the log of the mean likelihood over all s relative to the best."""
     total = variances + GRID[:, None, None] ** 2
     weights = 1.0 / total
     mean = (weights * values).sum(axis=1) / weights.sum(axis=1)
     squares = (values - mean[:, None, :]) ** 2 * weights
-    # With the mean integrated out, or a few values would seem narrower than they are.
+    # The mean is integrated out. Else the width of a few values would be biased towards zero.
     logs = -0.5 * (np.log(total) + squares).sum(axis=(1, 2)) - 0.5 * np.log(weights.sum(axis=1)).sum(axis=1)
     top = int(np.argmax(logs))
     best = math.log(float(GRID[top]))

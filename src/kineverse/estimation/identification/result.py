@@ -11,7 +11,7 @@ import numpy as np
 import numpy.typing as npt
 
 from kineverse.errors import InvalidValueError, UnknownNameError, suggest
-from kineverse.lie import Stack
+from kineverse.lie import Array
 from kineverse.model.operation import Operation
 
 from .ambiguities import slide_child_origin
@@ -23,95 +23,95 @@ from .optimise import Solution
 from .unwrapping import find_revolving_joint
 
 SURE = 0.95
-"""From this probability on, a family is called the right one."""
+"""Least probability at which the best family is reported as identified."""
 
 
 @dataclass(frozen=True)
 class Fit:
-    """The most likely member of one family.
+    """Most likely member of one joint family.
 
     Attributes
     ----------
     family
-        Its name.
+        Name of the family.
     probability
-        Of the family, among those that were tried.
+        Posterior probability of the family among those that were compared.
     log_evidence
-        Natural logarithm; differences between families count.
+        Natural logarithm of the evidence. Only differences between families are meaningful.
     parameters
-        By name, in the parent's axes: ``axis`` (3,), a ``point`` on it (3,) [m], the ``pitch``
+        Parameters by name, in the parent's axes: ``axis`` (3,), a ``point`` on it (3,) [m], the ``pitch``
         [m/revolution], the ``centre`` of a sphere (3,), the ``normal`` of a plane (3,), and ``reference``,
         the child's pose at joint values 0, (4, 4).
     covariance
-        Of ``coordinates``, (n, n).
+        Covariance of ``coordinates``, (n, n).
     coordinates
-        What the rows of the covariance are: ``axis.x`` and ``axis.y`` [rad] are turns of the axis about the
-        first two columns of :attr:`frame`, ``point.x`` and ``point.y`` [m] shift it along them, ``pitch``
-        [m/revolution]; the rest, ``child.…``, moves the child in the joint's frame.
+        Names of the rows of the covariance. ``axis.x`` and ``axis.y`` [rad] rotate the axis about the first
+        two columns of :attr:`frame`, ``point.x`` and ``point.y`` [m] shift it along them, ``pitch`` is in
+        [m/revolution]; the others, ``child.…``, move the child in the joint's frame.
     frame
-        The joint's frame in the parent, (4, 4): its z axis is the axis, its origin the point.
+        The joint's frame in the parent, (4, 4). Its z axis is the axis and its origin the point.
     joint_values
-        (N, k), [m] and [rad].
+        Joint values, (N, k), [m] and [rad].
     deviations
-        Their standard deviations, (N, k).
+        Standard deviations of the joint values, (N, k).
     residuals
-        What is left of the relative poses, in the parent's axes, (N, m) [m] and [rad].
-    told
-        Whether the data carry what the family has beyond a pose.
+        Residuals of the relative poses in the parent's axes, (N, m) [m] and [rad].
+    is_determined
+        True if the data determine the parameters of the family.
     reason
-        If not, why.
+        Explanation if they do not, else empty.
     rows
-        6 if poses of the child were seen, 3 if positions.
+        6 if poses of the child were observed, 3 for positions.
     motion
-        The member of the family, as the solver has it.
-    outlying
-        The numbers of the observations that are wrong altogether if the family is right, from 0. The fit does
-        without them; their joint values are the nearest, and what is left of them is large.
+        The motion model with its parameters.
+    outliers
+        Indices of the observations that are outliers under this family. The fit ignores them. Their joint
+        values are those of the nearest poses, and their residuals are large.
     """
 
     family: str
     probability: float
     log_evidence: float
-    parameters: Mapping[str, Stack | float]
-    covariance: Stack
+    parameters: Mapping[str, Array | float]
+    covariance: Array
     coordinates: tuple[str, ...]
-    frame: Stack
-    joint_values: Stack
-    deviations: Stack
-    residuals: Stack
-    told: bool
+    frame: Array
+    joint_values: Array
+    deviations: Array
+    residuals: Array
+    is_determined: bool
     reason: str
     rows: int
     motion: Any
     outliers: tuple[int, ...] = ()
 
     @property
-    def right(self) -> npt.NDArray[np.int_]:
-        """The numbers of the observations that the fit is made of."""
+    def inliers(self) -> npt.NDArray[np.int_]:
+        """Indices of the observations that are no outliers."""
         return np.setdiff1d(np.arange(len(self.residuals)), self.outliers)
 
     @property
-    def range(self) -> Stack:
-        """The least and the largest of each joint value that was seen, (k, 2)."""
+    def range(self) -> Array:
+        """Least and largest value of each joint value over the inliers, (k, 2)."""
         if not self.joint_values.shape[1]:
             return np.zeros((0, 2))
-        values = self.joint_values[self.right]
+        values = self.joint_values[self.inliers]
         return np.column_stack([values.min(axis=0), values.max(axis=0)])
 
     @property
-    def poses(self) -> Stack:
-        """The poses of the child in the parent at the joint values, (N, 4, 4)."""
-        poses: Stack = self.motion.at(self.joint_values).pose
+    def poses(self) -> Array:
+        """Poses of the child in the parent at the joint values, (N, 4, 4)."""
+        poses: Array = self.motion.linearise(self.joint_values).pose
         return poses
 
     @property
     def rms(self) -> tuple[float, float]:
-        """What is left of positions [m] and orientations [rad], root mean square over what is right."""
-        squares = np.mean(self.residuals[self.right] ** 2, axis=0)
+        """Root mean square residual of positions [m] and orientations [rad] over the inliers."""
+        squares = np.mean(self.residuals[self.inliers] ** 2, axis=0)
         return math.sqrt(float(squares[:3].sum())), math.sqrt(float(squares[3:].sum()))
 
-    def at(self, rows: npt.NDArray[np.int_]) -> Self:
-        """Return the fit with some of its observations."""
+    def select(self, rows: npt.NDArray[np.int_]) -> Self:
+        """Return the fit restricted to some of its observations."""
         return replace(
             self,
             joint_values=self.joint_values[rows],
@@ -121,13 +121,13 @@ class Fit:
         )
 
     @property
-    def turned(self) -> float:
-        """The most that it turned about its axis from one observation to the next [rad].
+    def largest_turn(self) -> float:
+        """Largest rotation about the axis from one inlier to the next [rad].
 
-        Where turns were counted and this is not well below half a turn, they may be more, or fewer.
+        The count of revolutions is reliable only if this is well below π.
         """
         joint = find_revolving_joint(self.motion)
-        return 0.0 if joint is None else float(np.abs(np.diff(self.joint_values[self.right, joint])).max())
+        return 0.0 if joint is None else float(np.abs(np.diff(self.joint_values[self.inliers, joint])).max())
 
     def deviation(self, coordinate: str) -> float:
         """Return the standard deviation of a coordinate.
@@ -148,19 +148,19 @@ class Fit:
     def operation(
         self, name: str, parent: str, child: str | None = None, *, as_point: bool = False
     ) -> Operation:
-        """Return the joint as an operation, with the range that was seen as its limits.
+        """Return the joint as an operation, with the observed range as its limits.
 
         Parameters
         ----------
         name, parent, child
-            Of the articulation and its frames; the child is called like the articulation if None.
+            Names of the articulation and its frames. By default the child is named like the articulation.
         as_point
-            Whether the child is a point, and it does not matter how its frame is turned.
+            True if the child is a point, so that the orientation of its frame does not matter.
 
         Raises
         ------
         InvalidValueError
-            If only positions of the child were seen, so that its orientation is not known.
+            If only positions of the child were observed, so that its orientation is unknown.
         """
         if self.rows == 3 and isinstance(self.motion, GroupMotion) and not as_point:
             raise InvalidValueError(
@@ -181,51 +181,51 @@ class Fit:
 
 
 class LazyFit(NamedTuple):
-    """A family with its probability, and what makes its fit once somebody looks at it."""
+    """Family with its probability, and the function that computes its fit on first access."""
 
     family: str
     probability: float
-    make: Callable[[], Fit]
+    compute: Callable[[], Fit]
 
 
 @dataclass(frozen=True, eq=False)
 class IdentificationResult:
-    """Every family that was tried, the most probable first. Fits are made when they are looked at.
+    """Fits of all families, the most probable first, each computed on first access.
 
     Attributes
     ----------
-    offers
-        One for each family.
+    lazy_fits
+        Families, their probabilities, and the functions that compute the fits.
     noise_scale
-        By how much the standard deviations of the noise were scaled; 1 where it was given.
+        Estimated factor on the standard deviations of the noise; 1 if the noise was stated.
     """
 
-    offers: tuple[LazyFit, ...]
+    lazy_fits: tuple[LazyFit, ...]
     noise_scale: float = 1.0
-    _made: dict[int, Fit] = field(default_factory=dict, repr=False)
+    _computed: dict[int, Fit] = field(default_factory=dict, repr=False)
 
     @property
     def fits(self) -> tuple[Fit, ...]:
-        """One for each family."""
+        """Fits of all families, the most probable first."""
         return tuple(self._fit(k) for k in range(len(self)))
 
     @property
     def probabilities(self) -> dict[str, float]:
-        """By family, the largest first."""
-        return {offer.family: offer.probability for offer in self.offers}
+        """Probability of each family, the largest first."""
+        return {lazy_fit.family: lazy_fit.probability for lazy_fit in self.lazy_fits}
 
     @property
     def best(self) -> Fit:
-        """The most probable one."""
+        """Fit of the most probable family."""
         return self._fit(0)
 
     @property
     def is_ambiguous(self) -> bool:
-        """Whether no family stands out, or what the best one is about is not known."""
-        return self.best.probability < SURE or not self.best.told
+        """True if no family is probable enough, or the data do not determine the best one."""
+        return self.best.probability < SURE or not self.best.is_determined
 
     def __getitem__(self, family: str) -> Fit:
-        tried = [offer.family for offer in self.offers]
+        tried = [lazy_fit.family for lazy_fit in self.lazy_fits]
         if family not in tried:
             raise UnknownNameError(f"The family {family!r} was not tried. {suggest(family, tried, 'family')}")
         return self._fit(tried.index(family))
@@ -234,7 +234,7 @@ class IdentificationResult:
         return iter(self.fits)
 
     def __len__(self) -> int:
-        return len(self.offers)
+        return len(self.lazy_fits)
 
     def __str__(self) -> str:
         if not self.is_ambiguous:
@@ -245,17 +245,17 @@ class IdentificationResult:
         return "cannot tell: " + " or ".join(f"{name} ({p:.0%})" for name, p in likely.items())
 
     def _fit(self, k: int) -> Fit:
-        if k not in self._made:
-            self._made[k] = self.offers[k].make()
-        return self._made[k]
+        if k not in self._computed:
+            self._computed[k] = self.lazy_fits[k].compute()
+        return self._computed[k]
 
 
-# A direction that is known no better than this is not known [rad].
-_KNOWN = math.radians(20.0)
+# Largest standard deviation of a direction that counts as determined [rad].
+_WELL_KNOWN = math.radians(20.0)
 
 
 def build_fit(solution: Solution[FamilyMember], known: Evidence, log: float, probability: float) -> Fit:
-    """Return the fit of a family."""
+    """Return the fit of a family from its solution and evidence."""
     motion, covariance, values, covariances = slide_child_origin(
         solution.motion, known.covariance.copy(), known.joint_values, known.joint_covariances
     )
@@ -268,14 +268,14 @@ def build_fit(solution: Solution[FamilyMember], known: Evidence, log: float, pro
         family=motion.name,
         probability=probability,
         log_evidence=log,
-        parameters=motion.named(),
+        parameters=motion.named_parameters(),
         covariance=covariance,
         coordinates=names,
         frame=motion.left if isinstance(motion, GroupMotion) else np.eye(4),
         joint_values=values,
         deviations=np.sqrt(np.einsum("nii->ni", covariances)),
         residuals=solution.residuals,
-        told=not reason,
+        is_determined=not reason,
         reason=reason,
         rows=solution.residuals.shape[1],
         motion=motion,
@@ -283,7 +283,7 @@ def build_fit(solution: Solution[FamilyMember], known: Evidence, log: float, pro
 
 
 def _untested_reason(solution: Solution[FamilyMember]) -> str:
-    """Return that a family of joints could not but fit, as two positions always lie on a line."""
+    """Return the reason why a fit is no test: it has as many unknowns as measured numbers. Else empty."""
     motion, seen = solution.motion, solution.residuals.size
     if not isinstance(motion, GroupMotion) or not motion.size or not motion.joints:
         return ""
@@ -293,10 +293,10 @@ def _untested_reason(solution: Solution[FamilyMember]) -> str:
     )
 
 
-def _undetermined_reason(names: tuple[str, ...], covariance: Stack) -> str:
-    """Return what the data do not tell."""
+def _undetermined_reason(names: tuple[str, ...], covariance: Array) -> str:
+    """Return the reason why the parameters are not determined, or an empty string."""
     turns = [i for i, name in enumerate(names) if name.startswith("axis.")]
     if not turns:
         return ""
     worst = math.sqrt(float(np.linalg.eigvalsh(covariance[np.ix_(turns, turns)])[-1]))
-    return "" if worst <= _KNOWN else f"its axis is known to {math.degrees(worst):.0f}° only"
+    return "" if worst <= _WELL_KNOWN else f"its axis is known to {math.degrees(worst):.0f}° only"

@@ -1,9 +1,8 @@
 """Length scale of the data.
 
-What is believed beforehand, that levers are within a unit and pitches within a tenth of it, should be as true
-of a crane as of a cupboard, and of poses in millimetres. So observations are looked at in units of their
-size, and what comes out is said in theirs again. All families share the unit, so it is no reason for one of
-them.
+The priors assume levers within a unit of length and pitches within a tenth of it. They have to hold for a
+crane as well as for a cupboard, and for poses in millimetres. So observations are scaled to a unit of their
+own size, and fits are scaled back. All families share the unit, so their comparison does not depend on it.
 """
 
 from __future__ import annotations
@@ -13,44 +12,47 @@ from dataclasses import replace
 
 import numpy as np
 
-from kineverse.lie import Stack
+from kineverse.lie import Array
 
 from .custom_family import FamilyMotion
 from .families import WX, GroupMotion
 from .observations import Observations
 from .result import Fit
 
-# A part turns by 15° or more, as a rule: the lever is within four times of how far it is from the middle.
+# For rotations of 15° or more, the lever is within four times the median distance from the middle.
 _TIMES = 4.0
 
 
-def length_scale(seen: Observations) -> float:
-    """Return the unit: four times how far relative positions are from their middle, by the median; or 1."""
-    positions = seen.relative[:, :3, 3]
+def length_scale(observations: Observations) -> float:
+    """Return four times the median distance of relative positions from their median [m], at least 1."""
+    positions = observations.relative[:, :3, 3]
     off = np.linalg.norm(positions - np.median(positions, axis=0), axis=1)
     return max(1.0, _TIMES * float(np.median(off)))
 
 
-def in_units(seen: Observations, unit: float) -> Observations:
-    """Return observations with lengths in a unit."""
+def in_units(observations: Observations, unit: float) -> Observations:
+    """Return observations with lengths in a unit [m]."""
     if unit == 1.0:
-        return seen
+        return observations
     scale = np.array([1.0 / unit] * 3 + [1.0] * 3)
     by = np.outer(scale, scale)
-    of_parent = None if seen.parent_covariance is None else seen.parent_covariance * by
-    of_child = seen.child_covariance * by[: seen.rows, : seen.rows]
+    of_parent = None if observations.parent_covariance is None else observations.parent_covariance * by
+    of_child = observations.child_covariance * by[: observations.rows, : observations.rows]
     return Observations(
-        _placed(seen.parent, 1.0 / unit), _placed(seen.child, 1.0 / unit), of_parent, of_child
+        _scale_positions(observations.parent, 1.0 / unit),
+        _scale_positions(observations.child, 1.0 / unit),
+        of_parent,
+        of_child,
     )
 
 
 def log_density(count: int, unit: float) -> float:
-    """Return what the logarithm of a density of so many poses, given a mean pose, has to be changed by."""
+    """Return the log ratio of densities of ``count`` poses, given a mean pose, in metres and in units."""
     return 3.0 * (1 - count) * math.log(unit)
 
 
 def in_metres(fit: Fit, unit: float) -> Fit:
-    """Return a fit in units with the lengths that the observations had."""
+    """Return a fit with lengths in a unit [m], converted to metres."""
     if unit == 1.0:
         return fit
     residuals = fit.residuals.copy()
@@ -61,16 +63,16 @@ def in_metres(fit: Fit, unit: float) -> Fit:
     if not isinstance(motion, GroupMotion):
         return replace(fit, residuals=residuals)
     scale = np.array([unit if _is_length(name) else 1.0 for name in fit.coordinates])
-    slides = np.array([unit if j < WX else 1.0 for j in motion.freedom.joints])
+    slides = np.array([unit if j < WX else 1.0 for j in motion.parametrisation.joints])
     motion = replace(
         motion,
-        left=_placed(motion.left, unit),
-        right=_placed(motion.right, unit),
+        left=_scale_positions(motion.left, unit),
+        right=_scale_positions(motion.right, unit),
         pitch=unit * motion.pitch,
     )
     return replace(
         fit,
-        parameters=motion.named(),
+        parameters=motion.named_parameters(),
         covariance=fit.covariance * np.outer(scale, scale),
         frame=motion.left,
         joint_values=fit.joint_values * slides,
@@ -80,14 +82,14 @@ def in_metres(fit: Fit, unit: float) -> Fit:
     )
 
 
-def _placed(poses: Stack, factor: float) -> Stack:
+def _scale_positions(poses: Array, factor: float) -> Array:
     result = poses.copy()
     result[..., :3, 3] *= factor
     return result
 
 
 def _is_length(coordinate: str) -> bool:
-    """Whether a coordinate of a joint is a length, or one per turn."""
+    """Return True if a coordinate of a joint is a length, or a length per revolution."""
     return coordinate == "pitch" or coordinate.rpartition(".")[0] == "point" or coordinate in _PLACES
 
 

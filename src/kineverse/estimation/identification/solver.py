@@ -12,39 +12,40 @@ from weakref import WeakKeyDictionary
 
 import numpy as np
 
-from kineverse.lie import Stack
+from kineverse.lie import Array
 
 from . import ambiguities, maximum_likelihood, optimise, range_prior
-from . import evidence as integrated
 from .bindings import MOTION_SIZE, Given, Problem, library, pack_motion, problem_of, unpack_motion
-from .evidence import Evidence
+from .evidence import Evidence, laplace_evidence
 from .families import PITCHES, REACH, GroupMotion, JointFamily
 from .maximum_likelihood import Scored
 from .motion_model import FamilyMember, LinearisedPoses
 from .observations import Observations
 from .optimise import InitialGuess, JointValuePrior, Solution
 
-# Numbers behind those of the motion. Mean and precision of what is believed are for six joint values at most.
+# Header entries after those of the motion. Prior mean and precision have room for six joint values.
 _COST, _CONVERGED, _MARGINAL, _LOG = range(MOTION_SIZE, MOTION_SIZE + 4)
 _MEAN, _PRECISION, _HEAD = MOTION_SIZE + 4, MOTION_SIZE + 10, MOTION_SIZE + 16
 
 
 class SolutionBuffer:
-    """All numbers of a solution, and the arrays that they are.
+    """Contiguous memory of a solution, shared with C, and views of it as arrays.
 
     Parameters
     ----------
     motion
-        A member of the family.
-    belief
-        What is believed of joint values.
+        Initial member of the family.
+    joint_prior
+        Prior of the joint values.
     values, parents
-        Joint values (N, k) and true poses of the parent (N, 4, 4) to begin with.
+        Initial joint values (N, k) and true poses of the parent (N, 4, 4).
     """
 
     __slots__ = ("_covariances", "_linear", "_motion", "_parents", "_residuals", "_values", "numbers")
 
-    def __init__(self, motion: GroupMotion, belief: JointValuePrior, values: Stack, parents: Stack) -> None:
+    def __init__(
+        self, motion: GroupMotion, joint_prior: JointValuePrior, values: Array, parents: Array
+    ) -> None:
         count, rows, joints, size = len(parents), motion.rows, motion.joints, motion.size
         shapes = ((joints,), (4, 4), (rows,), (rows, rows), (4, 4), (rows, size), (rows, joints))
         lengths = [count * math.prod(shape) for shape in shapes]
@@ -60,29 +61,29 @@ class SolutionBuffer:
         self._parents[:] = parents
         head = self.numbers
         head[:MOTION_SIZE] = pack_motion(motion)
-        head[_MARGINAL] = belief.marginal
-        head[_MEAN : _MEAN + joints] = belief.mean
-        head[_PRECISION : _PRECISION + joints] = belief.precision
+        head[_MARGINAL] = joint_prior.marginal
+        head[_MEAN : _MEAN + joints] = joint_prior.mean
+        head[_PRECISION : _PRECISION + joints] = joint_prior.precision
 
     @staticmethod
-    def of(solution: Solution[GroupMotion]) -> SolutionBuffer:
-        """Return a solution in memory of its own."""
-        answer = SolutionBuffer(solution.motion, solution.belief, solution.values, solution.parent)
-        answer.numbers[_COST], answer.numbers[_CONVERGED] = solution.cost, solution.converged
-        answer._residuals[:] = solution.residuals
-        answer._covariances[:] = solution.covariance
-        for to, array in zip(answer._linear, solution.linear, strict=True):
+    def from_solution(solution: Solution[GroupMotion]) -> SolutionBuffer:
+        """Return a copy of a solution in a new buffer."""
+        buffer = SolutionBuffer(solution.motion, solution.joint_prior, solution.values, solution.parent)
+        buffer.numbers[_COST], buffer.numbers[_CONVERGED] = solution.cost, solution.converged
+        buffer._residuals[:] = solution.residuals
+        buffer._covariances[:] = solution.covariance
+        for to, array in zip(buffer._linear, solution.linear, strict=True):
             to[:] = array
-        return answer
+        return buffer
 
     @property
     def log_evidence(self) -> float:
-        """The logarithm of the evidence."""
+        """Logarithm of the evidence."""
         return float(self.numbers[_LOG])
 
     @property
     def solution(self) -> Solution[GroupMotion]:
-        """What C has left here. It shares this memory."""
+        """Solution in the buffer. Its arrays share the memory."""
         head, joints = self.numbers, self._values.shape[1]
         return Solution(
             motion=unpack_motion(self._motion, head),
@@ -92,7 +93,7 @@ class SolutionBuffer:
             covariance=self._covariances,
             linear=self._linear,
             parent=self._parents,
-            belief=JointValuePrior(
+            joint_prior=JointValuePrior(
                 head[_MEAN : _MEAN + joints],
                 head[_PRECISION : _PRECISION + joints],
                 bool(head[_MARGINAL]),
@@ -119,129 +120,154 @@ _CONSTANTS = {
     "settled": maximum_likelihood.SETTLED,
     "turns": maximum_likelihood.TURNS,
 }
-# Memory of more numbers than this is given back after each stage.
+# Largest number of doubles of a work memory that is kept between stages.
 _KEPT = 4_000_000
 
 
 class IdentificationSolver:
-    """Does what :mod:`.refining` and :mod:`.evidence` do, in C once that is compiled."""
+    """Stages of :mod:`.maximum_likelihood` and :mod:`.evidence`, in C once it is compiled, else in numpy."""
 
     @property
     def is_native(self) -> bool:
-        """Whether C does the work."""
+        """True if the C kernels are loaded."""
         return library.is_native
 
     def prepare(self, wait: bool = False) -> bool:
-        """Have C compiled, see :meth:`.SourceLibrary.prepare`."""
+        """Compile the C kernels in the background, see :meth:`.SourceLibrary.prepare`."""
         return library.prepare(wait)
 
     def solve(
         self,
-        seen: Observations,
+        observations: Observations,
         start: InitialGuess,
-        parent: Stack,
-        belief: JointValuePrior,
+        parent: Array,
+        joint_prior: JointValuePrior,
         steps: int = optimise.STEPS,
     ) -> Solution[FamilyMember]:
-        """Do what :func:`.optimise.levenberg_marquardt` does."""
+        """Run :func:`.optimise.levenberg_marquardt`."""
         motion = start.motion
-        if not _is_for_c(motion):
-            return optimise.levenberg_marquardt(seen, motion, start.values, parent, belief, steps)
-        problem, answer = _problem(seen, motion), SolutionBuffer(motion, belief, start.values, parent)
+        if not _has_kernel(motion):
+            return optimise.levenberg_marquardt(
+                observations, motion, start.values, parent, joint_prior, steps
+            )
+        problem, buffer = (
+            _problem(observations, motion),
+            SolutionBuffer(motion, joint_prior, start.values, parent),
+        )
         problem.steps = steps
-        _run(library.code.solve, problem, answer)
-        return answer.solution
+        _run(library.code.solve, problem, buffer)
+        return buffer.solution
 
-    def likeliest(self, seen: Observations, starts: Sequence[InitialGuess]) -> Scored:
-        """Do what :func:`.maximum_likelihood.maximum_likelihood` does."""
-        motions = [start.motion for start in starts if _is_for_c(start.motion)]
+    def maximum_likelihood(self, observations: Observations, starts: Sequence[InitialGuess]) -> Scored:
+        """Run :func:`.maximum_likelihood.maximum_likelihood`."""
+        motions = [start.motion for start in starts if _has_kernel(start.motion)]
         if len(motions) < len(starts):
-            return maximum_likelihood.maximum_likelihood(seen, starts)
+            return maximum_likelihood.maximum_likelihood(observations, starts)
         motion = motions[0]
-        answer = SolutionBuffer(motion, JointValuePrior.vague(motion.joints), starts[0].values, seen.parent)
+        buffer = SolutionBuffer(
+            motion, JointValuePrior.vague(motion.joints), starts[0].values, observations.parent
+        )
         begin, values = (
             np.array([pack_motion(m) for m in motions]),
             np.array([start.values for start in starts]),
         )
         given = len(starts), begin.ctypes.data, values.ctypes.data
-        _run(library.code.likeliest, _problem(seen, motion), answer, given)
-        return Scored(answer.solution, answer.log_evidence)
+        _run(library.code.likeliest, _problem(observations, motion), buffer, given)
+        return Scored(buffer.solution, buffer.log_evidence)
 
-    def refined(self, seen: Observations, solution: Solution[FamilyMember]) -> Scored:
-        """Do what :func:`.maximum_likelihood.maximise_marginal_likelihood` does."""
-        if not _is_of_c(solution):
-            return maximum_likelihood.maximise_marginal_likelihood(seen, solution)
-        answer = SolutionBuffer.of(solution)
-        _run(library.code.refine, _problem(seen, solution.motion), answer)
-        return Scored(answer.solution, answer.log_evidence)
-
-    def continued(
-        self, seen: Observations, start: InitialGuess, parent: Stack, belief: JointValuePrior, known: int
+    def maximise_marginal_likelihood(
+        self, observations: Observations, solution: Solution[FamilyMember]
     ) -> Scored:
-        """Do what :func:`.maximum_likelihood.continue_from` does."""
+        """Run :func:`.maximum_likelihood.maximise_marginal_likelihood`."""
+        if not _is_kernel_solution(solution):
+            return maximum_likelihood.maximise_marginal_likelihood(observations, solution)
+        buffer = SolutionBuffer.from_solution(solution)
+        _run(library.code.refine, _problem(observations, solution.motion), buffer)
+        return Scored(buffer.solution, buffer.log_evidence)
+
+    def continue_from(
+        self,
+        observations: Observations,
+        start: InitialGuess,
+        parent: Array,
+        joint_prior: JointValuePrior,
+        known: int,
+    ) -> Scored:
+        """Run :func:`.maximum_likelihood.continue_from`."""
         motion = start.motion
-        if not _is_for_c(motion):
-            return maximum_likelihood.continue_from(seen, start, parent, belief, known)
-        problem, answer = _problem(seen, motion), SolutionBuffer(motion, belief, start.values, parent)
-        problem.given.fresh = len(seen) - known
-        _run(library.code.carry_on, problem, answer)
-        return Scored(answer.solution, answer.log_evidence)
+        if not _has_kernel(motion):
+            return maximum_likelihood.continue_from(observations, start, parent, joint_prior, known)
+        problem, buffer = (
+            _problem(observations, motion),
+            SolutionBuffer(motion, joint_prior, start.values, parent),
+        )
+        problem.given.fresh = len(observations) - known
+        _run(library.code.carry_on, problem, buffer)
+        return Scored(buffer.solution, buffer.log_evidence)
 
     def evidence(self, solution: Solution[FamilyMember], scale: float = 1.0) -> Evidence:
-        """Do what :func:`.evidence.laplace_evidence` does, for noise that is larger by a factor."""
-        if not _is_of_c(solution):
-            return integrated.laplace_evidence(solution.scaled(scale))
-        logs, *rest = _rated(solution, np.array([scale]))
+        """Run :func:`.evidence.laplace_evidence`, for noise that is larger by a factor."""
+        if not _is_kernel_solution(solution):
+            return laplace_evidence(solution.scaled(scale))
+        logs, *rest = _evaluate_evidence(solution, np.array([scale]))
         values, covariances, information = rest
-        return Evidence.of(float(logs[0]), information, solution.motion.size, values, covariances)
+        return Evidence.from_information(
+            float(logs[0]), information, solution.motion.size, values, covariances
+        )
 
-    def log_evidences(self, solution: Solution[FamilyMember], scales: Stack) -> Stack:
-        """Return the logarithm of the evidence for noise that is larger by several factors."""
-        if not _is_of_c(solution):
-            return np.array([integrated.laplace_evidence(solution.scaled(c)).log_evidence for c in scales])
-        return _rated(solution, scales)[0]
+    def log_evidences(self, solution: Solution[FamilyMember], scales: Array) -> Array:
+        """Return the log evidence for noise that is larger by each of several factors."""
+        if not _is_kernel_solution(solution):
+            return np.array([laplace_evidence(solution.scaled(c)).log_evidence for c in scales])
+        return _evaluate_evidence(solution, scales)[0]
 
 
 solver = IdentificationSolver()
 
 
-def _is_for_c(motion: FamilyMember) -> TypeGuard[GroupMotion]:
+def _has_kernel(motion: FamilyMember) -> TypeGuard[GroupMotion]:
     return library.is_native and isinstance(motion, GroupMotion) and motion.is_plain
 
 
-def _is_of_c(solution: Solution[FamilyMember]) -> TypeGuard[Solution[GroupMotion]]:
-    return _is_for_c(solution.motion)
+def _is_kernel_solution(solution: Solution[FamilyMember]) -> TypeGuard[Solution[GroupMotion]]:
+    return _has_kernel(solution.motion)
 
 
 def _run(
     stage: Callable[..., None],
     problem: Problem,
-    answer: SolutionBuffer,
+    buffer: SolutionBuffer,
     given: Sequence[int] = (),
-    results: Sequence[Stack] = (),
+    results: Sequence[Array] = (),
 ) -> None:
-    """Run a stage: what it is given comes before its memory, and its results after the answer."""
+    """Run a C stage with the arguments problem, given values, work memory, solution and results."""
     where = ctypes.addressof(problem)
-    memory = _memory.of(library.code.memory_of(where))
-    addresses = (array.ctypes.data for array in (memory, answer.numbers, *results))
+    memory = _memory.reserve(library.code.memory_of(where))
+    addresses = (array.ctypes.data for array in (memory, buffer.numbers, *results))
     stage(where, *given, *addresses)
 
 
-def _rated(solution: Solution[GroupMotion], scales: Stack) -> tuple[Stack, ...]:
-    """Return the logarithms of the evidence; of the last also joint values, covariances and information."""
+def _evaluate_evidence(solution: Solution[GroupMotion], scales: Array) -> tuple[Array, ...]:
+    """Return the log evidence for each scale, and joint values, covariances and information of the last."""
     motion, (count, joints) = solution.motion, solution.values.shape
     problem = Problem.from_buffer_copy(_family(motion.group, motion.rows))
     problem.given.count = count
     unknowns = motion.size + joints + motion.slides
     shapes = (len(scales),), (count, joints), (count, joints, joints), (unknowns, unknowns)
     results = tuple(np.empty(shape) for shape in shapes)
-    _run(library.code.rate, problem, SolutionBuffer.of(solution), (len(scales), scales.ctypes.data), results)
+    _run(
+        library.code.rate,
+        problem,
+        SolutionBuffer.from_solution(solution),
+        (len(scales), scales.ctypes.data),
+        results,
+    )
     return results
 
 
-def _problem(seen: Observations, motion: GroupMotion) -> Problem:
+def _problem(observations: Observations, motion: GroupMotion) -> Problem:
     problem = Problem.from_buffer_copy(_family(motion.group, motion.rows))
-    problem.given = _given(seen)
+    problem.given = _given(observations)
     return problem
 
 
@@ -253,38 +279,42 @@ def _family(group: JointFamily, rows: int) -> Problem:
     return problem
 
 
-_known: WeakKeyDictionary[Observations, Given] = WeakKeyDictionary()
+_structures: WeakKeyDictionary[Observations, Given] = WeakKeyDictionary()
 
 
-def _given(seen: Observations) -> Given:
-    """Return observations as C has them; they are the same for all families."""
-    given = _known.get(seen)
+def _given(observations: Observations) -> Given:
+    """Return the C structure of observations. All families share it, so it is cached."""
+    given = _structures.get(observations)
     if given is None:
-        given = Given(count=len(seen), known=seen.parent_covariance is None, softer=len(seen.softness))
+        given = Given(
+            count=len(observations),
+            known=observations.parent_covariance is None,
+            softer=len(observations.softness),
+        )
         arrays = {
-            "parent": seen.parent,
-            "child": seen.child,
-            "parent_covariance": seen.parent_covariance,
-            "child_covariance": seen.child_covariance,
-            "softness": np.array(seen.softness),
+            "parent": observations.parent,
+            "child": observations.child,
+            "parent_covariance": observations.parent_covariance,
+            "child_covariance": observations.child_covariance,
+            "softness": np.array(observations.softness),
         }
-        # Kept with it, as C only knows where they are.
+        # The structure holds bare addresses, so it has to keep the arrays alive.
         given.arrays = [np.ascontiguousarray(a) for a in arrays.values() if a is not None]
         there = iter(given.arrays)
         for name, array in arrays.items():
             setattr(given, name, None if array is None else next(there).ctypes.data)
-        _known[seen] = given
+        _structures[observations] = given
     return given
 
 
 class _Memory(threading.local):
-    """What C works in, kept from stage to stage."""
+    """Work memory of the C stages, one for each thread, reused between stages."""
 
     def __init__(self) -> None:
         self._numbers = np.empty(0)
 
-    def of(self, size: int) -> Stack:
-        """Return so many numbers at least."""
+    def reserve(self, size: int) -> Array:
+        """Return memory of at least ``size`` numbers."""
         if len(self._numbers) >= size:
             return self._numbers
         numbers = np.empty(size)

@@ -1,9 +1,8 @@
 """Counting of revolutions in sequential observations.
 
-A pose says how far something has turned, but not how often it has gone round. From one observation to the
-next it takes the shorter way: a crank, a valve or a wheel is counted so as long as it turns by less than half
-a turn in between. A screw has moved by its lead with every turn, and if that is little beside the noise only
-the count shows it.
+A pose determines an angle only up to whole revolutions. In a sequence, the joint is assumed to take the
+shorter way from one observation to the next. The count is right if it rotates by less than half a revolution
+between them. If the lead of a screw is small compared with the noise, only the count reveals it.
 """
 
 from __future__ import annotations
@@ -13,7 +12,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from kineverse.lie import Stack, inverse
+from kineverse.lie import Array, inverse
 
 from .families import WX, WY, WZ, GroupMotion
 from .motion_model import FamilyMember, MotionModel
@@ -23,34 +22,34 @@ from .range_prior import fit_joint_ranges, solve_per_observation
 
 
 def find_revolving_joint(motion: MotionModel) -> int | None:
-    """Return the number of the joint value that counts turns about an axis, None if there is none."""
+    """Return the index of the joint value that is an angle about a fixed axis; None if there is none."""
     if not isinstance(motion, GroupMotion):
         return None
-    joints = motion.freedom.joints
+    joints = motion.parametrisation.joints
     return None if WX in joints or WY in joints or WZ not in joints else joints.index(WZ)
 
 
 def unwrap_solution(solution: Solution[FamilyMember]) -> Solution[FamilyMember]:
-    """Return the same with turns counted along the observations; a screw has counted them already."""
+    """Return the solution with angles unwrapped along the observations. A screw is unwrapped already."""
     joint = find_revolving_joint(solution.motion)
     if joint is None or is_screw(solution.motion):
         return solution
     values = solution.values.copy()
     values[:, joint] = np.unwrap(values[:, joint])
-    mean = solution.belief.mean.copy()
+    mean = solution.joint_prior.mean.copy()
     mean[joint] = values[:, joint].mean()
-    return replace(solution, values=values, belief=replace(solution.belief, mean=mean))
+    return replace(solution, values=values, joint_prior=replace(solution.joint_prior, mean=mean))
 
 
-def unwrap_screw(seen: Observations, solution: Solution[FamilyMember]) -> InitialGuess | None:
-    """Return a screw that goes round as often as the observations do; None if this one does."""
+def unwrap_screw(observations: Observations, solution: Solution[FamilyMember]) -> InitialGuess | None:
+    """Return a screw with the revolutions of the observations; None if this one has them already."""
     motion = solution.motion
     if not isinstance(motion, GroupMotion) or not is_screw(motion):
         return None
     angles = np.unwrap(solution.values[:, 0])
     if np.array_equal(angles, solution.values[:, 0]):
         return None
-    along = (inverse(motion.left) @ seen.relative)[:, 2, 3]
+    along = (inverse(motion.left) @ observations.relative)[:, 2, 3]
     pitch, offset = np.polyfit(angles, along, 1)
     right = motion.right.copy()
     right[2, 3] = offset
@@ -58,10 +57,10 @@ def unwrap_screw(seen: Observations, solution: Solution[FamilyMember]) -> Initia
 
 
 def log_unwrapping_gain(solution: Solution[FamilyMember]) -> float:
-    """Return by how much a screw is more probable, as a logarithm, as its turns were counted and not drawn.
+    """Return the gain in log evidence of a screw whose revolutions are counted instead of unknown.
 
-    Other joints have their joint values within one turn, and so should it: otherwise each observation would
-    pay for all the turns that it could have had.
+    The joint values of other families lie within one revolution. Without the correction each observation of
+    a screw would pay for the choice among many revolutions.
     """
     if not is_screw(solution.motion):
         return 0.0
@@ -72,16 +71,16 @@ def log_unwrapping_gain(solution: Solution[FamilyMember]) -> float:
     before = fit_joint_ranges(solution.motion, known)
     after = fit_joint_ranges(solution.motion, replace(known, values=within))
     gain = after.log_density - before.log_density
-    # The mean is integrated over, and is the less known the more turns there are.
+    # The evidence integrates over the mean, which is less certain with more revolutions.
     gain += _spread(after.deviations, known.covariances) - _spread(before.deviations, known.covariances)
     return max(0.0, gain)
 
 
-def _spread(deviations: Stack, covariances: Stack) -> float:
-    """Return the logarithm of the standard deviation of the mean of joint values."""
+def _spread(deviations: Array, covariances: Array) -> float:
+    """Return the logarithm of the standard deviation of the mean joint value."""
     return -0.5 * math.log(float(np.sum(1.0 / (deviations[0] ** 2 + covariances[:, 0, 0]))))
 
 
 def is_screw(motion: FamilyMember) -> bool:
-    """Whether it moves along its axis with every turn."""
+    """Return True for a screw."""
     return isinstance(motion, GroupMotion) and motion.group.pitch

@@ -204,7 +204,11 @@ class JointObservations:
     def select(self, rows: slice | npt.NDArray[np.int_]) -> JointObservations:
         """Return some of the observations."""
         return JointObservations(
-            self.joint, self.served, self.observations.at(rows), self.residuals.select(rows), self.times[rows]
+            self.joint,
+            self.served,
+            self.observations.select(rows),
+            self.residuals.select(rows),
+            self.times[rows],
         )
 
 
@@ -223,7 +227,7 @@ def judge_joint(
         recent = data.select(slice(int(np.searchsorted(data.times, implausible_since)), None))
         right = np.arange(len(recent.times))
         if outliers is not None and len(right) >= 2:
-            right = identify_observations(recent.observations, families, outliers).best.right
+            right = identify_observations(recent.observations, families, outliers).best.inliers
     inliers = recent.select(right)
     alternative = identify_observations(inliers.observations, families) if len(right) >= 2 else None
     probabilities = _probabilities(inliers, alternative)
@@ -285,7 +289,7 @@ def _propose_replacement(
 ) -> tuple[Operation | None, str]:
     if alternative is None or len(recent.times) < _LEAST_COUNT:
         return None, "it was seen too seldom since to say what it is instead"
-    if not alternative.best.told:
+    if not alternative.best.is_determined:
         return None, f"what it is instead is not known yet, {alternative}"
     if not follows_another(model, data.joint) and _explains_alone(model, recent, alternative):
         # Another joint would not resolve the contradiction.

@@ -230,15 +230,15 @@ class KnownMotion:
         """Number of joint values."""
         return self.served.joints
 
-    def at(self, values: Array) -> LinearisedPoses:
+    def linearise(self, values: Array) -> LinearisedPoses:
         """Return the poses at joint values (N, k)."""
         return self.served.linearise(self.served.retract(self.reference, values))
 
-    def moved(self, step: Array) -> Self:
+    def retract(self, step: Array) -> Self:
         """Return itself: there are no parameters."""
         return self
 
-    def bounded(self, values: Array, step: Array) -> Array:
+    def retract_joints(self, values: Array, step: Array) -> Array:
         """Return joint values after a step: at most half a radian at once, and inside the limits."""
         is_angle = self.served.is_angle
         step = np.where(is_angle, np.clip(step, -0.5, 0.5), step)

@@ -22,8 +22,9 @@ from kineverse.estimation.identification.families import WX, GroupMotion
 from kineverse.estimation.identification.found_operations import joint_operation, rigid_pose
 from kineverse.estimation.identification.observations import Observations
 from kineverse.estimation.identification.outlier_rejection import RowIndices
-from kineverse.estimation.identification.projection import project_observations, squared_errors
+from kineverse.estimation.identification.projection import project_observations
 from kineverse.estimation.identification.result import Fit
+from kineverse.estimation.linear_algebra import squared_errors
 from kineverse.estimation.robust import CHI_SQUARED_6
 from kineverse.expressions.expression import Expression
 from kineverse.lie import Array, exp_so3, inverse, transform
@@ -123,8 +124,8 @@ def extend_fit(fit: Fit, observations: Observations, used: RowIndices) -> tuple[
     others = np.setdiff1d(np.arange(len(observations)), used)
     if not len(others) or not fit.motion.joints:
         return used, fit
-    solution = project_observations(fit.motion, fit.joint_values, observations.at(others))
-    fits = squared_errors(solution) < CHI_SQUARED_6
+    solution = project_observations(fit.motion, fit.joint_values, observations.select(others))
+    fits = squared_errors(solution.residuals, solution.covariance) < CHI_SQUARED_6
     values = np.concatenate([solution.values[fits], fit.joint_values])
     return np.concatenate([others[fits], used]), replace(fit, joint_values=values)
 
@@ -211,7 +212,7 @@ def build_replacement(
     before = find_joint_value(model, joint, served, records)
     same_kind, position = False, None
     if motion.joints == 1 and before is not None:
-        turns = motion.freedom.joints[0] >= WX
+        turns = motion.parametrisation.joints[0] >= WX
         same_kind = bool(served.is_angle[0]) == turns
         known = others[:, 0] if others.shape[1] else coordinates[:, 0]
         old = before.evaluate(np.where(np.isfinite(known), known, coordinates[:, 0]))
@@ -309,7 +310,7 @@ def _align_values(
         slope = 1.0
     shift = float(new.mean()) - slope * float(old.mean())
     twist = np.zeros(6)
-    twist[motion.freedom.joints[0]] = shift
+    twist[motion.parametrisation.joints[0]] = shift
     twist[2] += motion.pitch * twist[5]
     motion = replace(motion, left=motion.left @ transform(exp_so3(twist[3:]), twist[:3]))
     return motion, (new - shift)[:, None], slope

@@ -1,7 +1,7 @@
-"""``estimation-grid``: hinges and sliders from poses, over noise, number and range of observations.
+"""Experiment ``estimation-grid``: identified hinges and sliders over noise, number and range of observations.
 
-Each fit is held against the Cramér-Rao bound of its own sample, see :mod:`.bound`, and the most probable
-family against the true one.
+Each fit is compared with the Cramér-Rao bound of its own sample, see :mod:`.cramer_rao`, and the most
+probable family with the true one.
 """
 
 from .report import OPTIONS, run

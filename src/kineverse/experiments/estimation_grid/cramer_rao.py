@@ -1,15 +1,15 @@
 """Cramér-Rao bound of joint parameters, by finite differences of the observations.
 
-Unknown are the axis, the child's pose at zero, and for each observation the joint value and the parent's
-true pose. Seen are both poses, twelve numbers with independent errors. Their derivatives by all unknowns give
-the Fisher information; joint values and parents' poses are eliminated one observation at a time. Nothing here
-comes from the estimator.
+The unknowns are the axis, the child's pose at zero, and for each observation the joint value and the parent's
+true pose. The measurements are both poses, twelve numbers with independent errors. Their derivatives by all
+unknowns give the Fisher information. Joint values and parent poses are eliminated one observation at a time.
+The computation shares nothing with the estimator.
 
-A motion that is short beside the noise is not known so well by anyone. What tells the axis is the spread s²
-of the joint values, and these are known themselves with a variance c² only; of the spread s⁴/(s² + c²) is
-left, as in any regression with errors in both variables. :func:`compute_attainable_bound` is the bound with the joint
-values drawn together by that. For a slider with equal noise all around it is exactly that of joint values
-drawn from a Gaussian; as N grows the maximum of the likelihood reaches it, and not the other one.
+No estimator reaches this bound for a motion that is short compared with the noise. The variance s² of the
+joint values determines the axis, and each joint value has a variance c² of its own. The effective variance is
+s⁴/(s² + c²), as in any regression with errors in both variables. :func:`compute_attainable_bound` is the
+bound for joint values contracted accordingly. For a slider with isotropic noise it is exactly the bound of
+Gaussian joint values. For large N the maximum of the likelihood reaches it, and not the Cramér-Rao bound.
 """
 
 from __future__ import annotations
@@ -19,15 +19,12 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
-import numpy.typing as npt
 
 from kineverse.experiments.estimation_grid.samples import Cell, JointSamples, joint_motions
-from kineverse.lie import retract
-
-Array = npt.NDArray[np.float64]
+from kineverse.lie import Array, retract
 
 STEP = 1e-5
-"""Of the central differences [m], [rad]: their error is its square."""
+"""Step of the central differences [m], [rad]. Their error is of second order."""
 
 UNKNOWNS_PER_OBSERVATION = 7
 """Unknowns of an observation: the parent's pose, and the joint value, last."""
@@ -35,14 +32,14 @@ UNKNOWNS_PER_OBSERVATION = 7
 
 @dataclass(frozen=True, eq=False)
 class Bound:
-    """The least covariances of what is estimated of each sample.
+    """Lower bounds of the covariances of the estimates of each sample.
 
     Attributes
     ----------
     direction
-        Of the axis' direction, in two directions across it, (S, 2, 2) [rad²].
+        Direction of the axis, in two directions across it, (S, 2, 2) [rad²].
     point
-        Of the place of the axis across it, at the middle of the child's way, (S, 2, 2) [m²]; NaN for sliders.
+        Position of the axis across it, at the middle of the child's path, (S, 2, 2) [m²]; NaN for sliders.
     """
 
     direction: Array
@@ -50,12 +47,12 @@ class Bound:
 
     @property
     def degrees(self) -> Array:
-        """The least root mean square of the angle between the true axis and an estimate, (S,) [deg]."""
+        """Bound of the root mean square angle between the true axis and an estimate, (S,) [deg]."""
         return np.asarray(np.degrees(np.sqrt(np.trace(self.direction, axis1=1, axis2=2))))
 
     @property
     def metres(self) -> Array:
-        """The least root mean square of the distance of the axes, (S,) [m]; NaN for sliders."""
+        """Bound of the root mean square distance of the axes, (S,) [m]; NaN for sliders."""
         return np.asarray(np.sqrt(np.trace(self.point, axis1=1, axis2=2)))
 
 
@@ -64,7 +61,7 @@ def compute_bound(samples: JointSamples) -> Bound:
     cell = samples.cell
     shared = 8 if cell.joint == "prismatic" else 10
     weighed = _derivatives(samples, shared, range(shared + UNKNOWNS_PER_OBSERVATION))
-    # The joint's zero is a matter of choice: without a loss the first joint value is taken as known.
+    # The joint's zero is a gauge freedom, so the first joint value may be known without loss.
     weighed[:, 0, :, -1] = 0.0
     of_shared, of_own = weighed[..., :shared], weighed[..., shared:]
     information = _transpose(of_shared) @ of_shared
@@ -78,7 +75,7 @@ def compute_bound(samples: JointSamples) -> Bound:
 
 
 def compute_attainable_bound(samples: JointSamples) -> Bound:
-    """Return the bound with joint values as near to each other as they can be told apart, see the module."""
+    """Return the bound with contracted joint values, see the module."""
     shared = 8 if samples.cell.joint == "prismatic" else 10
     own = _derivatives(samples, shared, range(shared, shared + UNKNOWNS_PER_OBSERVATION))
     variance = np.linalg.inv(_transpose(own) @ own)[..., -1, -1]
@@ -89,7 +86,7 @@ def compute_attainable_bound(samples: JointSamples) -> Bound:
 
 
 def orthonormal_complement(axis: Array) -> Array:
-    """Return two directions across each axis (S, 3), and each other, (S, 3, 2)."""
+    """Return two orthonormal directions across each axis (S, 3), (S, 3, 2)."""
     least = np.eye(3)[np.argmin(np.abs(axis), axis=1)]
     first = np.cross(axis, least)
     first /= np.linalg.norm(first, axis=1, keepdims=True)
@@ -97,21 +94,21 @@ def orthonormal_complement(axis: Array) -> Array:
 
 
 def _derivatives(samples: JointSamples, shared: int, unknowns: Sequence[int]) -> Array:
-    """Return the derivatives of what is seen by some unknowns, in standard deviations: (S, N, 12, n)."""
+    """Return the derivatives of the measurements by some unknowns, in standard deviations, (S, N, 12, n)."""
     found = np.stack([_difference(samples, shared, k) for k in unknowns], axis=-1)
     weighed: Array = found / _deviations(samples.cell)[:, None]
     return weighed
 
 
 def _difference(samples: JointSamples, shared: int, k: int) -> Array:
-    """Return the derivatives of what is seen by the unknown k, (S, N, 12)."""
+    """Return the derivatives of the measurements by the unknown k, (S, N, 12)."""
     there, back = (_observation_errors(samples, shared, k, sign * STEP) for sign in (1.0, -1.0))
     found: Array = (there - back) / (2.0 * STEP)
     return found
 
 
 def _observation_errors(samples: JointSamples, shared: int, k: int, step: float) -> Array:
-    """Return how far both poses are from the true ones if the unknown k is off by a step, (S, N, 12)."""
+    """Return the errors of both poses for a step in the unknown k, (S, N, 12)."""
     change = np.zeros(shared + UNKNOWNS_PER_OBSERVATION)
     change[k] = step
     sides = orthonormal_complement(samples.axis)
@@ -129,9 +126,9 @@ def _observation_errors(samples: JointSamples, shared: int, k: int, step: float)
 
 
 def _pose_errors(poses: Array, others: Array) -> Array:
-    """Return by what small errors poses are off others, (..., 6) [m], [rad]."""
+    """Return the small errors of poses relative to others, (..., 6) [m], [rad]."""
     turned = poses[..., :3, :3] @ _transpose(others[..., :3, :3])
-    # Of a small rotation; its third order does not matter to a derivative.
+    # Valid for small rotations. The third-order error does not affect the derivative.
     angles = 0.5 * np.stack(
         [turned[..., k - 1, k - 2] - turned[..., k - 2, k - 1] for k in range(3)], axis=-1
     )

@@ -1,4 +1,4 @@
-"""The cells of the estimation grid, fitted one after the other or on all cores."""
+"""Fits of the estimation grid, sequential or on all cores."""
 
 from __future__ import annotations
 
@@ -12,7 +12,6 @@ from contextlib import contextmanager
 from itertools import product
 
 import numpy as np
-import numpy.typing as npt
 
 from kineverse.errors import KineverseError
 from kineverse.estimation import identify, pose_covariance
@@ -21,8 +20,7 @@ from kineverse.experiments.estimation_grid.cramer_rao import Bound, compute_atta
 from kineverse.experiments.estimation_grid.results import CellResult
 from kineverse.experiments.estimation_grid.samples import Cell, Joint, JointSamples, draw_samples
 from kineverse.experiments.registry import Progress
-
-Array = npt.NDArray[np.float64]
+from kineverse.lie import Array
 
 SEED = 2011
 SAMPLES = 50
@@ -37,7 +35,7 @@ RANGES: dict[Joint, tuple[float, ...]] = {
 
 
 def make_grid() -> list[Cell]:
-    """Return all cells."""
+    """Return all cells of the grid."""
     return [
         Cell(joint, position, orientation, count, reach)
         for joint, ranges in RANGES.items()
@@ -46,7 +44,7 @@ def make_grid() -> list[Cell]:
 
 
 def make_quick_grid() -> list[Cell]:
-    """Return a few cells from all over the grid."""
+    """Return a few cells spread over the grid."""
     return [
         Cell(joint, position, orientation, count, reach)
         for joint, ranges in RANGES.items()
@@ -58,24 +56,24 @@ def make_quick_grid() -> list[Cell]:
 def fit_all(
     cells: Sequence[Cell], samples: int, progress: Progress, workers: int | None = None
 ) -> list[CellResult]:
-    """Return what came out of cells, in their order.
+    """Fit samples of each cell and return the results in the same order.
 
     Parameters
     ----------
     cells
-        What to fit.
+        Cells to fit.
     samples
-        How many of each.
+        Number of samples of each cell.
     progress
-        Wraps the cells.
+        Progress reporter.
     workers
-        How many processes; None for one on each core.
+        Number of processes; None for one on each core.
     """
     workers = workers or os.cpu_count() or 1
     if workers == 1:
         return [fit_cell(cell, samples) for cell in progress(cells, "estimation-grid", "cell")]
-    # Fresh processes, since forks of one that compiles in the background may hang. Long cells first, so that
-    # all end at about the same time.
+    # Spawned processes, because a fork during a background compilation may hang. Long cells first, so that
+    # all processes end at about the same time.
     order = sorted(range(len(cells)), key=lambda k: -cells[k].count)
     with _workers(workers) as pool:
         jobs: list[tuple[int, Future[CellResult]]] = [
@@ -86,7 +84,7 @@ def fit_all(
 
 
 def fit_cell(cell: Cell, count: int) -> CellResult:
-    """Fit so many samples of a cell; the same ones each time."""
+    """Fit samples of a cell, drawn with a fixed seed."""
     samples = draw_samples(cell, count, np.random.default_rng(_seed(cell)))
     limit, reach = compute_bound(samples), compute_attainable_bound(samples)
     fits = [_fit(samples, k) for k in range(count)]
@@ -106,7 +104,7 @@ def fit_cell(cell: Cell, count: int) -> CellResult:
 
 
 def _fit(samples: JointSamples, k: int) -> tuple[Fit | None, str, bool]:
-    """Return the fit of the true family if there is one, the most probable family, and if that is told."""
+    """Return the fit of the true family or None, the most probable family, and True if it is unambiguous."""
     cell = samples.cell
     covariance = pose_covariance(cell.position, cell.orientation)
     try:
@@ -122,7 +120,7 @@ def _fit(samples: JointSamples, k: int) -> tuple[Fit | None, str, bool]:
 
 
 def _degrees(fit: Fit | None, axis: Array) -> float:
-    """Return the angle between the true axis and the one found; an axis has no sign."""
+    """Return the angle between the true and the estimated axis [deg], regardless of sign."""
     if fit is None:
         return math.nan
     found = np.asarray(fit.parameters["axis"])
@@ -130,7 +128,7 @@ def _degrees(fit: Fit | None, axis: Array) -> float:
 
 
 def _metres(fit: Fit | None, samples: JointSamples, k: int) -> float:
-    """Return how far the axis found is off the true one in the plane across it, at the middle of the way."""
+    """Return the distance of the estimated axis from the true one, in the plane across it at mid-path [m]."""
     if fit is None or samples.cell.joint == "prismatic":
         return math.nan
     axis, point = samples.axis[k], samples.point[k]
@@ -143,21 +141,21 @@ def _metres(fit: Fit | None, samples: JointSamples, k: int) -> float:
 
 
 def _spread(limit: Bound) -> float:
-    """Return the relative variance of the sum of squared angles, if they are what the bound says."""
+    """Return the relative variance of the sum of squared angles under the bound."""
     squares = np.trace(limit.direction @ limit.direction, axis1=1, axis2=2).sum()
     return float(2.0 * squares / np.trace(limit.direction, axis1=1, axis2=2).sum() ** 2)
 
 
 def _seed(cell: Cell) -> list[int]:
-    """Return a seed of a cell's own, whatever other cells there are."""
+    """Return the seed of a cell, independent of the other cells."""
     micro = (round(1e6 * value) for value in (cell.position, cell.orientation, cell.range))
     return [SEED, cell.joint == "revolute", cell.count, *micro]
 
 
 def _end_with_parent() -> None:
-    """End this process when the one that made it is gone: its own end would not reach us."""
+    """End this worker process when its parent is gone, because no signal tells it."""
     parent = multiprocessing.parent_process()
-    assert parent is not None  # it is what runs this
+    assert parent is not None  # this runs in a worker process
 
     def wait() -> None:
         parent.join()
@@ -168,7 +166,7 @@ def _end_with_parent() -> None:
 
 @contextmanager
 def _workers(count: int) -> Iterator[ProcessPoolExecutor]:
-    """Yield processes that use a core each."""
+    """Provide a pool of processes with one thread each."""
     names = ("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS", "MKL_NUM_THREADS")
     before = {name: os.environ.get(name) for name in names}
     os.environ.update(dict.fromkeys(names, "1"))

@@ -1,4 +1,4 @@
-"""Results of the estimation grid as tables, numbers and figure."""
+"""Report of the estimation grid: tables, numbers and figure."""
 
 from __future__ import annotations
 
@@ -31,11 +31,11 @@ FIGURE_SIZE = (13.0, 8.0)
 COLORS = {"revolute": "tab:blue", "prismatic": "tab:orange"}
 JOINT_NAMES = {"revolute": "hinge", "prismatic": "slider"}
 TOP = 2.5
-"""Larger ratios are drawn at the edge."""
+"""Largest ratio of the plots. Larger ones are drawn at the edge."""
 
 
 def draw_grid(canvas: Canvas, results: Sequence[CellResult]) -> None:
-    """Draw a point for each cell: errors over both bounds, and how many types are right."""
+    """Draw a point for each cell: ratios to both bounds, and the share of right families."""
     (bound, attained), (place, right) = canvas.subplots(2, 2)
     _plot_ratios(bound, results, [r.bound for r in results], [r.ratio for r in results])
     bound.set(title="direction, over the Cramér-Rao bound", xlabel="the bound [deg]")
@@ -85,13 +85,13 @@ Cells = tuple[float | str, ...]
 
 
 def run(progress: Progress, options: Options) -> Report:
-    """Fit the grid; a few cells of it, with fewer samples, if it has to be quick."""
+    """Fit the grid; with the option ``quick`` a few cells and fewer samples."""
     cells, samples = (make_quick_grid(), QUICK_SAMPLES) if options.quick else (make_grid(), SAMPLES)
     return report_grid(fit_all(cells, samples, progress))
 
 
 def report_grid(results: Sequence[CellResult]) -> Report:
-    """Return the report on what came out."""
+    """Return the report on the results."""
     total = summarize_cells(results)
     return Report(
         name="estimation-grid",
@@ -139,7 +139,7 @@ def _target_rows(total: GridSummary) -> ReportTable:
 
 
 def _error_rows(what: str, ratios: ErrorRatios) -> tuple[Cells, ...]:
-    """Return the rows on errors over a bound."""
+    """Return the rows on ratios of errors to a bound."""
     asked = f"<= {MOST_OVER:g}"
     return tuple(
         (
@@ -236,7 +236,7 @@ def _worst(results: Sequence[CellResult]) -> ReportTable:
 
 
 def format_joint_range(joint: str, reach: float) -> str:
-    """Return a range in words."""
+    """Format the range of a joint."""
     return f"{math.degrees(reach):.0f} deg" if joint == "revolute" else f"{100 * reach:.0f} cm"
 
 
@@ -274,7 +274,7 @@ def _numbers(result: CellResult) -> dict[str, Any]:
 
 
 def _to_json(value: Any) -> Any:
-    """Return values as JSON has them: nothing for what is not finite."""
+    """Convert a value for JSON, with null for numbers that are not finite."""
     if isinstance(value, dict):
         return {name: _to_json(inner) for name, inner in value.items()}
     return None if isinstance(value, float) and not math.isfinite(value) else value

@@ -1,4 +1,4 @@
-"""Results of the estimation grid by cell, and their comparison with the attainable bound."""
+"""Results of the estimation grid, their comparison with the bounds, and the targets."""
 
 from __future__ import annotations
 
@@ -10,43 +10,43 @@ import numpy as np
 import numpy.typing as npt
 
 from kineverse.experiments.estimation_grid.samples import Cell
+from kineverse.lie import Array
 
-Array = npt.NDArray[np.float64]
 Flags = npt.NDArray[np.bool_]
 
 NEAR, TELLING = 10.0, 5.0
-"""Bounds [deg] below which errors are compared with the bound, and types have to be right."""
+"""Bounds [deg] below which errors are compared with the bound, and below which families have to be right."""
 
 MOST_OVER, LEAST_RIGHT = 1.1, 0.99
-"""Allowed ratio of errors to the bound, and required part of correct types."""
+"""Largest ratio of errors to a bound, and least share of right families."""
 
 FAR_OFF = 6.0
-"""An error of so many times what can be attained is a divergence: by chance, hardly one in a million is."""
+"""Ratio of an error to the attainable bound that counts as divergence. The chance is one in a million."""
 
 
 @dataclass(frozen=True, eq=False)
 class CellResult:
-    """Outcome of the samples of a cell.
+    """Results of the samples of a cell.
 
     Attributes
     ----------
     cell
-        What they have in common.
+        Cell of the samples.
     degrees, metres
-        How far the axis found is off in direction and place, (S,); NaN where there is none, as the place of a
-        slider.
+        Errors of the axis in direction [deg] and position [m], (S,); NaN without an estimate, and for the
+        position of a slider.
     bound_degrees, bound_metres
-        The Cramér-Rao bounds of these, (S,), see :func:`.cramer_rao.compute_bound`.
+        Their Cramér-Rao bounds, (S,), see :func:`.cramer_rao.compute_bound`.
     attainable_degrees, attainable_metres
-        What can be attained at best, (S,), see :func:`.cramer_rao.compute_attainable_bound`.
+        Their attainable bounds, (S,), see :func:`.cramer_rao.compute_attainable_bound`.
     spread
-        The relative variance of the sum of squares of ``degrees`` by chance, at what can be attained.
+        Relative variance of the sum of squares of ``degrees`` at the attainable bound.
     right
-        Whether the most probable family is the true one, (S,).
+        Mask of the samples in which the most probable family is the true one, (S,).
     told
-        Whether the answer was more than "cannot tell", (S,).
+        Mask of the samples with an unambiguous result, (S,).
     called
-        The most probable family of each.
+        Most probable family of each sample.
     """
 
     cell: Cell
@@ -63,27 +63,27 @@ class CellResult:
 
     @property
     def bound(self) -> float:
-        """The Cramér-Rao bound of the root mean square of the direction's error [deg]."""
+        """Cramér-Rao bound of the root mean square direction error [deg]."""
         return rms(self.bound_degrees)
 
     @property
     def attainable(self) -> float:
-        """Attainable bound of the error [deg]."""
+        """Attainable bound of the root mean square direction error [deg]."""
         return rms(self.attainable_degrees)
 
     @property
     def ratio(self) -> float:
-        """Root mean square of the direction's error over its Cramér-Rao bound."""
+        """Ratio of the root mean square direction error to its Cramér-Rao bound."""
         return rms(self.degrees) / self.bound
 
     @property
     def attained(self) -> float:
-        """Root mean square of the direction's error over what can be attained."""
+        """Ratio of the root mean square direction error to its attainable bound."""
         return rms(self.degrees) / self.attainable
 
     @property
     def diverged(self) -> int:
-        """Number of samples without an axis, or with one that is far off where it can be known."""
+        """Number of samples without an axis, or with a divergent one where the bound is small."""
         lost = ~np.isfinite(self.degrees)
         if self.attainable < NEAR:
             lost |= self.degrees > FAR_OFF * self.attainable_degrees
@@ -91,25 +91,25 @@ class CellResult:
 
     @property
     def by_chance(self) -> float:
-        """Probability that attainable errors exceed the bound by too much by chance."""
+        """Probability that errors at the attainable bound exceed the target ratio by chance."""
         excess = (MOST_OVER**2 - 1.0) / math.sqrt(self.spread)
         return 0.5 * math.erfc(excess / math.sqrt(2.0))
 
 
 @dataclass(frozen=True)
 class ErrorRatios:
-    """Errors over a bound, in the cells where that is near.
+    """Ratios of errors to a bound, in the cells with a small bound.
 
     Attributes
     ----------
     near
-        How many cells these are.
+        Number of these cells.
     direction, place
-        Root mean squares over the bounds, all fits together; NaN if there are none.
+        Root mean square ratios of direction and position over all fits; NaN without cells.
     worst
-        The largest ratio of the direction in a cell.
+        Largest ratio of the direction in a cell.
     over
-        In how many cells that is more than it may be.
+        Number of cells above the target ratio.
     """
 
     near: int
@@ -121,26 +121,26 @@ class ErrorRatios:
 
 @dataclass(frozen=True)
 class GridSummary:
-    """Several cells together.
+    """Summary of several cells.
 
     Attributes
     ----------
     cells, fits
-        How many there are.
+        Numbers of cells and fits.
     bound, attainable
-        Errors over the Cramér-Rao bound, and over what can be attained.
+        Ratios of errors to the Cramér-Rao bound and to the attainable bound.
     over_by_chance
-        In how many cells errors would be too much above what can be attained by chance.
+        Expected number of cells above the target ratio at the attainable bound.
     right
-        How many types are right, as a part, where the Cramér-Rao bound tells; NaN if it does nowhere.
+        Share of right families in cells with a small Cramér-Rao bound; NaN without such cells.
     right_attainable
-        The same where what can be attained tells.
+        The same for cells with a small attainable bound.
     told
-        How many were told, rather than answered by "cannot tell", as a part, in the cells of ``right``.
+        Share of unambiguous results in the cells of ``right``.
     told_wrong
-        How many of all fits were told, and wrong.
+        Number of fits with an unambiguous and wrong family.
     diverged
-        How many fits did.
+        Number of divergent fits.
     """
 
     cells: int
@@ -156,7 +156,7 @@ class GridSummary:
 
 
 def summarize_cells(results: Sequence[CellResult]) -> GridSummary:
-    """Return several cells together."""
+    """Summarise several cells."""
     telling = [r for r in results if r.bound < TELLING]
     return GridSummary(
         cells=len(results),
@@ -173,7 +173,7 @@ def summarize_cells(results: Sequence[CellResult]) -> GridSummary:
 
 
 def rms(values: Array) -> float:
-    """Return a root mean square."""
+    """Return the root mean square."""
     return float(np.sqrt(np.mean(values**2)))
 
 

@@ -1,9 +1,9 @@
-"""Two parts with a joint between them, seen with noise: the samples of the estimation grid.
+"""Samples of the estimation grid: noisy poses of two parts with a joint between them.
 
-In the parent's frame lies an axis of any direction, half a metre from its origin; the child's origin is .4 m
-off it at the joint's zero. The child's pose in the parent is ``motion(q) · C``, with a motion about or along
-that axis. The observer stands somewhere else each time, and sees both poses with errors in the observer's
-axes: ``(p + δp, Exp(δθ) R)``.
+The axis has a random direction and a distance of 0.5 m from the origin of the parent. The origin of the child
+is 0.4 m from the axis at the joint's zero. The child's pose in the parent is ``motion(q) · C``, with a motion
+about or along the axis. The observer has a random pose at each observation. Both poses are measured with
+errors in the observer's axes: ``(p + δp, Exp(δθ) R)``.
 """
 
 from __future__ import annotations
@@ -13,31 +13,29 @@ from dataclasses import dataclass
 from typing import Literal
 
 import numpy as np
-import numpy.typing as npt
 
-from kineverse.lie import exp_so3, quaternion, retract, transform, translation, unit_vector
+from kineverse.lie import Array, exp_so3, quaternion, retract, transform, translation, unit_vector
 
-Array = npt.NDArray[np.float64]
 Joint = Literal["prismatic", "revolute"]
 
 TO_AXIS, LEVER = 0.5, 0.4
-"""From the parent's origin to the axis, and from the axis to the child's origin [m]."""
+"""Distance from the parent's origin to the axis, and from the axis to the child's origin [m]."""
 
 
 @dataclass(frozen=True)
 class Cell:
-    """Parameters common to the samples of one cell of the grid.
+    """Cell of the grid: joint, noise, number and range of observations.
 
     Attributes
     ----------
     joint
-        What the joint is.
+        Joint family.
     position, orientation
         Standard deviations of each coordinate of both poses [m], [rad].
     count
-        How many observations there are.
+        Number of observations.
     range
-        How far the joint moves [rad] or [m].
+        Range of the joint [rad] or [m].
     """
 
     joint: Joint
@@ -49,25 +47,25 @@ class Cell:
 
 @dataclass(frozen=True, eq=False)
 class JointSamples:
-    """Several recordings of different objects, and what is true of them.
+    """Random recordings of one cell, with the true joints.
 
     Attributes
     ----------
     cell
-        What they have in common.
+        Cell of the samples.
     axis
-        Directions of length one in the parent's frame, (S, 3).
+        Unit vectors of the axes in the parent's frame, (S, 3).
     point
-        Of the axis, the nearest to the middle of the child's way, (S, 3) [m]. A slider has no place, and this
-        is the middle itself.
+        Points of the axes nearest to the middle of the child's path, (S, 3) [m]; for a slider, the middle of
+        the path itself.
     zero
         Poses of the child in the parent at the joint's zero, (S, 4, 4).
     joint_values
-        (S, N), evenly over the range.
+        Joint values, evenly over the range, (S, N).
     parents
         True poses of the parent in the observer's frame, (S, N, 4, 4).
     seen_parents, seen_children
-        What was seen of both, (S, N, 4, 4).
+        Measured poses of both, (S, N, 4, 4).
     """
 
     cell: Cell
@@ -81,7 +79,7 @@ class JointSamples:
 
 
 def draw_samples(cell: Cell, count: int, rng: np.random.Generator) -> JointSamples:
-    """Return so many samples of a cell."""
+    """Draw random samples of a cell."""
     axis = _random_directions(rng, count)
     to_axis, lever = _random_orthogonal(rng, axis), _random_orthogonal(rng, axis)
     point = TO_AXIS * to_axis
@@ -97,7 +95,7 @@ def draw_samples(cell: Cell, count: int, rng: np.random.Generator) -> JointSampl
 
 
 def joint_motions(joint: Joint, axis: Array, point: Array, values: Array) -> Array:
-    """Return how joints have moved things, (S, N, 4, 4), by axes (S, 3), points on them and values (S, N)."""
+    """Return the motions (S, N, 4, 4) of joints with axes and points (S, 3) at joint values (S, N)."""
     along = values[..., None] * axis[:, None]
     if joint == "prismatic":
         return translation(along)
@@ -116,7 +114,7 @@ def _random_directions(rng: np.random.Generator, count: int) -> Array:
 
 
 def _random_orthogonal(rng: np.random.Generator, axis: Array) -> Array:
-    """Return directions across axes, (S, 3)."""
+    """Return random unit vectors orthogonal to axes, (S, 3)."""
     return unit_vector(np.cross(axis, _random_directions(rng, len(axis))))
 
 

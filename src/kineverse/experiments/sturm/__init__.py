@@ -1,4 +1,4 @@
-"""``sturm``: doors and drawers that others recorded, and whether they are taken for what they are."""
+"""Experiment ``sturm``: classification of published recordings of doors and drawers."""
 
 from .classify import OPTIONS, run
 

@@ -1,4 +1,4 @@
-"""Classification of the recordings as hinges and drawers: report and figure."""
+"""Classification of the recordings as hinges and drawers, with report and figure."""
 
 from __future__ import annotations
 
@@ -30,85 +30,86 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True, eq=False)
 class Classification:
-    """A recording and what it was taken for.
+    """Identification result of a recording.
 
     Attributes
     ----------
     recording
-        What was seen.
-    found
-        All families with their probabilities.
+        Recording with its label.
+    result
+        Identification result with the probabilities of all families.
     """
 
     recording: LabelledRecording
-    found: IdentificationResult
+    result: IdentificationResult
 
     @property
-    def called(self) -> str:
-        """The most probable family."""
-        return self.found.best.family
+    def predicted(self) -> str:
+        """Most probable family."""
+        return self.result.best.family
 
     @property
-    def right(self) -> bool:
-        """True if the type is the label."""
-        return self.called == self.recording.label
+    def is_correct(self) -> bool:
+        """True if the most probable family is the label."""
+        return self.predicted == self.recording.label
 
 
 def classify_recording(recording: LabelledRecording) -> Classification:
-    """Identify what one recording shows."""
+    """Identify the joint of one recording."""
     return Classification(recording, identify(None, recording.poses, child_covariance=recording.covariance))
 
 
 FIGURE_COLUMNS = 10
 SMALL, LARGE = 1.5, 4.0
-"""The edge of a picture of one recording, and of a missed one [inch]."""
+"""Edge of the picture of a recording, and of a misclassified one [inch]."""
 
 RIGHT, WRONG = "0.25", "tab:red"
 
 
-def figure_size(judged: Sequence[Classification]) -> tuple[float, float]:
-    """Return width and height of the whole [inch]."""
-    missed = sum(not j.right for j in judged)
-    return FIGURE_COLUMNS * SMALL, SMALL * math.ceil(len(judged) / FIGURE_COLUMNS) + LARGE * missed + 0.5
+def figure_size(classified: Sequence[Classification]) -> tuple[float, float]:
+    """Return width and height of the figure [inch]."""
+    misclassified = sum(not j.is_correct for j in classified)
+    rows = math.ceil(len(classified) / FIGURE_COLUMNS)
+    return FIGURE_COLUMNS * SMALL, SMALL * rows + LARGE * misclassified + 0.5
 
 
-def draw_recordings(canvas: Canvas, judged: Sequence[Classification]) -> None:
-    """Draw all recordings with what they were taken for, and below both explanations of those missed."""
-    missed = [j for j in judged if not j.right]
-    rows = math.ceil(len(judged) / FIGURE_COLUMNS)
-    heights = [SMALL * rows, *[LARGE] * len(missed)]
+def draw_recordings(canvas: Canvas, classified: Sequence[Classification]) -> None:
+    """Draw all recordings with their classes, and below both fits of the misclassified ones."""
+    misclassified = [j for j in classified if not j.is_correct]
+    rows = math.ceil(len(classified) / FIGURE_COLUMNS)
+    heights = [SMALL * rows, *[LARGE] * len(misclassified)]
     above, *below = canvas.subfigures(len(heights), 1, height_ratios=heights, squeeze=False)[:, 0]
     axes = above.subplots(rows, FIGURE_COLUMNS, squeeze=False).ravel()
-    for place, one in zip(axes, judged, strict=False):
-        _draw_recording(place, one)
-    for place in axes[len(judged) :]:
+    for place, item in zip(axes, classified, strict=False):
+        _draw_recording(place, item)
+    for place in axes[len(classified) :]:
         place.axis("off")
-    for part, one in zip(below, missed, strict=True):
-        families = (one.recording.label, one.found.best.family)
+    for part, item in zip(below, misclassified, strict=True):
+        families = (item.recording.label, item.result.best.family)
         for place, family, shown in zip(
             part.subplots(1, 4), (families[0], *families, families[1]), (0, 1, 0, 1), strict=True
         ):
-            looked = FitProjection.at(one.found[family], one.recording.poses)
-            (draw_axial_view, draw_side_view)[shown](place, looked)
+            projection = FitProjection.at(item.result[family], item.recording.poses)
+            (draw_axial_view, draw_side_view)[shown](place, projection)
             place.set_title(
-                f"{family} {one.found[family].probability:.2g}: {place.get_title()}", fontsize="small"
+                f"{family} {item.result[family].probability:.2g}: {place.get_title()}", fontsize="small"
             )
-        part.suptitle(f"missed: {one.recording.name}", color=WRONG)
+        part.suptitle(f"missed: {item.recording.name}", color=WRONG)
 
 
-def _draw_recording(axes: Axes, one: Classification) -> None:
-    looked = FitProjection.at(one.found.best, one.recording.poses)
-    right, up = (2, 0) if one.found.best.family == "prismatic" else (0, 1)
-    axes.plot(looked.seen[:, right], looked.seen[:, up], ".", markersize=2, color="tab:orange")
-    axes.plot(looked.way[:, right], looked.way[:, up], linewidth=0.8, color="tab:blue")
-    if looked.turns:
+def _draw_recording(axes: Axes, item: Classification) -> None:
+    projection = FitProjection.at(item.result.best, item.recording.poses)
+    right, up = (2, 0) if item.result.best.family == "prismatic" else (0, 1)
+    axes.plot(projection.seen[:, right], projection.seen[:, up], ".", markersize=2, color="tab:orange")
+    axes.plot(projection.way[:, right], projection.way[:, up], linewidth=0.8, color="tab:blue")
+    if projection.turns:
         axes.plot(0.0, 0.0, "+", color="tab:blue", markersize=5)
     axes.set_aspect("equal", adjustable="datalim")
     axes.set_xticks([])
     axes.set_yticks([])
-    color = RIGHT if one.right else WRONG
-    name = "\n".join(one.recording.name.split("/")[-2:])
-    axes.set_title(f"{name}: {one.called}", fontsize=6, color=color)
+    color = RIGHT if item.is_correct else WRONG
+    name = "\n".join(item.recording.name.split("/")[-2:])
+    axes.set_title(f"{name}: {item.predicted}", fontsize=6, color=color)
     for spine in axes.spines.values():
         spine.set_color(color)
 
@@ -120,21 +121,21 @@ LABEL_NAMES = {"revolute": "hinge", "prismatic": "drawer"}
 
 
 def run(progress: Progress, options: Options) -> Report:
-    """Identify what each recording shows, with what is fixed beforehand for its kind of sensor."""
+    """Identify the joint of each recording, with fixed noise for its kind of sensor."""
     recordings = list(read_labelled_recordings(options.data))
     return report_recordings(
         [classify_recording(recording) for recording in progress(recordings, "sturm", "recording")]
     )
 
 
-def report_recordings(judged: Sequence[Classification]) -> Report:
-    """Return the report on recordings."""
-    right = sum(j.right for j in judged)
-    missed = [j for j in judged if not j.right]
-    share = right / len(judged)
+def report_recordings(classified: Sequence[Classification]) -> Report:
+    """Return the report on the classified recordings."""
+    right = sum(j.is_correct for j in classified)
+    misclassified = [j for j in classified if not j.is_correct]
+    share = right / len(classified)
     return Report(
         name="sturm",
-        title=f"Recorded doors and drawers ({SOURCE}): {right} of {len(judged)} taken for what they are",
+        title=f"Recorded doors and drawers ({SOURCE}): {right} of {len(classified)} taken for what they are",
         tables=(
             ReportTable(
                 "The recordings",
@@ -149,7 +150,7 @@ def report_recordings(judged: Sequence[Classification]) -> Report:
                     "rms [mm]",
                     "right",
                 ),
-                tuple(_recording_row(j) for j in judged),
+                tuple(_recording_row(j) for j in classified),
             ),
             ReportTable(
                 "What is asked for, and what came out",
@@ -167,8 +168,8 @@ def report_recordings(judged: Sequence[Classification]) -> Report:
                 "Missed",
                 ("recording", "shows", "all families, the most probable first"),
                 tuple(
-                    (j.recording.name, LABEL_NAMES[j.recording.label], _format_families(j.found))
-                    for j in missed
+                    (j.recording.name, LABEL_NAMES[j.recording.label], _format_families(j.result))
+                    for j in misclassified
                 ),
             ),
         ),
@@ -180,42 +181,42 @@ def report_recordings(judged: Sequence[Classification]) -> Report:
             },
             "right": share,
             "asked": LEAST_RIGHT,
-            "missed": [j.recording.name for j in missed],
-            "recordings": [_numbers(j) for j in judged],
+            "missed": [j.recording.name for j in misclassified],
+            "recordings": [_numbers(j) for j in classified],
         },
-        figure=Figure(lambda canvas: draw_recordings(canvas, judged), figure_size(judged)),
+        figure=Figure(lambda canvas: draw_recordings(canvas, classified), figure_size(classified)),
     )
 
 
 def axis_distance(fit: Fit) -> float:
-    """Return the mean distance of the child from the axis [m]; NaN for what does not turn about one."""
+    """Return the mean distance of the child from the axis [m]; NaN without a rotation axis."""
     if fit.family not in ("revolute", "screw", "cylindrical"):
         return math.nan
     axis, point = np.asarray(fit.parameters["axis"]), np.asarray(fit.parameters["point"])
-    offsets = fit.motion.at(fit.joint_values).pose[:, :3, 3] - point
+    offsets = fit.motion.linearise(fit.joint_values).pose[:, :3, 3] - point
     return float(np.linalg.norm(np.cross(offsets, axis), axis=1).mean())
 
 
 def format_travel(fit: Fit) -> str:
-    """Return how far the joint moved, in words."""
+    """Format the range of the joint values."""
     ways = np.ptp(fit.joint_values, axis=0) if fit.joint_values.size else []
     turns = fit.family in ("revolute", "screw")
     return " ".join(f"{math.degrees(way):.0f} deg" if turns else f"{way:.2f} m" for way in ways) or "-"
 
 
-def _recording_row(judged: Classification) -> tuple[float | str, ...]:
-    best, recording = judged.found.best, judged.recording
+def _recording_row(item: Classification) -> tuple[float | str, ...]:
+    best, recording = item.result.best, item.recording
     around = axis_distance(best)
     return (
         recording.name,
         float(len(recording.poses)),
         LABEL_NAMES[recording.label],
-        judged.called,
+        item.predicted,
         best.probability,
         around if math.isfinite(around) else "-",
         format_travel(best),
         1e3 * best.rms[0],
-        ("yes" if judged.right else "NO") + (", cannot tell" if judged.found.is_ambiguous else ""),
+        ("yes" if item.is_correct else "NO") + (", cannot tell" if item.result.is_ambiguous else ""),
     )
 
 
@@ -223,17 +224,17 @@ def _format_families(found: IdentificationResult) -> str:
     return ", ".join(f"{fit.family} {fit.probability:.2g}" for fit in found.fits)
 
 
-def _numbers(judged: Classification) -> dict[str, Any]:
-    best, recording = judged.found.best, judged.recording
+def _numbers(item: Classification) -> dict[str, Any]:
+    best, recording = item.result.best, item.recording
     around = axis_distance(best)
     return {
         "name": recording.name,
         "count": len(recording.poses),
         "label": recording.label,
-        "taken_for": judged.called,
-        "right": judged.right,
-        "told": not judged.found.is_ambiguous,
-        "probabilities": {fit.family: fit.probability for fit in judged.found.fits},
+        "taken_for": item.predicted,
+        "right": item.is_correct,
+        "told": not item.result.is_ambiguous,
+        "probabilities": {fit.family: fit.probability for fit in item.result.fits},
         "radius": around if math.isfinite(around) else None,
         "ranges": best.range.tolist(),
         "rms": list(best.rms),

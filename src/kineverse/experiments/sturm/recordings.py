@@ -1,7 +1,7 @@
-"""The recordings of Sturm, Stachniss and Burgard (2011), and what each of them shows.
+"""Recordings of Sturm, Stachniss and Burgard (2011) with their labels.
 
-Handles and markers of doors and drawers, moved by hand or by a robot. They belong to others and do not come
-with this package; folders and files are named as in the repository ``tum-vision/articulation``.
+They contain handles and markers of doors and drawers, moved by hand or by a robot. They are not part of this
+package. Folders and files are named as in the repository ``tum-vision/articulation``.
 """
 
 from __future__ import annotations
@@ -13,14 +13,11 @@ from pathlib import Path
 from types import MappingProxyType
 from typing import Literal
 
-import numpy as np
-import numpy.typing as npt
-
 from kineverse.errors import FormatError
 from kineverse.estimation.noise import pose_covariance
 from kineverse.estimation.recordings import read_recording
+from kineverse.lie import Array
 
-Array = npt.NDArray[np.float64]
 Label = Literal["revolute", "prismatic"]
 
 FOLDER = "sturm_tracks"
@@ -46,32 +43,32 @@ LABELS: Mapping[str, Label] = MappingProxyType(
         "models_data/door.txt": "revolute",
     }
 )
-"""Objects by the names of their files."""
+"""Label of each file, derived from the names of the objects."""
 
 COLUMNS: Mapping[str, str] = MappingProxyType({"models_data/door.txt": "x,y,z,qx,qy,qz,qw,-,-"})
-"""Columns of the pose in files that have more."""
+"""Columns of files that have more than those of a pose."""
 
 POSITION, ORIENTATION = 0.01, math.radians(5.0)
-"""Deviation of tracked poses from an ideal joint, in each coordinate [m] and about each axis [rad].
+"""Standard deviations of the deviation from an ideal joint, of each coordinate [m] and about each axis [rad].
 
-That is not the jitter of a sensor, a millimetre and less: hands slip, handles and hinges give way, and planar
-markers are seen tilted.
+They are larger than the sensor noise of a millimetre or less: hands slip, handles and hinges yield, and
+planar markers have systematic orientation errors.
 """
 
 THINNED = 20
-"""Number of poses taken of a recording, evenly over time: neighbouring ones share most of their errors."""
+"""Number of poses used of each recording, evenly over time, because errors of neighbours are correlated."""
 
 
 @dataclass(frozen=True, eq=False)
 class LabelledRecording:
-    """A recording and its label.
+    """Recording with its label.
 
     Attributes
     ----------
     name
-        The file in its folder, without its suffix.
+        Path of the file in its folder, without suffix.
     label
-        What it is a recording of.
+        True joint family.
     poses
         (N, 4, 4) of a marker, or positions (N, 3) of a handle, in the camera's frame [m].
     """
@@ -82,7 +79,7 @@ class LabelledRecording:
 
     @property
     def covariance(self) -> Array:
-        """Of each pose (6, 6) or position (3, 3), the same for all recordings."""
+        """Covariance of each pose (6, 6) or position (3, 3), the same for all recordings."""
         whole = pose_covariance(POSITION, ORIENTATION)
         return whole if self.poses.ndim == 3 else whole[:3, :3]
 
@@ -93,12 +90,12 @@ def read_labelled_recordings(folder: Path | None) -> Iterator[LabelledRecording]
     Parameters
     ----------
     folder
-        The one with ``cabinet_one`` and the others; None for ``sturm_tracks`` in the current one.
+        Folder that contains ``cabinet_one`` and the others; None for ``sturm_tracks`` in the current folder.
 
     Raises
     ------
     FormatError
-        If there is no such folder, none of the recordings is in it, or one cannot be read.
+        If the folder does not exist, contains none of the recordings, or one cannot be read.
     """
     place = Path(FOLDER) if folder is None else folder
     found = sorted((file, label) for pattern, label in LABELS.items() for file in place.glob(pattern))

@@ -1,10 +1,10 @@
 """Rigid bodies, joints between them, and identification of the kinematic graph.
 
-Every pair of parts is identified. Parts that do not move against each other are one rigid body. Bodies are
-connected by the tree of largest evidence, where the density of all poses is the product over the tree's
-connections of how the child was seen in the parent, as if the latter's place were known. So given the tree,
-connections are independent, and the probability of each is its share in the sum over all trees. A pair beside
-the tree that moves in fewer ways than the tree lets it closes a loop.
+Every pair of parts is identified. Parts without relative motion form a rigid body. Bodies are connected by
+the spanning tree of largest evidence. The density of all poses is a product over the connections of the tree:
+that of the child in the parent, as if the parent's pose were known. So the connections are independent given
+the tree, and the probability of each is its share in the sum over all trees. A pair outside the tree closes a
+loop if its mobility is lower than that of the path in the tree.
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ from kineverse.errors import DuplicateNameError, InvalidValueError, ModelError
 from kineverse.estimation.identification.found_operations import rigid_pose
 from kineverse.estimation.identification.observations import PosesLike, PoseTrack, check_tracks, exact_track
 from kineverse.estimation.identification.result import SURE, Fit, IdentificationResult
-from kineverse.lie import Stack, inverse
+from kineverse.lie import Array, inverse
 from kineverse.model.frame import WORLD
 from kineverse.model.model import Model
 from kineverse.model.operation import Operation
@@ -40,20 +40,20 @@ from .spanning_trees import (
 
 @dataclass(frozen=True)
 class RigidBody:
-    """Parts that do not move against each other.
+    """Set of parts without relative motion.
 
     Attributes
     ----------
     parts
-        The first stands for all of them in edges.
-    places
-        Their poses in the first, (4, 4), by name.
+        Names of the parts. The first represents the body in edges.
+    poses
+        Poses of the parts in the first, (4, 4), by name.
     probability
-        That they are one.
+        Probability that the parts form one body.
     """
 
     parts: tuple[str, ...]
-    places: Mapping[str, Stack]
+    poses: Mapping[str, Array]
     probability: float = 1.0
 
     def __str__(self) -> str:
@@ -62,42 +62,44 @@ class RigidBody:
 
 
 def find_rigid_bodies(
-    seen: Mapping[str, PoseTrack], pairs: Mapping[frozenset[str], PartPair]
+    tracks: Mapping[str, PoseTrack], pairs: Mapping[frozenset[str], PartPair]
 ) -> tuple[RigidBody, ...]:
-    """Return rigid bodies: parts join while more speaks for it than against it over all pairs."""
-    group: dict[str, tuple[str, ...]] = {name: (name,) for name in seen}
-    surest = dict.fromkeys(seen, 1.0)
-    for joined in sorted(pairs.values(), key=lambda p: -p.rigid):
+    """Return the rigid bodies, merged while the sum of log odds over all pairs across is positive."""
+    group: dict[str, tuple[str, ...]] = {name: (name,) for name in tracks}
+    surest = dict.fromkeys(tracks, 1.0)
+    for joined in sorted(pairs.values(), key=lambda p: -p.log_odds_rigid):
         a, b = group[joined.parent], group[joined.child]
-        if a == b or joined.rigid <= 0.0:
+        if a == b or joined.log_odds_rigid <= 0.0:
             continue
         across = [pairs[frozenset((x, y))] for x in a for y in b if frozenset((x, y)) in pairs]
-        odds = sum(p.rigid for p in across)
+        odds = sum(p.log_odds_rigid for p in across)
         if odds <= 0.0:
             continue
-        least = min(joined.found["rigid"].probability, surest[a[0]], surest[b[0]])
+        least = min(joined.result["rigid"].probability, surest[a[0]], surest[b[0]])
         for name in (*a, *b):
             group[name], surest[name] = (*a, *b), least
     result = []
     for parts in dict.fromkeys(group.values()):
-        # What was seen most often stands for all, unless it is a point, and the world before everything.
-        often = {p: (p == WORLD, not seen[p].is_point, int(seen[p].seen.sum())) for p in parts}
-        ordered = sorted(parts, key=lambda p: (*(-n for n in often[p]), list(seen).index(p)))
-        places = _places(ordered, pairs, {p for p in parts if seen[p].is_point})
+        # The world represents its body, else the part that was observed most often, points last.
+        often = {p: (p == WORLD, not tracks[p].is_point, int(tracks[p].seen.sum())) for p in parts}
+        ordered = sorted(parts, key=lambda p: (*(-n for n in often[p]), list(tracks).index(p)))
+        places = _poses_in_first(ordered, pairs, {p for p in parts if tracks[p].is_point})
         result.append(RigidBody(tuple(ordered), places, surest[parts[0]]))
     return tuple(result)
 
 
-def _places(parts: list[str], pairs: Mapping[frozenset[str], PartPair], points: set[str]) -> dict[str, Stack]:
-    """Return the poses of parts in the first, along the pairs that are surest to be rigid."""
+def _poses_in_first(
+    parts: list[str], pairs: Mapping[frozenset[str], PartPair], points: set[str]
+) -> dict[str, Array]:
+    """Return the poses of parts in the first, along the pairs with the largest odds of being rigid."""
     places = {parts[0]: np.eye(4)}
-    rigid = {c: p.rigid for c, p in pairs.items() if c <= set(parts)}
+    rigid = {c: p.log_odds_rigid for c, p in pairs.items() if c <= set(parts)}
     tree = spanning_tree(parts, rigid, points)
     for part in parts[1:]:
         place = np.eye(4)
         for a, b in pairwise(tree_path(tree, parts[0], part)):
             known = pairs[frozenset((a, b))]
-            reference = np.asarray(known.found["rigid"].parameters["reference"])
+            reference = np.asarray(known.result["rigid"].parameters["reference"])
             place = place @ (reference if known.parent == a else inverse(reference))
         places[part] = place
     return places
@@ -105,64 +107,65 @@ def _places(parts: list[str], pairs: Mapping[frozenset[str], PartPair], points: 
 
 @dataclass(frozen=True)
 class KinematicEdge:
-    """A joint between two parts.
+    """Joint between two parts.
 
     Attributes
     ----------
     parent, child
-        The parts.
-    found
-        What was identified between them, see :class:`~kineverse.estimation.IdentificationResult`.
+        Names of the parts.
+    result
+        Identification result, see :class:`~kineverse.estimation.IdentificationResult`.
     times
-        The numbers of the observations in which both were seen, those of the joint values.
+        Indices of the observations of both parts, which are those of the joint values.
     probability
-        That this joint is there, over all trees of joints; 1 for one that closes a loop.
-    others
-        The pairs that may be connected while these are not, with their probabilities, if these are not
-        negligible.
-    closing
-        How a loop is closed in a model; None for the joints of the tree, and for a loop that cannot be
-        closed, as where coordinates of a ball would have to follow others.
+        Probability of this connection over all trees; 1 for a joint that closes a loop.
+    alternatives
+        Pairs that may be connected instead, with probabilities that are not negligible.
+    closure
+        Closure of a loop in a model. None for the joints of the tree, and for a loop that cannot be closed,
+        such as one with dependent coordinates of a ball.
     """
 
     parent: str
     child: str
-    found: IdentificationResult
+    result: IdentificationResult
     times: npt.NDArray[np.int_]
     probability: float = 1.0
-    others: Mapping[tuple[str, str], float] = field(default_factory=dict)
-    closing: LoopClosure | None = None
+    alternatives: Mapping[tuple[str, str], float] = field(default_factory=dict)
+    closure: LoopClosure | None = None
 
     @property
     def fit(self) -> Fit:
-        """The most probable joint, with its covariance and the range that was seen."""
-        return self.found.best
+        """Most probable joint, with its covariance and the observed range."""
+        return self.result.best
 
     def __str__(self) -> str:
-        words = f"{self.parent} -> {self.child}: {self.found}"
-        for (a, b), probability in self.others.items():
+        words = f"{self.parent} -> {self.child}: {self.result}"
+        for (a, b), probability in self.alternatives.items():
             words += f"; or {a} -> {b} ({probability:.0%})"
         return words
 
 
 @dataclass(frozen=True)
 class KinematicGraph:
-    """Bodies and the joints between them.
+    """Rigid bodies and the joints between them.
 
     Attributes
     ----------
     bodies
-        Rigid bodies, each part in one of them.
+        Rigid bodies. Each part is in one of them.
     edges
-        The joints, from the roots outwards: parents first.
+        Joints of the spanning tree, parents first.
     loops
-        Pairs beside these that move in fewer ways against each other than the joints between them allow.
-    connections
-        The probability that there is a joint between two bodies, over all trees, for all pairs that were seen
-        together and close no loop, the likeliest first.
+        Joints outside the tree that close loops.
     roots
-        The parts from which edges go outwards: the world if it was one, and one for every group of parts that
-        was never seen together with others.
+        Roots of the tree: the world if it is a part, and one for each group of parts that was never observed
+        together with the others.
+    connections
+        Probability of a joint between two bodies, over all trees, the largest first. Pairs that close a loop
+        or were never observed together are left out.
+    points
+        Parts that were observed as points.
     """
 
     bodies: tuple[RigidBody, ...]
@@ -173,22 +176,22 @@ class KinematicGraph:
     points: tuple[str, ...] = ()
 
     def operations(self, prefix: str | None = None, close: bool = True) -> Iterator[Operation]:
-        """Yield what builds the model, parents first: joints are called like their child.
+        """Yield the operations that build the model, parents first. Joints are named like their child.
 
-        A loop between ``a`` and ``b`` has the frames ``b/a/seat``, on a, and ``b/a/pin``, on b, and is called
+        A loop between ``a`` and ``b`` has the frames ``b/a/seat`` on a, ``b/a/pin`` on b, and the name
         ``b/a/loop``.
 
         Parameters
         ----------
         prefix
-            Put in front of all names but the world's, with a slash.
+            Prefix of all names except ``world``, separated by a slash.
         close
-            Whether loops are closed; else their tree is all there is.
+            True to close loops; False for the tree alone.
 
         Raises
         ------
         ModelError
-            For a loop whose coordinates cannot follow others, as those of a ball in its tree.
+            For a loop that cannot be closed, such as one with a ball in its tree.
         """
 
         def name(part: str) -> str:
@@ -205,32 +208,31 @@ class KinematicGraph:
                 yield edge.fit.operation(name(first), name(edge.parent), as_point=first in self.points)
             body = next(b for b in self.bodies if b.parts[0] == first)
             for part in body.parts[1:]:
-                origin = rigid_pose(body.places[part])
+                origin = rigid_pose(body.poses[part])
                 yield Fixed(name=name(part), parent=name(first), child=name(part), origin=origin)
         for loop in self.loops if close else ():
-            if loop.closing is None:
+            if loop.closure is None:
                 raise ModelError(
                     f"The loop of '{loop.parent}' and '{loop.child}' cannot be closed: it has coordinates "
                     "that cannot follow others, as those of a ball, or it is a screw that would close it. "
                     "Say close=False for a model in which it is open."
                 )
-            yield from loop.closing.operations(name)
+            yield from loop.closure.operations(name)
 
     def model(self, prefix: str | None = None, close: bool = True) -> Model:
-        """Return a model with a frame for each part.
+        """Build a model with a frame for each part.
 
         Parameters
         ----------
         prefix
-            Put in front of all names but the world's, with a slash.
+            Prefix of all names except ``world``, separated by a slash.
         close
-            Whether loops are closed; else their tree is all there is.
+            True to close loops; False for the tree alone.
 
         Raises
         ------
         ModelError, NoSolutionError
-            For a loop whose coordinates cannot follow others, and for one that does not close or is singular
-            where it was seen.
+            For a loop that cannot be closed, does not close, or is singular at the observed configurations.
         """
         model = Model()
         with model.edit() as edit:
@@ -254,62 +256,61 @@ def identify_graph(
     families: FamilyChoice = None,
     progress: Callable[[int, int], object] | None = None,
 ) -> KinematicGraph:
-    """Return which part hangs on which, and how.
+    """Identify the kinematic graph of several parts from noisy poses (Sturm et al. 2011).
 
-    N parts have N (N - 1) / 2 pairs, or N (N + 1) / 2 with the world, and each is identified.
+    N parts have N (N - 1) / 2 pairs, or N (N + 1) / 2 with the world. Each pair is identified.
 
     Parameters
     ----------
     poses
-        From names of parts to their poses over time, all in one frame: (N, 4, 4), or pairs of poses and
-        covariance, (6, 6) or (N, 6, 6). A pose that was not seen is NaN throughout. Of a part that was only
-        seen as a point, positions, (N, 3), with (3, 3) or (N, 3, 3).
+        Poses over time by name of the part, all in one frame: (N, 4, 4), or pairs of poses and covariance,
+        (6, 6) or (N, 6, 6). A pose of NaN only is a gap. For a part observed as a point, positions (N, 3)
+        with (3, 3) or (N, 3, 3).
     noise
-        The covariance, (6, 6), of those that come with none, see :mod:`kineverse.estimation.noise`.
+        Covariance, (6, 6), of parts that have none of their own, see :mod:`kineverse.estimation.noise`.
     world
-        Whether the frame of the poses is the world: then it is a part as well, which is exactly known. False
-        for an observer that moves.
+        True if the frame of the poses is the world. The world is then a part, too, with an exact pose. False
+        for a moving observer.
     families
-        What is tried for each pair, see :func:`~kineverse.estimation.identify`.
+        Families to compare for each pair, see :func:`~kineverse.estimation.identify`.
     progress
-        Called with the number of pairs that are done and that of all.
+        Callback with the number of finished pairs and the number of all pairs.
 
     Raises
     ------
     ShapeError, InvalidValueError
-        For poses or covariances that are none, less than two parts, if all of them are points, and if it is
-        not known how well a part is seen.
+        For invalid poses or covariances, fewer than two parts, points only, and a part without covariance.
     DuplicateNameError
-        For a part that is called ``world`` beside the world.
+        For a part named ``world`` in addition to the world.
     UnknownNameError
-        For a family that does not exist.
+        For an unknown family.
     """
-    seen = check_tracks(poses, noise, points=True)
+    tracks = check_tracks(poses, noise, points=True)
     if world:
-        if WORLD in seen:
+        if WORLD in tracks:
             raise DuplicateNameError(
                 "The world is a part already; call the part otherwise, or say world=False."
             )
-        seen = {WORLD: exact_track(max((len(t.poses) for t in seen.values()), default=0)), **seen}
-    if len(seen) < 2:
+        tracks = {WORLD: exact_track(max((len(t.poses) for t in tracks.values()), default=0)), **tracks}
+    if len(tracks) < 2:
         raise InvalidValueError("How parts are connected takes at least two of them, or one and the world.")
-    if all(track.is_point for track in seen.values()):
+    if all(track.is_point for track in tracks.values()):
         raise InvalidValueError(
             "Only positions were seen, of all parts. What a part hangs on has to be seen as a pose, "
             "(N, 4, 4); the world is one, unless world=False."
         )
-    pairs = identify_pairs(seen, families, progress)
-    bodies = find_rigid_bodies(seen, pairs)
+    pairs = identify_pairs(tracks, families, progress)
+    bodies = find_rigid_bodies(tracks, pairs)
     firsts = [body.parts[0] for body in bodies]
     between = {c: p for c, p in pairs.items() if c <= set(firsts)}
-    points = {name for name, track in seen.items() if track.is_point}
+    points = {name for name, track in tracks.items() if track.is_point}
     tree = spanning_tree(firsts, {c: p.gain for c, p in between.items()}, points)
-    # From the world, or from what most parts hang on, but never from a point.
+    # The root is the world, else the part with the most connections, and never a point.
     first = sorted(firsts, key=lambda n: (n != WORLD, n in points, -sum(n in c for c in tree)))
     roots, directed = orient_tree(first, firsts, tree)
-    joints = [_towards(between[frozenset(ends)], ends[0], seen, families) for ends in directed]
-    loops = _loops({c: p for c, p in between.items() if not c & points}, joints)
-    # What closes a loop is there beside the tree, not in place of a part of it.
+    joints = [_orient_pair(between[frozenset(ends)], ends[0], tracks, families) for ends in directed]
+    loops = _find_loops({c: p for c, p in between.items() if not c & points}, joints)
+    # A joint that closes a loop is no alternative to a joint of the tree.
     gains = {c: p.gain for c, p in between.items() if c not in loops}
     likely = edge_probabilities(firsts, gains, points)
     edges = []
@@ -320,26 +321,28 @@ def identify_graph(
             found = replacement_probabilities(connection, tree, gains, points)
             others = {(between[c].parent, between[c].child): p for c, p in found.items() if p > 1.0 - SURE}
         edges.append(
-            KinematicEdge(joint.parent, joint.child, joint.found, joint.times, likely[connection], others)
+            KinematicEdge(joint.parent, joint.child, joint.result, joint.times, likely[connection], others)
         )
     ordered = sorted(likely.items(), key=lambda pair: -pair[1])
     connections = {(between[c].parent, between[c].child): p for c, p in ordered}
-    of_points = tuple(name for name in seen if name in points)
+    of_points = tuple(name for name in tracks if name in points)
     return KinematicGraph(bodies, tuple(edges), tuple(loops.values()), roots, connections, of_points)
 
 
-def _towards(known: PartPair, parent: str, seen: Mapping[str, PoseTrack], families: FamilyChoice) -> PartPair:
-    """Return a pair seen from its other end, if need be."""
+def _orient_pair(
+    known: PartPair, parent: str, tracks: Mapping[str, PoseTrack], families: FamilyChoice
+) -> PartPair:
+    """Return a pair with the given parent, identified again in the other direction if necessary."""
     if known.parent == parent:
         return known
-    turned = identify_pair(seen, known.child, known.parent, families)
+    turned = identify_pair(tracks, known.child, known.parent, families)
     return known if turned is None else turned
 
 
-def _loops(
+def _find_loops(
     between: Mapping[frozenset[str], PartPair], joints: Sequence[PartPair]
 ) -> dict[frozenset[str], KinematicEdge]:
-    """Return what closes loops of a tree, by its ends."""
+    """Return the joints that close loops of a tree, by their two parts."""
     tree = {frozenset((joint.parent, joint.child)): joint for joint in joints}
     candidates = []
     for connection, known in between.items():
@@ -347,7 +350,7 @@ def _loops(
         if connection not in tree and way and closes_loop(known, way):
             candidates.append(ObservedLoop(known, way))
     found = {}
-    for (joint, _), closing in close_loops(candidates, joints):
-        edge = KinematicEdge(joint.parent, joint.child, joint.found, joint.times, closing=closing)
+    for (joint, _), closure in close_loops(candidates, joints):
+        edge = KinematicEdge(joint.parent, joint.child, joint.result, joint.times, closure=closure)
         found[frozenset((joint.parent, joint.child))] = edge
     return found

@@ -1,11 +1,11 @@
 """Closure equations of observed loops.
 
-A tree of joints and one joint more, L · g(a) · R, make a loop. The latter has ends in both of its parts, the
-seat parent · L and the pin child · R⁻¹, which are together but for what g moves. A linkage in a plane needs
-only two equations of all that say so, and as axes are known with noise, nothing would fulfil more. So those
-are taken that depend most on the coordinates, and those coordinates follow that they tell best, judged by the
-worst of all configurations that were seen. A loop that takes nothing away which others have left is none: a
-short motion is like that of many joints.
+A tree of joints and one additional joint, L · g(a) · R, form a loop. The additional joint has an end in each
+of its parts, the seat parent · L and the pin child · R⁻¹. The two coincide except for the motion g. A planar
+linkage needs only two of the equations for that. Because the axes have noise, more equations could not be
+fulfilled. So the equations with the largest dependence on the coordinates are chosen, and as dependent
+coordinates those that they determine best, in the worst of the observed configurations. A loop that removes
+no mobility left by the other loops is dropped, because a short motion is similar to that of many joints.
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ from kineverse.estimation.identification.families import GroupMotion
 from kineverse.estimation.identification.found_operations import family_coordinates, rigid_pose
 from kineverse.estimation.identification.result import Fit
 from kineverse.estimation.linear_algebra import invert_matrices
-from kineverse.lie import Stack, inverse, skew, transform
+from kineverse.lie import Array, inverse, skew, transform
 from kineverse.loops import CloseLoop
 from kineverse.loops.equations import AXES
 from kineverse.model.frame import Frame
@@ -49,27 +49,27 @@ CONSTRAINED_COMPONENTS: Mapping[str, tuple[int, ...]] = {
     "spherical": (_X, _Y, _Z),
     "planar": (_Z, _RX, _RY),
 }
-"""Which components of its pin in its seat each joint holds, out of x, y, z and turns about them."""
+"""Components of the pin in the seat that each joint constrains: x, y, z and the rotations about them."""
 
-# Their axes may be turned about z.
+# Families whose seat may be rotated about z.
 _ABOUT_Z = ("prismatic", "revolute", "cylindrical", "planar")
-# How many standard deviations axes may be off, and what is a way to part however badly they are known.
+# Tolerance for the axes in standard deviations, and the largest tolerance of the rank.
 _WELL_KNOWN, _SMALL = 4.0, 0.15
 
 
 class ObservedLoop(NamedTuple):
-    """A joint, and the joints of a tree from its parent to its child."""
+    """Joint outside the tree, and the chain of tree joints from its parent to its child."""
 
     joint: ObservedJoint
-    others: Sequence[ObservedJoint]
+    chain: Sequence[ObservedJoint]
 
     @property
     def strength(self) -> float:
-        """How far the joint moved, in units of how well that is known, less where it hardly turned.
+        """Range of the joint in standard deviations, reduced for small rotations.
 
-        Any short motion is like that of a hinge somewhere.
+        Any short motion resembles a rotation about a distant axis.
         """
-        fit = self.joint.found.best
+        fit = self.joint.result.best
         moved = np.ptp(fit.joint_values, axis=0)
         known = np.maximum(fit.deviations.mean(axis=0), 1e-12)
         bent = np.where(find_angles(fit), np.minimum(moved, 1.0), 1.0)
@@ -78,31 +78,31 @@ class ObservedLoop(NamedTuple):
 
 @dataclass(frozen=True)
 class LoopClosure:
-    """How a loop is closed: a pin coincides with a seat in some components, and coordinates follow.
+    """Closure of a loop: a pin coincides with a seat in some components by dependent coordinates.
 
     Attributes
     ----------
     name
-        What frames and articulations begin with.
+        Prefix of the names of frames and articulations.
     seat_in, seat
-        The part that has the seat, and its pose there, (4, 4).
+        Name of the part with the seat, and pose of the seat in it, (4, 4).
     pin_in, pin
-        The same of the pin.
+        Name of the part with the pin, and pose of the pin in it, (4, 4).
     mask, dependent, home
-        See :class:`kineverse.CloseLoop`.
+        As for :class:`kineverse.CloseLoop`.
     """
 
     name: str
     seat_in: str
-    seat: Stack
+    seat: Array
     pin_in: str
-    pin: Stack
+    pin: Array
     mask: tuple[str, ...]
     dependent: tuple[str, ...]
     home: tuple[tuple[str, float], ...]
 
     def operations(self, name: Callable[[str], str]) -> Iterator[Operation]:
-        """Yield what closes the loop, with names of parts as they are in the model."""
+        """Yield the operations that close the loop, with names of parts mapped to the model."""
         title = name(self.name)
         yield AddFrame(f"{title}/seat", Frame.of(name(self.seat_in), rigid_pose(self.seat)))
         yield AddFrame(f"{title}/pin", Frame.of(name(self.pin_in), rigid_pose(self.pin)))
@@ -118,59 +118,59 @@ class LoopClosure:
 
 @dataclass(frozen=True)
 class _Ends:
-    """A seat and a pin, see :class:`LoopClosure`.
+    """Seat and pin of a loop, see :class:`LoopClosure`.
 
     Attributes
     ----------
     motion
-        Of the pin in the axes of the seat.
-    held
-        The components that coincide.
+        Twists of the pin in the axes of the seat.
+    constrained
+        Components that coincide.
     """
 
-    seat: Stack
-    pin: Stack
+    seat: Array
+    pin: Array
     motion: Twists
-    held: tuple[int, ...]
+    constrained: tuple[int, ...]
 
 
 def close_loops(
     loops: Iterable[ObservedLoop], joints: Sequence[ObservedJoint]
 ) -> Iterator[tuple[ObservedLoop, LoopClosure | None]]:
-    """Yield the loops that take away what others leave, the smallest first, and how they are closed.
+    """Yield the loops that remove mobility, the shortest first, with their closures.
 
-    That is None where coordinates between both parts cannot follow others, as those of a ball, and for joints
-    that do more than to leave components free, as screws.
+    The closure is None if a coordinate cannot be dependent, as that of a ball, and for joints that couple
+    components, such as screws.
 
     Parameters
     ----------
     loops
-        What may be one.
+        Candidate loops.
     joints
         All joints of the tree.
     """
-    # Which of them are loops is told in another order than that in which they are closed.
-    kept = []
-    followers = DependentCoordinates()
+    # Loops are selected by strength and then closed by length.
+    selected = []
+    dependents = DependentCoordinates()
     for loop in sorted(loops, key=lambda loop: -loop.strength):
         ends = _ends(loop)
         if ends is None:
             yield loop, None
-        elif _can_move(loop) and (plan := _plan(loop, ends, followers)) is not None:
-            followers.add(plan.motion, plan.columns, plan.slopes)
-            kept.append((loop, ends))
-    seen = {
-        x: (joint.times, joint.found.best.joint_values[:, k])
+        elif _can_move(loop) and (plan := _plan(loop, ends, dependents)) is not None:
+            dependents.add(plan.motion, plan.columns, plan.slopes)
+            selected.append((loop, ends))
+    observed = {
+        x: (joint.times, joint.result.best.joint_values[:, k])
         for joint in joints
-        for k, x in enumerate(_coordinates(joint.found.best, joint.child) or ())
+        for k, x in enumerate(_coordinates(joint.result.best, joint.child) or ())
     }
-    followers = DependentCoordinates()
-    for loop, ends in sorted(kept, key=lambda pair: len(pair[0].others)):
-        plan = _plan(loop, ends, followers, followers.leading)
+    dependents = DependentCoordinates()
+    for loop, ends in sorted(selected, key=lambda pair: len(pair[0].chain)):
+        plan = _plan(loop, ends, dependents, dependents.leading)
         if plan is None:
             yield loop, None
             continue
-        followers.add(plan.motion, plan.columns, plan.slopes)
+        dependents.add(plan.motion, plan.columns, plan.slopes)
         joint, names = loop.joint, plan.motion.names
         turn = transform(plan.axes, np.zeros(3))
         yield (
@@ -181,48 +181,48 @@ def close_loops(
                 ends.seat @ turn,
                 joint.child,
                 ends.pin @ turn,
-                mask=tuple(AXES[ends.held[k]] for k in plan.rows),
+                mask=tuple(AXES[ends.constrained[k]] for k in plan.rows),
                 dependent=tuple(names[k] for k in plan.columns),
-                home=_home(seen, names, plan.columns, plan.motion.times),
+                home=_find_home(observed, names, plan.columns, plan.motion.times),
             ),
         )
 
 
 class _Plan(NamedTuple):
-    """Which rows are zero, in which axes of the seat, and which columns follow, by which slopes."""
+    """Plan of a closure: axes of the seat, rows that are zero, dependent columns and their slopes."""
 
     motion: Twists
-    axes: Stack
+    axes: Array
     rows: list[int]
     columns: list[int]
-    slopes: Stack
+    slopes: Array
 
 
 def _plan(
-    loop: ObservedLoop, ends: _Ends, followers: DependentCoordinates, leading: Iterable[str] = ()
+    loop: ObservedLoop, ends: _Ends, dependents: DependentCoordinates, leading: Iterable[str] = ()
 ) -> _Plan | None:
-    """Return how a loop is closed; None if nothing is left of it to close, or nothing that could follow."""
-    fit = loop.joint.found.best
-    motion = followers.resolved(ends.motion)
-    axes = _axes(motion.twists, fit.family in _ABOUT_Z)
-    equations = _equations(motion.twists, axes)[:, ends.held]
-    whole = _equations(ends.motion.twists, axes)[:, ends.held]
-    able = [k for k, x in enumerate(motion.names) if x not in leading]
-    # Something moves, or no loop would have been seen.
+    """Return the plan of a closure; None if the loop removes no mobility or has no possible dependent."""
+    fit = loop.joint.result.best
+    motion = dependents.resolve(ends.motion)
+    axes = _align_axes(motion.twists, fit.family in _ABOUT_Z)
+    equations = _equations(motion.twists, axes)[:, ends.constrained]
+    whole = _equations(ends.motion.twists, axes)[:, ends.constrained]
+    eligible = [k for k, x in enumerate(motion.names) if x not in leading]
+    # An observed loop has at least one degree of freedom.
     count = min(_rank(equations, _tolerance(loop), whole), len(motion.names) - 1)
-    if not 0 < count <= len(able):
+    if not 0 < count <= len(eligible):
         return None
-    rows, columns = _chosen(equations, count, able)
+    rows, columns = _choose_equations(equations, count, eligible)
     leads = [k for k in range(len(motion.names)) if k not in columns]
     chosen = equations[:, rows]
     return _Plan(motion, axes, rows, columns, -invert_matrices(chosen[:, :, columns]) @ chosen[:, :, leads])
 
 
 def _can_move(loop: ObservedLoop) -> bool:
-    """Whether a loop can move for more than a moment, unlike three hinges in a line."""
+    """Return True if a loop has finite mobility, unlike three hinges in a line."""
     elsewhere = _ends(loop, np.random.default_rng(0))
-    assert elsewhere is not None  # as where it was seen
-    equations = _equations(elsewhere.motion.twists, np.eye(3))[:, elsewhere.held]
+    assert elsewhere is not None  # as for the observed configurations
+    equations = _equations(elsewhere.motion.twists, np.eye(3))[:, elsewhere.constrained]
     return _rank(equations, _tolerance(loop)) < len(elsewhere.motion.names)
 
 
@@ -231,7 +231,7 @@ def _title(loop: ObservedLoop) -> str:
 
 
 def _coordinates(fit: Fit, name: str) -> tuple[str, ...] | None:
-    """Return the coordinates that are a joint's values, in their order; None if it has others."""
+    """Return the coordinates of the joint values of a fit; None if they are not the joint values."""
     if isinstance(fit.motion, FamilyMotion):
         return family_coordinates(fit.motion, name)
     if fit.family == "cylindrical":
@@ -242,99 +242,101 @@ def _coordinates(fit: Fit, name: str) -> tuple[str, ...] | None:
 
 
 def _ends(loop: ObservedLoop, random: np.random.Generator | None = None) -> _Ends | None:
-    """Return the ends of a loop, where they were seen or elsewhere.
+    """Return the ends of a loop in the observed configurations, or in random ones.
 
-    None if it cannot be closed.
+    The result is None if the loop cannot be closed.
     """
-    joint, fit = loop.joint, loop.joint.found.best
+    joint, fit = loop.joint, loop.joint.result.best
     names: list[str] = []
-    for other in loop.others:
-        between = _coordinates(other.found.best, other.child)
+    for other in loop.chain:
+        between = _coordinates(other.result.best, other.child)
         if between is None:
             return None
         names += between
     if not isinstance(fit.motion, GroupMotion) or fit.family not in CONSTRAINED_COMPONENTS:
         return None
-    ring = build_chain(loop.others, joint.parent, random)
+    ring = build_chain(loop.chain, joint.parent, random)
     seat, pin = fit.motion.left, inverse(fit.motion.right)
     axes = np.broadcast_to(seat[:3, :3], (len(ring.times), 3, 3))
-    twists = _moved(ring.twists, ring.poses[:, :3, :3] @ pin[:3, 3], axes)
+    twists = _transform_twists(ring.twists, ring.poses[:, :3, :3] @ pin[:3, 3], axes)
     return _Ends(seat, pin, Twists(tuple(names), ring.times, twists), CONSTRAINED_COMPONENTS[fit.family])
 
 
-def _moved(twists: Stack, offset: Stack, parent_R_axes: Stack) -> Stack:
-    """Return twists (N, 6, n) of a point at some offset, in other axes."""
+def _transform_twists(twists: Array, offset: Array, parent_R_axes: Array) -> Array:
+    """Return twists (N, 6, n) of a point at an offset, in other axes."""
     linear = twists[:, :3] - skew(offset) @ twists[:, 3:]
     axes_R_parent = np.swapaxes(parent_R_axes, 1, 2)
-    moved: Stack = np.concatenate([axes_R_parent @ linear, axes_R_parent @ twists[:, 3:]], axis=1)
+    moved: Array = np.concatenate([axes_R_parent @ linear, axes_R_parent @ twists[:, 3:]], axis=1)
     return moved
 
 
-def _axes(twists: Stack, about_z: bool) -> Stack:
-    """Return axes along which linkages in a plane move or do not: their plane contains or leaves out one."""
+def _align_axes(twists: Array, about_z: bool) -> Array:
+    """Return axes of the seat that are aligned with the plane of a planar linkage."""
     v, w = (np.concatenate([*part.transpose(0, 2, 1)]) for part in (twists[:, :3], twists[:, 3:]))
     if about_z:
         # In a plane, ω and z x v are along its normal.
         normal = np.concatenate([_lever(twists) * w[:, :2], v[:, 1::-1] * (-1.0, 1.0)])
         x = np.linalg.eigh(normal.T @ normal)[1][:, 1]
         return np.array([[x[0], -x[1], 0.0], [x[1], x[0], 0.0], [0.0, 0.0, 1.0]])
-    axes: Stack = np.linalg.eigh(v.T @ v)[1]
+    axes: Array = np.linalg.eigh(v.T @ v)[1]
     axes[:, 2] *= np.linalg.det(axes)
     return axes
 
 
-def _lever(twists: Stack) -> float:
-    """Return how many metres make a radian."""
+def _lever(twists: Array) -> float:
+    """Return the lever that makes radians and metres comparable [m]."""
     v, w = (float(np.sum(part**2)) for part in (twists[:, :3], twists[:, 3:]))
     return math.sqrt(v / w) if v and w else 1.0
 
 
-def _equations(twists: Stack, seat_R_new: Stack) -> Stack:
-    """Return twists in new axes, with radians and metres alike, (N, 6, n)."""
+def _equations(twists: Array, seat_R_new: Array) -> Array:
+    """Return twists in new axes, with translations divided by the lever, (N, 6, n)."""
     lever = _lever(twists)
     parts = [seat_R_new.T @ twists[:, :3] / lever, seat_R_new.T @ twists[:, 3:]]
     return np.concatenate(parts, axis=1)
 
 
 def _tolerance(loop: ObservedLoop) -> float:
-    """Return up to which part of the largest a way to part may be due to axes that are not well known."""
-    fits = [joint.found.best for joint in (loop.joint, *loop.others)]
+    """Return the relative singular value below which a motion is explained by uncertain axes."""
+    fits = [joint.result.best for joint in (loop.joint, *loop.chain)]
     axes = [fit.deviation(c) for fit in fits for c in fit.coordinates if c.startswith("axis.")]
     return min(max(RANK_TOLERANCE, _WELL_KNOWN * max(axes, default=0.0)), _SMALL)
 
 
-def _rank(equations: Stack, tolerance: float, whole: Stack | None = None) -> int:
-    """Return in how many ways the ends can part; they are small beside those if nothing else held them."""
+def _rank(equations: Array, tolerance: float, whole: Array | None = None) -> int:
+    """Return the median rank of the equations, relative to the largest singular value of ``whole``."""
     values = np.linalg.svd(equations, compute_uv=False)
     most = values if whole is None else np.linalg.svd(whole, compute_uv=False)
     return int(np.median(np.sum(values > tolerance * np.median(most[:, 0]), axis=1)))
 
 
-def _chosen(equations: Stack, count: int, able: Sequence[int]) -> tuple[list[int], list[int]]:
-    """Return the rows, and the columns that follow, by which a loop is told best where it is told worst."""
+def _choose_equations(equations: Array, count: int, eligible: Sequence[int]) -> tuple[list[int], list[int]]:
+    """Return the rows and the dependent columns with the best conditioning in the worst configuration."""
 
-    def told(square: Stack) -> float:
+    def conditioning(square: Array) -> float:
         return float(np.linalg.svd(square, compute_uv=False)[:, -1].min())
 
-    rows = max(combinations(range(equations.shape[1]), count), key=lambda some: told(equations[:, some]))
+    rows = max(
+        combinations(range(equations.shape[1]), count), key=lambda some: conditioning(equations[:, some])
+    )
     chosen = equations[:, rows]
-    columns = max(combinations(able, count), key=lambda some: told(chosen[:, :, some]))
+    columns = max(combinations(eligible, count), key=lambda some: conditioning(chosen[:, :, some]))
     return list(rows), list(columns)
 
 
-def _home(
-    seen: Mapping[str, tuple[Times, Stack]], names: Sequence[str], columns: Sequence[int], times: Times
+def _find_home(
+    observed: Mapping[str, tuple[Times, Array]], names: Sequence[str], columns: Sequence[int], times: Times
 ) -> tuple[tuple[str, float], ...]:
-    """Return the coordinates when those that do not follow were in the middle of what was seen of them."""
+    """Return the observed configuration in which independent coordinates are nearest to mid-range."""
 
-    def at(x: str, time: Times | np.int_) -> Stack:
-        when, values = seen[x]
-        there: Stack = values[np.searchsorted(when, time)]
+    def at(x: str, time: Times | np.int_) -> Array:
+        when, values = observed[x]
+        there: Array = values[np.searchsorted(when, time)]
         return there
 
     off = np.zeros(len(times))
     for k in set(range(len(names))) - {*columns}:
-        values = seen[names[k]][1]
+        values = observed[names[k]][1]
         middle, range_ = 0.5 * (values.min() + values.max()), np.ptp(values) or 1.0
         off += ((at(names[k], times) - middle) / range_) ** 2
     best = times[np.argmin(off)]

@@ -8,7 +8,7 @@ from typing import TypeVar
 
 import numpy as np
 
-from kineverse.lie import Stack
+from kineverse.lie import Array
 
 NodeT = TypeVar("NodeT", bound=Hashable)
 
@@ -16,10 +16,10 @@ NodeT = TypeVar("NodeT", bound=Hashable)
 def spanning_tree(
     nodes: Iterable[NodeT], gains: Mapping[frozenset[NodeT], float], leaves: Collection[NodeT] = ()
 ) -> list[frozenset[NodeT]]:
-    """Return the connections of the tree with the largest sum of gains; of several trees, if need be.
+    """Return the connections of the spanning tree, or forest, with the largest sum of gains.
 
-    The structure of largest likelihood, if densities are products over connections (Chow and Liu 1968).
-    Leaves have one connection at most.
+    It is the structure of largest likelihood if the density is a product over connections (Chow and Liu
+    1968). Leaves have one connection at most.
     """
     group = {node: {node} for node in nodes}
     chosen = []
@@ -37,7 +37,7 @@ def spanning_tree(
 def split_tree(
     connection: frozenset[NodeT], tree: Iterable[frozenset[NodeT]]
 ) -> tuple[frozenset[NodeT], frozenset[NodeT]]:
-    """Return what is on either side of a connection of a tree."""
+    """Return the nodes on either side of a connection of a tree."""
     rest = [c for c in tree if c != connection]
     parts = []
     for node in connection:
@@ -51,17 +51,16 @@ def split_tree(
 def edge_probabilities(
     nodes: Iterable[NodeT], gains: Mapping[frozenset[NodeT], float], leaves: Collection[NodeT] = ()
 ) -> dict[frozenset[NodeT], float]:
-    """Return the probability of each connection, over all trees that connect what can be connected.
+    """Return the probability of each connection over all maximal spanning forests.
 
-    A tree's probability is proportional to exp(Σ gains of its connections): all trees are equally probable
-    beforehand, and what speaks for one connection is independent of the others, given the tree. By the
-    matrix-tree theorem (Kirchhoff 1847) a connection ij of weight w is in a tree with probability w / c,
-    where c is the conductance between i and j of a network with these weights. It is found by taking away all
-    other nodes, one after the other (star-mesh transform), which adds and multiplies positive numbers only:
-    in logarithms every digit stays, however far gains are apart.
+    The probability of a tree is proportional to exp(Σ gains of its connections), with a uniform prior over
+    trees. By the matrix-tree theorem (Kirchhoff 1847) a connection ij of weight w is in a tree with
+    probability w / c. Here c is the conductance between i and j in a network with these weights. It is
+    computed by eliminating all other nodes one by one (star-mesh transform). This only adds and multiplies
+    positive numbers, so logarithms lose no digits for gains that differ by orders of magnitude.
 
-    Leaves have one connection at most, so each of them chooses by itself. The probabilities sum up to the
-    number of connections of a tree.
+    Leaves have one connection at most, so each leaf is independent. The probabilities add up to the number of
+    connections of a tree.
     """
     order = {node: k for k, node in enumerate(node for node in nodes if node not in leaves)}
     logs = np.full((len(order), len(order)), -np.inf)
@@ -90,9 +89,10 @@ def replacement_probabilities(
     gains: Mapping[frozenset[NodeT], float],
     leaves: Collection[NodeT] = (),
 ) -> dict[frozenset[NodeT], float]:
-    """Return the probabilities of connections between both sides of one, in trees without that one.
+    """Return the probabilities of the connections that replace one, in trees without it.
 
-    The likeliest first. They sum up to at least the probability that the one is not there.
+    They connect the two sides of the removed one and are sorted by probability. Their sum is at least the
+    probability that the one is absent.
     """
     one, other = split_tree(connection, tree)
     around = {c: gain for c, gain in gains.items() if c <= one | other}
@@ -104,8 +104,8 @@ def replacement_probabilities(
     return dict(sorted(across.items(), key=lambda pair: -pair[1]))
 
 
-def _log_conductance(logs: Stack, start: int, end: int) -> float:
-    """Return the logarithm of the conductance between two nodes, from those of all connections."""
+def _log_conductance(logs: Array, start: int, end: int) -> float:
+    """Return the log conductance between two nodes, from the log conductances of all connections."""
     order = [*(k for k in range(len(logs)) if k not in (start, end)), start, end]
     left = logs[np.ix_(order, order)]
     for _ in order[2:]:
@@ -117,7 +117,7 @@ def _log_conductance(logs: Stack, start: int, end: int) -> float:
 
 
 def tree_path(tree: Iterable[frozenset[NodeT]], start: NodeT, end: NodeT) -> list[NodeT]:
-    """Return the nodes from one to another along a tree; nothing if there is no way."""
+    """Return the nodes on the path between two nodes of a tree; an empty list if they are not connected."""
     connections = list(tree)
     before: dict[NodeT, NodeT] = {start: start}
     reached = [start]
@@ -139,7 +139,10 @@ def tree_path(tree: Iterable[frozenset[NodeT]], start: NodeT, end: NodeT) -> lis
 def orient_tree(
     first: Iterable[NodeT], nodes: Sequence[NodeT], tree: Iterable[frozenset[NodeT]]
 ) -> tuple[tuple[NodeT, ...], list[tuple[NodeT, NodeT]]]:
-    """Return roots, and connections from them outwards; what comes first is a root, if another is not."""
+    """Return the roots and the connections directed away from them.
+
+    In each component of the forest, the node that comes first in ``first`` is the root.
+    """
     connections = list(tree)
     roots: list[NodeT] = []
     directed: list[tuple[NodeT, NodeT]] = []
