@@ -12,7 +12,7 @@ from living_kitchen.unknown_mechanisms import STRANGERS
 
 import kineverse as kv
 from kineverse.cli import main
-from kineverse.cli.demo import MODELS, STATE, add_arguments
+from kineverse.cli.demo import MODELS, STATE, _find_example, add_arguments
 from kineverse.cli.exercise import SAMPLES_PER_RANGE, exercise_model
 
 
@@ -67,6 +67,29 @@ def test_headless_sliders_drive_everything_write_a_picture_and_end(tmp_path, cap
     assert "45 DoF driven" in out
     assert "0 limits violated" in out
     assert path.read_bytes().startswith(b"\x89PNG")
+
+
+def test_outside_a_checkout_the_demo_shows_the_sliders_and_says_so(tmp_path, monkeypatch, capsys):
+    path = tmp_path / "picture.png"
+    monkeypatch.setattr("kineverse.cli.demo._find_example", lambda: False)
+    assert main(["demo", "--headless", "--picture", str(path)]) == 0
+    out, err = capsys.readouterr()
+    assert "45 DoF driven" in out
+    assert err.startswith("kineverse: note: the living kitchen is an example of the source checkout")
+    assert len(err.splitlines()) == 1
+    assert path.read_bytes().startswith(b"\x89PNG")
+
+
+@pytest.mark.parametrize("in_checkout", [True, False])
+def test_the_example_is_found_beside_the_sources_only(tmp_path, monkeypatch, in_checkout):
+    example = tmp_path / "examples" / "living_kitchen" / "__init__.py"
+    if in_checkout:
+        example.parent.mkdir(parents=True)
+        example.touch()
+    monkeypatch.setattr("kineverse.__file__", str(tmp_path / "src" / "kineverse" / "__init__.py"))
+    monkeypatch.setattr(sys, "path", [])
+    assert _find_example() is in_checkout
+    assert sys.path == [str(tmp_path / "examples")] * in_checkout
 
 
 def test_headless_needs_the_core_alone(tmp_path):
