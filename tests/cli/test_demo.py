@@ -8,7 +8,7 @@ import sys
 
 import numpy as np
 import pytest
-from living_kitchen.unknown_mechanisms import STRANGERS
+from living_kitchen.unknown_mechanisms import MECHANISMS
 
 import kineverse as kv
 from kineverse.cli import main
@@ -56,7 +56,7 @@ def test_the_strangers_on_offer_are_those_there_are():
     parser = argparse.ArgumentParser()
     add_arguments(parser)
     (option,) = (action for action in parser._actions if action.dest == "stranger")
-    assert sorted(option.choices) == sorted(STRANGERS)
+    assert sorted(option.choices) == sorted(MECHANISMS)
 
 
 def test_headless_sliders_drive_everything_write_a_picture_and_end(tmp_path, capsys):
@@ -110,7 +110,7 @@ def test_who_interrupts_finds_no_empty_picture(tmp_path, monkeypatch):
         if dt > 0.0:
             raise KeyboardInterrupt
 
-    monkeypatch.setattr("living_kitchen.Life.step", interrupted)
+    monkeypatch.setattr("living_kitchen.Simulation.step", interrupted)
     with contextlib.suppress(KeyboardInterrupt):
         assert main(["demo", "--headless", "--picture", str(tmp_path / "x.png")]) != 0
     assert not list(tmp_path.iterdir())

@@ -117,8 +117,8 @@ def test_an_address_cannot_have_the_page_show_something_else():
 
 def test_tokens_are_random_and_are_only_in_addresses_for_others():
     for host in ("127.0.0.1", "localhost", "::1", "127.0.0.2"):
-        assert AccessControl.of(host).token == ""
-    one, other = AccessControl.of("0.0.0.0"), AccessControl.of("0.0.0.0")
+        assert AccessControl.from_host(host).token == ""
+    one, other = AccessControl.from_host("0.0.0.0"), AccessControl.from_host("0.0.0.0")
     assert one.token != other.token
     assert len(one.token) >= 32
     assert one.address(8080).endswith(f":8080/{one.token}")
@@ -178,7 +178,7 @@ def test_a_server_that_is_up_answers_its_own_page_alone():
 
 
 def test_a_server_for_others_wants_its_token(monkeypatch):
-    monkeypatch.setattr(AccessControl, "of", staticmethod(lambda host: AccessControl(host, "s3cret")))
+    monkeypatch.setattr(AccessControl, "from_host", staticmethod(lambda host: AccessControl(host, "s3cret")))
     server = web.start(0, "shared")
     try:
         port = server.get_port()
@@ -196,7 +196,7 @@ def test_a_server_for_others_wants_its_token(monkeypatch):
 
 
 def test_a_viser_that_serves_otherwise_is_refused_rather_than_left_open(monkeypatch):
-    monkeypatch.setattr(web, "_seeing", lambda function, name, thing: function)
+    monkeypatch.setattr(web, "_replace_global", lambda function, name, thing: function)
     stopped = []
     monkeypatch.setattr(web, "stop", lambda server, stop=web.stop: (stop(server), stopped.append(server)))
     with pytest.raises(

@@ -224,7 +224,7 @@ def test_what_is_near_is_shown_and_follows_the_sliders(opened):
 def corners(viewer, camera):
     """Where the corners of the scene are in the picture of a browser, (N, 2) in [-1, 1] if they are in it."""
     poses = {name: viewer.pose(name) for name in viewer.model.frames}
-    points = TriangleSoup.of(collect_drawables(viewer.model), poses).corners.reshape(-1, 3)
+    points = TriangleSoup.from_drawables(collect_drawables(viewer.model), poses).corners.reshape(-1, 3)
     place = Camera(tuple(camera.position), tuple(camera.look_at), field_of_view=camera.fov)
     seen = (points - place.position) @ place.axes.T
     assert (seen[:, 2] > 0).all()

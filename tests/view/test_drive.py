@@ -59,14 +59,14 @@ def test_angles_make_a_quaternion_and_come_back(angles):
     names = [f"ball/stick/{angle}" for angle in ("roll", "pitch", "yaw")]
     assert list(orientations.limits) == names
     for name, value in zip(names, angles, strict=True):
-        quaternion = orientations.turned(name, value)
+        quaternion = orientations.set_angle(name, value)
     roll, pitch, yaw = angles
     expected = (kv.rotation_z(yaw) @ kv.rotation_y(pitch) @ kv.rotation_x(roll))()
     np.testing.assert_allclose(
         model.fk("ball/stick", "ball/socket")(kv.State(quaternion))[:3, :3], expected[:3, :3], atol=1e-12
     )
     orientations.angles = dict.fromkeys(names, 0.0)
-    orientations.read(quaternion)
+    orientations.update(quaternion)
     np.testing.assert_allclose([orientations.angles[name] for name in names], angles, atol=1e-6)
 
 
@@ -79,7 +79,7 @@ def test_only_quaternions_are_shown_as_angles():
     ]
     assert QuaternionAngles(kv.load("fetch"), complete(kv.load("fetch"))).limits == {}
     # A quaternion of zero is no rotation, and no reason to fail.
-    orientations.read(dict.fromkeys(names, 0.0))
+    orientations.update(dict.fromkeys(names, 0.0))
     assert set(orientations.angles.values()) == {0.0}
 
 
@@ -92,19 +92,19 @@ def test_driving_is_integration_and_stops_where_a_constraint_would_break():
     driving.speeds["ackermann/car/drive:velocity"] = 1.0
     values = {**complete(model), "ackermann/car/steering": 0.4}
     for _ in range(20):
-        values.update(driving.after(values, 0.1))
+        values.update(driving.step(values, 0.1))
     expected = model.integrate(
         {**complete(model), "ackermann/car/steering": 0.4}, {"ackermann/car/drive:velocity": 1.0}, 2.0
     )
     assert values == pytest.approx({str(s): v for s, v in expected.items()})
     # However long the page slept, nothing jumps.
-    assert driving.after(values, 100.0)["ackermann/car/drive"] == pytest.approx(2.2)
+    assert driving.step(values, 100.0)["ackermann/car/drive"] == pytest.approx(2.2)
 
     ball = kv.load("articulations/ball")
     driving, values = VelocityDrive(ball), complete(ball)
     driving.speeds["ball/stick/wx:velocity"] = 2.0
     for _ in range(30):
-        values.update(driving.after(values, 0.05))
+        values.update(driving.step(values, 0.05))
     assert not driving.running
     assert not ball.violations(values)
     assert 0.6 < 2 * math.atan2(values["ball/stick/qx"], values["ball/stick/qw"]) <= 0.7
@@ -122,8 +122,11 @@ def test_locks_are_read_off_the_limits_of_speeds():
     ranges = Ranges(lock())
     assert ranges.lockable == ["door", "ratchet"]
     values = {"bolt": 0.0, "door": 0.3, "drawer": 0.0, "ratchet": 0.0}
-    assert ranges.held(values) == {"door": (True, True), "ratchet": (True, False)}
-    assert ranges.held({**values, "bolt": 0.1}) == {"door": (False, False), "ratchet": (True, False)}
+    assert ranges.locked_directions(values) == {"door": (True, True), "ratchet": (True, False)}
+    assert ranges.locked_directions({**values, "bolt": 0.1}) == {
+        "door": (False, False),
+        "ratchet": (True, False),
+    }
 
 
 pytest.importorskip("viser", reason="the page needs the extra 'view'")

@@ -139,7 +139,7 @@ def test_names_that_are_html_are_text_on_the_page(browser, hostile):
 
 
 def test_other_pages_in_the_browser_cannot_reach_the_viewer_and_its_own_can(browser, monkeypatch):
-    monkeypatch.setattr(AccessControl, "of", staticmethod(lambda host: AccessControl(host, "s3cret")))
+    monkeypatch.setattr(AccessControl, "from_host", staticmethod(lambda host: AccessControl(host, "s3cret")))
     attempt = """([address, protocol]) => new Promise(done => {
       const socket = new WebSocket(address, protocol)
       socket.onmessage = () => done('read')

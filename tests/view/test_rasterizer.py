@@ -16,7 +16,7 @@ SEEDS = st.integers(0, 10_000)
 
 def traced(projection, corners, one_sided):
     """The same question by brute force: each ray against each triangle."""
-    rays = projection.rays(np.arange(projection.width * projection.height)).astype(float)
+    rays = projection.pixel_rays(np.arange(projection.width * projection.height)).astype(float)
     found, nearest = np.full(len(rays), -1), np.full(len(rays), np.inf)
     for k, (a, b, c) in enumerate(corners - projection.origin):
         normal = np.cross(b - a, c - a)
@@ -41,7 +41,7 @@ def test_what_is_seen_is_what_rays_hit(seed, one_sided):
     # Every other example stands amidst the triangles: some are cut by the picture's plane.
     eye = rng.uniform(-1, 1, 3) * (0.7 if seed % 2 else 4.0)
     camera = Camera(tuple(eye), tuple(rng.uniform(-0.5, 0.5, 3)), field_of_view=1.0)
-    projection = Projection.of(camera, 40, 30)
+    projection = Projection.from_camera(camera, 40, 30)
     sides = np.full(len(corners), one_sided)
     seen, near = rasterize(projection, corners, sides)
     expected, distance = traced(projection, corners, sides)
@@ -53,7 +53,7 @@ def test_what_is_seen_is_what_rays_hit(seed, one_sided):
 
 def test_single_precision_sees_the_same():
     ball = mesh_geometry(Sphere(1.0))
-    projection = Projection.of(fit_camera(ball.vertices, 0.3, 0.4, 1.0), 64, 64)
+    projection = Projection.from_camera(fit_camera(ball.vertices, 0.3, 0.4, 1.0), 64, 64)
     corners = ball.vertices[ball.faces]
     double, _ = rasterize(projection, corners)
     single, _ = rasterize(projection, corners.astype(np.float32))
@@ -63,14 +63,14 @@ def test_single_precision_sees_the_same():
 def test_half_opaque_covers_half_of_its_pixels():
     box = mesh_geometry(Box((1.0, 1.0, 1.0)))
     corners = box.vertices[box.faces]
-    projection = Projection.of(fit_camera(box.vertices, 0.0, 0.0, 1.0), 64, 64)
+    projection = Projection.from_camera(fit_camera(box.vertices, 0.0, 0.0, 1.0), 64, 64)
     solid, _ = rasterize(projection, corners, np.ones(12, dtype=bool))
     half, _ = rasterize(projection, corners, np.ones(12, dtype=bool), np.full(12, 0.5))
     assert (half >= 0).sum() == pytest.approx(0.5 * (solid >= 0).sum(), rel=0.05)
 
 
 def test_nothing_to_see_is_no_trouble():
-    projection = Projection.of(Camera((1, 0, 0), (0, 0, 0)), 8, 8)
+    projection = Projection.from_camera(Camera((1, 0, 0), (0, 0, 0)), 8, 8)
     for corners in (np.zeros((0, 3, 3)), np.full((1, 3, 3), 5.0), np.zeros((2, 3, 3))):
         seen, near = rasterize(projection, corners)
         assert (seen == -1).all()
@@ -81,8 +81,8 @@ def test_nothing_to_see_is_no_trouble():
 def test_framing_has_all_points_in_the_picture_and_no_room_to_spare(seed, azimuth, elevation, aspect):
     points = np.random.default_rng(seed).uniform(-2, 2, (20, 3))
     camera = fit_camera(points, azimuth, elevation, aspect, margin=0.08)
-    projection = Projection.of(camera, round(1000 * aspect), 1000)
-    xy, _ = projection.pixels(projection.local(points))
+    projection = Projection.from_camera(camera, round(1000 * aspect), 1000)
+    xy, _ = projection.to_pixels(projection.to_camera(points))
     share = xy / [projection.width, projection.height]
     assert (share > 0.079).all()
     assert (share < 0.921).all()

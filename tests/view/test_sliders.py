@@ -22,8 +22,8 @@ def test_limits_that_depend_on_the_state_follow_it():
     ranges = Ranges(dependent())
     assert ranges.names == ["door", "drawer"]
     assert ranges.varying == ["drawer"]
-    assert ranges.at({"door": 0.0, "drawer": 0.0})["drawer"] == (0.0, 0.0)
-    assert ranges.at({"door": 0.8, "drawer": 0.0}) == {"door": (0.0, 1.0), "drawer": (0.0, 0.4)}
+    assert ranges.limits_at({"door": 0.0, "drawer": 0.0})["drawer"] == (0.0, 0.0)
+    assert ranges.limits_at({"door": 0.8, "drawer": 0.0}) == {"door": (0.0, 1.0), "drawer": (0.0, 0.4)}
 
 
 def test_limits_are_those_of_the_model_and_parameters_are_none_of_them():
@@ -33,7 +33,7 @@ def test_limits_are_those_of_the_model_and_parameters_are_none_of_them():
         edit.add_frame("shelf", parent="world", transform=kv.rotation_x(tilt))
     ranges = Ranges(model)
     assert ranges.varying == []
-    assert ranges.at(complete(model)) == {
+    assert ranges.limits_at(complete(model)) == {
         "cabinet/door": (0.0, 1.5),
         "cabinet/drawer": (0.0, 0.4),
         "cabinet/knob": (-INF, INF),
@@ -95,7 +95,7 @@ def test_poses_are_those_of_the_model():
     model = cabinet()
     poses = FramePoses(model)
     values = {**complete(model), "cabinet/door": 0.7, "cabinet/drawer": 0.1}
-    at = dict(zip(poses.names, poses.at(values), strict=True))
+    at = dict(zip(poses.names, poses.evaluate(values), strict=True))
     np.testing.assert_array_equal(at["world"], np.eye(4))
     for name in model.frames:
         np.testing.assert_allclose(at[name], model.fk(name)(kv.State(values)), atol=1e-12)
@@ -105,7 +105,7 @@ def test_poses_are_those_of_the_model():
 
 
 def test_a_model_without_frames_has_the_world():
-    assert FramePoses(kv.Model()).at({}).tolist() == [np.eye(4).tolist()]
+    assert FramePoses(kv.Model()).evaluate({}).tolist() == [np.eye(4).tolist()]
 
 
 @given(st.lists(st.floats(-1, 1), min_size=4, max_size=4).filter(lambda q: np.linalg.norm(q) > 0.1))
@@ -145,14 +145,14 @@ def test_the_show_starts_where_things_are_and_stays_inside_the_limits(share, now
     limits = {"a": (-1.0, 2.0), "b": (0.0, 0.4)}
     start = {name: low + share * (high - low) for name, (low, high) in limits.items()}
     show = RangeAnimation(start, limits, now=50.0)
-    assert show.at(50.0) == pytest.approx(start)
-    for name, value in show.at(50.0 + now).items():
+    assert show.values_at(50.0) == pytest.approx(start)
+    for name, value in show.values_at(50.0 + now).items():
         assert limits[name][0] - 1e-9 <= value <= limits[name][1] + 1e-9
 
 
 def test_the_show_reaches_both_ends():
     show = RangeAnimation({"a": 0.0}, {"a": (-1.0, 2.0)}, now=0.0)
-    values = [show.at(t)["a"] for t in np.linspace(2.0, 12.0, 400)]
+    values = [show.values_at(t)["a"] for t in np.linspace(2.0, 12.0, 400)]
     assert min(values) == pytest.approx(-1.0, abs=0.01)
     assert max(values) == pytest.approx(2.0, abs=0.01)
 

@@ -78,7 +78,7 @@ def test_normals_are_unit_and_point_away_from_the_middle(shape):
 @given(PRIMITIVES, st.tuples(*[st.sampled_from([-1.5, -1.0, 0.5, 2.0])] * 3))
 def test_a_mirrored_surface_keeps_its_outside_outside(shape, scale):
     surface = mesh_geometry(shape)
-    assert volume(surface.scaled(scale)) == pytest.approx(abs(np.prod(scale)) * volume(surface))
+    assert volume(surface.scale(scale)) == pytest.approx(abs(np.prod(scale)) * volume(surface))
 
 
 def test_equal_primitives_share_one_surface():
@@ -88,7 +88,7 @@ def test_equal_primitives_share_one_surface():
 def test_moved_by_a_rotation_turns_vertices_and_normals():
     turn = np.array([[0.0, -1, 0, 1], [1, 0, 0, 2], [0, 0, 1, 3], [0, 0, 0, 1]])
     surface = mesh_geometry(Box((2.0, 4.0, 6.0)))
-    moved = surface.moved(turn)
+    moved = surface.transform(turn)
     np.testing.assert_allclose(moved.bounds, [[-1, 1, 0], [3, 3, 6]])
     np.testing.assert_allclose(moved.normals, surface.normals @ turn[:3, :3].T)
 
@@ -122,6 +122,6 @@ def test_join_shifts_indices_and_keeps_colours_only_if_all_have_some():
     both = concatenate_meshes([box, mark])
     assert volume(both) == pytest.approx(volume(box) + volume(mark))
     assert both.colors is None
-    painted = [s.painted(np.ones((len(s.faces), 4))) for s in (box, mark)]
+    painted = [s.with_colors(np.ones((len(s.faces), 4))) for s in (box, mark)]
     assert concatenate_meshes(painted).colors.shape == (len(both.faces), 4)
     assert painted[0].without_colors().colors is None

@@ -152,13 +152,13 @@ def test_what_is_moved_while_the_page_is_made_anew_is_not_lost(page, monkeypatch
     def then_moved(model, fixed=viewer._fixed):
         found = fixed(model)
         if threading.current_thread() is page._worker:
-            monkeypatch.setattr(viewer, "_fixed", fixed)
+            monkeypatch.setattr(viewer, "_freeze", fixed)
             other = threading.Thread(target=page.move, args=({"cabinet/door": 0.7},))
             other.start()
             other.join()
         return found
 
-    monkeypatch.setattr(viewer, "_fixed", then_moved)
+    monkeypatch.setattr(viewer, "_freeze", then_moved)
     with page.model.edit() as edit:
         # And a program may move what it is editing.
         page.move({"cabinet/drawer": 0.2})

@@ -88,8 +88,8 @@ def draw_recordings(canvas: Canvas, judged: Sequence[Classification]) -> None:
         for place, family, shown in zip(
             part.subplots(1, 4), (families[0], *families, families[1]), (0, 1, 0, 1), strict=True
         ):
-            looked = FitProjection.at(one.found[family], one.recording.poses)
-            (draw_axial_view, draw_side_view)[shown](place, looked)
+            projection = FitProjection.from_fit(one.found[family], one.recording.poses)
+            (draw_axial_view, draw_side_view)[shown](place, projection)
             place.set_title(
                 f"{family} {one.found[family].probability:.2g}: {place.get_title()}", fontsize="small"
             )
@@ -97,11 +97,13 @@ def draw_recordings(canvas: Canvas, judged: Sequence[Classification]) -> None:
 
 
 def _draw_recording(axes: Axes, one: Classification) -> None:
-    looked = FitProjection.at(one.found.best, one.recording.poses)
+    projection = FitProjection.from_fit(one.found.best, one.recording.poses)
     right, up = (2, 0) if one.found.best.family == "prismatic" else (0, 1)
-    axes.plot(looked.seen[:, right], looked.seen[:, up], ".", markersize=2, color="tab:orange")
-    axes.plot(looked.way[:, right], looked.way[:, up], linewidth=0.8, color="tab:blue")
-    if looked.turns:
+    axes.plot(
+        projection.observed[:, right], projection.observed[:, up], ".", markersize=2, color="tab:orange"
+    )
+    axes.plot(projection.path[:, right], projection.path[:, up], linewidth=0.8, color="tab:blue")
+    if projection.has_axis:
         axes.plot(0.0, 0.0, "+", color="tab:blue", markersize=5)
     axes.set_aspect("equal", adjustable="datalim")
     axes.set_xticks([])
