@@ -1,4 +1,4 @@
-"""Pictures of learned joints: the views are along and across the axis, and the spread drawn is that of the fit."""
+"""Plots of identified joints: views along and across the axis, and the uncertainty of the fit."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ def found():
     return identify(None, hinge(), noise=NOISE)
 
 
-def test_one_looks_along_the_axis(found):
+def test_fit_projection_looks_along_the_axis(found):
     fit = found["revolute"]
     projection = FitProjection.from_fit(fit, hinge())
     np.testing.assert_allclose(projection.axes.T @ projection.axes, np.eye(3), atol=1e-12)
@@ -47,7 +47,7 @@ def test_one_looks_along_the_axis(found):
     assert projection.path[100, 0] == pytest.approx(radii[0], rel=0.02)
 
 
-def test_a_slider_moves_along_its_axis():
+def test_fit_projection_of_a_prismatic_joint_moves_along_its_axis():
     rng = np.random.default_rng(1)
     points = np.linspace(0, 0.4, 20)[:, None] * AXIS + POINT + 0.002 * rng.standard_normal((20, 3))
     fit = identify(None, points, noise=pose_covariance(0.002, 1))["prismatic"]
@@ -57,7 +57,7 @@ def test_a_slider_moves_along_its_axis():
 
 
 @pytest.mark.parametrize("height", [0.0, 0.7, -2.0])
-def test_the_spread_drawn_is_that_of_axes_drawn_at_random(found, height):
+def test_axis_covariances_of_a_projection_are_those_of_sampled_axes(found, height):
     fit = found["revolute"]
     projection = FitProjection.from_fit(fit, hinge())
     names = ["axis.x", "axis.y", "point.x", "point.y"]
@@ -92,7 +92,7 @@ def test_every_family_is_drawn(family, whole):
 
 
 @pytest.mark.parametrize("family", ["revolute", "prismatic"])
-def test_what_does_not_fit_is_ringed(found, family):
+def test_outliers_are_ringed(found, family):
     figure = pytest.importorskip("matplotlib.figure").Figure(figsize=SIZE, layout="constrained")
     draw_fit(figure, replace(found[family], outliers=(3, 8)), hinge(), "a title")
     projection = FitProjection.from_fit(found[family], hinge())
@@ -102,7 +102,7 @@ def test_what_does_not_fit_is_ringed(found, family):
     np.testing.assert_allclose(ringed, expected)
 
 
-def test_a_family_of_ones_own_is_drawn():
+def test_a_custom_family_is_drawn():
     figure = pytest.importorskip("matplotlib.figure").Figure(figsize=SIZE, layout="constrained")
     q, radius = kv.position("q"), kv.parameter("radius", 0.5)
     circle = kv.rotation_z(q) @ kv.translation(radius, 0, 0)

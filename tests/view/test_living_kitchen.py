@@ -1,4 +1,4 @@
-"""The scene that lives, without a browser: what moves, what is seen, what is believed and learned."""
+"""The simulation of the demo without a browser: motion, readings, tracking, identification and drawing."""
 
 from __future__ import annotations
 
@@ -45,7 +45,7 @@ def chest():
 # -- what moves --------------------------------------------------------------------------------------------
 
 
-def test_everything_opens_within_its_limits_and_no_faster_than_it_may():
+def test_the_trajectory_covers_all_ranges_within_position_and_speed_limits():
     model = kv.load("kitchen")
     trajectory = PeriodicTrajectory(model)
     names, h = trajectory.names, 1e-4
@@ -61,7 +61,7 @@ def test_everything_opens_within_its_limits_and_no_faster_than_it_may():
     assert min(reached.values()) > 0.85
 
 
-def test_a_few_things_move_at_a_time_and_all_of_it_repeats():
+def test_the_trajectory_is_periodic_and_moves_a_few_joints_at_a_time():
     trajectory = PeriodicTrajectory(kv.load("kitchen"))
     for time in np.linspace(5.0, trajectory.period, 30):
         later, soon = trajectory.evaluate(time + trajectory.period), trajectory.evaluate(time + 0.1)
@@ -74,7 +74,7 @@ def test_a_few_things_move_at_a_time_and_all_of_it_repeats():
 # -- what is seen ------------------------------------------------------------------------------------------
 
 
-def test_noise_is_what_its_covariance_says_and_the_shares_are_what_was_asked_for():
+def test_readings_have_the_covariance_and_fractions_of_the_sensor_model():
     poses = np.tile(np.eye(4), (4000, 1, 1))
     poses[:, :3, :3] = Rotation.random(4000, random_state=1).as_matrix()
     sensor = SensorModel(0.02, outliers=0.2, hidden=0.5)
@@ -90,12 +90,12 @@ def test_noise_is_what_its_covariance_says_and_the_shares_are_what_was_asked_for
 
 
 @pytest.mark.parametrize("wrong", [{"noise": 0.0}, {"noise": math.nan}, {"outliers": 1.0}, {"hidden": -0.1}])
-def test_a_sight_that_is_none_is_refused(wrong):
+def test_invalid_sensor_models_are_refused(wrong):
     with pytest.raises(kv.errors.InvalidValueError, match=next(iter(wrong))):
         SensorModel(**wrong)
 
 
-def test_equal_seeds_live_equal_lives_and_others_do_not():
+def test_simulations_of_equal_seeds_are_equal():
     # C that becomes ready in the midst of a life rounds otherwise than numpy.
     Simulation().kitchen_tracker.tracker.wait()
     one, two, other = (simulate(0.5, seed=seed)[0] for seed in (3, 3, 4))
@@ -107,14 +107,14 @@ def test_equal_seeds_live_equal_lives_and_others_do_not():
 # -- what is believed --------------------------------------------------------------------------------------
 
 
-def test_the_track_is_nearer_than_the_markers_and_as_sure_as_it_may_be(chest):
+def test_the_track_is_more_accurate_than_the_markers_and_consistent(chest):
     quality = average(chest[1][36:])
     assert quality.marker == pytest.approx(math.sqrt(3.0) * 0.03, rel=0.05)
     assert quality.mean < 0.25 * quality.marker
     assert 0.75 < quality.nees < 1.3
 
 
-def test_outliers_are_told_apart():
+def test_tracking_rejects_outliers():
     simulation, qualities, _ = simulate(2.5, sensor=SensorModel(0.03, outliers=0.2))
     assert average(qualities[12:]).mean < 0.3 * math.sqrt(3.0) * 0.03
     wrong = {
@@ -131,12 +131,12 @@ def test_outliers_are_told_apart():
     assert len(wrong.symmetric_difference(simulation.kitchen_tracker.estimate.outliers)) <= 2
 
 
-def test_who_does_not_see_a_door_knows_how_far_it_may_have_gone():
+def test_the_track_of_hidden_markers_is_consistent():
     _, qualities, _ = simulate(20.0, seed=1, sensor=SensorModel(0.03, hidden=0.5))
     assert 0.6 < average(qualities[36:]).nees < 1.5
 
 
-def test_what_is_hidden_becomes_doubtful_and_another_noise_is_taken_in():
+def test_hidden_markers_become_uncertain_and_a_new_sensor_model_is_used():
     simulation, *_ = simulate(1.5)
     sure = simulation.kitchen_tracker.uncertainty_lengths()
     simulation.sensor = SensorModel(0.05, hidden=0.5)
@@ -149,7 +149,7 @@ def test_what_is_hidden_becomes_doubtful_and_another_noise_is_taken_in():
     assert uncertainty_color(0.8) != uncertainty_color(0.05)
 
 
-def test_ways_lead_through_the_tracked_places_and_are_as_long_as_doubts(chest):
+def test_uncertainty_paths_pass_the_tracked_positions_and_have_their_lengths(chest):
     kitchen_tracker = chest[0].kitchen_tracker
     ways = kitchen_tracker.uncertainty_paths()
     np.testing.assert_allclose(ways[:, 2], kitchen_tracker.positions(kitchen_tracker.values), atol=1e-12)
@@ -161,7 +161,7 @@ def test_ways_lead_through_the_tracked_places_and_are_as_long_as_doubts(chest):
 
 
 @pytest.mark.parametrize("name", list(MECHANISMS))
-def test_a_stranger_is_learned_and_then_tracked(name, chest):
+def test_an_unknown_mechanism_is_identified_and_then_tracked(name, chest):
     simulation, _, off = chest if name == "chest" else simulate(10.0, mechanism=name)
     mechanism, learner = simulation.mechanism, simulation.learner
     assert max(learner.history[0].probabilities.values()) < 0.95  # nobody can tell at first
@@ -175,14 +175,14 @@ def test_a_stranger_is_learned_and_then_tracked(name, chest):
     assert np.mean(off[-20:]) < 1.2 * simulation.sensor.noise
 
 
-def test_a_stranger_is_learned_between_outliers():
+def test_an_unknown_mechanism_is_identified_despite_outliers():
     simulation, *_ = simulate(8.0, seed=2, sensor=SensorModel(0.03, outliers=0.2))
     best = simulation.learner.result.best
     assert (best.family, simulation.learner.result.is_ambiguous) == ("revolute", False)
     assert axis_error(best, *simulation.mechanism.axis)[0] < math.radians(9.0)
 
 
-def test_wrong_poses_of_a_stranger_are_sorted_out():
+def test_the_gate_rejects_outliers_and_keeps_inliers():
     gate, markers, sensor = OutlierGate(), MarkerSampler(2, 3), SensorModel(0.03, outliers=0.2, hidden=0.3)
     missed = dropped = right = 0
     for k in range(120):
@@ -197,7 +197,7 @@ def test_wrong_poses_of_a_stranger_are_sorted_out():
     assert dropped < 0.05 * right
 
 
-def test_another_stranger_is_met_from_the_beginning():
+def test_a_changed_mechanism_restarts_identification():
     simulation, *_ = simulate(2.0)
     assert simulation.learner.result is not None
     simulation.change_mechanism()
@@ -213,7 +213,7 @@ def test_another_stranger_is_met_from_the_beginning():
     assert simulation.mechanism.name == "crate"
 
 
-def test_a_stranger_stays_for_a_while_and_goes():
+def test_mechanisms_change_after_their_time():
     simulation = Simulation()
     simulation.step(39.0)
     assert simulation.mechanism.name == "chest"
@@ -222,7 +222,7 @@ def test_a_stranger_stays_for_a_while_and_goes():
 
 
 @pytest.mark.parametrize("name", list(MECHANISMS))
-def test_where_the_true_axis_is_what_a_fit_of_exact_poses_finds(name):
+def test_the_true_axis_is_that_of_a_fit_of_exact_poses(name):
     mechanism = MECHANISMS[name]()
     poses = [mechanism.poses(q) for q in np.linspace(*mechanism.limits, 30)]
     base, part = (np.array(found) for found in zip(*poses, strict=True))
@@ -232,7 +232,7 @@ def test_where_the_true_axis_is_what_a_fit_of_exact_poses_finds(name):
     assert distance < 1e-6
 
 
-def test_the_spread_of_an_axis_is_that_of_axes_drawn_by_its_covariance(chest):
+def test_axis_covariances_are_those_of_sampled_axes(chest):
     fit = chest[0].learner.result.best
     index = [fit.coordinates.index(n) for n in ("point.x", "point.y", "axis.x", "axis.y")]
     covariance = fit.covariance[np.ix_(index, index)]
@@ -248,7 +248,7 @@ def test_the_spread_of_an_axis_is_that_of_axes_drawn_by_its_covariance(chest):
 # -- what is drawn -----------------------------------------------------------------------------------------
 
 
-def test_rods_are_round_and_tubes_two_deviations_wide(chest):
+def test_rods_are_round_and_axis_tubes_are_two_deviations_wide(chest):
     points = np.array([[0.0, 0.0, 0.0], [0.1, 0.2, 0.2], [0.2, 0.4, 0.4]])
     away = create_rod(points, 0.05).vertices - np.repeat(points, 16, axis=0)
     np.testing.assert_allclose(np.linalg.norm(away, axis=1), 0.05)
@@ -264,7 +264,7 @@ def test_rods_are_round_and_tubes_two_deviations_wide(chest):
     np.testing.assert_allclose(np.sqrt(squares), SIGMAS, rtol=0.02)
 
 
-def test_a_picture_shows_both_worlds_and_the_axis_once_it_is_known(chest):
+def test_a_picture_shows_both_worlds_and_the_identified_axis(chest):
     young, simulation = Simulation(), chest[0]
     before, after = (picture(one, (500, 260)).astype(int) for one in (young, simulation))
     assert before.shape == (260, 500, 3)
@@ -282,7 +282,7 @@ def test_a_picture_shows_both_worlds_and_the_axis_once_it_is_known(chest):
     assert blue(after[:, 250:]) > 3 * blue(after[:130, :250])
 
 
-def test_the_part_that_nobody_understands_yet_is_not_drawn_as_if_one_did():
+def test_the_part_of_an_unidentified_mechanism_is_not_drawn_in_the_estimate():
     drawables = SceneDrawables(Simulation())
     key = drawables.identified.key("stranger/part")
     assert key not in {part.frame for part in drawables.parts()}
@@ -290,7 +290,7 @@ def test_the_part_that_nobody_understands_yet_is_not_drawn_as_if_one_did():
     assert key not in drawables.poses()
 
 
-def test_reports_say_what_the_numbers_are(chest):
+def test_reports_contain_errors_and_probabilities(chest):
     simulation = chest[0]
     assert f"{1e3 * simulation.average_quality.marker:.0f} mm" in format_kitchen(simulation)
     said = format_mechanism(simulation)

@@ -1,4 +1,4 @@
-"""The scene that lives as a person meets it: the page, its thread, and a real Chromium that opens it."""
+"""The page of the demo: its thread, and a real Chromium that opens it."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ def threads():
     return {thread.name for thread in threading.enumerate()}
 
 
-def test_a_page_waits_for_who_looks_and_leaves_nothing_behind():
+def test_a_page_without_browsers_pauses_and_stop_frees_thread_and_port():
     with SimulationPage(port=0) as page:
         assert "kineverse-living" in threads()
         assert page.address.startswith("http://127.0.0.1:")
@@ -41,7 +41,7 @@ def test_a_page_waits_for_who_looks_and_leaves_nothing_behind():
         probe.bind(("127.0.0.1", port))  # and the port is free again
 
 
-def test_a_port_in_use_is_an_error_and_no_thread():
+def test_a_port_in_use_is_refused_without_a_thread_left():
     with socket.socket() as other:
         other.bind(("127.0.0.1", 0))
         other.listen()
@@ -50,7 +50,7 @@ def test_a_port_in_use_is_an_error_and_no_thread():
     assert "kineverse-living" not in threads()
 
 
-def test_a_moment_that_fails_is_logged_and_life_goes_on(monkeypatch, caplog):
+def test_a_failed_step_is_logged_and_the_simulation_continues(monkeypatch, caplog):
     done = threading.Event()
     moments = iter([True, False])
 
@@ -104,7 +104,7 @@ def shot(tab):
 
 
 @pytest.mark.browser
-def test_the_scene_lives_in_the_browser_and_what_is_learned_is_said(browser, monkeypatch):
+def test_the_browser_shows_the_simulation_and_the_identified_joint(browser, monkeypatch):
     # However slowly the page is drawn, the stranger waits to be learned.
     monkeypatch.setattr("living_kitchen.simulation.MECHANISM_TIME", 3600.0)
     simulation, errors = Simulation(), []
@@ -139,7 +139,7 @@ def test_the_scene_lives_in_the_browser_and_what_is_learned_is_said(browser, mon
 
 
 @pytest.mark.browser
-def test_two_look_at_one_life_and_one_of_them_leaves(browser):
+def test_a_second_browser_continues_after_the_first_has_left(browser):
     errors = []
     with SimulationPage(port=0) as page:
         tab = opened(browser, page, errors)

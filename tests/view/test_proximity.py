@@ -1,4 +1,4 @@
-"""What is near, as numbers, marks, text and pixels; of models of which every distance is known."""
+"""Proximity queries as numbers, markers, text and pixels, in models of known distances."""
 
 from __future__ import annotations
 
@@ -53,7 +53,7 @@ def row(count: int) -> kv.Model:
 
 
 @given(st.floats(1e-3, 1.0), st.floats(0.0, 1.0), st.floats(0.0, 1.0))
-def test_the_nearer_the_redder(radius, one, other):
+def test_distance_color_is_redder_for_smaller_distances(radius, one, other):
     near, far = sorted((one, other))
     (r0, g0, _), (r1, g1, _) = distance_color(near * radius, radius), distance_color(far * radius, radius)
     assert r0 - g0 >= r1 - g1 - 1e-12
@@ -64,12 +64,12 @@ def test_the_nearer_the_redder(radius, one, other):
     ("metres", "text"),
     [(0.1, "100 mm"), (0.0123, "12.3 mm"), (0.00089, "0.89 mm"), (-0.002, "−2.0 mm"), (-1e-9, "0.00 mm")],
 )
-def test_millimetres(metres, text):
+def test_format_millimetres(metres, text):
     assert format_millimetres(metres) == text
 
 
 @pytest.mark.parametrize("gap", [0.05, -0.0004, -0.03])
-def test_lines_join_the_nearest_points_and_arrows_show_where_to_move(gap):
+def test_markers_join_nearest_points_and_arrows_point_along_the_normal(gap):
     found = ProximityQuery(two_balls()).evaluate({"gap": gap}, 0.1)
     assert (found.found, found.touching) == (1, int(gap <= 0))
     marks = ProximityMarkers.from_result(found, length=0.2)
@@ -85,7 +85,7 @@ def test_lines_join_the_nearest_points_and_arrows_show_where_to_move(gap):
     assert np.isfinite(np.concatenate(surfaces)).all()
 
 
-def test_pairs_are_chosen_by_name_and_ignored_ones_shown_with_the_reason():
+def test_pairs_are_filtered_by_name_and_ignored_ones_have_a_reason():
     model = two_balls()
     near = ProximityQuery(model)
     assert [(p.a, p.b) for p in near.evaluate({"gap": 0.0}, 0.4).pairs] == [("left", "right")]
@@ -105,7 +105,7 @@ def test_pairs_are_chosen_by_name_and_ignored_ones_shown_with_the_reason():
     assert "excepted: &lt;soft&gt;" in text
 
 
-def test_a_crowd_is_counted():
+def test_pairs_beyond_the_limit_are_counted():
     model = row(MOST_PAIRS + 6)
     found = ProximityQuery(model).evaluate({f"x{k}": 0.0 for k in range(MOST_PAIRS + 6)}, 0.01)
     assert (found.found, len(found.pairs), found.touching) == (MOST_PAIRS + 5, MOST_PAIRS, 0)
@@ -115,7 +115,7 @@ def test_a_crowd_is_counted():
     assert f"{MOST_PAIRS + 5} pairs within 0.01 m, none touches" in text
 
 
-def test_bodies_without_distances_are_left_out_and_said(tmp_path):
+def test_bodies_without_distances_are_excluded_and_reported(tmp_path):
     model = two_balls()
     with model.edit() as edit:
         lost = Body(visuals=(Shape(Mesh("lost.stl", folder=str(tmp_path))),))
@@ -146,7 +146,7 @@ def test_a_state_without_poses_has_no_distances_and_the_next_one_has():
     assert near.evaluate({"q": 4.0}).pairs[0].distance == pytest.approx(0.05)
 
 
-def test_collision_shapes_are_what_distances_are_computed_to(tmp_path):
+def test_drawn_collision_shapes_are_those_of_distances(tmp_path):
     trimesh = pytest.importorskip("trimesh")
     cross = trimesh.util.concatenate(
         [trimesh.creation.box((1, 0.2, 0.2)), trimesh.creation.box((0.2, 1, 0.2))]
@@ -167,7 +167,7 @@ def test_collision_shapes_are_what_distances_are_computed_to(tmp_path):
     assert volume == pytest.approx(0.2 * (1.0 - 4 * 0.4 * 0.4 / 2), rel=1e-6)
 
 
-def test_pictures_show_what_is_near_through_the_bodies():
+def test_pictures_show_nearest_pairs_through_bodies():
     camera = Camera((0.1, -1.0, 0.2), (0.1, 0.0, 0.1))
     model = two_balls()
 

@@ -1,4 +1,4 @@
-"""The folder of collisions and the thread behind it, without a browser."""
+"""The proximity panel and its background thread, without a browser."""
 
 from __future__ import annotations
 
@@ -37,7 +37,7 @@ def nodes(page):
     return set(page.collisions._drawn)
 
 
-def test_meshes_are_shown_and_measured_as_they_were_decomposed(tmp_path, monkeypatch):
+def test_decomposed_meshes_are_used_for_shapes_and_distances(tmp_path, monkeypatch):
     """A post with a beam across, and a ball between the two that touches the hull around both only."""
     boxes = [trimesh.creation.box((0.1, 0.1, 0.4)), trimesh.creation.box((0.4, 0.1, 0.1))]
     trimesh.util.concatenate(boxes).export(tmp_path / "cross.stl")
@@ -79,12 +79,12 @@ def test_meshes_are_shown_and_measured_as_they_were_decomposed(tmp_path, monkeyp
         assert page.collisions.result.touching == 0
 
 
-def test_nothing_is_computed_or_shown_before_it_is_asked_for(page):
+def test_no_query_runs_before_a_request(page):
     page.move({"cabinet/drawer": 0.1})
     assert page.settled()
     assert page.collisions.result is None
     assert (report(page), nodes(page)) == ("", set())
-    assert page.collisions.worker._near is None
+    assert page.collisions.worker._query is None
 
 
 def test_the_nearest_pairs_follow_the_sliders(page):
@@ -134,7 +134,7 @@ def test_bodies_are_half_transparent_while_lines_are_shown_in_them(page):
     assert (report(page), nodes(page)) == ("", set())
 
 
-def test_what_is_switched_on_stays_on_over_edits(page):
+def test_settings_survive_edits(page):
     page.collisions.show_near(0.15, containing="lid")
     page.collisions.show_shapes()
     assert page.settled()
@@ -154,7 +154,7 @@ def test_what_is_switched_on_stays_on_over_edits(page):
     assert "40.0 mm" in report(page)
 
 
-def test_edits_while_it_looks_leave_no_trace(page, caplog):
+def test_edits_during_a_query_leave_no_trace(page, caplog):
     page.collisions.show_near(0.3)
     for k in range(12):
         with page.model.edit() as edit:
@@ -169,7 +169,7 @@ def test_edits_while_it_looks_leave_no_trace(page, caplog):
     assert page.collisions.status.failure == ""
 
 
-def test_bodies_with_missing_meshes_are_said_to_have_no_distances(tmp_path):
+def test_bodies_with_missing_meshes_are_reported_as_excluded(tmp_path):
     model = with_mesh("nowhere.stl", str(tmp_path))
     with view(model, port=0) as page:
         page.collisions.show_near()
@@ -179,7 +179,7 @@ def test_bodies_with_missing_meshes_are_said_to_have_no_distances(tmp_path):
         assert page.collisions.result.found == 0
 
 
-def test_a_state_without_poses_is_said_and_left_again():
+def test_a_state_without_poses_is_reported_until_the_next_state():
     model, q = kv.Model(), kv.position("q")
     cube = Body(visuals=(Shape(Box((1.0, 1.0, 1.0))),))
     with model.edit() as edit:
@@ -200,13 +200,13 @@ def test_a_state_without_poses_is_said_and_left_again():
 
 
 @pytest.mark.parametrize("radius", [-0.1, float("nan"), float("inf")])
-def test_radii_that_are_none_are_refused(page, radius):
+def test_invalid_radii_are_refused(page, radius):
     with pytest.raises(InvalidValueError, match="radius"):
         page.collisions.show_near(radius)
     assert page.collisions.result is None
 
 
-def test_without_the_extra_the_folder_names_it(monkeypatch):
+def test_without_coal_the_folder_names_the_extra(monkeypatch):
     monkeypatch.setattr(proximity_panel, "is_installed", lambda: False)
     monkeypatch.setitem(sys.modules, "coal", None)
     with view(cabinet(), port=0) as page:
