@@ -33,13 +33,13 @@ WIDTH, HEIGHT, SHOWN = 300, 64, 40
 
 INTRODUCTION = join_html(
     element("b", "Left: the truth"),
-    ", with the markers as they are seen, through noise.",
+    ", with noisy markers.",
     BREAK,
-    element("b", "Right: what is believed"),
-    " from the markers. Bars: ± 2σ; blue is sure, orange not.",
+    element("b", "Right: the estimate"),
+    " from the markers. Bars: ± 2σ; blue is certain, orange is not.",
     BREAK,
     element("b", "In front: a stranger"),
-    ". Nobody says how it moves; that is learned.",
+    ", a mechanism of unknown type. It is identified, then tracked.",
 )
 
 
@@ -61,7 +61,7 @@ class Panel:
         HtmlBox(gui, _box(INTRODUCTION))
         self._paused = gui.add_checkbox("pause", False)
         self._speed = gui.add_slider("speed", 0.25, 3.0, 0.25, 1.0)
-        with gui.add_folder("What is seen"):
+        with gui.add_folder("Sensor"):
             self._noise = gui.add_slider("noise [cm]", 0.5, 10.0, 0.5, 100.0 * simulation.sensor.noise)
             self._wrong = gui.add_checkbox(f"{WRONG:.0%} outliers", False)
             self._hidden = gui.add_checkbox(f"{MISSING:.0%} hidden", False)
@@ -110,7 +110,7 @@ def format_kitchen(simulation: Simulation) -> Html:
     rejected = len(simulation.kitchen_tracker.estimate.outliers)
     _, rows = tabulate_tracking(simulation, quality)
     visible = simulation.readings.visible
-    rows.append(("seen now", f"{int(visible.sum())} of {len(visible)} markers, {rejected} not believed"))
+    rows.append(("seen now", f"{int(visible.sum())} of {len(visible)} markers, {rejected} rejected"))
     return _box(_table(rows))
 
 

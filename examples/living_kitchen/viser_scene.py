@@ -30,7 +30,7 @@ HIDDEN_SCALE = 1e-4
 POSE_TOLERANCE = 2e-4
 """Largest change of a pose that is not sent [m], [rad]."""
 
-CAPTIONS = {"the truth": (0.4, 0.0, 2.75), "what is believed": (0.4, 0.0, 2.75)}
+CAPTIONS = {"the truth": (0.4, 0.0, 2.75), "the estimate": (0.4, 0.0, 2.75)}
 
 
 class SceneNodes:

@@ -222,7 +222,7 @@ def test_nearest_pairs_are_shown_and_follow_the_sliders(opened):
 
 
 def corners(viewer, camera):
-    """Where the corners of the scene are in the picture of a browser, (N, 2) in [-1, 1] if they are in it."""
+    """Project the corners of the scene into the picture of a browser, (N, 2) in [-1, 1] if they are in it."""
     poses = {name: viewer.pose(name) for name in viewer.model.frames}
     points = TriangleSoup.from_drawables(collect_drawables(viewer.model), poses).corners.reshape(-1, 3)
     place = Camera(tuple(camera.position), tuple(camera.look_at), field_of_view=camera.fov)

@@ -140,7 +140,7 @@ def content(viewer):
 
 
 def by_hand(viewer, name, value):
-    """What the page does when somebody moves a slider."""
+    """Move a slider as a user of the page does."""
     viewer._panel._sliders[name].value = value
     viewer._set_from_slider(name, value)
     assert viewer.settled()

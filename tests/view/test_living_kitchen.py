@@ -28,7 +28,7 @@ STEP = 1.0 / 12.0
 
 
 def simulate(seconds, **options):
-    """Return a life after some seconds, and at each step its figures and how far off the stranger's part is."""
+    """Return a simulation after some seconds, and at each step its quality and the error of the tracked part."""
     simulation, qualities, off = Simulation(**options), [], []
     for _ in range(round(seconds / STEP)):
         simulation.step(STEP)
@@ -42,7 +42,7 @@ def chest():
     return simulate(10.0)
 
 
-# -- what moves --------------------------------------------------------------------------------------------
+# -- motion ----------------------------------------------------------------------------------------------
 
 
 def test_the_trajectory_covers_all_ranges_within_position_and_speed_limits():
@@ -71,7 +71,7 @@ def test_the_trajectory_is_periodic_and_moves_a_few_joints_at_a_time():
             assert later[name] == pytest.approx(now[name], abs=1e-9)
 
 
-# -- what is seen ------------------------------------------------------------------------------------------
+# -- readings --------------------------------------------------------------------------------------------
 
 
 def test_readings_have_the_covariance_and_fractions_of_the_sensor_model():
@@ -82,7 +82,7 @@ def test_readings_have_the_covariance_and_fractions_of_the_sensor_model():
     good = ~readings.wrong
     turns = Rotation.from_matrix(readings.poses[:, :3, :3] @ np.swapaxes(poses[:, :3, :3], 1, 2)).as_rotvec()
     errors = np.hstack([readings.poses[:, :3, 3], turns])[good]
-    # Of 3200 numbers the standard deviation is known to 1.3 %.
+    # The standard deviation of 3200 numbers is known to 1.3 %.
     np.testing.assert_allclose(errors.std(axis=0), np.sqrt(np.diag(sensor.covariance)), rtol=0.06)
     assert readings.wrong.mean() == pytest.approx(0.2, abs=0.03)
     assert readings.visible.mean() == pytest.approx(0.5, abs=0.04)
@@ -96,7 +96,7 @@ def test_invalid_sensor_models_are_refused(wrong):
 
 
 def test_simulations_of_equal_seeds_are_equal():
-    # C that becomes ready in the midst of a life rounds otherwise than numpy.
+    # C that becomes ready during a simulation rounds otherwise than numpy.
     Simulation().kitchen_tracker.tracker.wait()
     one, two, other = (simulate(0.5, seed=seed)[0] for seed in (3, 3, 4))
     np.testing.assert_array_equal(one.readings.poses, two.readings.poses)
@@ -104,7 +104,7 @@ def test_simulations_of_equal_seeds_are_equal():
     assert one.kitchen_tracker.values != other.kitchen_tracker.values
 
 
-# -- what is believed --------------------------------------------------------------------------------------
+# -- tracking --------------------------------------------------------------------------------------------
 
 
 def test_the_track_is_more_accurate_than_the_markers_and_consistent(chest):
@@ -157,21 +157,21 @@ def test_uncertainty_paths_pass_the_tracked_positions_and_have_their_lengths(che
     np.testing.assert_allclose(kitchen_tracker.uncertainty_lengths(), lengths)
 
 
-# -- what is learned ---------------------------------------------------------------------------------------
+# -- identification --------------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize("name", list(MECHANISMS))
 def test_an_unknown_mechanism_is_identified_and_then_tracked(name, chest):
     simulation, _, off = chest if name == "chest" else simulate(10.0, mechanism=name)
     mechanism, learner = simulation.mechanism, simulation.learner
-    assert max(learner.history[0].probabilities.values()) < 0.95  # nobody can tell at first
+    assert max(learner.history[0].probabilities.values()) < 0.95  # ambiguous at first
     assert not learner.result.is_ambiguous
     assert learner.result.best.family == mechanism.family
     angle, distance, sigmas = axis_error(learner.result.best, *mechanism.axis)
     assert angle < math.radians(9.0)
     assert distance < 0.06
     assert sigmas < 2.2
-    # The mean of what a marker is off is 1.6 standard deviations of one coordinate.
+    # The mean error of a marker is 1.6 standard deviations of one coordinate.
     assert np.mean(off[-20:]) < 1.2 * simulation.sensor.noise
 
 
@@ -245,7 +245,7 @@ def test_axis_covariances_are_those_of_sampled_axes(chest):
     np.testing.assert_allclose(found, expected, atol=0.05 * np.abs(expected).max())
 
 
-# -- what is drawn -----------------------------------------------------------------------------------------
+# -- drawing ---------------------------------------------------------------------------------------------
 
 
 def test_rods_are_round_and_axis_tubes_are_two_deviations_wide(chest):

@@ -105,7 +105,7 @@ def shot(tab):
 
 @pytest.mark.browser
 def test_the_browser_shows_the_simulation_and_the_identified_joint(browser, monkeypatch):
-    # However slowly the page is drawn, the stranger waits to be learned.
+    # The mechanism stays, however slowly the page is drawn.
     monkeypatch.setattr("living_kitchen.simulation.MECHANISM_TIME", 3600.0)
     simulation, errors = Simulation(), []
     while simulation.time < 5.5:

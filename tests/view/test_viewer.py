@@ -99,9 +99,9 @@ def test_half_transparent_bodies_cast_no_shadows(page):
         return {(node.cast_shadow, node.receive_shadow) for node, _ in page._scene._visuals}
 
     assert shadows() == {(True, True)}
-    page._scene.show_through(True)
+    page._scene.show_transparent(True)
     assert shadows() == {(False, False)}
-    page._scene.show_through(False)
+    page._scene.show_transparent(False)
     assert shadows() == {(True, True)}
 
 

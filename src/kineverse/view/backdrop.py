@@ -22,6 +22,13 @@ WHITE_LEVEL = 1.75
 """The radiance that is displayed as pure white."""
 
 
+PICTURE_BACKGROUND = (np.array([0.93, 0.945, 0.96]), np.array([0.70, 0.745, 0.80]))
+"""Display colours of the background of pictures, at the lower and the upper edge, in [0, 1]."""
+
+PAGE_BACKGROUND = ((240, 243, 246), (196, 207, 219))
+"""Colours of the background of the page, at the lower and the upper edge, in [0, 255]."""
+
+
 @dataclass(frozen=True, slots=True)
 class DirectionalLight:
     """Infinitely distant lamp with a shadow map: a depth picture from the direction of the lamp.
@@ -176,6 +183,14 @@ def compute_outlines(
     return np.asarray(np.float32(1.0) - darker[covered])
 
 
+def draw_background(projection: Projection) -> Singles:
+    """Return display values (height·width, 3) of the background of a picture."""
+    rows = np.linspace(1.0, 0.0, projection.height)[:, None]
+    below, above = PICTURE_BACKGROUND
+    column = (below + (above - below) * rows**1.5).astype(np.float32)
+    return np.repeat(column, projection.width, axis=0)
+
+
 def draw_ground(
     image: Singles, empty: Integers, corners: Floats, projection: Projection, lamp: DirectionalLight
 ) -> None:
@@ -218,10 +233,6 @@ def draw_ground(
     image[pixel] = np.clip(image[pixel] * tone.astype(np.float32)[:, None], 0.0, 1.0)
 
 
-BELOW, ABOVE = (240, 243, 246), (196, 207, 219)
-"""The background, from the lower to the upper edge."""
-
-
 def set_up(server: Any) -> None:
     """Light the page: a lamp with a shadow from above the left shoulder, and a sky without one.
 
@@ -238,7 +249,8 @@ def set_up(server: Any) -> None:
         "/light/fill", color=(235, 240, 255), intensity=0.35, position=(-4.0, -3.0, 5.0)
     )
     rows = np.linspace(0.0, 1.0, 128)[:, None, None] ** 0.7
-    gradient = np.array(ABOVE) + (np.array(BELOW) - np.array(ABOVE)) * rows
+    below, above = map(np.array, PAGE_BACKGROUND)
+    gradient = above + (below - above) * rows
     scene.set_background_image(np.repeat(gradient, 8, axis=1).astype(np.uint8), format="png")
 
 

@@ -18,6 +18,7 @@ from kineverse.view.auto_camera import choose_camera, weigh_drawables
 from kineverse.view.backdrop import (
     DirectionalLight,
     compute_outlines,
+    draw_background,
     draw_ground,
     shade,
     to_display,
@@ -82,9 +83,6 @@ def _chunk(kind: bytes, body: bytes) -> bytes:
 
 SAMPLES = 2
 """Number of computed pixels along each edge of a final one."""
-
-BACKGROUND_COLORS = (np.array([0.93, 0.945, 0.96]), np.array([0.70, 0.745, 0.80]))
-"""Display colours of the background below and above."""
 
 ARROW = 0.07
 """Length of arrows at contacts, as a fraction of the height of the picture."""
@@ -196,7 +194,7 @@ def save_picture(path: str | Path, model: ModelView, state: StateLike | None = N
 
 def _render(scene: TriangleSoup, projection: Projection, camera: Camera) -> Singles:
     """Return (height, width, 3) display values of a scene on its ground."""
-    image = _background(projection)
+    image = draw_background(projection)
     if len(scene.corners):
         seen, near = rasterize(projection, scene.corners, scene.closed, scene.colors[:, 3])
         away = np.subtract(camera.position, camera.target)
@@ -211,13 +209,6 @@ def _render(scene: TriangleSoup, projection: Projection, camera: Camera) -> Sing
             image[covered] = display
         draw_ground(image, np.flatnonzero(seen < 0), scene.corners, projection, lamp)
     return image.reshape(projection.height, projection.width, 3)
-
-
-def _background(projection: Projection) -> Singles:
-    rows = np.linspace(1.0, 0.0, projection.height)[:, None]
-    below, above = BACKGROUND_COLORS
-    column = (below + (above - below) * rows**1.5).astype(np.float32)
-    return np.repeat(column, projection.width, axis=0)
 
 
 def _surface_points(

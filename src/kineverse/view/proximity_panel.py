@@ -276,7 +276,7 @@ class ProximityPanel:
     def _show(self, status: ProximityStatus) -> None:
         """Draw a status; called by the background thread."""
         self._write_report(status)
-        self._scene.show_through(self.worker.request.enabled)
+        self._scene.show_transparent(self.worker.request.enabled)
         with self._server.atomic():
             before = self._drawn
             result = status.result

@@ -27,7 +27,7 @@ from kineverse.view.triangle_mesh import Floats, Integers, TriangleMesh
 FIELD_OF_VIEW, ASPECT = 0.8, 1.25
 ROOT = "/model"
 
-SEE_THROUGH = 0.45
+FADED_OPACITY = 0.45
 """Opacity of bodies while frames or nearest points inside of them are shown."""
 
 
@@ -66,7 +66,7 @@ class ViewerScene:
         self._lock = threading.RLock()
         self._frames_shown, self._labels_shown, self._filter = False, False, ""
         self._visuals_shown, self._collisions_shown, self._ground_shown = True, False, True
-        self._decomposed, self._through = False, False
+        self._decomposed, self._transparent = False, False
         backdrop.set_up(server)
         self.refresh(model, values)
 
@@ -104,19 +104,19 @@ class ViewerScene:
             self.poses = poses
             if not len(moved):
                 return 0
-            turned = to_wxyz(poses[moved])
+            quaternions = to_wxyz(poses[moved])
             with self._server.atomic():
-                for k, wxyz in zip(moved, turned, strict=True):
+                for k, wxyz in zip(moved, quaternions, strict=True):
                     node = self._nodes.get(self.names[k])
                     if node is not None:
                         node.position, node.wxyz = poses[k, :3, 3], wxyz
                 self._move_frames()
             return len(moved)
 
-    def _replace_non_finite(self, poses: Floats, instead: Floats) -> Floats:
+    def _replace_non_finite(self, poses: Floats, replacements: Floats) -> Floats:
         """Return poses, with others in place of those that are not finite; note the frames of these."""
         self.unplaced = self._kinematics.unplaced(poses)
-        return np.where(np.isfinite(poses).all(axis=(1, 2), keepdims=True), poses, instead)
+        return np.where(np.isfinite(poses).all(axis=(1, 2), keepdims=True), poses, replacements)
 
     def pose(self, frame: str) -> Floats:
         """Return the pose of a frame that was drawn last, 4×4."""
@@ -173,10 +173,10 @@ class ViewerScene:
         """True if the collision shapes are shown."""
         return self._collisions_shown
 
-    def show_through(self, shown: bool) -> None:
+    def show_transparent(self, shown: bool) -> None:
         """Make bodies half transparent, or opaque again, for markers inside of them."""
         with self._lock:
-            self._through = shown
+            self._transparent = shown
             self._fade()
 
     def show_visuals(self, shown: bool) -> None:
@@ -192,14 +192,14 @@ class ViewerScene:
         backdrop.set_floor(self._server, self._floor, self._extent, shown)
 
     def _fade(self) -> None:
-        through = self._frames_shown or self._through
+        transparent = self._frames_shown or self._transparent
         for node, opacity in self._visuals:
-            wanted = min(opacity or 1.0, SEE_THROUGH) if through else opacity
+            wanted = min(opacity or 1.0, FADED_OPACITY) if transparent else opacity
             if node.opacity != wanted:
                 node.opacity = wanted
-            if node.cast_shadow == through:
+            if node.cast_shadow == transparent:
                 # Shadows ignore opacity: half transparent bodies would cast black ones onto themselves.
-                node.cast_shadow = node.receive_shadow = not through
+                node.cast_shadow = node.receive_shadow = not transparent
 
     def _add(self, items: Iterable[Drawable], kind: Kind) -> list[tuple[Any, float | None]]:
         """Add shapes below the nodes of their frames; return their nodes and opacities."""

@@ -83,7 +83,7 @@ def start(port: int | None = None, label: str = "", host: str = HOST) -> Any:
         def address(self) -> str:
             return access.address(self.get_port())
 
-    with quiet():
+    with suppress_console():
         server = LocalServer(host=host, port=_free_port(host, port), label=label, verbose=False)
     if not gate.installed:
         stop(server)
@@ -96,12 +96,12 @@ def start(port: int | None = None, label: str = "", host: str = HOST) -> Any:
 
 def stop(server: Any) -> None:
     """Stop a server, and wait until it has released its port."""
-    with quiet():
+    with suppress_console():
         server.stop()
 
 
 @contextlib.contextmanager
-def quiet() -> Any:
+def suppress_console() -> Any:
     """Keep viser from printing to standard output, which belongs to the caller."""
     import rich
 
