@@ -72,7 +72,7 @@ def pages(monkeypatch):
             answers.append((answer.status, b"<html" in answer.read().lower()))
 
     monkeypatch.setattr(viewer.Viewer, "wait", fetch)
-    monkeypatch.setattr(living.LivingPage, "wait", fetch)
+    monkeypatch.setattr(living.SimulationPage, "wait", fetch)
     for name in ("DISPLAY", "WAYLAND_DISPLAY", "BROWSER"):
         monkeypatch.delenv(name, raising=False)
     return answers

@@ -1,12 +1,12 @@
-"""A scene that lives: a kitchen in motion, seen through noise, tracked beside the truth, and a joint learned.
+"""Demo scene: a kitchen in motion, tracked from noisy markers, and a joint that is identified.
 
-:class:`.life.Life` is the scene itself, numbers only: what moves, what is seen of it, what is believed. It is
-drawn by :mod:`.picture` without a browser and by :mod:`.page` in one.
+:class:`.simulation.Simulation` is the scene in numbers: true motion, readings, estimates. It is drawn by
+:mod:`.picture` without a browser and by :mod:`.page` in one.
 """
 
 from __future__ import annotations
 
-from .sensor import Sight
-from .simulation import Life
+from .sensor import SensorModel
+from .simulation import Simulation
 
-__all__ = ["Life", "Sight"]
+__all__ = ["SensorModel", "Simulation"]

@@ -1,4 +1,4 @@
-"""Which poses of a stranger are wrong: nobody knows yet how it moves, but it does not jump."""
+"""Outlier gate for poses of two bodies whose joint is not known yet."""
 
 from __future__ import annotations
 
@@ -9,15 +9,15 @@ import kineverse as kv
 from kineverse.estimation import ObservedPose, Outliers, Tracker
 from kineverse.model.frame import WORLD
 
-from .sensor import Seen, Sight
+from .sensor import MarkerReadings, SensorModel
 from .unknown_mechanisms import BASE, PART
 
-RESTLESS = 0.05
-"""The variance that each direction and turn gains [m²/s], [rad²/s]."""
+PROCESS_NOISE = 0.05
+"""Variance that each coordinate gains [m²/s], [rad²/s]."""
 
 
-class Sorter:
-    """Follows base and part as two things that float, by a tracker that knows of outliers."""
+class OutlierGate:
+    """Outlier gate that tracks base and part as two floating bodies, with an outlier model."""
 
     def __init__(self) -> None:
         self._model = kv.Model()
@@ -25,26 +25,26 @@ class Sorter:
             for name in (BASE, PART):
                 edit.apply(kv.Floating(name=name, parent=WORLD, child=name))
         self._tracker: Tracker | None = None
-        self._sight: Sight | None = None
+        self._sensor: SensorModel | None = None
 
-    def good(self, seen: Seen, dt: float, sight: Sight) -> npt.NDArray[np.bool_]:
-        """Return which of base and part (2,) are seen where they can be, ``dt`` after the last time [s]."""
-        if sight.outliers == 0.0:
+    def find_inliers(self, readings: MarkerReadings, dt: float, sensor: SensorModel) -> npt.NDArray[np.bool_]:
+        """Return a mask (2,) of inliers, for base and part, ``dt`` after the previous readings [s]."""
+        if sensor.outliers == 0.0:
             self._tracker = None
-            return seen.there
-        if self._tracker is None or sight != self._sight:
-            self._tracker, self._sight = self._begin(sight), sight
+            return readings.visible
+        if self._tracker is None or sensor != self._sensor:
+            self._tracker, self._sensor = self._create_tracker(sensor), sensor
         if dt > 0.0:
             self._tracker.predict(dt)
-        names = [name for name, there in zip((BASE, PART), seen.there, strict=True) if there]
-        poses = {BASE: seen.poses[0], PART: seen.poses[1]}
+        names = [name for name, visible in zip((BASE, PART), readings.visible, strict=True) if visible]
+        poses = {BASE: readings.poses[0], PART: readings.poses[1]}
         wrong = self._tracker.update({name: poses[name] for name in names}).outliers
         return np.array([name in names and name not in wrong for name in (BASE, PART)])
 
-    def _begin(self, sight: Sight) -> Tracker:
+    def _create_tracker(self, sensor: SensorModel) -> Tracker:
         return Tracker(
             self._model,
-            [ObservedPose(name, covariance=sight.covariance) for name in (BASE, PART)],
-            process_noise=dict.fromkeys(self._model.speeds, RESTLESS),
-            outliers=Outliers(sight.outliers),
+            [ObservedPose(name, covariance=sensor.covariance) for name in (BASE, PART)],
+            process_noise=dict.fromkeys(self._model.speeds, PROCESS_NOISE),
+            outliers=Outliers(sensor.outliers),
         )

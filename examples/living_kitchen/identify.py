@@ -1,4 +1,4 @@
-"""Learning a joint while it moves: poses are kept, families weighed, and the best one becomes a model."""
+"""Online identification of a joint: poses are stored, and the best family becomes a model that is tracked."""
 
 from __future__ import annotations
 
@@ -9,108 +9,112 @@ import numpy as np
 
 import kineverse as kv
 from kineverse.estimation import Fit, IdentificationResult, ObservedPose, Outliers, Tracker, identify
+from kineverse.experiments.plots import AXIAL_FAMILIES
 from kineverse.model.frame import WORLD
 from kineverse.view.triangle_mesh import Floats
 
-from .gating import Sorter
-from .sensor import Seen, Sight
+from .gating import OutlierGate
+from .sensor import MarkerReadings, SensorModel
 from .unknown_mechanisms import BASE, PART
 
 LEARNED = "stranger/learned"
-"""The joint in the model that was learned."""
+"""Name of the joint in the identified model."""
 
-LOOKS, THINKS = 0.25, 1.0
-"""How often a pose is kept, and how often all of them are weighed [s]."""
+SAMPLE_PERIOD, IDENTIFICATION_PERIOD = 0.25, 1.0
+"""Periods of storing a pose, and of identification [s]."""
 
-FEWEST, MOST = 4, 96
-"""With how many poses the weighing begins, and from how many on every other one is forgotten."""
+FEWEST_POSES, MOST_POSES = 4, 96
+"""Number of poses at which identification begins, and above which every other one is dropped."""
 
-RESTLESS = 0.06
-"""Of what was learned: the variance that a coordinate gains [m²/s], [rad²/s]."""
+PROCESS_NOISE = 0.06
+"""Variance that a coordinate of the identified joint gains [m²/s], [rad²/s]."""
 
-TOLD = ("revolute", "prismatic", "screw", "cylindrical", "rigid")
-"""Families of which a model is made; what else moves is only watched."""
+MODELLED_FAMILIES = ("revolute", "prismatic", "screw", "cylindrical", "rigid")
+"""Families that become a model; others are only reported."""
+
+DIRECTED_FAMILIES = (*AXIAL_FAMILIES, "prismatic")
+"""Families with a direction."""
 
 
 @dataclass(frozen=True, slots=True)
-class Thought:
-    """What was thought at a time [s]: the probability of each family."""
+class FamilyProbabilities:
+    """Probability of each family at a time [s]."""
 
     time: float
     probabilities: dict[str, float]
 
 
-class Learner:
-    """Learns how a part moves on its base from poses of both, which nobody explains to it.
+class JointLearner:
+    """Identification and tracking of the joint between a base and a part, from poses of both.
 
     Attributes
     ----------
-    found
-        What all poses so far say; None as long as there are too few.
-    thoughts
-        What was thought before, one for each time they were weighed.
+    result
+        The latest identification; None as long as there are too few poses.
+    history
+        The probabilities of all identifications so far.
     model
-        Base and part, connected by what was learned; None as long as nothing is certain.
+        Base and part, connected by the identified joint; None as long as the result is ambiguous.
     tracker
-        Of the joint that was learned, if it can move.
+        The tracker of the identified joint, if it can move.
     """
 
     def __init__(self) -> None:
-        self.found: IdentificationResult | None = None
-        self.thoughts: list[Thought] = []
+        self.result: IdentificationResult | None = None
+        self.history: list[FamilyProbabilities] = []
         self.model: kv.Model | None = None
         self.tracker: Tracker | None = None
         self._base: list[Floats] = []
         self._part: list[Floats] = []
         self._covariances: list[Floats] = []
         self._fk: Callable[[dict[str, float]], Floats] | None = None
-        self._looked = self._thought = -np.inf
-        self._sorter = Sorter()
-        self._pace = LOOKS
+        self._sampled = self._identified = -np.inf
+        self._gate = OutlierGate()
+        self._sample_period = SAMPLE_PERIOD
 
-    def step(self, seen: Seen, time: float, dt: float, sight: Sight) -> None:
-        """Take in what was seen of base and part, in this order, ``dt`` after the last time [s]."""
-        good = self._sorter.good(seen, dt, sight)
-        if good.all() and time >= self._looked + self._pace:
-            self._looked = time
-            self._keep(seen, sight)
-        if time >= self._thought + THINKS and len(self._part) >= FEWEST:
-            self._thought = time
-            self._think(time, sight)
+    def step(self, readings: MarkerReadings, time: float, dt: float, sensor: SensorModel) -> None:
+        """Process readings of base and part, in this order, ``dt`` after the previous ones [s]."""
+        inliers = self._gate.find_inliers(readings, dt, sensor)
+        if inliers.all() and time >= self._sampled + self._sample_period:
+            self._sampled = time
+            self._store(readings, sensor)
+        if time >= self._identified + IDENTIFICATION_PERIOD and len(self._part) >= FEWEST_POSES:
+            self._identified = time
+            self._identify(time, sensor)
         if self.tracker is not None:
             self.tracker.predict(dt)
-            if seen.there[1]:
-                self.tracker.update({PART: (seen.poses[1], sight.covariance)})
+            if readings.visible[1]:
+                self.tracker.update({PART: (readings.poses[1], sensor.covariance)})
 
-    def _keep(self, seen: Seen, sight: Sight) -> None:
-        """Remember poses, and forget every other one where there are many: old ones say as much as new."""
-        self._base.append(seen.poses[0])
-        self._part.append(seen.poses[1])
-        self._covariances.append(sight.covariance)
-        if len(self._part) > MOST:
+    def _store(self, readings: MarkerReadings, sensor: SensorModel) -> None:
+        """Store poses, and drop every other one if there are many: old ones are worth as much as new ones."""
+        self._base.append(readings.poses[0])
+        self._part.append(readings.poses[1])
+        self._covariances.append(sensor.covariance)
+        if len(self._part) > MOST_POSES:
             self._base, self._part = self._base[::2], self._part[::2]
             self._covariances = self._covariances[::2]
-            self._pace *= 2.0
+            self._sample_period *= 2.0
 
-    def _think(self, time: float, sight: Sight) -> None:
+    def _identify(self, time: float, sensor: SensorModel) -> None:
         covariances = np.array(self._covariances)
         base, part = np.array(self._base), np.array(self._part)
-        self.found = identify(base, part, parent_covariance=covariances, child_covariance=covariances)
-        self.thoughts.append(Thought(time, {fit.family: fit.probability for fit in self.found}))
-        best = self.found.best
-        if self.found.is_ambiguous or best.family not in TOLD:
+        self.result = identify(base, part, parent_covariance=covariances, child_covariance=covariances)
+        self.history.append(FamilyProbabilities(time, {fit.family: fit.probability for fit in self.result}))
+        best = self.result.best
+        if self.result.is_ambiguous or best.family not in MODELLED_FAMILIES:
             self.model = self.tracker = self._fk = None
             return
-        # The base stands somewhere, which is learned in the same way.
+        # The pose of the base is identified in the same way.
         stands = identify(None, base, child_covariance=covariances, families=["rigid"]).best
         model = kv.Model()
         with model.edit() as edit:
             edit.apply(stands.operation(BASE, WORLD))
             edit.apply(best.operation(LEARNED, BASE, PART))
-        self._follow(model, best, sight)
+        self._start_tracker(model, best, sensor)
 
-    def _follow(self, model: kv.Model, fit: Fit, sight: Sight) -> None:
-        """Track with what was just learned, from where the part was seen last."""
+    def _start_tracker(self, model: kv.Model, fit: Fit, sensor: SensorModel) -> None:
+        """Track the identified joint, from the last pose of the part."""
         self.model, self.tracker, self._fk = model, None, kv.compile(model.fk(PART))
         names = [str(s) for s in model.degrees_of_freedom]
         if names:
@@ -118,30 +122,53 @@ class Learner:
                 model,
                 [ObservedPose(PART)],
                 start=dict(zip(names, fit.joint_values[-1].tolist(), strict=True)),
-                process_noise={s.derivative(): RESTLESS for s in model.degrees_of_freedom},
-                outliers=Outliers(sight.outliers) if sight.outliers else None,
+                process_noise={s.derivative(): PROCESS_NOISE for s in model.degrees_of_freedom},
+                outliers=Outliers(sensor.outliers) if sensor.outliers else None,
             )
 
     @property
     def values(self) -> dict[str, float]:
-        """Of the coordinates of the model that was learned, by name."""
+        """The values of the coordinates of the identified model, by name."""
         if self.tracker is None:
             return {}
         return {str(symbol): value for symbol, value in self.tracker.estimate.state.items()}
 
     @property
     def part(self) -> Floats | None:
-        """Where the part is held to be, 4×4; None as long as nobody knows how it moves."""
+        """The estimated pose of the part, 4×4; None as long as there is no model."""
         return None if self._fk is None else self._fk(self.values)
 
     @property
-    def seen(self) -> Floats:
-        """The places at which the part was seen (N, 3) [m]."""
+    def part_positions(self) -> Floats:
+        """The stored positions of the part (N, 3) [m]."""
         return np.array(self._part).reshape(-1, 4, 4)[:, :3, 3]
 
     @property
     def base(self) -> Floats:
-        """Where the base is held to be; where it was seen last, while nothing is certain."""
+        """The estimated pose of the base; the last observed one as long as there is no model."""
         if self.model is not None:
             return np.asarray(self.model.fk(BASE)({}))
         return self._base[-1] if self._base else np.eye(4)
+
+
+def axis_error(fit: Fit, point: Floats, direction: Floats) -> tuple[float, float, float]:
+    """Return the error of a fit with respect to the true axis, which is given in the parent.
+
+    Returns ------- The angle between them [rad], the distance of the true axis from the point of the fit [m]
+    (0 for a prismatic joint), and both as a multiple of what the covariance predicts: 1 on average.
+    """
+    rotation, origin = fit.frame[:3, :3], fit.frame[:3, 3]
+    way = rotation.T @ direction
+    way = way if way[2] > 0.0 else -way
+    off = [-way[1], way[0]]
+    names = ["axis.x", "axis.y"]
+    distance = 0.0
+    if fit.family in AXIAL_FAMILIES:
+        start = rotation.T @ (point - origin)
+        crossing = start - way * (start[2] / way[2])
+        off, names = [*crossing[:2], *off], ["point.x", "point.y", *names]
+        distance = float(np.linalg.norm(crossing[:2]))
+    index = [fit.coordinates.index(name) for name in names]
+    delta = np.array(off)
+    square = float(delta @ np.linalg.solve(fit.covariance[np.ix_(index, index)], delta)) / len(delta)
+    return float(np.arccos(np.clip(way[2], -1.0, 1.0))), distance, float(np.sqrt(square))

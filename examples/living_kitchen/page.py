@@ -1,4 +1,4 @@
-"""The scene that lives, in the browser."""
+"""Page of the simulation in the browser."""
 
 from __future__ import annotations
 
@@ -8,39 +8,38 @@ import time
 
 from kineverse.errors import KineverseError
 from kineverse.view import server as web
+from kineverse.view.viewer import PANEL_WIDTH
 
 from .panel import Panel
-from .scene import Scenery
-from .simulation import Life
-from .viser_scene import Stagehand
+from .scene import SceneDrawables
+from .simulation import Simulation
+from .viser_scene import SceneNodes
 
 logger = logging.getLogger(__name__)
 
 PERIOD = 1.0 / 12.0
-"""Least time between two moments that are shown [s]."""
+"""Least time between two frames [s]."""
 
-SHARE = 0.5
-"""The part of the time in which the page thinks at most: the rest is for whoever shows it."""
+BUSY_FRACTION = 0.5
+"""Largest fraction of the time in which the page computes; the rest is left to the browser."""
 
-LONGEST = 0.2
-"""The longest step of the scene [s]; what took longer is not made up for."""
+LONGEST_STEP = 0.2
+"""The longest time step of the simulation [s]; slower frames slow it down."""
 
-REPORTED = 0.4
+REPORT_PERIOD = 0.4
 """Time between two reports in the panel [s]."""
 
-WIDTH = 380
-"""Width of the controls [pixels]."""
 
+class SimulationPage:
+    """Web page that runs and shows a simulation.
 
-class LivingPage:
-    """A life on a web page of this computer.
-
-    It goes on while somebody looks, and waits while nobody does. Use it as a context, or call :meth:`stop`.
+    The simulation runs while a browser shows the page, and pauses otherwise. Use it as a context, or call
+    :meth:`stop`.
 
     Parameters
     ----------
-    life
-        What is shown, and moved on from now on; one of its own if None.
+    simulation
+        The simulation to run; a new one if None.
     port
         The port, 0 for any free one; None for 8080 or any free one.
     label
@@ -58,7 +57,7 @@ class LivingPage:
 
     def __init__(
         self,
-        life: Life | None = None,
+        simulation: Simulation | None = None,
         *,
         port: int | None = None,
         label: str = "Kineverse",
@@ -66,15 +65,15 @@ class LivingPage:
     ) -> None:
         self._server = web.start(port, label, host)
         try:
-            self.life = life or Life()
+            self.simulation = simulation or Simulation()
             gui = self._server.gui
             gui.configure_theme(show_logo=False, show_share_button=False, brand_color=(34, 104, 172))
             gui.main_panel.dock_right()
-            gui.main_panel.set_width(WIDTH)
-            self._scenery = Scenery(self.life)
-            self._stage = Stagehand(self._server, self._scenery)
-            self._wanted: str | None = None
-            self._panel = Panel(gui, self.life, self._meet)
+            gui.main_panel.set_width(PANEL_WIDTH)
+            self._drawables = SceneDrawables(self.simulation)
+            self._nodes = SceneNodes(self._server, self._drawables)
+            self._requested: str | None = None
+            self._panel = Panel(gui, self.simulation, self._request_mechanism)
         except BaseException:
             web.stop(self._server)
             raise
@@ -89,7 +88,7 @@ class LivingPage:
         return str(self._server.address)
 
     def wait(self) -> None:
-        """Keep the page up until :meth:`stop` or Ctrl-C; without a page this is an error."""
+        """Keep the page up until :meth:`stop` or Ctrl-C; an error after that."""
         if self._stopping.is_set():
             raise KineverseError(web.TAKEN_DOWN)
         # A wait without a limit cannot be interrupted on every platform.
@@ -97,7 +96,7 @@ class LivingPage:
             pass
 
     def stop(self) -> None:
-        """Take the page down; calling it again does nothing."""
+        """Take the page down; further calls do nothing."""
         if self._stopping.is_set():
             return
         self._stopping.set()
@@ -105,42 +104,42 @@ class LivingPage:
         web.stop(self._server)
         self._ended.set()
 
-    def __enter__(self) -> LivingPage:
+    def __enter__(self) -> SimulationPage:
         return self
 
     def __exit__(self, *_: object) -> None:
         self.stop()
 
-    def _meet(self, stranger: str) -> None:
-        """Note that somebody wants another stranger; it comes between two steps."""
-        self._wanted = stranger
+    def _request_mechanism(self, mechanism: str) -> None:
+        """Store a request for another mechanism, which is served between two steps."""
+        self._requested = mechanism
 
     def _work(self) -> None:
-        """Let the scene live until told to stop."""
+        """Run the simulation until :meth:`stop`."""
         last, took = time.monotonic(), 0.0
-        while not self._stopping.wait(max(PERIOD - took, took * (1.0 / SHARE - 1.0))):
+        while not self._stopping.wait(max(PERIOD - took, took * (1.0 / BUSY_FRACTION - 1.0))):
             now = time.monotonic()
-            passed, last = min(now - last, LONGEST), now
+            passed, last = min(now - last, LONGEST_STEP), now
             try:
                 if self._server.get_clients():
-                    self._go_on(passed)
+                    self._advance(passed)
             except Exception:
-                # The thread outlives whatever one moment does to it.
+                # The thread survives an error of one step.
                 logger.exception("the scene could not go on")
             took = time.monotonic() - now
 
-    def _go_on(self, passed: float) -> None:
-        wanted, self._wanted = self._wanted, None
-        if wanted is not None:
-            self.life.meet(wanted)
+    def _advance(self, passed: float) -> None:
+        requested, self._requested = self._requested, None
+        if requested is not None:
+            self.simulation.change_mechanism(requested)
         speed = self._panel.speed
-        self.life.sight = self._panel.sight
-        if speed or wanted is not None:
-            self.life.step(speed * passed)
-            if self.life.stranger is not self._scenery.known_stranger:
-                self._scenery.meet()
-            self._stage.update()
+        self.simulation.sensor = self._panel.sensor
+        if speed or requested is not None:
+            self.simulation.step(speed * passed)
+            if self.simulation.mechanism is not self._drawables.known_mechanism:
+                self._drawables.change_mechanism()
+            self._nodes.update()
         now = time.monotonic()
-        if now >= self._reported + REPORTED:
+        if now >= self._reported + REPORT_PERIOD:
             self._reported = now
             self._panel.update()

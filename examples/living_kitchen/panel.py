@@ -1,4 +1,4 @@
-"""The controls of the scene that lives, and what it says in words and numbers."""
+"""Controls and reports of the simulation."""
 
 from __future__ import annotations
 
@@ -7,14 +7,14 @@ from typing import Any
 
 from kineverse.view.hypertext import BREAK, Html, HtmlBox, element, join_html
 
-from .identify import Thought
-from .report import table_of_learning, table_of_tracking
-from .sensor import Sight
-from .simulation import Life
-from .unknown_mechanisms import STRANGERS
+from .identify import FamilyProbabilities
+from .report import tabulate_identification, tabulate_tracking
+from .sensor import SensorModel
+from .simulation import Simulation
+from .unknown_mechanisms import MECHANISMS
 
 WRONG, MISSING = 0.2, 0.5
-"""The parts of the observations that are wrong, and that are hidden, when that is switched on."""
+"""Fractions of outliers and of hidden readings, if switched on."""
 
 COLORS = {
     "rigid": "#868e96",
@@ -26,110 +26,110 @@ COLORS = {
     "planar": "#0c8599",
     "free": "#6741d9",
 }
-"""Of families, in the order in which they are listed."""
+"""Colours of families, in the order in which they are listed."""
 
 WIDTH, HEIGHT, SHOWN = 300, 64, 40
-"""The size of the picture of probabilities [pixels], and how many thoughts it shows."""
+"""Size of the plot of probabilities [pixels], and the number of identifications it shows."""
 
 INTRODUCTION = join_html(
     element("b", "Left: the truth"),
-    ", with the markers as they are seen, through noise.",
+    ", with noisy markers.",
     BREAK,
-    element("b", "Right: what is believed"),
-    " from the markers. Bars: ± 2σ; blue is sure, orange not.",
+    element("b", "Right: the estimate"),
+    " from the markers. Bars: ± 2σ; blue is certain, orange is not.",
     BREAK,
     element("b", "In front: a stranger"),
-    ". Nobody says how it moves; that is learned.",
+    ", a mechanism of unknown type. It is identified, then tracked.",
 )
 
 
 class Panel:
-    """The controls of a life.
+    """Controls of a simulation.
 
     Parameters
     ----------
     gui
         The gui of a viser server.
-    life
-        What is described.
-    meet
-        Called with the name of the stranger that somebody wants to see learned, from the beginning.
+    simulation
+        The simulation to report on.
+    change_mechanism
+        Called with the name of the mechanism that a user selects or restarts.
     """
 
-    def __init__(self, gui: Any, life: Life, meet: Callable[[str], None]) -> None:
-        self._life = life
+    def __init__(self, gui: Any, simulation: Simulation, change_mechanism: Callable[[str], None]) -> None:
+        self._simulation = simulation
         HtmlBox(gui, _box(INTRODUCTION))
         self._paused = gui.add_checkbox("pause", False)
         self._speed = gui.add_slider("speed", 0.25, 3.0, 0.25, 1.0)
-        with gui.add_folder("What is seen"):
-            self._noise = gui.add_slider("noise [cm]", 0.5, 10.0, 0.5, 100.0 * life.sight.noise)
+        with gui.add_folder("Sensor"):
+            self._noise = gui.add_slider("noise [cm]", 0.5, 10.0, 0.5, 100.0 * simulation.sensor.noise)
             self._wrong = gui.add_checkbox(f"{WRONG:.0%} outliers", False)
             self._hidden = gui.add_checkbox(f"{MISSING:.0%} hidden", False)
         with gui.add_folder("The kitchen, tracked"):
             self._kitchen = HtmlBox(gui, Html())
         with gui.add_folder("The stranger, learned"):
-            names = list(STRANGERS)
-            self._stranger = gui.add_dropdown("stranger", names, initial_value=life.stranger.name)
+            names = list(MECHANISMS)
+            self._choice = gui.add_dropdown("stranger", names, initial_value=simulation.mechanism.name)
             again = gui.add_button("Forget, and learn again")
             self._learned = HtmlBox(gui, Html())
-        self._stranger.on_update(lambda event: self._choose(event.target.value))
-        again.on_click(lambda _: meet(self._stranger.value))
-        self._meet = meet
+        self._choice.on_update(lambda event: self._choose(event.target.value))
+        again.on_click(lambda _: change_mechanism(self._choice.value))
+        self._change_mechanism = change_mechanism
         self.update()
 
-    def _choose(self, stranger: str) -> None:
-        # The list also changes when another one has come by itself, which is no wish.
-        if stranger != self._life.stranger.name:
-            self._meet(stranger)
+    def _choose(self, mechanism: str) -> None:
+        # The list also changes when the simulation replaces the mechanism, which is no request.
+        if mechanism != self._simulation.mechanism.name:
+            self._change_mechanism(mechanism)
 
     @property
     def speed(self) -> float:
-        """How fast time passes; 0 while it is stopped."""
+        """Simulated time per real time; 0 during a pause."""
         return 0.0 if self._paused.value else float(self._speed.value)
 
     @property
-    def sight(self) -> Sight:
-        """How well things are to be seen."""
-        return Sight(
+    def sensor(self) -> SensorModel:
+        """The selected sensor model."""
+        return SensorModel(
             float(self._noise.value) / 100.0,
             WRONG if self._wrong.value else 0.0,
             MISSING if self._hidden.value else 0.0,
         )
 
     def update(self) -> None:
-        """Say how it is now."""
-        self._kitchen.show(kitchen_report(self._life))
-        self._learned.show(stranger_report(self._life))
-        if self._stranger.value != self._life.stranger.name:
-            self._stranger.value = self._life.stranger.name
+        """Update the reports."""
+        self._kitchen.show(format_kitchen(self._simulation))
+        self._learned.show(format_mechanism(self._simulation))
+        if self._choice.value != self._simulation.mechanism.name:
+            self._choice.value = self._simulation.mechanism.name
 
 
-def kitchen_report(life: Life) -> Html:
-    """Return HTML: how far markers and the belief are off, how honest it is, and what it costs."""
-    now = life.figures
-    rejected = len(life.following.estimate.outliers)
-    _, rows = table_of_tracking(life, now)
-    there = life.seen.there
-    rows.append(("seen now", f"{int(there.sum())} of {len(there)} markers, {rejected} not believed"))
+def format_kitchen(simulation: Simulation) -> Html:
+    """Return HTML: errors of markers and of the track, its consistency, and the duration of an update."""
+    quality = simulation.average_quality
+    rejected = len(simulation.kitchen_tracker.estimate.outliers)
+    _, rows = tabulate_tracking(simulation, quality)
+    visible = simulation.readings.visible
+    rows.append(("seen now", f"{int(visible.sum())} of {len(visible)} markers, {rejected} rejected"))
     return _box(_table(rows))
 
 
-def stranger_report(life: Life) -> Html:
-    """Return HTML: what is thought of the stranger, how that came about, and how far it is off."""
-    learner, found = life.learner, life.learner.found
+def format_mechanism(simulation: Simulation) -> Html:
+    """Return HTML: the probabilities of families so far, the identified joint, and its error."""
+    learner, found = simulation.learner, simulation.learner.result
     if found is None:
         return _box(element("b", "looking …"))
-    # Families have bars, and the words say what comes of them.
+    # Families have bars instead of rows.
     elsewhere = {fit.family for fit in found} | {"conclusion"}
-    rows = [row for row in table_of_learning(life)[1] if row[0] not in elsewhere]
-    return _box(element("b", str(found)), _table(rows), _bars(learner.thoughts), *_history(learner.thoughts))
+    rows = [row for row in tabulate_identification(simulation)[1] if row[0] not in elsewhere]
+    return _box(element("b", str(found)), _table(rows), _bars(learner.history), *_history(learner.history))
 
 
-def _bars(thoughts: Sequence[Thought]) -> Html:
-    """Return a bar for each family that is not out of the question."""
+def _bars(history: Sequence[FamilyProbabilities]) -> Html:
+    """Return a bar for each family with a noticeable probability."""
     lines = []
     for family, color in COLORS.items():
-        share = thoughts[-1].probabilities.get(family, 0.0)
+        share = history[-1].probabilities.get(family, 0.0)
         if share < 0.005:
             continue
         lines.append(
@@ -144,20 +144,20 @@ def _bars(thoughts: Sequence[Thought]) -> Html:
     return element("div", *lines, style="margin:4px 0")
 
 
-def _history(thoughts: Sequence[Thought]) -> list[Html]:
-    """Return a picture of probabilities over time, and what it is."""
-    shown = thoughts[-SHOWN:]
+def _history(history: Sequence[FamilyProbabilities]) -> list[Html]:
+    """Return a plot of probabilities over time, and its caption."""
+    shown = history[-SHOWN:]
     if len(shown) < 2:
         return []
     begin, end = shown[0].time, shown[-1].time
     lines = []
     for family, color in COLORS.items():
-        values = [thought.probabilities.get(family, 0.0) for thought in shown]
+        values = [entry.probabilities.get(family, 0.0) for entry in shown]
         if max(values) < 0.05:
             continue
         points = " ".join(
-            f"{WIDTH * (thought.time - begin) / (end - begin):.1f},{2 + (HEIGHT - 4) * (1.0 - value):.1f}"
-            for thought, value in zip(shown, values, strict=True)
+            f"{WIDTH * (entry.time - begin) / (end - begin):.1f},{2 + (HEIGHT - 4) * (1.0 - value):.1f}"
+            for entry, value in zip(shown, values, strict=True)
         )
         lines.append(element("polyline", points=points, fill="none", stroke=color, stroke_width=2))
     size = {"viewBox": f"0 0 {WIDTH} {HEIGHT}", "width": "100%", "height": HEIGHT}

@@ -1,4 +1,4 @@
-"""A picture of the scene that lives, without a browser."""
+"""Picture of the simulation without a browser."""
 
 from __future__ import annotations
 
@@ -11,21 +11,23 @@ from kineverse.model.frame import WORLD
 from kineverse.view.camera import Camera
 from kineverse.view.pictures import draw_picture, write_png
 
-from .scene import CAMERA, Scenery, marks_of
-from .simulation import Life
+from .scene import CAMERA, SceneDrawables, create_marks
+from .simulation import Simulation
 
 SIZE = (1200, 600)
 """Width and height [pixels]."""
 
 
-def picture(life: Life, size: tuple[int, int] = SIZE, camera: Camera = CAMERA) -> npt.NDArray[np.uint8]:
-    """Return a picture of a life at this moment as (height, width, 3) bytes."""
-    scenery = Scenery(life)
+def picture(
+    simulation: Simulation, size: tuple[int, int] = SIZE, camera: Camera = CAMERA
+) -> npt.NDArray[np.uint8]:
+    """Return a picture of the present state of a simulation as (height, width, 3) bytes."""
+    drawables = SceneDrawables(simulation)
     return draw_picture(
-        scenery.parts(), {WORLD: np.eye(4), **scenery.poses()}, size, camera, marks_of(scenery)
+        drawables.parts(), {WORLD: np.eye(4), **drawables.poses()}, size, camera, create_marks(drawables)
     )
 
 
-def save(path: str | Path, life: Life) -> None:
+def save(path: str | Path, simulation: Simulation) -> None:
     """Write :func:`picture` to a PNG file."""
-    write_png(path, picture(life))
+    write_png(path, picture(simulation))

@@ -1,4 +1,4 @@
-"""A model that stands somewhere in the scene, in its own colours or in those of what is only believed."""
+"""Bodies of a model at a pose in the scene, in their own colours or in those of an estimate."""
 
 from __future__ import annotations
 
@@ -12,32 +12,32 @@ from kineverse.view.drawables import Drawable, Rgba, collect_drawables
 from kineverse.view.poses import FramePoses
 from kineverse.view.triangle_mesh import Floats, concatenate_meshes
 
-PAPER, INK = (0.88, 0.93, 0.98), (0.38, 0.50, 0.64)
-"""The colours of what is believed and does not move: those of white and black things."""
+LIGHT_TONE, DARK_TONE = (0.88, 0.93, 0.98), (0.38, 0.50, 0.64)
+"""The colours of white and black parts of an estimate that do not move."""
 
-DOUBTS = ((0.22, 0.50, 0.88), (0.98, 0.80, 0.30), (0.94, 0.36, 0.10))
-"""The colours of what is believed to be somewhere: within little, within more, within much."""
+UNCERTAINTY_COLORS = ((0.22, 0.50, 0.88), (0.98, 0.80, 0.30), (0.94, 0.36, 0.10))
+"""The colours of moving parts of an estimate, by increasing uncertainty."""
 
-LITTLE, MUCH = 0.08, 0.8
-"""The doubts of the first and the last of these [m]."""
+LEAST_LENGTH, LARGEST_LENGTH = 0.08, 0.8
+"""The uncertainties of the first and the last of these colours [m]."""
 
-SHADES = 12
-"""How many colours there are between them."""
+COLOR_STEPS = 12
+"""Number of colours between them."""
 
 
-class Figure:
-    """The bodies of a model, placed in the scene.
+class PlacedModel:
+    """Bodies of a model, placed in the scene.
 
     Parameters
     ----------
     name
-        Tells its parts from those of other figures.
+        Prefix of its frames in the scene.
     model
-        What is shown.
+        The model.
     place
-        Where its world is in the scene, 4×4.
+        The pose of its world in the scene, 4×4.
     paint
-        What becomes of the colours of bodies; they stay if None.
+        Function that replaces the colours of bodies; None keeps them.
 
     Attributes
     ----------
@@ -62,32 +62,32 @@ class Figure:
         self._poses = FramePoses(model, sorted({part.frame for part in shown}))
 
     def key(self, frame: str) -> str:
-        """Return what a frame of the model is called in the scene."""
+        """Return the name of a frame of the model in the scene."""
         return f"{self._name}|{frame}"
 
     def poses(self, values: Mapping[str, float]) -> dict[str, Floats]:
-        """Return where the frames that have bodies are in the scene, by key."""
+        """Return the poses in the scene of the frames that have bodies, by key."""
         names = map(self.key, self._poses.names)
-        return dict(zip(names, self._place @ self._poses.at(values), strict=True))
+        return dict(zip(names, self._place @ self._poses.evaluate(values), strict=True))
 
 
-def on_paper(color: Rgba) -> Rgba:
-    """Return the colour of something as it is drawn where it is only believed."""
+def estimate_color(color: Rgba) -> Rgba:
+    """Return the colour of a body in the estimated kitchen."""
     red, green, blue, alpha = color
-    return _between(INK, PAPER, 0.3 * red + 0.59 * green + 0.11 * blue, alpha)
+    return _between(DARK_TONE, LIGHT_TONE, 0.3 * red + 0.59 * green + 0.11 * blue, alpha)
 
 
-def doubtful(doubt: float) -> Rgba:
-    """Return the colour of a part that may be anywhere on a way of a length [m]."""
-    share = np.log(max(doubt, LITTLE) / LITTLE) / np.log(MUCH / LITTLE)
-    # In steps, so that a page need not be told of every change.
-    share = 2.0 * round(min(float(share), 1.0) * SHADES) / SHADES
-    low, high = DOUBTS[:2] if share < 1.0 else DOUBTS[1:]
+def uncertainty_color(length: float) -> Rgba:
+    """Return the colour of a part whose position is uncertain along a path of a length [m]."""
+    share = np.log(max(length, LEAST_LENGTH) / LEAST_LENGTH) / np.log(LARGEST_LENGTH / LEAST_LENGTH)
+    # In steps, so that small changes are not sent to the page.
+    share = 2.0 * round(min(float(share), 1.0) * COLOR_STEPS) / COLOR_STEPS
+    low, high = UNCERTAINTY_COLORS[:2] if share < 1.0 else UNCERTAINTY_COLORS[1:]
     return _between(low, high, share % 1.0 if share < 2.0 else 1.0, 1.0)
 
 
-def shaded(color: Rgba, own: Rgba) -> Rgba:
-    """Return a colour as dark as a part's own one has it: what is inside of a drawer stays dark."""
+def shade(color: Rgba, own: Rgba) -> Rgba:
+    """Return a colour at the brightness of a part's own colour: the inside of a drawer stays dark."""
     light = 0.45 + 0.55 * (0.3 * own[0] + 0.59 * own[1] + 0.11 * own[2])
     return color[0] * light, color[1] * light, color[2] * light, own[3]
 

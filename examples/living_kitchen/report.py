@@ -1,50 +1,53 @@
-"""How a life went, in the words and numbers of tables."""
+"""Tables of tracking and identification results."""
 
 from __future__ import annotations
 
 import math
 
-from .axis_uncertainty import WITH_AXIS, error
-from .simulation import Life
-from .track import Figures
+from .identify import DIRECTED_FAMILIES, axis_error
+from .simulation import Simulation
+from .track import TrackingQuality
 
 Table = tuple[tuple[str, str], list[tuple[str, str]]]
 
 
-def table_of_tracking(life: Life, figures: Figures) -> Table:
-    """Return head and rows: how far markers and beliefs were off, how honest these are, what they cost."""
-    return ("the kitchen, tracked", f"{len(life.following.tracker.symbols)} DoF"), [
-        ("markers are off by", millimetres(figures.marker)),
-        ("the track is off by", millimetres(figures.mean)),
-        ("at most", millimetres(figures.most)),
-        ("NEES, 1 is honest", f"{figures.nees:.2f}"),
-        ("an update takes", f"{1e3 * figures.seconds:.2f} ms"),
+def tabulate_tracking(simulation: Simulation, quality: TrackingQuality) -> Table:
+    """Return head and rows: errors of markers and track, its consistency, the duration of an update."""
+    return ("the kitchen, tracked", f"{len(simulation.kitchen_tracker.tracker.symbols)} DoF"), [
+        ("markers are off by", format_length(quality.marker)),
+        ("the track is off by", format_length(quality.mean)),
+        ("at most", format_length(quality.most)),
+        ("NEES, 1 is honest", f"{quality.nees:.2f}"),
+        ("an update takes", f"{1e3 * quality.seconds:.2f} ms"),
     ]
 
 
-def table_of_learning(life: Life) -> Table:
-    """Return head and rows: what was learned of the stranger, how sure that is, and how far off."""
-    learner, head = life.learner, ("the stranger, learned", life.stranger.name)
-    found = learner.found
+def tabulate_identification(simulation: Simulation) -> Table:
+    """Return head and rows: the identified joint of the mechanism, its uncertainty and its error."""
+    learner, head = simulation.learner, ("the stranger, learned", simulation.mechanism.name)
+    found = learner.result
     if found is None:
-        return head, [("poses", str(len(learner.seen)))]
+        return head, [("poses", str(len(learner.part_positions)))]
     best = found.best
     likely = [fit for fit in found.fits if fit.probability > 0.005]
-    rows = [("poses", str(len(learner.seen))), *((fit.family, f"{fit.probability:.3f}") for fit in likely)]
+    rows = [
+        ("poses", str(len(learner.part_positions))),
+        *((fit.family, f"{fit.probability:.3f}") for fit in likely),
+    ]
     if found.is_ambiguous:
         rows.append(("conclusion", "cannot tell"))
-    elif best.family in WITH_AXIS:
-        angle, distance, _ = error(best, *life.stranger.axis)
+    elif best.family in DIRECTED_FAMILIES:
+        angle, distance, _ = axis_error(best, *simulation.mechanism.axis)
         sigma = math.degrees(max(best.deviation("axis.x"), best.deviation("axis.y")))
         rows.append(("axis", f"± {sigma:.1f}°, off by {math.degrees(angle):.1f}°"))
         if "point.x" in best.coordinates:
             sigma = max(best.deviation("point.x"), best.deviation("point.y"))
-            rows.append(("its place", f"± {millimetres(sigma)}, off by {millimetres(distance)}"))
-    if life.part_error is not None:
-        rows.append(("the tracked part is off by", millimetres(life.part_error)))
+            rows.append(("its place", f"± {format_length(sigma)}, off by {format_length(distance)}"))
+    if simulation.part_error is not None:
+        rows.append(("the tracked part is off by", format_length(simulation.part_error)))
     return head, rows
 
 
-def millimetres(length: float) -> str:
-    """Return a length [m] in millimetres."""
+def format_length(length: float) -> str:
+    """Format a length [m] in millimetres."""
     return "–" if math.isnan(length) else f"{1e3 * length:.0f} mm"

@@ -1,4 +1,4 @@
-"""The scene that lives as things to draw: the truth, what is seen of it, and beside it what is believed."""
+"""Drawable parts of the simulation: the truth with its markers, and beside it the estimate."""
 
 from __future__ import annotations
 
@@ -9,152 +9,159 @@ import numpy as np
 from kineverse.model.frame import WORLD
 from kineverse.spatial import translation
 from kineverse.view.camera import Camera
-from kineverse.view.drawables import Drawable
+from kineverse.view.drawables import AXIS_COLORS, Drawable
 from kineverse.view.triangle_mesh import Floats, TriangleMesh
 
 from . import marker_meshes as marks
-from .axis_uncertainty import WITH_AXIS
-from .placed_model import Figure, doubtful, on_paper, shaded
-from .simulation import Life
+from .identify import DIRECTED_FAMILIES
+from .placed_model import PlacedModel, estimate_color, shade, uncertainty_color
+from .simulation import Simulation
 from .unknown_mechanisms import BASE, PART
 
-BESIDE = np.asarray(translation(-2.4, -4.9, 0.0)({}))
-"""Where the world that is believed is drawn: to the right of the true one."""
+ESTIMATE_POSE = np.asarray(translation(-2.4, -4.9, 0.0)({}))
+"""Pose of the estimated world in the scene: to the right of the true one."""
 
 CAMERA = Camera((-9.2, 3.2, 4.9), (-1.7, -2.1, 0.5), field_of_view=0.54)
-"""Both worlds, over the islands towards the rows."""
+"""View of both worlds, over the islands towards the rows."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Learned:
-    """What is drawn of an axis that was learned.
+class AxisDrawing:
+    """Identified axis with its uncertainty.
 
     Attributes
     ----------
     lines, tubes
-        Over the truth, and over what is believed.
+        Line and tube in the true world, and in the estimated one.
     """
 
     lines: tuple[Floats, Floats]
     tubes: tuple[TriangleMesh, TriangleMesh]
 
 
-class Scenery:
-    """What is drawn of a life.
+class SceneDrawables:
+    """Drawable parts of a simulation.
 
     Attributes
     ----------
-    truth, believed
+    truth, estimate
         The kitchens.
-    stranger, learned
-        What moves without anybody knowing how, and what was made of it; None before that.
+    mechanism, identified
+        The true mechanism, and the identified one.
     """
 
-    def __init__(self, life: Life) -> None:
-        self.life = life
-        self.truth = Figure("truth", life.kitchen)
-        self.believed = Figure("believed", life.kitchen, BESIDE, on_paper)
+    def __init__(self, simulation: Simulation) -> None:
+        self.simulation = simulation
+        self.truth = PlacedModel("truth", simulation.kitchen)
+        self.estimate = PlacedModel("believed", simulation.kitchen, ESTIMATE_POSE, estimate_color)
         self._owners = self._marker_of_frames()
-        self.meet()
+        self.change_mechanism()
 
-    def meet(self) -> None:
-        """Take in that there is another stranger."""
-        self.known_stranger = self.life.stranger
-        self.stranger = Figure("stranger", self.known_stranger.model)
-        self.learned = Figure("learned", self.known_stranger.model, None, on_paper)
-        key = self.learned.key(PART)
-        self.learned.parts = [
-            replace(part, color=shaded(doubtful(0.0), part.color)) if part.frame == key else part
-            for part in self.learned.parts
+    def change_mechanism(self) -> None:
+        """Take over a new mechanism of the simulation."""
+        self.known_mechanism = self.simulation.mechanism
+        self.mechanism = PlacedModel("stranger", self.known_mechanism.model)
+        self.identified = PlacedModel("learned", self.known_mechanism.model, None, estimate_color)
+        key = self.identified.key(PART)
+        self.identified.parts = [
+            replace(part, color=shade(uncertainty_color(0.0), part.color)) if part.frame == key else part
+            for part in self.identified.parts
         ]
 
     def _marker_of_frames(self) -> dict[str, int]:
-        """Return which marker moves with each frame that moves, by key."""
-        life, model = self.life, self.life.kitchen
-        owner = {s: k for k, frame in enumerate(life.following.frames) for s in model.fk(frame).symbols}
+        """Return the index of the marker that moves with each moving frame, by key."""
+        simulation, model = self.simulation, self.simulation.kitchen
+        owner = {
+            s: k for k, frame in enumerate(simulation.kitchen_tracker.frames) for s in model.fk(frame).symbols
+        }
         found = {}
         for frame in model.frames:
             symbols = () if frame == WORLD else model.fk(frame).symbols
             if symbols and symbols[0] in owner:
-                found[self.believed.key(frame)] = owner[symbols[0]]
+                found[self.estimate.key(frame)] = owner[symbols[0]]
         return found
 
     def poses(self) -> dict[str, Floats]:
-        """Return where all figures are, by the frames of their parts."""
-        life = self.life
-        base, part = self.believed_stranger()
+        """Return the poses of all frames that have parts, by key."""
+        simulation = self.simulation
+        base, part = self.estimated_mechanism()
         return {
-            **self.truth.poses(life.truth),
-            **self.believed.poses(life.following.values),
-            **{self.stranger.key(n): p for n, p in zip((BASE, PART), life.poses, strict=True)},
-            self.learned.key(BASE): base,
-            **({} if part is None else {self.learned.key(PART): part}),
+            **self.truth.poses(simulation.truth),
+            **self.estimate.poses(simulation.kitchen_tracker.values),
+            **{self.mechanism.key(n): p for n, p in zip((BASE, PART), simulation.poses, strict=True)},
+            self.identified.key(BASE): base,
+            **({} if part is None else {self.identified.key(PART): part}),
         }
 
-    def believed_stranger(self) -> tuple[Floats, Floats | None]:
-        """Return where base and part are held to be; None for a part of which nobody knows how it moves."""
-        learner = self.life.learner
+    def estimated_mechanism(self) -> tuple[Floats, Floats | None]:
+        """Return the estimated poses of base and part; None for a part without a model."""
+        learner = self.simulation.learner
         part = learner.part
-        return BESIDE @ learner.base, None if part is None else BESIDE @ part
+        return ESTIMATE_POSE @ learner.base, None if part is None else ESTIMATE_POSE @ part
 
     def colors(self) -> dict[str, tuple[float, float, float, float]]:
-        """Return the colours of what moves and is believed, by how sure its place is, by key of the frame."""
-        doubts = self.life.following.doubt()
-        return {key: doubtful(float(doubts[k])) for key, k in self._owners.items()}
+        """Return the colours of moving frames of the estimate, by their uncertainty, by key."""
+        lengths = self.simulation.kitchen_tracker.uncertainty_lengths()
+        return {key: uncertainty_color(float(lengths[k])) for key, k in self._owners.items()}
 
     def parts(self) -> list[Drawable]:
-        """Return all bodies as they are now."""
+        """Return all bodies in their present colours."""
         tones = self.colors()
-        found = [*self.truth.parts, *self.stranger.parts]
-        for part in self.believed.parts:
+        found = [*self.truth.parts, *self.mechanism.parts]
+        for part in self.estimate.parts:
             tone = tones.get(part.frame)
-            color = part.color if tone is None else shaded(tone, part.color)
+            color = part.color if tone is None else shade(tone, part.color)
             found.append(replace(part, color=color))
-        known = self.life.learner.model is not None
-        found += [p for p in self.learned.parts if known or p.frame == self.learned.key(BASE)]
+        known = self.simulation.learner.model is not None
+        found += [p for p in self.identified.parts if known or p.frame == self.identified.key(BASE)]
         return found
 
     def markers(self) -> Floats:
-        """Return the poses of all markers that are seen, those of the stranger last (m, 4, 4)."""
-        life = self.life
-        return np.concatenate([life.seen.poses[life.seen.there], life.stranger_seen.poses])
+        """Return the poses of all visible markers, those of the mechanism last (m, 4, 4)."""
+        simulation = self.simulation
+        return np.concatenate(
+            [simulation.readings.poses[simulation.readings.visible], simulation.mechanism_readings.poses]
+        )
 
-    def bars(self) -> Floats:
-        """Return where believed markers may be, (m, points, 3)."""
-        ways: Floats = self.life.following.ways() + BESIDE[:3, 3]
-        return ways
+    def uncertainty_bars(self) -> Floats:
+        """Return the paths of uncertainty of the estimated markers, (m, points, 3)."""
+        paths: Floats = self.simulation.kitchen_tracker.uncertainty_paths() + ESTIMATE_POSE[:3, 3]
+        return paths
 
-    def axis(self) -> Learned | None:
-        """Return the axis that was learned, if it has one and it is known."""
-        learner, found = self.life.learner, self.life.learner.found
-        if found is None or found.is_ambiguous or found.best.family not in WITH_AXIS:
+    def axis(self) -> AxisDrawing | None:
+        """Return the identified axis, if there is one."""
+        learner, found = self.simulation.learner, self.simulation.learner.result
+        if found is None or found.is_ambiguous or found.best.family not in DIRECTED_FAMILIES:
             return None
         base = learner.base
-        middle = (np.linalg.inv(base) @ np.append(learner.seen.mean(axis=0), 1.0))[:3]
-        line, tube = marks.axis_line(found.best, middle), marks.axis_tube(found.best, middle)
-        beside = BESIDE @ base
-        lines = tuple(line @ pose[:3, :3].T + pose[:3, 3] for pose in (base, beside))
-        return Learned((lines[0], lines[1]), (tube.moved(base), tube.moved(beside)))
+        middle = (np.linalg.inv(base) @ np.append(learner.part_positions.mean(axis=0), 1.0))[:3]
+        line, tube = marks.compute_axis_line(found.best, middle), marks.create_axis_tube(found.best, middle)
+        shifted = ESTIMATE_POSE @ base
+        lines = tuple(line @ pose[:3, :3].T + pose[:3, 3] for pose in (base, shifted))
+        return AxisDrawing((lines[0], lines[1]), (tube.transform(base), tube.transform(shifted)))
 
-    def cloud(self) -> Floats:
-        """Return the places at which the stranger's part was seen, where they are believed (n, 3)."""
-        seen: Floats = self.life.learner.seen + BESIDE[:3, 3]
-        return seen
+    def observed_positions(self) -> Floats:
+        """Return the stored positions of the mechanism's part, in the estimated world (n, 3)."""
+        positions: Floats = self.simulation.learner.part_positions + ESTIMATE_POSE[:3, 3]
+        return positions
 
 
-def marks_of(scenery: Scenery) -> list[Drawable]:
-    """Return everything that is no body, as parts in the world."""
+def create_marks(drawables: SceneDrawables) -> list[Drawable]:
+    """Return markers, bars and axes as parts in the world."""
     found = []
-    for pose in scenery.markers():
-        for rod, color in zip(marks.marker(pose), marks.AXES, strict=True):
-            found.append(Drawable(WORLD, rod, (*color, 1.0), "visual"))
-    found += [Drawable(WORLD, marks.bar(way), (*marks.BARS, 1.0), "visual") for way in scenery.bars()]
-    for point in scenery.cloud():
-        dot = marks.rod(point + np.array([[0.0, 0.0, -0.012], [0.0, 0.0, 0.012]]), 0.012)
+    for pose in drawables.markers():
+        for rod, color in zip(marks.create_marker(pose), AXIS_COLORS, strict=True):
+            found.append(Drawable(WORLD, rod, color, "visual"))
+    found += [
+        Drawable(WORLD, marks.create_bar(way), (*marks.BARS, 1.0), "visual")
+        for way in drawables.uncertainty_bars()
+    ]
+    for point in drawables.observed_positions():
+        dot = marks.create_rod(point + np.array([[0.0, 0.0, -0.012], [0.0, 0.0, 0.012]]), 0.012)
         found.append(Drawable(WORLD, dot, (*marks.CLOUD, 1.0), "visual"))
-    axis = scenery.axis()
+    axis = drawables.axis()
     if axis is not None:
         for line, tube in zip(axis.lines, axis.tubes, strict=True):
             found.append(Drawable(WORLD, tube, (*marks.TUBE, 0.4), "visual"))
-            found.append(Drawable(WORLD, marks.rod(line, marks.LINE), (*marks.AXIS, 1.0), "visual"))
+            found.append(Drawable(WORLD, marks.create_rod(line, marks.LINE), (*marks.AXIS, 1.0), "visual"))
     return found

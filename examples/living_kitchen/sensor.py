@@ -1,4 +1,4 @@
-"""What is seen of poses: noise, wrong observations, and what is hidden."""
+"""Simulated marker sensor: noise, outliers, and hidden markers."""
 
 from __future__ import annotations
 
@@ -12,26 +12,26 @@ from kineverse.estimation import pose_covariance
 from kineverse.lie import retract
 from kineverse.view.triangle_mesh import Floats
 
-TURN = np.radians(1.0) / 0.01
-"""The orientation's standard deviation for each of the position's: 1° a centimetre [rad/m]."""
+ORIENTATION_RATIO = np.radians(1.0) / 0.01
+"""Ratio of the orientation's standard deviation to the position's: 1° a centimetre [rad/m]."""
 
-BLINK = 3.0
-"""For how long something stays hidden [s]."""
+HIDDEN_TIME = 3.0
+"""Time for which a marker stays hidden [s]."""
 
-ASTRAY = 0.5
-"""How far off a wrong observation is, as a standard deviation of each coordinate [m]."""
+OUTLIER_DEVIATION = 0.5
+"""Standard deviation of each coordinate of an outlier [m]."""
 
 
 @dataclass(frozen=True, slots=True)
-class Sight:
-    """How well poses are seen.
+class SensorModel:
+    """Noise, outliers and visibility of observed poses.
 
     Attributes
     ----------
     noise
-        The standard deviation of each coordinate of a position [m]; orientations go with it, 1° a centimetre.
+        The standard deviation of each coordinate of a position [m]; of orientations 1° a centimetre of it.
     outliers, hidden
-        The parts of the observations that are plain wrong, and that are missing.
+        The fractions of readings that are outliers, and that are missing.
     """
 
     noise: float = 0.03
@@ -47,44 +47,44 @@ class Sight:
 
     @property
     def covariance(self) -> Floats:
-        """Of the errors of a pose that is not wrong, 6×6, see :mod:`kineverse.estimation.noise`."""
-        return pose_covariance(self.noise, TURN * self.noise)
+        """The covariance of the error of an inlier, 6×6, see :mod:`kineverse.estimation.noise`."""
+        return pose_covariance(self.noise, ORIENTATION_RATIO * self.noise)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Seen:
-    """Observations of one moment.
+class MarkerReadings:
+    """Readings of all markers at one time.
 
     Attributes
     ----------
     poses
         (m, 4, 4).
-    there, wrong
-        (m,) which of them were seen at all, and which of these are wrong.
+    visible, wrong
+        (m,) masks of the visible markers, and of the outliers.
     """
 
     poses: Floats
-    there: npt.NDArray[np.bool_]
+    visible: npt.NDArray[np.bool_]
     wrong: npt.NDArray[np.bool_]
 
 
-class Markers:
-    """Sees poses by a sequence of random numbers of its own."""
+class MarkerSampler:
+    """Sampler of readings, with a random generator of its own."""
 
     def __init__(self, count: int, seed: int) -> None:
         self._random = np.random.default_rng(seed)
-        self._lot = self._random.uniform(size=count)
+        self._lottery = self._random.uniform(size=count)
         self._drawn = 0.0
 
-    def look(self, poses: Floats, time: float, sight: Sight) -> Seen:
-        """Return what is seen of true poses (m, 4, 4) at a time [s]."""
+    def observe(self, poses: Floats, time: float, sensor: SensorModel) -> MarkerReadings:
+        """Return readings of true poses (m, 4, 4) at a time [s]."""
         count = len(poses)
-        if not self._drawn <= time < self._drawn + BLINK:
+        if not self._drawn <= time < self._drawn + HIDDEN_TIME:
             self._drawn = time
-            self._lot = self._random.uniform(size=count)
-        wrong = self._random.uniform(size=count) < sight.outliers
-        size = np.where(wrong, ASTRAY, sight.noise)[:, None]
-        moved = size * self._random.standard_normal((count, 3))
-        turned = TURN * size * self._random.standard_normal((count, 3))
-        seen = retract(poses, np.concatenate([moved, turned], axis=1))
-        return Seen(seen, self._lot >= sight.hidden, wrong)
+            self._lottery = self._random.uniform(size=count)
+        wrong = self._random.uniform(size=count) < sensor.outliers
+        size = np.where(wrong, OUTLIER_DEVIATION, sensor.noise)[:, None]
+        shifts = size * self._random.standard_normal((count, 3))
+        turns = ORIENTATION_RATIO * size * self._random.standard_normal((count, 3))
+        observed = retract(poses, np.concatenate([shifts, turns], axis=1))
+        return MarkerReadings(observed, self._lottery >= sensor.hidden, wrong)

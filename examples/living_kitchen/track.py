@@ -1,4 +1,4 @@
-"""The kitchen that is believed: a tracker of everything that opens, and how well it does."""
+"""Tracking of the kitchen from markers, and the quality of the track."""
 
 from __future__ import annotations
 
@@ -14,29 +14,29 @@ from kineverse.estimation import Estimate, ObservedPose, Tracker
 from kineverse.model.model_view import ModelView
 from kineverse.view.triangle_mesh import Floats
 
-from .sensor import Seen, Sight
+from .sensor import MarkerReadings, SensorModel
 
-RESTLESS = 0.1
-"""What may move at any time: the variance that a coordinate gains [m²/s], [rad²/s]."""
+PROCESS_NOISE = 0.1
+"""Variance that a coordinate gains, since any may move at any time [m²/s], [rad²/s]."""
 
 SIGMAS = 2.0
-"""How many standard deviations are shown."""
+"""Half width of drawn uncertainties, in standard deviations."""
 
 
 @dataclass(frozen=True, slots=True)
-class Figures:
-    """How good a belief is.
+class TrackingQuality:
+    """Errors of markers and of a track.
 
     Attributes
     ----------
     marker
-        How far markers are off: of those that were seen and are not wrong, root mean square [m].
+        The root mean square error of the positions of visible inliers [m].
     mean, most
-        How far the tracked places of the same markers are off, the mean and the largest [m].
+        The mean and the largest error of the tracked positions of the markers [m].
     nees
-        The normalised estimation error squared for each coordinate: 1 where a belief is as sure as it may be.
+        The normalised estimation error squared for each coordinate: 1 for a consistent track.
     seconds
-        What the update took.
+        The duration of the update.
     """
 
     marker: float
@@ -46,70 +46,72 @@ class Figures:
     seconds: float
 
 
-def average(figures: Sequence[Figures]) -> Figures:
-    """Return the figures of several moments as one: means, the largest ``most``, the median time."""
-    markers = [f.marker for f in figures if not math.isnan(f.marker)]
-    return Figures(
+def average(qualities: Sequence[TrackingQuality]) -> TrackingQuality:
+    """Return the average of qualities: means, the largest ``most``, the median time."""
+    markers = [f.marker for f in qualities if not math.isnan(f.marker)]
+    return TrackingQuality(
         float(np.sqrt(np.mean(np.square(markers)))) if markers else math.nan,
-        float(np.mean([f.mean for f in figures])),
-        max(f.most for f in figures),
-        float(np.mean([f.nees for f in figures])),
-        float(np.median([f.seconds for f in figures])),
+        float(np.mean([f.mean for f in qualities])),
+        max(f.most for f in qualities),
+        float(np.mean([f.nees for f in qualities])),
+        float(np.median([f.seconds for f in qualities])),
     )
 
 
-class Following:
-    """Tracks the coordinates of a model by markers on the parts that they move.
+class KitchenTracker:
+    """Tracker of the coordinates of a model, by markers on the parts that they move.
 
     Parameters
     ----------
     model
-        Whatever has an articulation with a coordinate has a marker, on its handle if there is one.
-    sight
-        How well it is seen.
+        The model. Each articulation with a coordinate has a marker, on its handle if there is one.
+    sensor
+        The sensor model of the markers.
     """
 
-    def __init__(self, model: ModelView, sight: Sight) -> None:
+    def __init__(self, model: ModelView, sensor: SensorModel) -> None:
         self.model = model
-        self.frames = marked(model)
+        self.frames = find_marked_frames(model)
         self._poses = kv.compile([model.fk(frame) for frame in self.frames])
         self._names = [str(symbol) for symbol in self._poses.inputs]
-        self.tracker = self._tracker(sight)
+        self.tracker = self._create_tracker(sensor)
         self.estimate: Estimate = self.tracker.estimate
-        self._sight = sight
+        self._sensor = sensor
 
-    def _tracker(self, sight: Sight, start: Estimate | None = None) -> Tracker:
-        """Return a tracker that begins where another one ended."""
+    def _create_tracker(self, sensor: SensorModel, start: Estimate | None = None) -> Tracker:
+        """Return a tracker that continues from an estimate."""
         return Tracker(
             self.model,
-            [ObservedPose(frame, covariance=sight.covariance) for frame in self.frames],
-            process_noise={symbol.derivative(): RESTLESS for symbol in self.model.degrees_of_freedom},
-            outliers=True if sight.outliers else None,
+            [ObservedPose(frame, covariance=sensor.covariance) for frame in self.frames],
+            process_noise={symbol.derivative(): PROCESS_NOISE for symbol in self.model.degrees_of_freedom},
+            outliers=True if sensor.outliers else None,
             start=None if start is None else start.state,
             uncertainty=None if start is None else {s: start.deviation[s] for s in start.state},
         )
 
-    def step(self, seen: Seen, truth: dict[str, float], dt: float, sight: Sight) -> Figures:
-        """Take in what was seen after ``dt`` seconds, and say how far off it and the belief are."""
-        if (sight.noise, sight.outliers) != (self._sight.noise, self._sight.outliers):
-            self.tracker = self._tracker(sight, self.estimate)
-        self._sight = sight
+    def step(
+        self, readings: MarkerReadings, truth: dict[str, float], dt: float, sensor: SensorModel
+    ) -> TrackingQuality:
+        """Update with readings taken after ``dt`` seconds, and return the quality of readings and track."""
+        if (sensor.noise, sensor.outliers) != (self._sensor.noise, self._sensor.outliers):
+            self.tracker = self._create_tracker(sensor, self.estimate)
+        self._sensor = sensor
         begin = time.perf_counter()
         if dt > 0.0:
             self.tracker.predict(dt)
-        self.estimate = self.tracker.update_poses(seen.poses, seen.there)
+        self.estimate = self.tracker.update_poses(readings.poses, readings.visible)
         seconds = time.perf_counter() - begin
-        return self._figures(seen, truth, seconds)
+        return self._rate(readings, truth, seconds)
 
-    def _figures(self, seen: Seen, truth: dict[str, float], seconds: float) -> Figures:
-        places = self.places(truth)
-        off = np.linalg.norm(self.places(self.values) - places, axis=1)
-        good = seen.there & ~seen.wrong
-        marker = np.linalg.norm(seen.poses[good, :3, 3] - places[good], axis=1)
-        # The Gaussian, and not the most probable state inside the limits, is what the covariance is about.
+    def _rate(self, readings: MarkerReadings, truth: dict[str, float], seconds: float) -> TrackingQuality:
+        positions = self.positions(truth)
+        off = np.linalg.norm(self.positions(self.values) - positions, axis=1)
+        good = readings.visible & ~readings.wrong
+        marker = np.linalg.norm(readings.poses[good, :3, 3] - positions[good], axis=1)
+        # The covariance is that of the Gaussian, not of the most probable state inside the limits.
         error = np.array([truth[str(s)] - self.estimate.state[s] for s in self.tracker.symbols])
         error -= self.estimate.mean
-        return Figures(
+        return TrackingQuality(
             float(np.sqrt(np.mean(marker**2))) if good.any() else float("nan"),
             float(off.mean()),
             float(off.max()),
@@ -126,14 +128,14 @@ class Following:
         """Return the poses of the marked frames, (m, 4, 4)."""
         return np.stack(self._poses(np.array([values[name] for name in self._names])))
 
-    def places(self, values: dict[str, float]) -> Floats:
+    def positions(self, values: dict[str, float]) -> Floats:
         """Return the positions of the marked frames, (m, 3)."""
         return self.poses(values)[:, :3, 3]
 
-    def ways(self, points: int = 5) -> Floats:
-        """Return where markers may be, ±2 standard deviations along their ways: (m, points, 3).
+    def uncertainty_paths(self, points: int = 5) -> Floats:
+        """Return the paths of markers through ±2 standard deviations: (m, points, 3).
 
-        Each coordinate is taken to move markers that no other one moves.
+        Each coordinate is assumed to move markers that no other one moves.
         """
         values, deviation = self.values, self.estimate.deviation
         limits = {str(s): bounds for s, bounds in self.tracker.limits.items()}
@@ -145,14 +147,14 @@ class Following:
         )
         return np.stack([poses[:, :3, 3] for poses in self._poses.batch(rows)])
 
-    def doubt(self) -> Floats:
-        """Return how far apart the ends of these ways are for each marked frame (m,) [m]."""
-        ways = self.ways(3)
-        lengths: Floats = np.linalg.norm(np.diff(ways, axis=1), axis=2).sum(axis=1)
+    def uncertainty_lengths(self) -> Floats:
+        """Return the lengths of the uncertainty paths of the marked frames (m,) [m]."""
+        paths = self.uncertainty_paths(3)
+        lengths: Floats = np.linalg.norm(np.diff(paths, axis=1), axis=2).sum(axis=1)
         return lengths
 
 
-def marked(model: ModelView) -> list[str]:
-    """Return the frames that carry a marker: handles, and what has none itself."""
+def find_marked_frames(model: ModelView) -> list[str]:
+    """Return the frames that carry a marker: handles, and moving frames without one."""
     moving = [record.child for record in model.articulations.values() if record.coordinates]
     return [f"{name}_handle" if f"{name}_handle" in model.frames else name for name in moving]

@@ -1,4 +1,4 @@
-"""How a kitchen lives: everything opens and shuts, smoothly, a few things at a time."""
+"""Periodic trajectory of a kitchen: all doors and drawers open and close smoothly, a few at a time."""
 
 from __future__ import annotations
 
@@ -7,44 +7,44 @@ from dataclasses import dataclass
 
 from kineverse.model.model_view import ModelView
 
-EVERY = 0.9
-"""From when one thing starts to open until the next one does [s]."""
+START_INTERVAL = 0.9
+"""Time between the starts of two motions [s]."""
 
-OPENING, OPEN = 2.6, 2.2
-"""How long it takes to open at least, and how long it stays open [s]."""
+OPENING_TIME, OPEN_TIME = 2.6, 2.2
+"""Shortest time of opening, and time for which it stays open [s]."""
 
-SHARE = 0.9
-"""The part of a range that is used."""
+RANGE_FRACTION = 0.9
+"""Fraction of a range that is used."""
 
-STEEPEST = 1.875
-"""The greatest slope of :func:`smooth`."""
+LARGEST_SLOPE = 1.875
+"""The largest slope of :func:`smooth_step`."""
 
-HASTE = 0.8
-"""The part of a speed limit that is used."""
+SPEED_FRACTION = 0.8
+"""Fraction of a speed limit that is used."""
 
 
 @dataclass(frozen=True, slots=True)
-class _Turn:
-    """When one degree of freedom starts, from where to where it goes, and how long that takes."""
+class _Motion:
+    """Start, end positions and duration of the motion of one degree of freedom."""
 
     start: float
-    shut: float
-    opened: float
-    lasts: float
+    closed: float
+    open: float
+    duration: float
 
 
-class Routine:
-    """The degrees of freedom of a model between their limits, as a function of time that repeats.
+class PeriodicTrajectory:
+    """Periodic motion of the degrees of freedom of a model between their limits.
 
     Parameters
     ----------
     model
-        Those of its coordinates move whose limits are finite numbers.
+        The model, whose coordinates with finite limits move.
 
     Attributes
     ----------
     period
-        After this time everything repeats [s].
+        The period [s].
     """
 
     def __init__(self, model: ModelView) -> None:
@@ -53,40 +53,42 @@ class Routine:
             for symbol in model.degrees_of_freedom
             if all(map(math.isfinite, limits := model.limits(symbol)))
         ]
-        self._turns: dict[str, _Turn] = {}
-        # Neighbours in the list are neighbours in the kitchen: what opens next is somewhere else.
+        self._motions: dict[str, _Motion] = {}
+        # Neighbours in the list are neighbours in the kitchen, so consecutive motions are spread over it.
         stride = _coprime(len(limited))
         for number in range(len(limited)):
             symbol, low, high = limited[number * stride % len(limited)]
-            way = SHARE * (high - low)
-            fastest = HASTE * min(abs(v) for v in model.limits(symbol.derivative()))
-            lasts = max(OPENING, STEEPEST * way / fastest) if fastest > 0.0 else OPENING
-            self._turns[str(symbol)] = _Turn(EVERY * number, low, low + way, lasts)
-        longest = max((turn.lasts for turn in self._turns.values()), default=OPENING)
-        self.period = max(EVERY * len(limited), 2.0 * longest + OPEN)
+            distance = RANGE_FRACTION * (high - low)
+            fastest = SPEED_FRACTION * min(abs(v) for v in model.limits(symbol.derivative()))
+            duration = OPENING_TIME
+            if fastest > 0.0:
+                duration = max(duration, LARGEST_SLOPE * distance / fastest)
+            self._motions[str(symbol)] = _Motion(START_INTERVAL * number, low, low + distance, duration)
+        longest = max((motion.duration for motion in self._motions.values()), default=OPENING_TIME)
+        self.period = max(START_INTERVAL * len(limited), 2.0 * longest + OPEN_TIME)
 
     @property
     def names(self) -> list[str]:
-        """What moves, in the order in which it does."""
-        return list(self._turns)
+        """The moving coordinates, in the order of their motions."""
+        return list(self._motions)
 
-    def at(self, time: float) -> dict[str, float]:
+    def evaluate(self, time: float) -> dict[str, float]:
         """Return the values at a time [s], by name [m], [rad]."""
-        return {name: self._value(turn, time) for name, turn in self._turns.items()}
+        return {name: self._value(motion, time) for name, motion in self._motions.items()}
 
-    def _value(self, turn: _Turn, time: float) -> float:
-        since = (time - turn.start) % self.period if time >= turn.start else 0.0
-        left = 2.0 * turn.lasts + OPEN - since
-        share = min(smooth(since / turn.lasts), smooth(left / turn.lasts))
-        return turn.shut + share * (turn.opened - turn.shut)
+    def _value(self, motion: _Motion, time: float) -> float:
+        since = (time - motion.start) % self.period if time >= motion.start else 0.0
+        left = 2.0 * motion.duration + OPEN_TIME - since
+        share = min(smooth_step(since / motion.duration), smooth_step(left / motion.duration))
+        return motion.closed + share * (motion.open - motion.closed)
 
 
-def smooth(share: float) -> float:
-    """Return a way from 0 to 1 that starts and ends without a jerk, 10 s³ - 15 s⁴ + 6 s⁵."""
+def smooth_step(share: float) -> float:
+    """Return a step from 0 to 1 without velocity and acceleration at its ends, 10 s³ - 15 s⁴ + 6 s⁵."""
     s = min(max(share, 0.0), 1.0)
     return s**3 * (10.0 - 15.0 * s + 6.0 * s * s)
 
 
 def _coprime(count: int) -> int:
-    """Return a stride by which all of so many places are visited, far from one to the next."""
+    """Return a stride that visits all of ``count`` places, far from one to the next."""
     return next((k for k in range(max(count // 3, 1), count + 1) if math.gcd(k, count) == 1), 1)

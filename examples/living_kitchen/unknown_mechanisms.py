@@ -1,4 +1,4 @@
-"""Things whose articulation nobody is told: a part that moves on a base, and bodies to see them by."""
+"""Mechanisms of unknown type: a base, a part that moves on it, and a hidden joint."""
 
 from __future__ import annotations
 
@@ -28,28 +28,28 @@ from kineverse.spatial import rotation_z, translation
 from kineverse.view.triangle_mesh import Floats
 
 BASE, PART, HIDDEN = "stranger/base", "stranger/part", "stranger/hidden"
-"""The frames that are seen, and the name of the joint that is not known."""
+"""The observed frames, and the name of the hidden joint."""
 
-STANDS = translation(-3.15, 0.95, 0.0) @ rotation_z(0.35)
-"""Where the base is: in the front, with its face to who looks at the kitchen."""
+BASE_POSE = translation(-3.15, 0.95, 0.0) @ rotation_z(0.35)
+"""Pose of the base: in front, facing the camera."""
 
 
 @dataclass(frozen=True)
-class Stranger:
-    """A base, a part, and what is hidden from those who look: the joint between them.
+class UnknownMechanism:
+    """Mechanism with a hidden joint between its base and its part.
 
     Attributes
     ----------
     name
-        What one would call it.
+        The name of the mechanism.
     family
-        What there is to be learned.
+        The family of its joint.
     joint
-        From the base to a frame on the axis, with its limits.
+        The joint from the base to a frame on the axis, with its limits.
     mount
-        Where the part is in that frame.
+        The pose of the part in that frame.
     base, part
-        What they look like, in their frames.
+        Their shapes, in their frames.
     """
 
     name: str
@@ -61,10 +61,10 @@ class Stranger:
 
     @cached_property
     def model(self) -> kv.Model:
-        """The truth, in which the joint is called :data:`HIDDEN`."""
+        """The true model, in which the joint is called :data:`HIDDEN`."""
         model = kv.Model()
         with model.edit() as edit:
-            edit.add_frame(BASE, parent=WORLD, transform=STANDS)
+            edit.add_frame(BASE, parent=WORLD, transform=BASE_POSE)
             edit.apply(self.joint)
             edit.add_frame(PART, parent=self.joint.child, transform=self.mount.matrix)
             edit.apply(SetBody(BASE, Body(visuals=self.base)))
@@ -72,7 +72,7 @@ class Stranger:
         return model
 
     @property
-    def reach(self) -> tuple[float, float]:
+    def limits(self) -> tuple[float, float]:
         """The limits of the joint [m], [rad]."""
         return self.model.limits(HIDDEN)
 
@@ -91,13 +91,13 @@ class Stranger:
     def axis(self) -> tuple[Floats, Floats]:
         """A point on the true axis [m], and its direction, in the base."""
         direction = np.array(self.joint.axis)
-        assert isinstance(self.joint.origin, Pose)  # as they are made here
+        assert isinstance(self.joint.origin, Pose)  # of all mechanisms below
         frame = self.joint.origin.matrix
         return frame[:3, 3], frame[:3, :3] @ direction / np.linalg.norm(direction)
 
 
-def chest() -> Stranger:
-    """Return a chest with a lid, hinged at the back."""
+def chest() -> UnknownMechanism:
+    """Return a chest with a lid that is hinged at the back."""
     width, depth, height, wall = 0.9, 0.5, 0.42, 0.03
     sides = _walls((depth, width, height), wall, WOOD)
     lid = (
@@ -105,11 +105,11 @@ def chest() -> Stranger:
         box_shape((0.03, 0.16, 0.03), (-depth / 2 - 0.035, 0.0, 0.0), STEEL),
     )
     hinge = Revolute(**_between((depth / 2 + 0.02, 0.0, height)), axis=(0.0, 1.0, 0.0), lower=0.0, upper=1.35)
-    return Stranger("chest", "revolute", hinge, _at(-depth / 2 - 0.02, 0.0, 0.025), sides, lid)
+    return UnknownMechanism("chest", "revolute", hinge, _at(-depth / 2 - 0.02, 0.0, 0.025), sides, lid)
 
 
-def crate() -> Stranger:
-    """Return a crate in a rack, to be pulled out a little upwards."""
+def crate() -> UnknownMechanism:
+    """Return a crate in a rack, which slides out and a little upwards."""
     width, depth, height = 0.6, 0.55, 0.5
     rack = (
         *_walls((depth, width, height), 0.03, STEEL),
@@ -121,11 +121,11 @@ def crate() -> Stranger:
         box_shape((0.03, 0.2, 0.03), (-depth / 2 - 0.04, 0.0, 0.08), DARK),
     )
     slide = Prismatic(**_between((-0.05, 0.0, 0.28)), axis=(-0.96, 0.0, 0.28), lower=0.0, upper=0.5)
-    return Stranger("crate", "prismatic", slide, _at(0.0, 0.0, 0.0), rack[1:], front)
+    return UnknownMechanism("crate", "prismatic", slide, _at(0.0, 0.0, 0.0), rack[1:], front)
 
 
-def stool() -> Stranger:
-    """Return a stool that rises as its seat is turned."""
+def stool() -> UnknownMechanism:
+    """Return a stool whose seat rises as it turns."""
     base = (
         rod_shape((0.0, 0.0, 0.0), (0.0, 0.0, 0.05), 0.26, DARK),
         rod_shape((0.0, 0.0, 0.05), (0.0, 0.0, 0.42), 0.035, STEEL),
@@ -138,11 +138,11 @@ def stool() -> Stranger:
     thread = Screw(
         **_between((0.0, 0.0, 0.46)), axis=(0.0, 0.0, 1.0), lower=0.0, upper=2.4, pitch=0.24 * math.tau / 2.4
     )
-    return Stranger("stool", "screw", thread, _at(0.0, 0.0, 0.0), base, seat)
+    return UnknownMechanism("stool", "screw", thread, _at(0.0, 0.0, 0.0), base, seat)
 
 
-STRANGERS: dict[str, Callable[[], Stranger]] = {"chest": chest, "crate": crate, "stool": stool}
-"""What there is to be learned, by name."""
+MECHANISMS: dict[str, Callable[[], UnknownMechanism]] = {"chest": chest, "crate": crate, "stool": stool}
+"""Constructors of the mechanisms, by name."""
 
 
 def _between(point: Vector3) -> dict[str, Any]:

@@ -1,4 +1,4 @@
-"""The scene that lives, on a page: nodes that are moved, and marks that are drawn anew."""
+"""viser nodes of the simulation: bodies that are moved, and marks that are redrawn."""
 
 from __future__ import annotations
 
@@ -12,40 +12,40 @@ from kineverse.view.poses import to_wxyz
 from kineverse.view.triangle_mesh import Floats
 
 from . import marker_meshes as marks
-from .placed_model import shaded
-from .scene import BESIDE, CAMERA, Scenery
+from .placed_model import shade
+from .scene import CAMERA, ESTIMATE_POSE, SceneDrawables
 from .unknown_mechanisms import BASE, PART
 
 ROOT = "/living"
 
 EXTENT = 12.0
-"""How large the scene is [m]."""
+"""Extent of the scene [m]."""
 
 FIELD_OF_VIEW = 0.86
-"""Of the camera [rad]: beside the controls a page is about as high as it is wide."""
+"""Field of view [rad]: beside the controls a page is about as high as it is wide."""
 
-HIDDEN = 1e-4
-"""The scale of a marker that is not seen."""
+HIDDEN_SCALE = 1e-4
+"""Scale of a hidden marker."""
 
-MOVED = 2e-4
-"""What has moved by less need not be sent [m], [rad]."""
+POSE_TOLERANCE = 2e-4
+"""Largest change of a pose that is not sent [m], [rad]."""
 
-WORDS = {"the truth": (0.4, 0.0, 2.75), "what is believed": (0.4, 0.0, 2.75)}
+CAPTIONS = {"the truth": (0.4, 0.0, 2.75), "the estimate": (0.4, 0.0, 2.75)}
 
 
-class Stagehand:
-    """Shows a scenery on a viser server, and sends what has changed.
+class SceneNodes:
+    """Nodes of a viser server that show a scene; an update sends only changes.
 
     Parameters
     ----------
     server
         A viser server.
-    scenery
-        What is shown.
+    drawables
+        The parts of the scene.
     """
 
-    def __init__(self, server: Any, scenery: Scenery) -> None:
-        self._server, self._scenery = server, scenery
+    def __init__(self, server: Any, drawables: SceneDrawables) -> None:
+        self._server, self._drawables = server, drawables
         backdrop.set_up(server)
         backdrop.set_floor(server, 0.0, EXTENT, True)
         away = np.subtract(CAMERA.position, CAMERA.target)
@@ -53,23 +53,23 @@ class Stagehand:
         start = server.initial_camera
         start.position, start.look_at = np.array(CAMERA.position), np.array(CAMERA.target)
         start.fov = FIELD_OF_VIEW
-        for number, (text, at) in enumerate(WORDS.items()):
-            place = np.asarray(at) + (BESIDE[:3, 3] if number else 0.0)
+        for number, (text, at) in enumerate(CAPTIONS.items()):
+            place = np.asarray(at) + (ESTIMATE_POSE[:3, 3] if number else 0.0)
             server.scene.add_label(f"{ROOT}/words{number}", text, position=place)
         self._nodes: dict[str, Any] = {}
         self._meshes: dict[str, list[tuple[Any, Drawable]]] = {}
         self._poses: dict[str, Floats] = {}
         self._colors: dict[str, Rgba] = {}
         with server.atomic():
-            self._add(scenery.truth.parts)
-            # No shadows on paper: they are much of the work of a browser without a graphics card.
-            self._add(scenery.believed.parts, shadows=False)
+            self._add(drawables.truth.parts)
+            # Estimates have no shadows, which are much of the work of a browser without a graphics card.
+            self._add(drawables.estimate.parts, shadows=False)
             self._add_marks()
-            self._add_stranger()
+            self._add_mechanism()
         self.update()
 
     def _add(self, parts: list[Drawable], shadows: bool = True) -> None:
-        poses = self._scenery.poses()
+        poses = self._drawables.poses()
         for number, part in enumerate(parts):
             key = part.frame
             if key not in self._nodes:
@@ -87,21 +87,21 @@ class Stagehand:
                 opacity=None if alpha >= 1.0 else alpha,
                 side="front" if part.surface.closed else "double",
                 cast_shadow=shadows,
-                # In a scene this large the shadow of a thing on itself is a pattern of stripes.
+                # In a scene this large the shadow of a body on itself is a pattern of stripes.
                 receive_shadow=False,
             )
             self._meshes.setdefault(key, []).append((mesh, part))
 
-    def _add_stranger(self) -> None:
-        scenery = self._scenery
-        self._thoughts = -1
-        self._shown_stranger = scenery.known_stranger
-        self._add(scenery.stranger.parts)
-        self._add(scenery.learned.parts, shadows=False)
+    def _add_mechanism(self) -> None:
+        drawables = self._drawables
+        self._drawn_results = -1
+        self._shown_mechanism = drawables.known_mechanism
+        self._add(drawables.mechanism.parts)
+        self._add(drawables.identified.parts, shadows=False)
 
     def _add_marks(self) -> None:
-        scene, life = self._server.scene, self._scenery.life
-        count = len(life.following.frames) + len(life.poses)
+        scene, simulation = self._server.scene, self._drawables.simulation
+        count = len(simulation.kitchen_tracker.frames) + len(simulation.poses)
         self._markers = scene.add_batched_axes(
             f"{ROOT}/markers",
             np.tile([1.0, 0.0, 0.0, 0.0], (count, 1)),
@@ -137,30 +137,30 @@ class Stagehand:
         ]
 
     def _segments(self) -> Floats:
-        """Return the ways of markers as lines (n, 2, 3)."""
-        ways = self._scenery.bars()
-        return np.stack([ways[:, :-1], ways[:, 1:]], axis=2).reshape(-1, 2, 3)
+        """Return the uncertainty bars as lines (n, 2, 3)."""
+        paths = self._drawables.uncertainty_bars()
+        return np.stack([paths[:, :-1], paths[:, 1:]], axis=2).reshape(-1, 2, 3)
 
     def update(self) -> None:
-        """Show everything as it is now."""
-        scenery = self._scenery
+        """Show the present state."""
+        drawables = self._drawables
         with self._server.atomic():
-            if scenery.known_stranger is not self._shown_stranger:
-                self._remove_stranger()
-                self._add_stranger()
-            for key, pose in scenery.poses().items():
-                if key in self._nodes and np.abs(pose - self._poses.get(key, np.inf)).max() > MOVED:
+            if drawables.known_mechanism is not self._shown_mechanism:
+                self._remove_mechanism()
+                self._add_mechanism()
+            for key, pose in drawables.poses().items():
+                if key in self._nodes and np.abs(pose - self._poses.get(key, np.inf)).max() > POSE_TOLERANCE:
                     self._place(key, pose)
-            for key, tone in scenery.colors().items():
+            for key, tone in drawables.colors().items():
                 if key in self._meshes and self._colors.get(key) != tone:
                     self._colors[key] = tone
                     for mesh, part in self._meshes[key]:
-                        mesh.color = _bytes(shaded(tone, part.color)[:3])
+                        mesh.color = _bytes(shade(tone, part.color)[:3])
             self._update_markers()
             self._bars.points = self._segments().astype(np.float32)
-            if len(scenery.life.learner.thoughts) != self._thoughts:
-                self._thoughts = len(scenery.life.learner.thoughts)
-                self._draw_learned()
+            if len(drawables.simulation.learner.history) != self._drawn_results:
+                self._drawn_results = len(drawables.simulation.learner.history)
+                self._draw_axis()
 
     def _place(self, key: str, pose: Floats) -> None:
         self._poses[key] = pose
@@ -168,20 +168,20 @@ class Stagehand:
         node.position, node.wxyz = pose[:3, 3], to_wxyz(pose[None])[0]
 
     def _update_markers(self) -> None:
-        life = self._scenery.life
-        poses = np.concatenate([life.seen.poses, life.stranger_seen.poses])
-        there = np.concatenate([life.seen.there, life.stranger_seen.there])
+        simulation = self._drawables.simulation
+        poses = np.concatenate([simulation.readings.poses, simulation.mechanism_readings.poses])
+        visible = np.concatenate([simulation.readings.visible, simulation.mechanism_readings.visible])
         self._markers.batched_positions = poses[:, :3, 3].astype(np.float32)
         self._markers.batched_wxyzs = to_wxyz(poses).astype(np.float32)
-        self._markers.batched_scales = np.where(there, 1.0, HIDDEN).astype(np.float32)
+        self._markers.batched_scales = np.where(visible, 1.0, HIDDEN_SCALE).astype(np.float32)
 
-    def _draw_learned(self) -> None:
-        """Draw what was thought last, which changes seldom."""
-        scenery = self._scenery
-        cloud, axis = scenery.cloud(), scenery.axis()
-        self._nodes[scenery.learned.key(PART)].visible = scenery.life.learner.model is not None
-        self._cloud.visible = bool(len(cloud))
-        self._cloud.points = cloud.astype(np.float32)
+    def _draw_axis(self) -> None:
+        """Draw the latest identified axis and the stored positions, which change seldom."""
+        drawables = self._drawables
+        observed_positions, axis = drawables.observed_positions(), drawables.axis()
+        self._nodes[drawables.identified.key(PART)].visible = drawables.simulation.learner.model is not None
+        self._cloud.visible = bool(len(observed_positions))
+        self._cloud.points = observed_positions.astype(np.float32)
         for mark in (*self._lines, *self._tubes):
             mark.visible = axis is not None
         if axis is None:
@@ -191,11 +191,11 @@ class Stagehand:
         for shown, tube in zip(self._tubes, axis.tubes, strict=True):
             shown.vertices, shown.faces = tube.vertices.astype(np.float32), tube.faces.astype(np.uint32)
 
-    def _remove_stranger(self) -> None:
-        scenery = self._scenery
-        for figure in (scenery.stranger, scenery.learned):
+    def _remove_mechanism(self) -> None:
+        drawables = self._drawables
+        for placed in (drawables.mechanism, drawables.identified):
             for frame in (BASE, PART):
-                key = figure.key(frame)
+                key = placed.key(frame)
                 self._nodes.pop(key).remove()
                 for table in (self._meshes, self._poses, self._colors):
                     table.pop(key, None)

@@ -8,11 +8,11 @@ import sys
 
 import numpy as np
 import pytest
-from living_kitchen.unknown_mechanisms import STRANGERS
+from living_kitchen.unknown_mechanisms import MECHANISMS
 
 import kineverse as kv
 from kineverse.cli import main
-from kineverse.cli.demo import MODELS, STATE, add_arguments
+from kineverse.cli.demo import MODELS, STATE, _find_example, add_arguments
 from kineverse.cli.exercise import SAMPLES_PER_RANGE, exercise_model
 
 
@@ -24,13 +24,13 @@ def both():
     return model
 
 
-def test_the_opening_scene_is_one_the_models_have_and_allow(both):
+def test_the_initial_state_is_valid_for_the_models(both):
     known = {str(symbol) for symbol in both.degrees_of_freedom}
     assert set(STATE) <= known
     assert list(both.violations(both.default_state().updated(STATE))) == []
 
 
-def test_headless_tracks_learns_writes_a_picture_and_ends(tmp_path, capsys):
+def test_headless_demo_tracks_identifies_and_writes_a_picture(tmp_path, capsys):
     path = tmp_path / "picture.png"
     assert main(["demo", "--headless", "--seconds", "8", "--picture", str(path)]) == 0
     out, err = capsys.readouterr()
@@ -43,7 +43,7 @@ def test_headless_tracks_learns_writes_a_picture_and_ends(tmp_path, capsys):
     assert path.read_bytes().startswith(b"\x89PNG")
 
 
-def test_a_short_life_cannot_tell_and_none_is_refused(tmp_path, capsys):
+def test_short_simulations_are_ambiguous_and_invalid_durations_refused(tmp_path, capsys):
     words = ["demo", "--headless", "--stranger", "stool", "--picture", str(tmp_path / "x.png"), "--seconds"]
     assert main([*words, "1"]) == 0
     assert "cannot tell" in capsys.readouterr().out
@@ -52,14 +52,14 @@ def test_a_short_life_cannot_tell_and_none_is_refused(tmp_path, capsys):
         assert "--seconds is between" in capsys.readouterr().err
 
 
-def test_the_strangers_on_offer_are_those_there_are():
+def test_the_choices_of_stranger_are_the_mechanisms():
     parser = argparse.ArgumentParser()
     add_arguments(parser)
     (option,) = (action for action in parser._actions if action.dest == "stranger")
-    assert sorted(option.choices) == sorted(STRANGERS)
+    assert sorted(option.choices) == sorted(MECHANISMS)
 
 
-def test_headless_sliders_drive_everything_write_a_picture_and_end(tmp_path, capsys):
+def test_headless_sliders_drive_all_coordinates_and_write_a_picture(tmp_path, capsys):
     path = tmp_path / "picture.png"
     assert main(["demo", "--sliders", "--headless", "--picture", str(path)]) == 0
     out, err = capsys.readouterr()
@@ -69,7 +69,30 @@ def test_headless_sliders_drive_everything_write_a_picture_and_end(tmp_path, cap
     assert path.read_bytes().startswith(b"\x89PNG")
 
 
-def test_headless_needs_the_core_alone(tmp_path):
+def test_outside_a_checkout_the_demo_shows_the_sliders_and_says_so(tmp_path, monkeypatch, capsys):
+    path = tmp_path / "picture.png"
+    monkeypatch.setattr("kineverse.cli.demo._find_example", lambda: False)
+    assert main(["demo", "--headless", "--picture", str(path)]) == 0
+    out, err = capsys.readouterr()
+    assert "45 DoF driven" in out
+    assert err.startswith("kineverse: note: the living kitchen is an example of the source checkout")
+    assert len(err.splitlines()) == 1
+    assert path.read_bytes().startswith(b"\x89PNG")
+
+
+@pytest.mark.parametrize("in_checkout", [True, False])
+def test_the_example_is_found_beside_the_sources_only(tmp_path, monkeypatch, in_checkout):
+    example = tmp_path / "examples" / "living_kitchen" / "__init__.py"
+    if in_checkout:
+        example.parent.mkdir(parents=True)
+        example.touch()
+    monkeypatch.setattr("kineverse.__file__", str(tmp_path / "src" / "kineverse" / "__init__.py"))
+    monkeypatch.setattr(sys, "path", [])
+    assert _find_example() is in_checkout
+    assert sys.path == [str(tmp_path / "examples")] * in_checkout
+
+
+def test_headless_demo_needs_the_core_only(tmp_path):
     extras = ("viser", "trimesh", "PIL", "scipy", "collada")
     code = (
         f"import sys\nfor name in {extras!r}: sys.modules[name] = None\n"
@@ -82,18 +105,18 @@ def test_headless_needs_the_core_alone(tmp_path):
     assert (tmp_path / "core.png").exists()
 
 
-def test_who_interrupts_finds_no_empty_picture(tmp_path, monkeypatch):
+def test_an_interrupted_demo_leaves_no_empty_picture(tmp_path, monkeypatch):
     def interrupted(self, dt):
         if dt > 0.0:
             raise KeyboardInterrupt
 
-    monkeypatch.setattr("living_kitchen.Life.step", interrupted)
+    monkeypatch.setattr("living_kitchen.Simulation.step", interrupted)
     with contextlib.suppress(KeyboardInterrupt):
         assert main(["demo", "--headless", "--picture", str(tmp_path / "x.png")]) != 0
     assert not list(tmp_path.iterdir())
 
 
-def test_a_picture_that_cannot_be_written_is_one_line(tmp_path, capsys):
+def test_an_unwritable_picture_is_reported_in_one_line(tmp_path, capsys):
     assert main(["demo", "--headless", "--picture", str(tmp_path / "none" / "x.png")]) == 2
     err = capsys.readouterr().err
     assert err.endswith("No such file or directory\n")
@@ -101,7 +124,7 @@ def test_a_picture_that_cannot_be_written_is_one_line(tmp_path, capsys):
 
 
 @pytest.mark.parametrize("words", [[], ["--sliders"]])
-def test_a_picture_is_no_jpeg(tmp_path, capsys, words):
+def test_pictures_of_other_formats_are_refused(tmp_path, capsys, words):
     path = tmp_path / "x.jpg"
     assert main(["demo", "--headless", "--picture", str(path), *words]) == 2
     err = capsys.readouterr().err
@@ -110,7 +133,7 @@ def test_a_picture_is_no_jpeg(tmp_path, capsys, words):
     assert not path.exists()
 
 
-def test_exercise_finds_faults_of_a_model():
+def test_exercise_model_reports_problems_of_a_model():
     a, b = kv.position("a"), kv.position("b")
     model = kv.Model()
     with model.edit() as edit:
@@ -127,6 +150,6 @@ def test_exercise_finds_faults_of_a_model():
     assert any(line.startswith("b: 1 frames have no rigid pose, such as rod") for line in result.problems)
 
 
-def test_driving_nothing_is_no_trouble():
+def test_exercise_model_accepts_an_empty_model():
     result = exercise_model(kv.Model())
     assert (result.freedoms, result.poses, result.problems) == (0, 0, [])

@@ -1,4 +1,4 @@
-"""Pictures of learned joints: the views are along and across the axis, and the spread drawn is that of the fit."""
+"""Plots of identified joints: views along and across the axis, and the uncertainty of the fit."""
 
 from __future__ import annotations
 
@@ -33,33 +33,33 @@ def found():
     return identify(None, hinge(), noise=NOISE)
 
 
-def test_one_looks_along_the_axis(found):
+def test_fit_projection_looks_along_the_axis(found):
     fit = found["revolute"]
-    looked = FitProjection.at(fit, hinge())
-    np.testing.assert_allclose(looked.axes.T @ looked.axes, np.eye(3), atol=1e-12)
-    assert np.linalg.det(looked.axes) == pytest.approx(1)
-    np.testing.assert_allclose(looked.axes[:, 2], fit.parameters["axis"])
+    projection = FitProjection.from_fit(fit, hinge())
+    np.testing.assert_allclose(projection.axes.T @ projection.axes, np.eye(3), atol=1e-12)
+    assert np.linalg.det(projection.axes) == pytest.approx(1)
+    np.testing.assert_allclose(projection.axes[:, 2], fit.parameters["axis"])
     # The fitted way is an arc about the origin, at its height.
-    radii = np.linalg.norm(looked.way[:, :2], axis=1)
+    radii = np.linalg.norm(projection.path[:, :2], axis=1)
     np.testing.assert_allclose(radii, radii[0])
-    np.testing.assert_allclose(looked.way[:, 2], 0, atol=1e-9)
+    np.testing.assert_allclose(projection.path[:, 2], 0, atol=1e-9)
     # The middle of the way is to the right.
-    assert looked.way[100, 0] == pytest.approx(radii[0], rel=0.02)
+    assert projection.path[100, 0] == pytest.approx(radii[0], rel=0.02)
 
 
-def test_a_slider_moves_along_its_axis():
+def test_fit_projection_of_a_prismatic_joint_moves_along_its_axis():
     rng = np.random.default_rng(1)
     points = np.linspace(0, 0.4, 20)[:, None] * AXIS + POINT + 0.002 * rng.standard_normal((20, 3))
     fit = identify(None, points, noise=pose_covariance(0.002, 1))["prismatic"]
-    looked = FitProjection.at(fit, points)
-    np.testing.assert_allclose(looked.way[:, :2], 0, atol=1e-9)
-    assert np.ptp(looked.way[:, 2]) == pytest.approx(0.4, abs=0.01)
+    projection = FitProjection.from_fit(fit, points)
+    np.testing.assert_allclose(projection.path[:, :2], 0, atol=1e-9)
+    assert np.ptp(projection.path[:, 2]) == pytest.approx(0.4, abs=0.01)
 
 
 @pytest.mark.parametrize("height", [0.0, 0.7, -2.0])
-def test_the_spread_drawn_is_that_of_axes_drawn_at_random(found, height):
+def test_axis_covariances_of_a_projection_are_those_of_sampled_axes(found, height):
     fit = found["revolute"]
-    looked = FitProjection.at(fit, hinge())
+    projection = FitProjection.from_fit(fit, hinge())
     names = ["axis.x", "axis.y", "point.x", "point.y"]
     chosen = [fit.coordinates.index(name) for name in names]
     covariance = fit.covariance[np.ix_(chosen, chosen)]
@@ -68,12 +68,12 @@ def test_the_spread_drawn_is_that_of_axes_drawn_at_random(found, height):
     directions = turns[:, :, 2] @ fit.frame[:3, :3].T
     points = fit.frame[:3, 3] + draws[:, 2:] @ fit.frame[:3, :2].T
     # Where these axes cross the plane at that height.
-    plane = looked.origin + height * looked.axes[:, 2]
-    ways = ((plane - points) @ looked.axes[:, 2]) / (directions @ looked.axes[:, 2])
-    crossings = (points + ways[:, None] * directions - plane) @ looked.axes[:, :2]
+    plane = projection.origin + height * projection.axes[:, 2]
+    ways = ((plane - points) @ projection.axes[:, 2]) / (directions @ projection.axes[:, 2])
+    crossings = (points + ways[:, None] * directions - plane) @ projection.axes[:, :2]
     expected = np.cov(crossings.T)
     np.testing.assert_allclose(
-        looked.shifts(np.array([height]))[0], expected, atol=0.05 * np.abs(expected).max()
+        projection.axis_covariances(np.array([height]))[0], expected, atol=0.05 * np.abs(expected).max()
     )
 
 
@@ -92,17 +92,17 @@ def test_every_family_is_drawn(family, whole):
 
 
 @pytest.mark.parametrize("family", ["revolute", "prismatic"])
-def test_what_does_not_fit_is_ringed(found, family):
+def test_outliers_are_ringed(found, family):
     figure = pytest.importorskip("matplotlib.figure").Figure(figsize=SIZE, layout="constrained")
     draw_fit(figure, replace(found[family], outliers=(3, 8)), hinge(), "a title")
-    looked = FitProjection.at(found[family], hinge())
+    projection = FitProjection.from_fit(found[family], hinge())
     side = next(axes for axes in figure.axes if axes.get_title() == "from the side")
     ringed = np.asarray(side.collections[-1].get_offsets())
-    expected = looked.seen[[3, 8]][:, [2, 0] if family == "prismatic" else [0, 2]]
+    expected = projection.observed[[3, 8]][:, [2, 0] if family == "prismatic" else [0, 2]]
     np.testing.assert_allclose(ringed, expected)
 
 
-def test_a_family_of_ones_own_is_drawn():
+def test_a_custom_family_is_drawn():
     figure = pytest.importorskip("matplotlib.figure").Figure(figsize=SIZE, layout="constrained")
     q, radius = kv.position("q"), kv.parameter("radius", 0.5)
     circle = kv.rotation_z(q) @ kv.translation(radius, 0, 0)

@@ -38,9 +38,9 @@ def paths(model):
     They are where they are at first, and then where nothing holds a door shut any more.
     """
     ranges, first = Ranges(model), complete(model)
-    opened = {name: high for name, (_, high) in ranges.at(first).items() if np.isfinite(high)}
+    opened = {name: high for name, (_, high) in ranges.limits_at(first).items() if np.isfinite(high)}
     for values in (first, {**first, **opened}):
-        for name, limits in ranges.at(values).items():
+        for name, limits in ranges.limits_at(values).items():
             path = np.clip(np.linspace(*choose_slider_range(limits, values[name], "rad"), SAMPLES), *limits)
             # A quaternion that turns over by one of its elements would be none half-way.
             yield name, path if not name.endswith("qw") else np.linspace(0.1, 1.0, SAMPLES), values

@@ -1,4 +1,4 @@
-"""Models small enough to know every number of."""
+"""Small models of which every number is known."""
 
 from __future__ import annotations
 

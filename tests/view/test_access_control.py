@@ -1,4 +1,4 @@
-"""Who is answered by the page: attacks by headers, on the rule itself and on a server that is up."""
+"""Access control of the page: attacks by headers, on the rule itself and on a running server."""
 
 from __future__ import annotations
 
@@ -53,7 +53,7 @@ FOREIGN_ORIGINS = (
 
 
 @pytest.mark.parametrize("name", ["127.0.0.1", "localhost", "[::1]", "LOCALHOST"])
-def test_the_own_page_is_answered(name):
+def test_requests_of_the_own_page_are_accepted(name):
     own = {"hosts": [f"{name}:8080"], "origins": [f"http://{name}:8080"], "port": 8080}
     assert ALONE.refusal("/", **own, websocket=True) == ""
     assert ALONE.refusal("/", **(own | {"origins": []}), websocket=False) == ""
@@ -72,7 +72,7 @@ def test_other_hosts_and_origins_are_refused(websocket):
     assert ALONE.refusal("/", **(own | {"origins": [*OWN["origins"], "http://evil.example"]})) == ORIGIN
 
 
-def test_over_the_network_a_token_is_asked_for_and_only_numbers_and_own_names_are_hosts():
+def test_network_requests_need_the_token_and_a_numeric_or_own_host():
     lan = {"hosts": ["192.168.0.7:8080"], "origins": ["http://192.168.0.7:8080"], "port": 8080}
     for path in ("/s3cret", "/s3cret/", "/s3cret/x", "/s3cret?darkMode"):
         assert SHARED.refusal(path, **lan, websocket=True) == ""
@@ -99,7 +99,7 @@ def test_over_the_network_a_token_is_asked_for_and_only_numbers_and_own_names_ar
     assert (SHARED.inner_path("/s3cret/a?b/c"), SHARED.inner_path("/s3cret")) == ("/a?b/c", "/")
 
 
-def test_an_address_cannot_have_the_page_show_something_else():
+def test_queries_that_show_data_from_elsewhere_are_refused():
     assert ALONE.refusal("/?websocket=ws://127.0.0.1:8080", **OWN) == ""
     assert SHARED.refusal("/s3cret?websocket=ws://127.0.0.1:8080/s3cret", **OWN) == ""
     for query in (
@@ -115,10 +115,10 @@ def test_an_address_cannot_have_the_page_show_something_else():
         assert ALONE.refusal(f"/?{query}", **OWN) == ELSE, query
 
 
-def test_tokens_are_random_and_are_only_in_addresses_for_others():
+def test_tokens_are_random_and_for_network_addresses_only():
     for host in ("127.0.0.1", "localhost", "::1", "127.0.0.2"):
-        assert AccessControl.of(host).token == ""
-    one, other = AccessControl.of("0.0.0.0"), AccessControl.of("0.0.0.0")
+        assert AccessControl.from_host(host).token == ""
+    one, other = AccessControl.from_host("0.0.0.0"), AccessControl.from_host("0.0.0.0")
     assert one.token != other.token
     assert len(one.token) >= 32
     assert one.address(8080).endswith(f":8080/{one.token}")
@@ -148,7 +148,7 @@ def handshake(port: int, path: str = "/", host: str | None = None, origin: str |
     return answer(port, path, host, *lines)
 
 
-def test_a_server_that_is_up_answers_its_own_page_alone():
+def test_a_running_server_answers_its_own_page_only():
     server = web.start(0, "a <b> title")
     try:
         port = server.get_port()
@@ -177,8 +177,8 @@ def test_a_server_that_is_up_answers_its_own_page_alone():
         web.stop(server)
 
 
-def test_a_server_for_others_wants_its_token(monkeypatch):
-    monkeypatch.setattr(AccessControl, "of", staticmethod(lambda host: AccessControl(host, "s3cret")))
+def test_a_network_server_requires_its_token(monkeypatch):
+    monkeypatch.setattr(AccessControl, "from_host", staticmethod(lambda host: AccessControl(host, "s3cret")))
     server = web.start(0, "shared")
     try:
         port = server.get_port()
@@ -195,8 +195,8 @@ def test_a_server_for_others_wants_its_token(monkeypatch):
         web.stop(server)
 
 
-def test_a_viser_that_serves_otherwise_is_refused_rather_than_left_open(monkeypatch):
-    monkeypatch.setattr(web, "_seeing", lambda function, name, thing: function)
+def test_a_viser_that_bypasses_access_control_is_refused(monkeypatch):
+    monkeypatch.setattr(web, "_replace_global", lambda function, name, thing: function)
     stopped = []
     monkeypatch.setattr(web, "stop", lambda server, stop=web.stop: (stop(server), stopped.append(server)))
     with pytest.raises(
@@ -206,7 +206,7 @@ def test_a_viser_that_serves_otherwise_is_refused_rather_than_left_open(monkeypa
     assert len(stopped) == 1
 
 
-def test_viser_and_websockets_stay_what_they_are_for_others():
+def test_viser_and_websockets_are_unchanged_for_other_servers():
     import websockets.asyncio.server
     from viser import infra
 
@@ -219,7 +219,7 @@ def test_viser_and_websockets_stay_what_they_are_for_others():
     )
 
 
-def test_hosts_that_are_none_of_this_computer_are_refused(monkeypatch):
+def test_hosts_of_other_computers_are_refused(monkeypatch):
     with pytest.raises(InvalidValueError, match=r"'192\.0\.2\.77' is no address of this computer"):
         web.start(0, host="192.0.2.77")
 

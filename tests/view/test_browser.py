@@ -1,4 +1,4 @@
-"""The page as a person meets it: a real Chromium opens it, moves a slider and sees the part move."""
+"""The page in a real Chromium: moving a slider moves the part."""
 
 from __future__ import annotations
 
@@ -112,7 +112,7 @@ def test_moving_a_slider_moves_the_part(opened, tmp_path):
     until(page, lambda: thumb.get_attribute("aria-valuenow") == "0")
 
 
-def test_violated_constraints_are_on_the_page(opened):
+def test_violated_constraints_are_listed_on_the_page(opened):
     viewer, page = opened
     page.get_by_text("All constraints hold.").wait_for()
     thumb = slider(page, viewer, "cabinet/door")
@@ -146,7 +146,7 @@ def test_frames_and_their_names_are_shown_on_demand(opened):
     until(page, lambda: reddish(shot(page)).sum() < 0.2 * reddish(before).sum())
 
 
-def test_sliders_can_be_found_by_name_and_edits_arrive(opened):
+def test_sliders_are_filtered_by_name_and_follow_edits(opened):
     import kineverse as kv
 
     viewer, page = opened
@@ -158,7 +158,7 @@ def test_sliders_can_be_found_by_name_and_edits_arrive(opened):
     row(page, "lid [m]").wait_for()
 
 
-def test_a_second_browser_sees_what_the_first_one_moved(opened, browser):
+def test_two_browsers_show_the_same_state(opened, browser):
     viewer, page = opened
     viewer.move({"cabinet/drawer": 0.4})
     other = browser.new_page(viewport={"width": 660, "height": 400})
@@ -170,7 +170,7 @@ def test_a_second_browser_sees_what_the_first_one_moved(opened, browser):
     other.close()
 
 
-def test_the_range_of_a_slider_follows_another_one(browser):
+def test_a_slider_range_follows_a_state_dependent_limit(browser):
     """The latch of a door: while its bolt is in, the door's slider goes nowhere; drawn, all the way."""
     with view(held_door(), port=0) as viewer:
         page = browser.new_page(viewport={"width": 660, "height": 400})
@@ -199,7 +199,7 @@ def greenish(image):
     return (g > 1.25 * r) & (g > 1.25 * b)
 
 
-def test_what_is_near_is_shown_and_follows_the_sliders(opened):
+def test_nearest_pairs_are_shown_and_follow_the_sliders(opened):
     viewer, page = opened
     viewer.move({"cabinet/door": 0.5})
     page.get_by_text("Collisions").click()
@@ -222,9 +222,9 @@ def test_what_is_near_is_shown_and_follows_the_sliders(opened):
 
 
 def corners(viewer, camera):
-    """Where the corners of the scene are in the picture of a browser, (N, 2) in [-1, 1] if they are in it."""
+    """Project the corners of the scene into the picture of a browser, (N, 2) in [-1, 1] if they are in it."""
     poses = {name: viewer.pose(name) for name in viewer.model.frames}
-    points = TriangleSoup.of(collect_drawables(viewer.model), poses).corners.reshape(-1, 3)
+    points = TriangleSoup.from_drawables(collect_drawables(viewer.model), poses).corners.reshape(-1, 3)
     place = Camera(tuple(camera.position), tuple(camera.look_at), field_of_view=camera.fov)
     seen = (points - place.position) @ place.axes.T
     assert (seen[:, 2] > 0).all()
@@ -232,7 +232,7 @@ def corners(viewer, camera):
     return seen[:, :2] / seen[:, 2:] / half
 
 
-def test_all_is_in_view_in_any_window_until_the_camera_is_moved_and_names_fit(browser):
+def test_the_camera_frames_the_model_in_any_window_until_it_is_moved(browser):
     with view(cabinet(), port=0) as viewer:
         page = browser.new_page(viewport={"width": 900, "height": 420})
         page.set_default_timeout(PATIENCE)

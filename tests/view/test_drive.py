@@ -1,4 +1,4 @@
-"""What sliders do that is more than setting a number: angles of quaternions, speeds, locks, loops that do not close."""
+"""Quaternion angles, speeds, locks and closed loops on the page."""
 
 from __future__ import annotations
 
@@ -53,24 +53,24 @@ def planar_loop():
 
 
 @given(ANGLES)
-def test_angles_make_a_quaternion_and_come_back(angles):
+def test_quaternion_angles_round_trip(angles):
     model = kv.load("articulations/ball")
     orientations = QuaternionAngles(model, complete(model))
     names = [f"ball/stick/{angle}" for angle in ("roll", "pitch", "yaw")]
     assert list(orientations.limits) == names
     for name, value in zip(names, angles, strict=True):
-        quaternion = orientations.turned(name, value)
+        quaternion = orientations.set_angle(name, value)
     roll, pitch, yaw = angles
     expected = (kv.rotation_z(yaw) @ kv.rotation_y(pitch) @ kv.rotation_x(roll))()
     np.testing.assert_allclose(
         model.fk("ball/stick", "ball/socket")(kv.State(quaternion))[:3, :3], expected[:3, :3], atol=1e-12
     )
     orientations.angles = dict.fromkeys(names, 0.0)
-    orientations.read(quaternion)
+    orientations.update(quaternion)
     np.testing.assert_allclose([orientations.angles[name] for name in names], angles, atol=1e-6)
 
 
-def test_only_quaternions_are_shown_as_angles():
+def test_only_quaternions_have_angle_sliders():
     model = kv.load("articulations/floating")
     orientations = QuaternionAngles(model, complete(model))
     names = [str(symbol) for symbol in model.degrees_of_freedom]
@@ -79,11 +79,11 @@ def test_only_quaternions_are_shown_as_angles():
     ]
     assert QuaternionAngles(kv.load("fetch"), complete(kv.load("fetch"))).limits == {}
     # A quaternion of zero is no rotation, and no reason to fail.
-    orientations.read(dict.fromkeys(names, 0.0))
+    orientations.update(dict.fromkeys(names, 0.0))
     assert set(orientations.angles.values()) == {0.0}
 
 
-def test_driving_is_integration_and_stops_where_a_constraint_would_break():
+def test_drive_integrates_and_stops_at_a_violated_constraint():
     model = kv.load("articulations/ackermann")
     driving = VelocityDrive(model)
     assert list(driving.speeds) == ["ackermann/car/drive:velocity"]
@@ -92,25 +92,25 @@ def test_driving_is_integration_and_stops_where_a_constraint_would_break():
     driving.speeds["ackermann/car/drive:velocity"] = 1.0
     values = {**complete(model), "ackermann/car/steering": 0.4}
     for _ in range(20):
-        values.update(driving.after(values, 0.1))
+        values.update(driving.step(values, 0.1))
     expected = model.integrate(
         {**complete(model), "ackermann/car/steering": 0.4}, {"ackermann/car/drive:velocity": 1.0}, 2.0
     )
     assert values == pytest.approx({str(s): v for s, v in expected.items()})
     # However long the page slept, nothing jumps.
-    assert driving.after(values, 100.0)["ackermann/car/drive"] == pytest.approx(2.2)
+    assert driving.step(values, 100.0)["ackermann/car/drive"] == pytest.approx(2.2)
 
     ball = kv.load("articulations/ball")
     driving, values = VelocityDrive(ball), complete(ball)
     driving.speeds["ball/stick/wx:velocity"] = 2.0
     for _ in range(30):
-        values.update(driving.after(values, 0.05))
+        values.update(driving.step(values, 0.05))
     assert not driving.running
     assert not ball.violations(values)
     assert 0.6 < 2 * math.atan2(values["ball/stick/qx"], values["ball/stick/qw"]) <= 0.7
 
 
-def test_what_nothing_drives_has_no_speeds():
+def test_a_model_without_rates_has_no_drive_speeds():
     assert VelocityDrive(kv.load("kitchen")).speeds == {}
     assert list(VelocityDrive(kv.load("fetch")).speeds) == [
         "fetch/l_wheel_joint:velocity",
@@ -118,12 +118,15 @@ def test_what_nothing_drives_has_no_speeds():
     ]
 
 
-def test_locks_are_read_off_the_limits_of_speeds():
+def test_locked_directions_follow_speed_limits():
     ranges = Ranges(lock())
     assert ranges.lockable == ["door", "ratchet"]
     values = {"bolt": 0.0, "door": 0.3, "drawer": 0.0, "ratchet": 0.0}
-    assert ranges.held(values) == {"door": (True, True), "ratchet": (True, False)}
-    assert ranges.held({**values, "bolt": 0.1}) == {"door": (False, False), "ratchet": (True, False)}
+    assert ranges.locked_directions(values) == {"door": (True, True), "ratchet": (True, False)}
+    assert ranges.locked_directions({**values, "bolt": 0.1}) == {
+        "door": (False, False),
+        "ratchet": (True, False),
+    }
 
 
 pytest.importorskip("viser", reason="the page needs the extra 'view'")
@@ -137,13 +140,13 @@ def content(viewer):
 
 
 def by_hand(viewer, name, value):
-    """What the page does when somebody moves a slider."""
+    """Move a slider as a user of the page does."""
     viewer._panel._sliders[name].value = value
-    viewer._moved(name, value)
+    viewer._set_from_slider(name, value)
     assert viewer.settled()
 
 
-def test_a_stick_is_turned_by_angles_and_a_zero_quaternion_is_survived():
+def test_angle_sliders_turn_a_ball_joint_and_accept_a_zero_quaternion():
     with view(kv.load("articulations/ball"), port=0) as viewer:
         assert list(viewer._panel._sliders) == [f"ball/stick/{angle}" for angle in ("roll", "pitch", "yaw")]
         by_hand(viewer, "ball/stick/roll", 0.5)
@@ -160,7 +163,7 @@ def test_a_stick_is_turned_by_angles_and_a_zero_quaternion_is_survived():
         assert viewer._panel._sliders["ball/stick/yaw"].value == pytest.approx(0.4, abs=1e-3)
 
 
-def test_a_base_is_driven_until_it_is_stopped():
+def test_a_base_drives_until_it_is_stopped():
     with view(kv.load("articulations/differential_drive"), port=0) as viewer:
         left, right = list(viewer._panel._speeds)
         viewer.drive({left: 3.0, right: 3.0})
@@ -188,7 +191,7 @@ def until(viewer, condition):
             viewer._change.wait(timeout=0.1)
 
 
-def test_ranges_and_locks_follow_other_sliders():
+def test_slider_ranges_and_locks_follow_the_state():
     with view(lock(), port=0) as viewer:
         sliders = viewer._panel._sliders
         assert sliders["door"].disabled
@@ -206,7 +209,7 @@ def test_ranges_and_locks_follow_other_sliders():
         assert viewer.values["ratchet"] == sliders["ratchet"].value == 0.4
 
 
-def test_where_a_loop_does_not_close_the_page_says_so_and_stays():
+def test_a_state_where_a_loop_does_not_close_is_reported_and_not_drawn():
     with view(planar_loop(), port=0) as viewer:
         assert list(viewer._panel._sliders) == ["crank"]
         by_hand(viewer, "crank", 0.3)
@@ -221,13 +224,13 @@ def test_where_a_loop_does_not_close_the_page_says_so_and_stays():
         assert np.abs(viewer.pose("rocker_tip") - before).max() > 1e-3
 
 
-def test_the_show_moves_what_has_no_limits_where_nothing_has():
+def test_animation_moves_unlimited_coordinates_if_none_is_limited():
     for name, path in (("four_bar", "four_bar/crank"), ("ball", "ball/stick/qx")):
         with view(kv.load(f"articulations/{name}"), port=0) as viewer:
             viewer.play()
             until(viewer, lambda viewer=viewer, path=path: abs(viewer.values[path]) > 0.01)
 
 
-def test_what_cannot_move_has_a_page():
+def test_a_rigid_model_has_a_page():
     with view(kv.load("articulations/fixed"), port=0) as viewer:
         assert "All constraints hold" in content(viewer)

@@ -93,7 +93,7 @@ def until(page, condition):
     pytest.fail(f"waited in vain for the page:\n{inside(page)[-3000:]}")
 
 
-def test_names_that_are_html_are_text_on_the_page(browser, hostile):
+def test_html_in_names_is_shown_as_text(browser, hostile):
     model, lost = hostile
     # Without the policy that comes with the page: escaping has to be enough.
     context = browser.new_context(bypass_csp=True, viewport={"width": 560, "height": 300})
@@ -138,8 +138,8 @@ def test_names_that_are_html_are_text_on_the_page(browser, hostile):
     context.close()
 
 
-def test_other_pages_in_the_browser_cannot_reach_the_viewer_and_its_own_can(browser, monkeypatch):
-    monkeypatch.setattr(AccessControl, "of", staticmethod(lambda host: AccessControl(host, "s3cret")))
+def test_only_the_own_page_of_a_browser_reaches_the_viewer(browser, monkeypatch):
+    monkeypatch.setattr(AccessControl, "from_host", staticmethod(lambda host: AccessControl(host, "s3cret")))
     attempt = """([address, protocol]) => new Promise(done => {
       const socket = new WebSocket(address, protocol)
       socket.onmessage = () => done('read')

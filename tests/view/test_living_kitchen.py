@@ -1,4 +1,4 @@
-"""The scene that lives, without a browser: what moves, what is seen, what is believed and learned."""
+"""The simulation of the demo without a browser: motion, readings, tracking, identification and drawing."""
 
 from __future__ import annotations
 
@@ -6,52 +6,53 @@ import math
 
 import numpy as np
 import pytest
-from living_kitchen.axis_uncertainty import error, spread
-from living_kitchen.gating import Sorter
-from living_kitchen.marker_meshes import REACH, SIGMAS, axis_line, axis_tube, rod
-from living_kitchen.panel import kitchen_report, stranger_report
+from living_kitchen.gating import OutlierGate
+from living_kitchen.identify import axis_error
+from living_kitchen.marker_meshes import REACH, SIGMAS, compute_axis_line, create_axis_tube, create_rod
+from living_kitchen.panel import format_kitchen, format_mechanism
 from living_kitchen.picture import picture
-from living_kitchen.placed_model import doubtful
-from living_kitchen.scene import Scenery
-from living_kitchen.sensor import Markers, Sight
-from living_kitchen.simulation import Life
+from living_kitchen.placed_model import uncertainty_color
+from living_kitchen.scene import SceneDrawables
+from living_kitchen.sensor import MarkerSampler, SensorModel
+from living_kitchen.simulation import Simulation
 from living_kitchen.track import average
-from living_kitchen.trajectory import Routine
-from living_kitchen.unknown_mechanisms import STRANGERS
+from living_kitchen.trajectory import PeriodicTrajectory
+from living_kitchen.unknown_mechanisms import MECHANISMS
 from scipy.spatial.transform import Rotation
 
 import kineverse as kv
 from kineverse.estimation import identify, pose_covariance
+from kineverse.experiments.plots import axis_covariances
 
 STEP = 1.0 / 12.0
 
 
-def lived(seconds, **options):
-    """Return a life after some seconds, and at each step its figures and how far off the stranger's part is."""
-    life, figures, off = Life(**options), [], []
+def simulate(seconds, **options):
+    """Return a simulation after some seconds, and at each step its quality and the error of the tracked part."""
+    simulation, qualities, off = Simulation(**options), [], []
     for _ in range(round(seconds / STEP)):
-        life.step(STEP)
-        figures.append(life.now)
-        off.append(life.part_error)
-    return life, figures, off
+        simulation.step(STEP)
+        qualities.append(simulation.quality)
+        off.append(simulation.part_error)
+    return simulation, qualities, off
 
 
 @pytest.fixture(scope="module")
 def chest():
-    return lived(10.0)
+    return simulate(10.0)
 
 
-# -- what moves --------------------------------------------------------------------------------------------
+# -- motion ----------------------------------------------------------------------------------------------
 
 
-def test_everything_opens_within_its_limits_and_no_faster_than_it_may():
+def test_the_trajectory_covers_all_ranges_within_position_and_speed_limits():
     model = kv.load("kitchen")
-    routine = Routine(model)
-    names, h = routine.names, 1e-4
+    trajectory = PeriodicTrajectory(model)
+    names, h = trajectory.names, 1e-4
     assert sorted(names) == sorted(map(str, model.degrees_of_freedom))
     reached = dict.fromkeys(names, 0.0)
-    for time in np.arange(0.0, routine.period + 8.0, 0.15):
-        now, soon = routine.at(time), routine.at(time + h)
+    for time in np.arange(0.0, trajectory.period + 8.0, 0.15):
+        now, soon = trajectory.evaluate(time), trajectory.evaluate(time + h)
         speeds = {f"{name}:velocity": (soon[name] - now[name]) / h for name in names}
         assert not list(model.violations({**now, **speeds}))
         for name in names:
@@ -60,168 +61,179 @@ def test_everything_opens_within_its_limits_and_no_faster_than_it_may():
     assert min(reached.values()) > 0.85
 
 
-def test_a_few_things_move_at_a_time_and_all_of_it_repeats():
-    routine = Routine(kv.load("kitchen"))
-    for time in np.linspace(5.0, routine.period, 30):
-        later, soon = routine.at(time + routine.period), routine.at(time + 0.1)
-        now = routine.at(time)
+def test_the_trajectory_is_periodic_and_moves_a_few_joints_at_a_time():
+    trajectory = PeriodicTrajectory(kv.load("kitchen"))
+    for time in np.linspace(5.0, trajectory.period, 30):
+        later, soon = trajectory.evaluate(time + trajectory.period), trajectory.evaluate(time + 0.1)
+        now = trajectory.evaluate(time)
         assert 1 <= sum(abs(now[n] - soon[n]) > 1e-4 for n in now) <= 12
-        for name in routine.names[:3]:
+        for name in trajectory.names[:3]:
             assert later[name] == pytest.approx(now[name], abs=1e-9)
 
 
-# -- what is seen ------------------------------------------------------------------------------------------
+# -- readings --------------------------------------------------------------------------------------------
 
 
-def test_noise_is_what_its_covariance_says_and_the_shares_are_what_was_asked_for():
+def test_readings_have_the_covariance_and_fractions_of_the_sensor_model():
     poses = np.tile(np.eye(4), (4000, 1, 1))
     poses[:, :3, :3] = Rotation.random(4000, random_state=1).as_matrix()
-    sight = Sight(0.02, outliers=0.2, hidden=0.5)
-    seen = Markers(4000, 0).look(poses, 0.0, sight)
-    good = ~seen.wrong
-    turns = Rotation.from_matrix(seen.poses[:, :3, :3] @ np.swapaxes(poses[:, :3, :3], 1, 2)).as_rotvec()
-    errors = np.hstack([seen.poses[:, :3, 3], turns])[good]
-    # Of 3200 numbers the standard deviation is known to 1.3 %.
-    np.testing.assert_allclose(errors.std(axis=0), np.sqrt(np.diag(sight.covariance)), rtol=0.06)
-    assert seen.wrong.mean() == pytest.approx(0.2, abs=0.03)
-    assert seen.there.mean() == pytest.approx(0.5, abs=0.04)
-    assert np.linalg.norm(seen.poses[seen.wrong, :3, 3], axis=1).mean() > 0.3
+    sensor = SensorModel(0.02, outliers=0.2, hidden=0.5)
+    readings = MarkerSampler(4000, 0).observe(poses, 0.0, sensor)
+    good = ~readings.wrong
+    turns = Rotation.from_matrix(readings.poses[:, :3, :3] @ np.swapaxes(poses[:, :3, :3], 1, 2)).as_rotvec()
+    errors = np.hstack([readings.poses[:, :3, 3], turns])[good]
+    # The standard deviation of 3200 numbers is known to 1.3 %.
+    np.testing.assert_allclose(errors.std(axis=0), np.sqrt(np.diag(sensor.covariance)), rtol=0.06)
+    assert readings.wrong.mean() == pytest.approx(0.2, abs=0.03)
+    assert readings.visible.mean() == pytest.approx(0.5, abs=0.04)
+    assert np.linalg.norm(readings.poses[readings.wrong, :3, 3], axis=1).mean() > 0.3
 
 
 @pytest.mark.parametrize("wrong", [{"noise": 0.0}, {"noise": math.nan}, {"outliers": 1.0}, {"hidden": -0.1}])
-def test_a_sight_that_is_none_is_refused(wrong):
+def test_invalid_sensor_models_are_refused(wrong):
     with pytest.raises(kv.errors.InvalidValueError, match=next(iter(wrong))):
-        Sight(**wrong)
+        SensorModel(**wrong)
 
 
-def test_equal_seeds_live_equal_lives_and_others_do_not():
-    # C that becomes ready in the midst of a life rounds otherwise than numpy.
-    Life().following.tracker.wait()
-    one, two, other = (lived(0.5, seed=seed)[0] for seed in (3, 3, 4))
-    np.testing.assert_array_equal(one.seen.poses, two.seen.poses)
-    assert one.following.values == two.following.values
-    assert one.following.values != other.following.values
+def test_simulations_of_equal_seeds_are_equal():
+    # C that becomes ready during a simulation rounds otherwise than numpy.
+    Simulation().kitchen_tracker.tracker.wait()
+    one, two, other = (simulate(0.5, seed=seed)[0] for seed in (3, 3, 4))
+    np.testing.assert_array_equal(one.readings.poses, two.readings.poses)
+    assert one.kitchen_tracker.values == two.kitchen_tracker.values
+    assert one.kitchen_tracker.values != other.kitchen_tracker.values
 
 
-# -- what is believed --------------------------------------------------------------------------------------
+# -- tracking --------------------------------------------------------------------------------------------
 
 
-def test_the_track_is_nearer_than_the_markers_and_as_sure_as_it_may_be(chest):
-    figures = average(chest[1][36:])
-    assert figures.marker == pytest.approx(math.sqrt(3.0) * 0.03, rel=0.05)
-    assert figures.mean < 0.25 * figures.marker
-    assert 0.75 < figures.nees < 1.3
+def test_the_track_is_more_accurate_than_the_markers_and_consistent(chest):
+    quality = average(chest[1][36:])
+    assert quality.marker == pytest.approx(math.sqrt(3.0) * 0.03, rel=0.05)
+    assert quality.mean < 0.25 * quality.marker
+    assert 0.75 < quality.nees < 1.3
 
 
-def test_outliers_are_told_apart():
-    life, figures, _ = lived(2.5, sight=Sight(0.03, outliers=0.2))
-    assert average(figures[12:]).mean < 0.3 * math.sqrt(3.0) * 0.03
+def test_tracking_rejects_outliers():
+    simulation, qualities, _ = simulate(2.5, sensor=SensorModel(0.03, outliers=0.2))
+    assert average(qualities[12:]).mean < 0.3 * math.sqrt(3.0) * 0.03
     wrong = {
-        f for f, w, t in zip(life.following.frames, life.seen.wrong, life.seen.there, strict=True) if w & t
+        f
+        for f, w, t in zip(
+            simulation.kitchen_tracker.frames,
+            simulation.readings.wrong,
+            simulation.readings.visible,
+            strict=True,
+        )
+        if w & t
     }
     assert wrong
-    assert len(wrong.symmetric_difference(life.following.estimate.outliers)) <= 2
+    assert len(wrong.symmetric_difference(simulation.kitchen_tracker.estimate.outliers)) <= 2
 
 
-def test_who_does_not_see_a_door_knows_how_far_it_may_have_gone():
-    _, figures, _ = lived(20.0, seed=1, sight=Sight(0.03, hidden=0.5))
-    assert 0.6 < average(figures[36:]).nees < 1.5
+def test_the_track_of_hidden_markers_is_consistent():
+    _, qualities, _ = simulate(20.0, seed=1, sensor=SensorModel(0.03, hidden=0.5))
+    assert 0.6 < average(qualities[36:]).nees < 1.5
 
 
-def test_what_is_hidden_becomes_doubtful_and_another_noise_is_taken_in():
-    life, *_ = lived(1.5)
-    sure = life.following.doubt()
-    life.sight = Sight(0.05, hidden=0.5)
+def test_hidden_markers_become_uncertain_and_a_new_sensor_model_is_used():
+    simulation, *_ = simulate(1.5)
+    sure = simulation.kitchen_tracker.uncertainty_lengths()
+    simulation.sensor = SensorModel(0.05, hidden=0.5)
     for _ in range(24):
-        life.step(STEP)
-    doubt = life.following.doubt()
-    assert 5 <= (~life.seen.there).sum() <= 18
-    assert doubt[~life.seen.there].mean() > 3.0 * sure.mean()
-    assert doubt[~life.seen.there].mean() > 2.0 * doubt[life.seen.there].mean()
-    assert doubtful(0.8) != doubtful(0.05)
+        simulation.step(STEP)
+    length = simulation.kitchen_tracker.uncertainty_lengths()
+    assert 5 <= (~simulation.readings.visible).sum() <= 18
+    assert length[~simulation.readings.visible].mean() > 3.0 * sure.mean()
+    assert length[~simulation.readings.visible].mean() > 2.0 * length[simulation.readings.visible].mean()
+    assert uncertainty_color(0.8) != uncertainty_color(0.05)
 
 
-def test_ways_lead_through_the_tracked_places_and_are_as_long_as_doubts(chest):
-    following = chest[0].following
-    ways = following.ways()
-    np.testing.assert_allclose(ways[:, 2], following.places(following.values), atol=1e-12)
-    lengths = np.linalg.norm(np.diff(following.ways(3), axis=1), axis=2).sum(axis=1)
-    np.testing.assert_allclose(following.doubt(), lengths)
+def test_uncertainty_paths_pass_the_tracked_positions_and_have_their_lengths(chest):
+    kitchen_tracker = chest[0].kitchen_tracker
+    ways = kitchen_tracker.uncertainty_paths()
+    np.testing.assert_allclose(ways[:, 2], kitchen_tracker.positions(kitchen_tracker.values), atol=1e-12)
+    lengths = np.linalg.norm(np.diff(kitchen_tracker.uncertainty_paths(3), axis=1), axis=2).sum(axis=1)
+    np.testing.assert_allclose(kitchen_tracker.uncertainty_lengths(), lengths)
 
 
-# -- what is learned ---------------------------------------------------------------------------------------
+# -- identification --------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("name", list(STRANGERS))
-def test_a_stranger_is_learned_and_then_tracked(name, chest):
-    life, _, off = chest if name == "chest" else lived(10.0, stranger=name)
-    stranger, learner = life.stranger, life.learner
-    assert max(learner.thoughts[0].probabilities.values()) < 0.95  # nobody can tell at first
-    assert not learner.found.is_ambiguous
-    assert learner.found.best.family == stranger.family
-    angle, distance, sigmas = error(learner.found.best, *stranger.axis)
+@pytest.mark.parametrize("name", list(MECHANISMS))
+def test_an_unknown_mechanism_is_identified_and_then_tracked(name, chest):
+    simulation, _, off = chest if name == "chest" else simulate(10.0, mechanism=name)
+    mechanism, learner = simulation.mechanism, simulation.learner
+    assert max(learner.history[0].probabilities.values()) < 0.95  # ambiguous at first
+    assert not learner.result.is_ambiguous
+    assert learner.result.best.family == mechanism.family
+    angle, distance, sigmas = axis_error(learner.result.best, *mechanism.axis)
     assert angle < math.radians(9.0)
     assert distance < 0.06
     assert sigmas < 2.2
-    # The mean of what a marker is off is 1.6 standard deviations of one coordinate.
-    assert np.mean(off[-20:]) < 1.2 * life.sight.noise
+    # The mean error of a marker is 1.6 standard deviations of one coordinate.
+    assert np.mean(off[-20:]) < 1.2 * simulation.sensor.noise
 
 
-def test_a_stranger_is_learned_between_outliers():
-    life, *_ = lived(8.0, seed=2, sight=Sight(0.03, outliers=0.2))
-    best = life.learner.found.best
-    assert (best.family, life.learner.found.is_ambiguous) == ("revolute", False)
-    assert error(best, *life.stranger.axis)[0] < math.radians(9.0)
+def test_an_unknown_mechanism_is_identified_despite_outliers():
+    simulation, *_ = simulate(8.0, seed=2, sensor=SensorModel(0.03, outliers=0.2))
+    best = simulation.learner.result.best
+    assert (best.family, simulation.learner.result.is_ambiguous) == ("revolute", False)
+    assert axis_error(best, *simulation.mechanism.axis)[0] < math.radians(9.0)
 
 
-def test_wrong_poses_of_a_stranger_are_sorted_out():
-    sorter, markers, sight = Sorter(), Markers(2, 3), Sight(0.03, outliers=0.2, hidden=0.3)
+def test_the_gate_rejects_outliers_and_keeps_inliers():
+    gate, markers, sensor = OutlierGate(), MarkerSampler(2, 3), SensorModel(0.03, outliers=0.2, hidden=0.3)
     missed = dropped = right = 0
     for k in range(120):
-        poses = np.stack(STRANGERS["stool"]().poses(0.5 - 0.5 * math.cos(0.1 * k)))
-        seen = markers.look(poses, k * STEP, sight)
-        good = sorter.good(seen, STEP, sight)
-        assert not (good & ~seen.there).any()
-        missed += (seen.wrong & good).sum()
-        right += (seen.there & ~seen.wrong).sum()
-        dropped += (seen.there & ~seen.wrong & ~good).sum()
+        poses = np.stack(MECHANISMS["stool"]().poses(0.5 - 0.5 * math.cos(0.1 * k)))
+        readings = markers.observe(poses, k * STEP, sensor)
+        good = gate.find_inliers(readings, STEP, sensor)
+        assert not (good & ~readings.visible).any()
+        missed += (readings.wrong & good).sum()
+        right += (readings.visible & ~readings.wrong).sum()
+        dropped += (readings.visible & ~readings.wrong & ~good).sum()
     assert missed <= 1
     assert dropped < 0.05 * right
 
 
-def test_another_stranger_is_met_from_the_beginning():
-    life, *_ = lived(2.0)
-    assert life.learner.found is not None
-    life.meet()
-    assert (life.stranger.name, life.learner.found, life.part_error) == ("crate", None, None)
-    life.step(STEP)
-    assert len(life.learner.seen) == 1
+def test_a_changed_mechanism_restarts_identification():
+    simulation, *_ = simulate(2.0)
+    assert simulation.learner.result is not None
+    simulation.change_mechanism()
+    assert (simulation.mechanism.name, simulation.learner.result, simulation.part_error) == (
+        "crate",
+        None,
+        None,
+    )
+    simulation.step(STEP)
+    assert len(simulation.learner.part_positions) == 1
     with pytest.raises(kv.errors.UnknownNameError, match=r"'boat'.*chest"):
-        life.meet("boat")
-    assert life.stranger.name == "crate"
+        simulation.change_mechanism("boat")
+    assert simulation.mechanism.name == "crate"
 
 
-def test_a_stranger_stays_for_a_while_and_goes():
-    life = Life()
-    life.step(39.0)
-    assert life.stranger.name == "chest"
-    life.step(2.0)
-    assert life.stranger.name == "crate"
+def test_mechanisms_change_after_their_time():
+    simulation = Simulation()
+    simulation.step(39.0)
+    assert simulation.mechanism.name == "chest"
+    simulation.step(2.0)
+    assert simulation.mechanism.name == "crate"
 
 
-@pytest.mark.parametrize("name", list(STRANGERS))
-def test_where_the_true_axis_is_what_a_fit_of_exact_poses_finds(name):
-    stranger = STRANGERS[name]()
-    poses = [stranger.poses(q) for q in np.linspace(*stranger.reach, 30)]
+@pytest.mark.parametrize("name", list(MECHANISMS))
+def test_the_true_axis_is_that_of_a_fit_of_exact_poses(name):
+    mechanism = MECHANISMS[name]()
+    poses = [mechanism.poses(q) for q in np.linspace(*mechanism.limits, 30)]
     base, part = (np.array(found) for found in zip(*poses, strict=True))
-    fit = identify(base, part, noise=pose_covariance(1e-4, 1e-4))[stranger.family]
-    angle, distance, _ = error(fit, *stranger.axis)
+    fit = identify(base, part, noise=pose_covariance(1e-4, 1e-4))[mechanism.family]
+    angle, distance, _ = axis_error(fit, *mechanism.axis)
     assert angle < 1e-6
     assert distance < 1e-6
 
 
-def test_the_spread_of_an_axis_is_that_of_axes_drawn_by_its_covariance(chest):
-    fit = chest[0].learner.found.best
+def test_axis_covariances_are_those_of_sampled_axes(chest):
+    fit = chest[0].learner.result.best
     index = [fit.coordinates.index(n) for n in ("point.x", "point.y", "axis.x", "axis.y")]
     covariance = fit.covariance[np.ix_(index, index)]
     drawn = np.random.default_rng(0).multivariate_normal(np.zeros(4), covariance, 20_000)
@@ -229,32 +241,32 @@ def test_the_spread_of_an_axis_is_that_of_axes_drawn_by_its_covariance(chest):
     ways = Rotation.from_rotvec(np.pad(drawn[:, 2:], ((0, 0), (0, 1)))).as_matrix()[:, :, 2]
     crossings = drawn[:, :2] + height * ways[:, :2] / ways[:, 2:]
     expected = np.cov(crossings.T)
-    found = spread(fit, np.array([height]))[0]
+    found = axis_covariances(fit, np.array([height]))[0]
     np.testing.assert_allclose(found, expected, atol=0.05 * np.abs(expected).max())
 
 
-# -- what is drawn -----------------------------------------------------------------------------------------
+# -- drawing ---------------------------------------------------------------------------------------------
 
 
-def test_rods_are_round_and_tubes_two_deviations_wide(chest):
+def test_rods_are_round_and_axis_tubes_are_two_deviations_wide(chest):
     points = np.array([[0.0, 0.0, 0.0], [0.1, 0.2, 0.2], [0.2, 0.4, 0.4]])
-    away = rod(points, 0.05).vertices - np.repeat(points, 16, axis=0)
+    away = create_rod(points, 0.05).vertices - np.repeat(points, 16, axis=0)
     np.testing.assert_allclose(np.linalg.norm(away, axis=1), 0.05)
     np.testing.assert_allclose(away @ [1.0, 2.0, 2.0], 0.0, atol=1e-12)
-    fit, near = chest[0].learner.found.best, np.array([0.0, 0.1, 0.4])
-    ends = axis_line(fit, near)
+    fit, near = chest[0].learner.result.best, np.array([0.0, 0.1, 0.4])
+    ends = compute_axis_line(fit, near)
     middle = ends.mean(axis=0)
     assert np.linalg.norm(ends[1] - ends[0]) == pytest.approx(2.0 * REACH)
     assert (near - middle) @ (ends[1] - ends[0]) == pytest.approx(0.0, abs=1e-12)
-    ring = (axis_tube(fit, near).vertices.reshape(13, -1, 3)[6] - middle) @ fit.frame[:3, :2]
+    ring = (create_axis_tube(fit, near).vertices.reshape(13, -1, 3)[6] - middle) @ fit.frame[:3, :2]
     above = float((middle - fit.frame[:3, 3]) @ fit.frame[:3, 2])
-    squares = np.einsum("ni,ij,nj->n", ring, np.linalg.inv(spread(fit, np.array([above]))[0]), ring)
+    squares = np.einsum("ni,ij,nj->n", ring, np.linalg.inv(axis_covariances(fit, np.array([above]))[0]), ring)
     np.testing.assert_allclose(np.sqrt(squares), SIGMAS, rtol=0.02)
 
 
-def test_a_picture_shows_both_worlds_and_the_axis_once_it_is_known(chest):
-    young, life = Life(), chest[0]
-    before, after = (picture(one, (500, 260)).astype(int) for one in (young, life))
+def test_a_picture_shows_both_worlds_and_the_identified_axis(chest):
+    young, simulation = Simulation(), chest[0]
+    before, after = (picture(one, (500, 260)).astype(int) for one in (young, simulation))
     assert before.shape == (260, 500, 3)
 
     def magenta(image):
@@ -270,19 +282,19 @@ def test_a_picture_shows_both_worlds_and_the_axis_once_it_is_known(chest):
     assert blue(after[:, 250:]) > 3 * blue(after[:130, :250])
 
 
-def test_the_part_that_nobody_understands_yet_is_not_drawn_as_if_one_did():
-    scenery = Scenery(Life())
-    key = scenery.learned.key("stranger/part")
-    assert key not in {part.frame for part in scenery.parts()}
-    assert scenery.axis() is None
-    assert key not in scenery.poses()
+def test_the_part_of_an_unidentified_mechanism_is_not_drawn_in_the_estimate():
+    drawables = SceneDrawables(Simulation())
+    key = drawables.identified.key("stranger/part")
+    assert key not in {part.frame for part in drawables.parts()}
+    assert drawables.axis() is None
+    assert key not in drawables.poses()
 
 
-def test_reports_say_what_the_numbers_are(chest):
-    life = chest[0]
-    assert f"{1e3 * life.figures.marker:.0f} mm" in kitchen_report(life)
-    said = stranger_report(life)
+def test_reports_contain_errors_and_probabilities(chest):
+    simulation = chest[0]
+    assert f"{1e3 * simulation.average_quality.marker:.0f} mm" in format_kitchen(simulation)
+    said = format_mechanism(simulation)
     assert "revolute" in said
-    assert f"{life.learner.found.best.probability:.2f}" in said
+    assert f"{simulation.learner.result.best.probability:.2f}" in said
     assert said.count("<polyline") >= 2
-    assert "looking" in stranger_report(Life())
+    assert "looking" in format_mechanism(Simulation())

@@ -1,4 +1,4 @@
-"""The scene that lives as a person meets it: the page, its thread, and a real Chromium that opens it."""
+"""The page of the demo: its thread, and a real Chromium that opens it."""
 
 from __future__ import annotations
 
@@ -7,13 +7,13 @@ import threading
 
 import numpy as np
 import pytest
-from living_kitchen.simulation import Life
+from living_kitchen.simulation import Simulation
 
 import kineverse as kv
 
 pytest.importorskip("viser", reason="the page needs the extra 'view'")
 
-from living_kitchen.page import LivingPage
+from living_kitchen.page import SimulationPage
 
 PATIENCE = 60_000
 """Longest wait for anything on the page [ms]: software rendering on a busy machine is slow."""
@@ -25,12 +25,12 @@ def threads():
     return {thread.name for thread in threading.enumerate()}
 
 
-def test_a_page_waits_for_who_looks_and_leaves_nothing_behind():
-    with LivingPage(port=0) as page:
+def test_a_page_without_browsers_pauses_and_stop_frees_thread_and_port():
+    with SimulationPage(port=0) as page:
         assert "kineverse-living" in threads()
         assert page.address.startswith("http://127.0.0.1:")
         page.stop()
-        assert page.life.time == 0.0
+        assert page.simulation.time == 0.0
         with pytest.raises(kv.KineverseError, match="There is no page to wait for"):
             page.wait()
     page.stop()
@@ -41,16 +41,16 @@ def test_a_page_waits_for_who_looks_and_leaves_nothing_behind():
         probe.bind(("127.0.0.1", port))  # and the port is free again
 
 
-def test_a_port_in_use_is_an_error_and_no_thread():
+def test_a_port_in_use_is_refused_without_a_thread_left():
     with socket.socket() as other:
         other.bind(("127.0.0.1", 0))
         other.listen()
         with pytest.raises(kv.errors.InvalidValueError, match=r"port \d+ is taken"):
-            LivingPage(port=other.getsockname()[1])
+            SimulationPage(port=other.getsockname()[1])
     assert "kineverse-living" not in threads()
 
 
-def test_a_moment_that_fails_is_logged_and_life_goes_on(monkeypatch, caplog):
+def test_a_failed_step_is_logged_and_the_simulation_continues(monkeypatch, caplog):
     done = threading.Event()
     moments = iter([True, False])
 
@@ -59,8 +59,8 @@ def test_a_moment_that_fails_is_logged_and_life_goes_on(monkeypatch, caplog):
             raise RuntimeError("stumbled")
         done.set()
 
-    with LivingPage(port=0) as page:
-        monkeypatch.setattr(Life, "step", step)
+    with SimulationPage(port=0) as page:
+        monkeypatch.setattr(Simulation, "step", step)
         monkeypatch.setattr(page._server, "get_clients", lambda: {0: None})
         assert done.wait(30.0)
     assert any("could not go on" in record.message for record in caplog.records)
@@ -104,44 +104,44 @@ def shot(tab):
 
 
 @pytest.mark.browser
-def test_the_scene_lives_in_the_browser_and_what_is_learned_is_said(browser, monkeypatch):
-    # However slowly the page is drawn, the stranger waits to be learned.
-    monkeypatch.setattr("living_kitchen.simulation.STAYS", 3600.0)
-    life, errors = Life(), []
-    while life.time < 5.5:
-        life.step(1.0 / 12.0)
-    assert life.learner.found.is_ambiguous
-    with LivingPage(life, port=0) as page:
+def test_the_browser_shows_the_simulation_and_the_identified_joint(browser, monkeypatch):
+    # The mechanism stays, however slowly the page is drawn.
+    monkeypatch.setattr("living_kitchen.simulation.MECHANISM_TIME", 3600.0)
+    simulation, errors = Simulation(), []
+    while simulation.time < 5.5:
+        simulation.step(1.0 / 12.0)
+    assert simulation.learner.result.is_ambiguous
+    with SimulationPage(simulation, port=0) as page:
         # It starts in a pause: a page that takes long to be drawn would miss the beginning.
         page._panel._paused.value = True
         tab = opened(browser, page, errors)
         tab.get_by_text("cannot tell").wait_for()
         before = shot(tab)
         assert np.ptp(before) > 150
-        assert life.time < 6.0
+        assert simulation.time < 6.0
         tab.get_by_label("pause").uncheck()
         tab.get_by_text("revolute, 9").wait_for()
         tab.get_by_text("the tracked part is off by").wait_for()
         until(tab, lambda: (np.abs(shot(tab) - before).max(axis=2) > 40).sum() > 150)
         # Switches change what is seen.
         tab.get_by_label("50% hidden").check()
-        until(tab, lambda: life.seen.there.sum() < 20)
+        until(tab, lambda: simulation.readings.visible.sum() < 20)
         tab.get_by_role("button", name="Forget, and learn again").click()
-        until(tab, lambda: len(life.learner.thoughts) < 3)
+        until(tab, lambda: len(simulation.learner.history) < 3)
         # Who leaves in the midst and comes back misses nothing.
         tab.close()
         again = opened(browser, page, errors)
-        time = life.time
-        until(again, lambda: life.time > time)
+        time = simulation.time
+        until(again, lambda: simulation.time > time)
         again.close()
     assert errors == []
     assert "kineverse-living" not in threads()
 
 
 @pytest.mark.browser
-def test_two_look_at_one_life_and_one_of_them_leaves(browser):
+def test_a_second_browser_continues_after_the_first_has_left(browser):
     errors = []
-    with LivingPage(port=0) as page:
+    with SimulationPage(port=0) as page:
         tab = opened(browser, page, errors)
         came, left = threading.Event(), threading.Event()
         page._server.on_client_connect(lambda _: came.set())
@@ -152,8 +152,8 @@ def test_two_look_at_one_life_and_one_of_them_leaves(browser):
         assert came.wait(60.0)
         tab.close()
         assert left.wait(60.0)
-        time = page.life.time
+        time = page.simulation.time
         other.get_by_text("the track is off by").wait_for(timeout=PATIENCE)
-        until(other, lambda: page.life.time > time)
+        until(other, lambda: page.simulation.time > time)
         other.close()
     assert errors == []

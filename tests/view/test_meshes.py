@@ -39,7 +39,7 @@ def tetrahedron(tmp_path):
 
 
 @pytest.mark.parametrize("name", ["two.obj", "two.stl"])
-def test_a_mesh_has_its_size_and_scale(tetrahedron, name):
+def test_meshes_are_loaded_in_size_and_scale(tetrahedron, name):
     surface = load_mesh(Mesh(name, scale=(1.0, 2.0, 0.001), folder=str(tetrahedron))).surface
     np.testing.assert_allclose(surface.bounds, [[0, 0, 0], [1, 2, 0.001]], atol=1e-7)
     assert len(surface.faces) == 4
@@ -56,7 +56,7 @@ def test_equal_files_are_read_once(tetrahedron):
     assert one.surface is other.surface
 
 
-def test_a_unit_of_collada_is_honoured(tmp_path):
+def test_the_unit_of_a_collada_file_is_applied(tmp_path):
     pytest.importorskip("collada")
     data = trimesh.exchange.dae.export_collada(trimesh.creation.box())
     data = data if isinstance(data, bytes) else data.encode()
@@ -71,7 +71,7 @@ def test_a_unit_of_collada_is_honoured(tmp_path):
 
 @pytest.mark.parametrize("content", [None, b"", b"this is no mesh", b"\x00\x01" * 400])
 @pytest.mark.parametrize("suffix", ["stl", "dae", "obj", "xyz123"])
-def test_what_cannot_be_loaded_is_a_marked_placeholder_and_said_once(tmp_path, caplog, content, suffix):
+def test_an_unreadable_mesh_is_a_placeholder_and_logged_once(tmp_path, caplog, content, suffix):
     uri = f"broken_{suffix}_{len(content or b'')}.{suffix}"
     if content is not None:
         (tmp_path / uri).write_bytes(content)
@@ -101,7 +101,7 @@ def test_a_body_whose_meshes_are_missing_is_shown_by_its_collision_shapes(tmp_pa
     np.testing.assert_allclose(by_frame["other"].surface.bounds[1], [0.5, 1.0, 1.5])
 
 
-def test_a_model_that_is_only_there_to_be_touched_is_shown_by_that():
+def test_a_model_without_visual_shapes_is_shown_by_its_collision_shapes():
     import kineverse as kv
 
     model = kv.Model()
@@ -112,7 +112,7 @@ def test_a_model_that_is_only_there_to_be_touched_is_shown_by_that():
     assert [part.kind for part in collect_drawables(model, "collision")] == ["collision"]
 
 
-def test_a_mesh_opens_what_lies_beside_it_and_nothing_outside(tetrahedron, tmp_path):
+def test_a_mesh_reads_files_inside_of_its_root_only(tetrahedron, tmp_path):
     inside = tmp_path / "in"
     (inside / "materials").mkdir(parents=True)
     (inside / "two.obj").write_text(OBJ.replace("two.mtl", "materials/two.mtl"))
@@ -133,7 +133,7 @@ def test_a_mesh_opens_what_lies_beside_it_and_nothing_outside(tetrahedron, tmp_p
     assert load_mesh(Mesh(named, folder=str(inside))).problem
 
 
-def test_what_is_packed_is_bounded_by_what_it_unpacks_to(tetrahedron, monkeypatch):
+def test_the_unpacked_size_of_archives_is_bounded(tetrahedron, monkeypatch):
     with zipfile.ZipFile(tetrahedron / "two.zip", "w", zipfile.ZIP_DEFLATED) as packed:
         packed.write(tetrahedron / "two.stl", "two.stl")
     (tetrahedron / "two.zae").write_bytes((tetrahedron / "two.zip").read_bytes())
@@ -142,7 +142,7 @@ def test_what_is_packed_is_bounded_by_what_it_unpacks_to(tetrahedron, monkeypatc
     assert "unpacks to" in load_mesh(Mesh("two.zae", folder=str(tetrahedron))).problem
 
 
-def test_what_one_description_may_open_another_does_not_get(tetrahedron, tmp_path):
+def test_meshes_of_one_root_are_not_shared_with_another(tetrahedron, tmp_path):
     (tmp_path / "in").mkdir()
     own = Mesh("two.stl", folder=str(tetrahedron))
     other = Mesh("two.stl", folder=str(tetrahedron), root=str(tmp_path / "in"))

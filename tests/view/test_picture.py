@@ -26,7 +26,7 @@ def bluish(image):
     return (b > 1.4 * r) & (b > 1.4 * g)
 
 
-def test_parts_are_seen_in_their_colours():
+def test_parts_are_drawn_in_their_colours():
     image = picture(cabinet(), camera=FRONT, size=SMALL)
     assert image.shape == (120, 160, 3)
     assert image.dtype == np.uint8
@@ -42,18 +42,18 @@ def test_opening_the_drawer_moves_red_pixels_and_shows_more_of_it():
     assert open_.sum() > 1.5 * shut.sum()
 
 
-def test_what_is_behind_is_hidden():
+def test_parts_behind_others_are_hidden():
     image = picture(cabinet(), camera=Camera((3.0, 0.0, 1.0), (0.0, 0.0, 0.5)), size=SMALL)
     assert reddish(image).sum() == bluish(image).sum() == 0
 
 
-def test_the_automatic_camera_stands_where_moving_parts_are_seen():
+def test_the_automatic_camera_shows_moving_parts():
     image = picture(cabinet(), size=SMALL)
     assert reddish(image).sum() > 50
     assert bluish(image).sum() > 50
 
 
-def test_states_may_be_given_by_symbol_by_name_or_as_states_that_know_more():
+def test_states_are_given_by_symbol_by_name_or_as_larger_states():
     model = cabinet()
     door = kv.position("cabinet/door")
     by_name = picture(model, {"cabinet/door": 1.0}, camera=FRONT, size=SMALL)
@@ -91,7 +91,7 @@ def test_models_without_bodies_show_their_frames(frames):
 
 
 @pytest.mark.parametrize("size", [(0, 10), (10, -1), (100_000, 100_000)])
-def test_sizes_that_are_no_picture_are_refused(size):
+def test_invalid_picture_sizes_are_refused(size):
     with pytest.raises(InvalidValueError):
         picture(cabinet(), size=size)
 
@@ -102,11 +102,11 @@ def test_every_shipped_model_makes_a_picture(name):
     assert len(np.unique(image.reshape(-1, 3), axis=0)) > 200
 
 
-def test_pictures_are_the_same_every_time():
+def test_pictures_are_deterministic():
     np.testing.assert_array_equal(picture(cabinet(), size=SMALL), picture(cabinet(), size=SMALL))
 
 
-def test_save_writes_a_png_that_others_read(tmp_path):
+def test_save_picture_writes_a_png_that_other_libraries_read(tmp_path):
     imaging = pytest.importorskip("PIL.Image")
     save_picture(tmp_path / "cabinet.png", cabinet(), {"cabinet/door": 0.7}, size=SMALL)
     with imaging.open(tmp_path / "cabinet.png") as file:
@@ -114,7 +114,7 @@ def test_save_writes_a_png_that_others_read(tmp_path):
 
 
 @pytest.mark.parametrize("channels", [3, 4])
-def test_a_png_says_what_it_is(channels):
+def test_encode_png_writes_valid_chunks(channels):
     pixels = np.random.default_rng(0).integers(0, 256, (5, 7, channels), dtype=np.uint8)
     data = encode_png(pixels)
     assert data.startswith(b"\x89PNG\r\n\x1a\n")
@@ -135,17 +135,17 @@ def test_a_png_says_what_it_is(channels):
 @pytest.mark.parametrize(
     "wrong", [np.zeros((4, 4)), np.zeros((4, 4, 2), np.uint8), np.zeros((0, 4, 3), np.uint8)]
 )
-def test_what_is_no_image_is_refused(wrong):
+def test_arrays_that_are_no_image_are_refused(wrong):
     with pytest.raises(ShapeError):
         encode_png(wrong)
 
 
-def test_colours_of_the_models_are_what_this_file_takes_them_for():
+def test_the_colours_of_the_test_models_are_as_assumed():
     assert RED[0] > 1.8 * max(RED[1:3])
     assert BLUE[2] > 1.4 * max(BLUE[:2])
 
 
-def test_a_file_is_called_what_it_is(tmp_path):
+def test_picture_names_of_other_formats_are_refused(tmp_path):
     pixels = np.zeros((2, 2, 3), dtype=np.uint8)
     for name in ("x.png", "x.PNG", "x"):
         write_png(tmp_path / name, pixels)

@@ -1,4 +1,4 @@
-"""What is near, as numbers, marks, text and pixels; of models of which every distance is known."""
+"""Proximity queries as numbers, markers, text and pixels, in models of known distances."""
 
 from __future__ import annotations
 
@@ -53,7 +53,7 @@ def row(count: int) -> kv.Model:
 
 
 @given(st.floats(1e-3, 1.0), st.floats(0.0, 1.0), st.floats(0.0, 1.0))
-def test_the_nearer_the_redder(radius, one, other):
+def test_distance_color_is_redder_for_smaller_distances(radius, one, other):
     near, far = sorted((one, other))
     (r0, g0, _), (r1, g1, _) = distance_color(near * radius, radius), distance_color(far * radius, radius)
     assert r0 - g0 >= r1 - g1 - 1e-12
@@ -64,15 +64,15 @@ def test_the_nearer_the_redder(radius, one, other):
     ("metres", "text"),
     [(0.1, "100 mm"), (0.0123, "12.3 mm"), (0.00089, "0.89 mm"), (-0.002, "−2.0 mm"), (-1e-9, "0.00 mm")],
 )
-def test_millimetres(metres, text):
+def test_format_millimetres(metres, text):
     assert format_millimetres(metres) == text
 
 
 @pytest.mark.parametrize("gap", [0.05, -0.0004, -0.03])
-def test_lines_join_the_nearest_points_and_arrows_show_where_to_move(gap):
-    found = ProximityQuery(two_balls()).at({"gap": gap}, 0.1)
+def test_markers_join_nearest_points_and_arrows_point_along_the_normal(gap):
+    found = ProximityQuery(two_balls()).evaluate({"gap": gap}, 0.1)
     assert (found.found, found.touching) == (1, int(gap <= 0))
-    marks = ProximityMarkers.of(found, length=0.2)
+    marks = ProximityMarkers.from_result(found, length=0.2)
     np.testing.assert_allclose(marks.lines, [[[0.1, 0, 0], [0.1 + gap, 0, 0]]], atol=1e-6)
     np.testing.assert_allclose(marks.colors, [distance_color(gap, 0.1)])
     if gap > 0:
@@ -85,29 +85,29 @@ def test_lines_join_the_nearest_points_and_arrows_show_where_to_move(gap):
     assert np.isfinite(np.concatenate(surfaces)).all()
 
 
-def test_pairs_are_chosen_by_name_and_ignored_ones_shown_with_the_reason():
+def test_pairs_are_filtered_by_name_and_ignored_ones_have_a_reason():
     model = two_balls()
     near = ProximityQuery(model)
-    assert [(p.a, p.b) for p in near.at({"gap": 0.0}, 0.4).pairs] == [("left", "right")]
-    assert near.at({"gap": 0.0}, 0.4, containing=" RIGHT ").found == 1
-    assert near.at({"gap": 0.0}, 0.4, containing="rail").found == 0
-    found = near.at({"gap": 0.0}, 0.4, ignored=True)
+    assert [(p.a, p.b) for p in near.evaluate({"gap": 0.0}, 0.4).pairs] == [("left", "right")]
+    assert near.evaluate({"gap": 0.0}, 0.4, containing=" RIGHT ").found == 1
+    assert near.evaluate({"gap": 0.0}, 0.4, containing="rail").found == 0
+    found = near.evaluate({"gap": 0.0}, 0.4, ignored=True)
     assert [(p.a, p.b, why) for p, why in found.ignored] == [("rail", "right", JOINED)]
-    assert (found.looked_at, found.unchecked_pairs) == (1, 2)
-    assert tuple(ProximityMarkers.of(found, 0.1).colors[-1]) == IGNORED
+    assert (found.checked_pairs, found.unchecked_pairs) == (1, 2)
+    assert tuple(ProximityMarkers.from_result(found, 0.1).colors[-1]) == IGNORED
     with model.edit() as edit:
         edit.write(RULES, rules_as_data([Rule("left", "right", why="<soft>")]))
-    near.follow()
-    found = near.at({"gap": 0.0}, 0.4, ignored=True)
+    near.refresh()
+    found = near.evaluate({"gap": 0.0}, 0.4, ignored=True)
     assert [why for _, why in found.ignored] == ["excepted: <soft>", JOINED]
     text = format_proximity(found, near.problems)
     assert "No pair is within 0.4 m." in text
     assert "excepted: &lt;soft&gt;" in text
 
 
-def test_a_crowd_is_counted():
+def test_pairs_beyond_the_limit_are_counted():
     model = row(MOST_PAIRS + 6)
-    found = ProximityQuery(model).at({f"x{k}": 0.0 for k in range(MOST_PAIRS + 6)}, 0.01)
+    found = ProximityQuery(model).evaluate({f"x{k}": 0.0 for k in range(MOST_PAIRS + 6)}, 0.01)
     assert (found.found, len(found.pairs), found.touching) == (MOST_PAIRS + 5, MOST_PAIRS, 0)
     text = format_proximity(found, {})
     assert text.count("1.0 mm") == LINES
@@ -115,13 +115,13 @@ def test_a_crowd_is_counted():
     assert f"{MOST_PAIRS + 5} pairs within 0.01 m, none touches" in text
 
 
-def test_bodies_without_distances_are_left_out_and_said(tmp_path):
+def test_bodies_without_distances_are_excluded_and_reported(tmp_path):
     model = two_balls()
     with model.edit() as edit:
         lost = Body(visuals=(Shape(Mesh("lost.stl", folder=str(tmp_path))),))
         edit.add_frame("part", "left", kv.translation(0, 0, 0), lost)
     near = ProximityQuery(model)
-    found = near.at({"gap": 0.05})
+    found = near.evaluate({"gap": 0.05})
     assert [(p.a, p.b) for p in found.pairs] == [("left", "right")]
     text = format_proximity(found, near.problems)
     assert "No distances to<" in text
@@ -129,9 +129,9 @@ def test_bodies_without_distances_are_left_out_and_said(tmp_path):
     with model.edit() as edit:
         edit.remove("frame part")
         edit.add_frame("part", "left", kv.translation(0, 0, 0), Body(visuals=(Shape(Sphere(0.11)),)))
-    near.follow()
+    near.refresh()
     assert near.problems == {}
-    assert "part" in {near.at({"gap": 0.05}).pairs[0].a, near.at({"gap": 0.05}).pairs[0].b}
+    assert "part" in {near.evaluate({"gap": 0.05}).pairs[0].a, near.evaluate({"gap": 0.05}).pairs[0].b}
 
 
 def test_a_state_without_poses_has_no_distances_and_the_next_one_has():
@@ -142,11 +142,11 @@ def test_a_state_without_poses_has_no_distances_and_the_next_one_has():
         edit.add_frame("post", "world", kv.translation(0, 0, 0), ball)
     near = ProximityQuery(model)
     with pytest.raises(KineverseError, match="hook"):
-        near.at({"q": 0.0})
-    assert near.at({"q": 4.0}).pairs[0].distance == pytest.approx(0.05)
+        near.evaluate({"q": 0.0})
+    assert near.evaluate({"q": 4.0}).pairs[0].distance == pytest.approx(0.05)
 
 
-def test_collision_shapes_are_what_distances_are_computed_to(tmp_path):
+def test_drawn_collision_shapes_are_those_of_distances(tmp_path):
     trimesh = pytest.importorskip("trimesh")
     cross = trimesh.util.concatenate(
         [trimesh.creation.box((1, 0.2, 0.2)), trimesh.creation.box((0.2, 1, 0.2))]
@@ -167,7 +167,7 @@ def test_collision_shapes_are_what_distances_are_computed_to(tmp_path):
     assert volume == pytest.approx(0.2 * (1.0 - 4 * 0.4 * 0.4 / 2), rel=1e-6)
 
 
-def test_pictures_show_what_is_near_through_the_bodies():
+def test_pictures_show_nearest_pairs_through_bodies():
     camera = Camera((0.1, -1.0, 0.2), (0.1, 0.0, 0.1))
     model = two_balls()
 

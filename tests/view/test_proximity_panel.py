@@ -1,4 +1,4 @@
-"""The folder of collisions and the thread behind it, without a browser."""
+"""The proximity panel and its background thread, without a browser."""
 
 from __future__ import annotations
 
@@ -37,7 +37,7 @@ def nodes(page):
     return set(page.collisions._drawn)
 
 
-def test_meshes_are_shown_and_measured_as_they_were_decomposed(tmp_path, monkeypatch):
+def test_decomposed_meshes_are_used_for_shapes_and_distances(tmp_path, monkeypatch):
     """A post with a beam across, and a ball between the two that touches the hull around both only."""
     boxes = [trimesh.creation.box((0.1, 0.1, 0.4)), trimesh.creation.box((0.4, 0.1, 0.1))]
     trimesh.util.concatenate(boxes).export(tmp_path / "cross.stl")
@@ -50,7 +50,7 @@ def test_meshes_are_shown_and_measured_as_they_were_decomposed(tmp_path, monkeyp
         ball = Body(collisions=(Shape(Sphere(0.02)),))
         edit.add_frame("ball", "world", kv.translation(kv.position("x"), 0, 0.09), ball)
     near = {
-        decomposed: ProximityQuery(model, decomposed).at({"x": 0.1}, 0.1).pairs[0]
+        decomposed: ProximityQuery(model, decomposed).evaluate({"x": 0.1}, 0.1).pairs[0]
         for decomposed in (False, True)
     }
     assert near[False].touches
@@ -66,31 +66,31 @@ def test_meshes_are_shown_and_measured_as_they_were_decomposed(tmp_path, monkeyp
         page.collisions.show_near(0.1)
         page.collisions.show_shapes()
         assert page.settled()
-        assert page.collisions.nearness.touching == 1
+        assert page.collisions.result.touching == 1
         one = len(page._scene._collisions)
         for shown, shapes, touching in ((True, one + 1, 0), (False, one, 1)):
             page.collisions.show_decomposed(shown)
             assert page.settled()
             assert page.collisions._controls[-1].value == shown
-            assert (len(page._scene._collisions), page.collisions.nearness.touching) == (shapes, touching)
+            assert (len(page._scene._collisions), page.collisions.result.touching) == (shapes, touching)
         page.collisions.show_decomposed()
         page.collisions.show_near(0.05)  # which changes nothing about that
         assert page.settled()
-        assert page.collisions.nearness.touching == 0
+        assert page.collisions.result.touching == 0
 
 
-def test_nothing_is_computed_or_shown_before_it_is_asked_for(page):
+def test_no_query_runs_before_a_request(page):
     page.move({"cabinet/drawer": 0.1})
     assert page.settled()
-    assert page.collisions.nearness is None
+    assert page.collisions.result is None
     assert (report(page), nodes(page)) == ("", set())
-    assert page.collisions.watch._near is None
+    assert page.collisions.worker._query is None
 
 
 def test_the_nearest_pairs_follow_the_sliders(page):
     page.collisions.show_near(0.1)
     assert page.settled()
-    (pair,) = page.collisions.nearness.pairs
+    (pair,) = page.collisions.result.pairs
     assert (pair.a, pair.b) == ("cabinet/drawer", "cabinet/door")
     assert pair.distance == pytest.approx(0.05)
     assert "50.0 mm" in report(page)
@@ -99,7 +99,7 @@ def test_the_nearest_pairs_follow_the_sliders(page):
     page.collisions.show_near(0.2)
     page.move({"cabinet/drawer": 0.4})
     assert page.settled()
-    (pair,) = page.collisions.nearness.pairs
+    (pair,) = page.collisions.result.pairs
     np.testing.assert_allclose(page.collisions._drawn["/near/lines"].points, [[pair.point_a, pair.point_b]])
     page.collisions.show_near(0.01)
     assert page.settled()
@@ -134,17 +134,17 @@ def test_bodies_are_half_transparent_while_lines_are_shown_in_them(page):
     assert (report(page), nodes(page)) == ("", set())
 
 
-def test_what_is_switched_on_stays_on_over_edits(page):
+def test_settings_survive_edits(page):
     page.collisions.show_near(0.15, containing="lid")
     page.collisions.show_shapes()
     assert page.settled()
-    assert page.collisions.nearness.found == 0
+    assert page.collisions.result.found == 0
     with page.model.edit() as edit:
         lid = Body(collisions=(Shape(Box((0.4, 0.6, 0.02))),))
         edit.add_frame("lid", "world", kv.translation(0, 0, 1.02 + kv.position("lid")), lid)
     page.move({"lid": 0.03})
     assert page.settled()
-    (pair,) = page.collisions.nearness.pairs
+    (pair,) = page.collisions.result.pairs
     assert {pair.a, pair.b} == {"lid", "cabinet/corpus"}
     assert pair.distance == pytest.approx(0.04)
     near, radius, only, ignored, _ = page.collisions._controls
@@ -154,7 +154,7 @@ def test_what_is_switched_on_stays_on_over_edits(page):
     assert "40.0 mm" in report(page)
 
 
-def test_edits_while_it_looks_leave_no_trace(page, caplog):
+def test_edits_during_a_query_leave_no_trace(page, caplog):
     page.collisions.show_near(0.3)
     for k in range(12):
         with page.model.edit() as edit:
@@ -165,21 +165,21 @@ def test_edits_while_it_looks_leave_no_trace(page, caplog):
         page.collisions.show_near(0.01 + 0.001 * k, containing="cube")
     assert page.settled()
     assert caplog.records == []
-    assert page.collisions.nearness.found == 11
-    assert page.collisions.seen.failure == ""
+    assert page.collisions.result.found == 11
+    assert page.collisions.status.failure == ""
 
 
-def test_bodies_with_missing_meshes_are_said_to_have_no_distances(tmp_path):
+def test_bodies_with_missing_meshes_are_reported_as_excluded(tmp_path):
     model = with_mesh("nowhere.stl", str(tmp_path))
     with view(model, port=0) as page:
         page.collisions.show_near()
         assert page.settled()
         assert "No distances to<" in report(page)
         assert "nowhere.stl" in report(page)
-        assert page.collisions.nearness.found == 0
+        assert page.collisions.result.found == 0
 
 
-def test_a_state_without_poses_is_said_and_left_again():
+def test_a_state_without_poses_is_reported_until_the_next_state():
     model, q = kv.Model(), kv.position("q")
     cube = Body(visuals=(Shape(Box((1.0, 1.0, 1.0))),))
     with model.edit() as edit:
@@ -200,13 +200,13 @@ def test_a_state_without_poses_is_said_and_left_again():
 
 
 @pytest.mark.parametrize("radius", [-0.1, float("nan"), float("inf")])
-def test_radii_that_are_none_are_refused(page, radius):
+def test_invalid_radii_are_refused(page, radius):
     with pytest.raises(InvalidValueError, match="radius"):
         page.collisions.show_near(radius)
-    assert page.collisions.nearness is None
+    assert page.collisions.result is None
 
 
-def test_without_the_extra_the_folder_names_it(monkeypatch):
+def test_without_coal_the_folder_names_the_extra(monkeypatch):
     monkeypatch.setattr(proximity_panel, "is_installed", lambda: False)
     monkeypatch.setitem(sys.modules, "coal", None)
     with view(cabinet(), port=0) as page:

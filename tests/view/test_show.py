@@ -1,4 +1,4 @@
-"""kv.show: in a script, at a prompt and in a notebook; and what a page is called."""
+"""kv.show in a script, at a prompt and in a notebook; titles of pages."""
 
 from __future__ import annotations
 
@@ -40,7 +40,7 @@ def opened(monkeypatch):
     return addresses
 
 
-def test_a_script_waits_until_ctrl_c_and_goes_on(monkeypatch, capfd, opened):
+def test_show_in_a_script_waits_until_ctrl_c(monkeypatch, capfd, opened):
     def interrupted(page):
         raise KeyboardInterrupt
 
@@ -58,7 +58,7 @@ def test_a_script_waits_until_ctrl_c_and_goes_on(monkeypatch, capfd, opened):
         page.wait()
 
 
-def test_it_returns_at_once_where_that_is_wanted(capfd, opened):
+def test_show_without_block_returns_at_once(capfd, opened):
     with kv.show(cabinet(), port=0, block=False, open_browser=False, degrees=True) as page:
         assert page.settled()
         assert page._panel.degrees
@@ -67,14 +67,14 @@ def test_it_returns_at_once_where_that_is_wanted(capfd, opened):
     assert opened == []
 
 
-def test_at_a_prompt_it_does_not_wait(monkeypatch, opened):
+def test_show_at_a_prompt_does_not_wait(monkeypatch, opened):
     monkeypatch.setattr(sys, "ps1", ">>> ", raising=False)
     page = show(cabinet(), port=0)
     page.stop()
     assert len(opened) == 1
 
 
-def test_in_a_notebook_the_page_is_the_result_of_the_cell(monkeypatch, capfd, opened):
+def test_show_in_a_notebook_returns_the_page_as_the_result_of_the_cell(monkeypatch, capfd, opened):
     shell = types.SimpleNamespace(kernel=object())
     monkeypatch.setitem(sys.modules, "IPython", types.SimpleNamespace(get_ipython=lambda: shell))
     with show(cabinet(), port=0) as page:
@@ -85,7 +85,7 @@ def test_in_a_notebook_the_page_is_the_result_of_the_cell(monkeypatch, capfd, op
     assert "taken down" in page._repr_html_()
 
 
-def test_without_a_screen_no_browser_is_looked_for(monkeypatch, opened):
+def test_show_without_a_screen_opens_no_browser(monkeypatch, opened):
     for name in ("DISPLAY", "WAYLAND_DISPLAY", "BROWSER"):
         monkeypatch.delenv(name, raising=False)
     monkeypatch.setattr(sys, "platform", "linux")
@@ -118,7 +118,7 @@ def test_a_real_script_ends_with_ctrl_c(hears_ctrl_c):
     assert out.startswith("went on <page of <Model: 1 frames, 1 DoF")
 
 
-def test_what_is_no_model_is_refused_and_nothing_is_left():
+def test_show_refuses_other_objects_and_leaves_no_thread():
     for wrong, words in (
         ("kitchen", r"shows a kineverse\.Model, not 'kitchen'\. Read it first: kv\.load\('kitchen'\)"),
         (None, "not a NoneType"),
@@ -130,7 +130,7 @@ def test_what_is_no_model_is_refused_and_nothing_is_left():
         kv.show(cabinet(), {"cabinet/dor": 1.0}, block=False)
 
 
-def test_a_state_may_lack_names_and_know_more_than_the_model(capfd):
+def test_show_accepts_partial_and_larger_states(capfd):
     state = cabinet().default_state().updated({"cabinet/door": 0.7})
     with kv.show(cabinet(), state, port=0, block=False, open_browser=False) as page:
         assert page.values["cabinet/door"] == 0.7
@@ -140,7 +140,7 @@ def test_a_state_may_lack_names_and_know_more_than_the_model(capfd):
         assert page.values == {"cabinet/drawer": 0.0, "cabinet/door": 0.0, "cabinet/knob": 1.0}
 
 
-def test_nothing_to_draw_then_something_then_nothing():
+def test_a_page_follows_bodies_that_come_and_go():
     model = kv.Model()
     with kv.show(model, port=0, block=False, open_browser=False) as page:
         assert page.settled()
@@ -155,7 +155,7 @@ def test_nothing_to_draw_then_something_then_nothing():
         assert "cannot be shown" not in page._panel._status.content
 
 
-def test_pages_are_called_what_models_are_called(tmp_path):
+def test_page_titles_are_names_of_models(tmp_path):
     both = kv.Model()
     both.include("shelf_door")
     both.include("shelf_drawers")

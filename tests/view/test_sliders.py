@@ -18,22 +18,22 @@ INF = math.inf
 LIMIT = st.one_of(st.floats(-10, 10), st.just(INF), st.just(-INF))
 
 
-def test_limits_that_depend_on_the_state_follow_it():
+def test_state_dependent_limits_follow_the_state():
     ranges = Ranges(dependent())
     assert ranges.names == ["door", "drawer"]
     assert ranges.varying == ["drawer"]
-    assert ranges.at({"door": 0.0, "drawer": 0.0})["drawer"] == (0.0, 0.0)
-    assert ranges.at({"door": 0.8, "drawer": 0.0}) == {"door": (0.0, 1.0), "drawer": (0.0, 0.4)}
+    assert ranges.limits_at({"door": 0.0, "drawer": 0.0})["drawer"] == (0.0, 0.0)
+    assert ranges.limits_at({"door": 0.8, "drawer": 0.0}) == {"door": (0.0, 1.0), "drawer": (0.0, 0.4)}
 
 
-def test_limits_are_those_of_the_model_and_parameters_are_none_of_them():
+def test_limits_are_those_of_the_degrees_of_freedom_without_parameters():
     model = cabinet()
     with model.edit() as edit:
         tilt = kv.parameter("tilt", 0.2)
         edit.add_frame("shelf", parent="world", transform=kv.rotation_x(tilt))
     ranges = Ranges(model)
     assert ranges.varying == []
-    assert ranges.at(complete(model)) == {
+    assert ranges.limits_at(complete(model)) == {
         "cabinet/door": (0.0, 1.5),
         "cabinet/drawer": (0.0, 0.4),
         "cabinet/knob": (-INF, INF),
@@ -41,7 +41,7 @@ def test_limits_are_those_of_the_model_and_parameters_are_none_of_them():
 
 
 @given(LIMIT, LIMIT, st.floats(-20, 20), st.sampled_from(["rad", "m", ""]), st.sampled_from([0.0, 0.2]))
-def test_what_a_slider_offers_is_finite_and_has_the_value_and_the_limits_in_it(a, b, value, unit, beyond):
+def test_slider_ranges_are_finite_and_contain_value_and_limits(a, b, value, unit, beyond):
     lower, upper = min(a, b), max(a, b)
     assume(lower < INF and upper > -INF)
     low, high = choose_slider_range((lower, upper), value, unit, beyond)
@@ -56,14 +56,14 @@ def test_what_a_slider_offers_is_finite_and_has_the_value_and_the_limits_in_it(a
     assert 900 <= (high - low) / choose_slider_step((low, high)) <= 11_000
 
 
-def test_sliders_stay_inside_of_limits_unless_asked_to_go_beyond():
+def test_slider_ranges_exceed_limits_only_on_demand():
     assert choose_slider_range((0.0, 1.5), 0.3, "rad") == (0.0, 1.5)
     assert choose_slider_range((0.0, 1.5), 0.3, "rad", 0.2) == (-0.3, 1.8)
     assert choose_slider_range((-INF, INF), 0.0, "rad") == (-math.pi, math.pi)
     assert choose_slider_range((-INF, INF), 0.0, "m") == (-2.0, 2.0)
 
 
-def test_units_are_read_off_the_motion():
+def test_units_are_inferred_from_the_motion():
     model = cabinet()
     rope, screw, mimic = kv.position("rope"), kv.position("screw"), kv.position("mimic")
     with model.edit() as edit:
@@ -91,11 +91,11 @@ def test_units_are_read_off_the_motion():
     assert infer_units(kv.Model(), {}, []) == {}
 
 
-def test_poses_are_those_of_the_model():
+def test_frame_poses_are_those_of_the_model():
     model = cabinet()
     poses = FramePoses(model)
     values = {**complete(model), "cabinet/door": 0.7, "cabinet/drawer": 0.1}
-    at = dict(zip(poses.names, poses.at(values), strict=True))
+    at = dict(zip(poses.names, poses.evaluate(values), strict=True))
     np.testing.assert_array_equal(at["world"], np.eye(4))
     for name in model.frames:
         np.testing.assert_allclose(at[name], model.fk(name)(kv.State(values)), atol=1e-12)
@@ -104,12 +104,12 @@ def test_poses_are_those_of_the_model():
         np.testing.assert_allclose(batch, np.tile(at[name], (3, 1, 1)), atol=1e-12)
 
 
-def test_a_model_without_frames_has_the_world():
-    assert FramePoses(kv.Model()).at({}).tolist() == [np.eye(4).tolist()]
+def test_frame_poses_of_an_empty_model_are_the_world():
+    assert FramePoses(kv.Model()).evaluate({}).tolist() == [np.eye(4).tolist()]
 
 
 @given(st.lists(st.floats(-1, 1), min_size=4, max_size=4).filter(lambda q: np.linalg.norm(q) > 0.1))
-def test_quaternions_come_back(numbers):
+def test_quaternions_round_trip(numbers):
     w, x, y, z = q = np.array(numbers) / np.linalg.norm(numbers)
     matrix = np.array(
         [
@@ -124,7 +124,7 @@ def test_quaternions_come_back(numbers):
 
 
 @given(*[st.floats(-3.1, 3.1)] * 3)
-def test_roll_pitch_yaw_come_back_as_the_same_rotation(roll, pitch, yaw):
+def test_roll_pitch_yaw_round_trip(roll, pitch, yaw):
     def matrix(angles):
         r, p, y = angles
         return np.array((kv.rotation_z(y) @ kv.rotation_y(p) @ kv.rotation_x(r))())
@@ -133,7 +133,7 @@ def test_roll_pitch_yaw_come_back_as_the_same_rotation(roll, pitch, yaw):
     np.testing.assert_allclose(matrix(roll_pitch_yaw(expected)), expected, atol=1e-9)
 
 
-def test_roll_pitch_yaw_where_they_are_not_unique():
+def test_roll_pitch_yaw_at_the_singularity_has_roll_zero():
     upright = np.array((kv.rotation_z(0.3) @ kv.rotation_y(math.pi / 2) @ kv.rotation_x(0.1))())
     roll, pitch, yaw = roll_pitch_yaw(upright)
     assert (roll, pitch) == (0.0, pytest.approx(math.pi / 2))
@@ -141,18 +141,18 @@ def test_roll_pitch_yaw_where_they_are_not_unique():
 
 
 @given(st.floats(0, 1), st.floats(0, 100))
-def test_the_show_starts_where_things_are_and_stays_inside_the_limits(share, now):
+def test_animation_starts_at_the_state_and_stays_within_the_limits(share, now):
     limits = {"a": (-1.0, 2.0), "b": (0.0, 0.4)}
     start = {name: low + share * (high - low) for name, (low, high) in limits.items()}
     show = RangeAnimation(start, limits, now=50.0)
-    assert show.at(50.0) == pytest.approx(start)
-    for name, value in show.at(50.0 + now).items():
+    assert show.values_at(50.0) == pytest.approx(start)
+    for name, value in show.values_at(50.0 + now).items():
         assert limits[name][0] - 1e-9 <= value <= limits[name][1] + 1e-9
 
 
-def test_the_show_reaches_both_ends():
+def test_animation_reaches_both_limits():
     show = RangeAnimation({"a": 0.0}, {"a": (-1.0, 2.0)}, now=0.0)
-    values = [show.at(t)["a"] for t in np.linspace(2.0, 12.0, 400)]
+    values = [show.values_at(t)["a"] for t in np.linspace(2.0, 12.0, 400)]
     assert min(values) == pytest.approx(-1.0, abs=0.01)
     assert max(values) == pytest.approx(2.0, abs=0.01)
 
@@ -167,7 +167,7 @@ def test_violations_are_listed_with_value_bounds_and_excess():
     assert "All constraints hold" in format_violations(())
 
 
-def test_long_lists_are_cut_and_names_are_no_markup():
+def test_long_reports_are_cut_and_names_are_escaped():
     from kineverse.model.violations import Violation
 
     many = [Violation(f"<script>{k}", 2.0, -INF, 1.0, 1.0) for k in range(MOST_LINES + 3)]

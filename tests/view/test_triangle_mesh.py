@@ -59,7 +59,7 @@ def extent(shape):
 
 
 @given(PRIMITIVES)
-def test_primitives_have_the_size_and_the_outside_of_what_they_stand_for(shape):
+def test_primitive_meshes_have_the_size_and_volume_of_the_primitive(shape):
     surface = mesh_geometry(shape)
     low, high = surface.bounds
     np.testing.assert_allclose(high - low, extent(shape), rtol=0.01)
@@ -69,31 +69,31 @@ def test_primitives_have_the_size_and_the_outside_of_what_they_stand_for(shape):
 
 
 @given(PRIMITIVES)
-def test_normals_are_unit_and_point_away_from_the_middle(shape):
+def test_normals_have_unit_length_and_point_outwards(shape):
     surface = mesh_geometry(shape)
     np.testing.assert_allclose(np.linalg.norm(surface.normals, axis=1), 1.0)
     assert (np.einsum("ij,ij->i", surface.normals, surface.vertices) > 0).all()
 
 
 @given(PRIMITIVES, st.tuples(*[st.sampled_from([-1.5, -1.0, 0.5, 2.0])] * 3))
-def test_a_mirrored_surface_keeps_its_outside_outside(shape, scale):
+def test_a_mirrored_mesh_keeps_its_outside_outside(shape, scale):
     surface = mesh_geometry(shape)
-    assert volume(surface.scaled(scale)) == pytest.approx(abs(np.prod(scale)) * volume(surface))
+    assert volume(surface.scale(scale)) == pytest.approx(abs(np.prod(scale)) * volume(surface))
 
 
-def test_equal_primitives_share_one_surface():
+def test_equal_primitives_share_one_mesh():
     assert mesh_geometry(Sphere(0.25)) is mesh_geometry(Sphere(0.25))
 
 
-def test_moved_by_a_rotation_turns_vertices_and_normals():
+def test_transform_rotates_vertices_and_normals():
     turn = np.array([[0.0, -1, 0, 1], [1, 0, 0, 2], [0, 0, 1, 3], [0, 0, 0, 1]])
     surface = mesh_geometry(Box((2.0, 4.0, 6.0)))
-    moved = surface.moved(turn)
+    moved = surface.transform(turn)
     np.testing.assert_allclose(moved.bounds, [[-1, 1, 0], [3, 3, 6]])
     np.testing.assert_allclose(moved.normals, surface.normals @ turn[:3, :3].T)
 
 
-def test_a_cube_of_shared_corners_gets_sharp_edges():
+def test_build_creased_mesh_of_a_cube_has_sharp_edges():
     box = mesh_geometry(Box((1.0, 1.0, 1.0)))
     corners, index = np.unique(box.vertices, axis=0, return_inverse=True)
     assert len(corners) == 8
@@ -103,13 +103,13 @@ def test_a_cube_of_shared_corners_gets_sharp_edges():
     assert (np.abs(surface.normals).max(axis=1) == 1.0).all()
 
 
-def test_a_finely_cut_ball_stays_smooth():
+def test_build_creased_mesh_of_a_fine_sphere_is_smooth():
     ball = mesh_geometry(Sphere(1.0))
     surface, _ = build_creased_mesh(ball.vertices, ball.faces)
     np.testing.assert_allclose(surface.normals, surface.vertices, atol=0.03)
 
 
-def test_faces_without_area_are_dropped_and_named():
+def test_faces_without_area_are_dropped_and_the_others_indexed():
     surface, kept = build_creased_mesh([[0, 0, 0], [1, 0, 0], [0, 1, 0], [2, 0, 0]], [[0, 1, 3], [0, 1, 2]])
     assert (len(surface.faces), kept.tolist()) == (1, [1])
     nothing, _ = build_creased_mesh(np.zeros((0, 3)), np.zeros((0, 3)))
@@ -117,11 +117,11 @@ def test_faces_without_area_are_dropped_and_named():
     np.testing.assert_array_equal(nothing.bounds, np.zeros((2, 3)))
 
 
-def test_join_shifts_indices_and_keeps_colours_only_if_all_have_some():
+def test_concatenate_meshes_shifts_indices_and_keeps_colours_only_if_all_have_some():
     box, mark = mesh_geometry(Box((1.0, 1.0, 1.0))), mesh_placeholder()
     both = concatenate_meshes([box, mark])
     assert volume(both) == pytest.approx(volume(box) + volume(mark))
     assert both.colors is None
-    painted = [s.painted(np.ones((len(s.faces), 4))) for s in (box, mark)]
+    painted = [s.with_colors(np.ones((len(s.faces), 4))) for s in (box, mark)]
     assert concatenate_meshes(painted).colors.shape == (len(both.faces), 4)
     assert painted[0].without_colors().colors is None

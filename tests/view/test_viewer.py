@@ -45,14 +45,14 @@ def test_the_page_is_served_to_this_computer_only(page, capfd):
     assert capfd.readouterr().out == ""
 
 
-def test_there_is_a_slider_inside_its_limits_for_each_degree_of_freedom(page):
+def test_each_degree_of_freedom_has_a_slider_within_its_limits(page):
     found = sliders(page)
     assert found["cabinet/drawer"] == ("drawer [m]   0 to 0.4", 0.0, 0.4, 0.0)
     assert found["cabinet/door"] == ("door [rad]   0 to 1.5", 0.0, 1.5, 0.0)
     assert found["cabinet/knob"] == ("knob [rad]   −3.14 to 3.14", -np.pi, np.pi, 0.0)
 
 
-def test_moving_and_resetting(page):
+def test_move_and_reset(page):
     page.move({"cabinet/drawer": 0.3, kv.position("cabinet/door"): 0.5})
     assert page.settled()
     np.testing.assert_allclose(page.pose("cabinet/drawer")[:3, 3], [-0.3, 0, 0.7])
@@ -94,18 +94,18 @@ def test_speeds_are_shown_in_degrees_too():
         assert all(" [°/s] " in s.label for s in turning)
 
 
-def test_what_is_seen_through_throws_no_shadows(page):
+def test_half_transparent_bodies_cast_no_shadows(page):
     def shadows():
         return {(node.cast_shadow, node.receive_shadow) for node, _ in page._scene._visuals}
 
     assert shadows() == {(True, True)}
-    page._scene.show_through(True)
+    page._scene.show_transparent(True)
     assert shadows() == {(False, False)}
-    page._scene.show_through(False)
+    page._scene.show_transparent(False)
     assert shadows() == {(True, True)}
 
 
-def test_frames_that_differ_by_a_character_like_a_slash_are_two_nodes():
+def test_frames_that_differ_by_a_slash_like_character_are_two_nodes():
     model = kv.Model()
     cube = Body(visuals=(Shape(Box((1.0, 1.0, 1.0))),))
     with model.edit() as edit:
@@ -115,7 +115,7 @@ def test_frames_that_differ_by_a_character_like_a_slash_are_two_nodes():
         assert len({node.name for node in page._scene._nodes.values()}) == 2
 
 
-def test_violated_constraints_are_shown_also_those_on_several(page):
+def test_violated_constraints_on_one_and_several_coordinates_are_shown(page):
     page.move({"cabinet/drawer": 0.4, "cabinet/door": 1.4})
     assert page.settled()
     assert "cabinet/no_clash" in page._panel._status.content
@@ -135,7 +135,7 @@ def test_sliders_follow_limits_that_depend_on_the_state():
         assert sliders(page)["drawer"][2] == pytest.approx(0.5)
 
 
-def test_the_page_follows_edits_and_keeps_what_is_still_there(page):
+def test_the_page_follows_edits_and_keeps_the_values_of_remaining_symbols(page):
     page.move({"cabinet/drawer": 0.25})
     with page.model.edit() as edit:
         edit.add_frame("lid", parent="world", transform=kv.translation(0, 0, kv.position("lid")))
@@ -146,19 +146,19 @@ def test_the_page_follows_edits_and_keeps_what_is_still_there(page):
     np.testing.assert_allclose(page.pose("lid")[2, 3], 0.1)
 
 
-def test_what_is_moved_while_the_page_is_made_anew_is_not_lost(page, monkeypatch):
+def test_values_moved_during_a_rebuild_are_kept(page, monkeypatch):
     from kineverse.view import viewer
 
-    def then_moved(model, fixed=viewer._fixed):
-        found = fixed(model)
+    def then_moved(model, freeze=viewer._freeze):
+        found = freeze(model)
         if threading.current_thread() is page._worker:
-            monkeypatch.setattr(viewer, "_fixed", fixed)
+            monkeypatch.setattr(viewer, "_freeze", freeze)
             other = threading.Thread(target=page.move, args=({"cabinet/door": 0.7},))
             other.start()
             other.join()
         return found
 
-    monkeypatch.setattr(viewer, "_fixed", then_moved)
+    monkeypatch.setattr(viewer, "_freeze", then_moved)
     with page.model.edit() as edit:
         # And a program may move what it is editing.
         page.move({"cabinet/drawer": 0.2})
@@ -168,7 +168,7 @@ def test_what_is_moved_while_the_page_is_made_anew_is_not_lost(page, monkeypatch
     assert sliders(page)["cabinet/door"][3] == 0.7
 
 
-def test_the_show_moves_what_has_limits(page):
+def test_play_moves_limited_coordinates(page):
     page.play()
     before = page.pose("cabinet/drawer")
     for _ in range(200):
@@ -185,7 +185,7 @@ def test_the_show_moves_what_has_limits(page):
     assert page.values["cabinet/drawer"] == 0.0
 
 
-def test_a_model_without_anything_has_a_page():
+def test_an_empty_model_has_a_page():
     with view(kv.Model(), port=0) as page:
         assert page.settled()
         assert page.values == {}
@@ -208,13 +208,13 @@ def test_switches_do_not_fail(page):
     scene.show_frames(False)
 
 
-def test_missing_meshes_are_said(tmp_path):
+def test_missing_meshes_are_reported(tmp_path):
     with view(with_mesh("nowhere.stl", str(tmp_path)), port=0) as page:
         (line,) = page.problems
         assert "nowhere.stl" in line
 
 
-def test_ports_that_are_taken_or_none_are_refused(page):
+def test_taken_and_invalid_ports_are_refused(page):
     taken = int(page.address.rpartition(":")[2])
     with pytest.raises(InvalidValueError, match="taken"):
         view(cabinet(), port=taken)
@@ -222,7 +222,7 @@ def test_ports_that_are_taken_or_none_are_refused(page):
         view(cabinet(), port=70_000)
 
 
-def test_stopping_twice_is_fine_and_frees_the_port():
+def test_stop_is_idempotent_and_frees_the_port():
     page = view(cabinet(), port=0)
     page.stop()
     page.stop()
@@ -231,7 +231,7 @@ def test_stopping_twice_is_fine_and_frees_the_port():
         probe.bind(("127.0.0.1", int(page.address.rpartition(":")[2])))
 
 
-def test_without_viser_the_extra_is_named(monkeypatch):
+def test_the_error_without_viser_names_the_extra(monkeypatch):
     monkeypatch.setitem(sys.modules, "viser", None)
     with pytest.raises(MissingDependencyError, match=r"pip install -e '.*\[view\]'"):
         view(cabinet(), port=0)
@@ -242,7 +242,7 @@ def test_an_unknown_name_in_the_state_leaves_no_server_behind():
         view(cabinet(), {"nothing": 1.0}, port=0)
 
 
-def test_what_is_not_finite_is_hidden_and_named():
+def test_frames_without_finite_poses_are_hidden_and_named():
     model, q = kv.Model(), kv.position("q")
     cube = Body(visuals=(Shape(Box((1.0, 1.0, 1.0))),))
     with model.edit() as edit:

@@ -83,7 +83,9 @@ def camera(model: kv.Model, states: list[dict[str, float]], take: Take, aspect: 
     """Return a camera that has the scene in all its states in the picture."""
     poses, items = FramePoses(model), collect_drawables(model)
     corners = [
-        TriangleSoup.of(items, dict(zip(poses.names, poses.at(state), strict=True))).corners.reshape(-1, 3)
+        TriangleSoup.from_drawables(
+            items, dict(zip(poses.names, poses.evaluate(state), strict=True))
+        ).corners.reshape(-1, 3)
         for state in states
     ]
     return fit_camera(np.concatenate(corners), take.azimuth, take.elevation, aspect, 0.4, margin=0.04)

@@ -4,12 +4,12 @@ from __future__ import annotations
 
 import numpy as np
 from living_kitchen.picture import picture
-from living_kitchen.simulation import Life
+from living_kitchen.simulation import Simulation
 
 
 def drawn() -> np.ndarray:
     """Return the picture, (height, width, 3) bytes."""
-    life = Life()
+    simulation = Simulation()
     for _ in range(156):
-        life.step(1.0 / 12.0)
-    return picture(life, (480, 240))
+        simulation.step(1.0 / 12.0)
+    return picture(simulation, (480, 240))

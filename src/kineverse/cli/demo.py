@@ -1,4 +1,4 @@
-"""``kineverse demo``: a kitchen that lives, or a kitchen and a robot to be moved by hand."""
+"""``kineverse demo``: a simulated kitchen that is tracked, or a kitchen and a robot with sliders."""
 
 from __future__ import annotations
 
@@ -15,17 +15,18 @@ from kineverse.errors import InvalidValueError
 from kineverse.expressions.printing import format_number
 
 if TYPE_CHECKING:
-    from living_kitchen.track import Figures
+    from living_kitchen.track import TrackingQuality
 
     import kineverse as kv
     from kineverse.view.camera import Camera
 
-HELP = """show a kitchen that lives, tracked through noise, and a joint that is learned
+HELP = """show a kitchen in motion that is tracked through noise, and a joint that is identified
 
-Opens it in the browser until Ctrl-C: doors and drawers move, noisy markers are all that is seen of them, and
-beside the truth stands what is believed. In front something moves of which nobody says how. With --headless
-some seconds of that pass without a browser, in numbers and a picture; that needs nothing beyond the core.
-With --sliders it is the kitchen and a robot instead, to be moved by hand.
+Opens it in the browser until Ctrl-C: doors and drawers move, and are tracked from noisy markers; the estimate
+is shown beside the truth. In front moves a mechanism of unknown type; it is identified, then tracked. With
+--headless it simulates some seconds of that without a browser, and writes numbers and a picture; that needs
+nothing beyond the core. With --sliders, and outside of a source checkout, it shows the kitchen and a robot
+instead, to be moved by hand.
 
 examples:
   kineverse demo
@@ -61,17 +62,17 @@ STATE = {
     "pr2/r_wrist_flex_joint": -0.35,
     "pr2/torso_lift_joint": 0.15,
 }
-"""Where sliders start [m], [rad]: the robot stands before the row, and somebody forgot to shut the doors."""
+"""The initial values of the sliders [m], [rad]: open doors, and the robot in front of them."""
 
 EYE, TARGET, VIEW = (-3.5, 4.9, 2.75), (0.2, 0.0, 0.8), 0.66
-"""Where it is seen from [m], [rad]: over the island's corner, along the open doors."""
+"""The initial camera [m], [rad]: over the corner of the island, along the open doors."""
 
 
 SECONDS, STEP, SETTLED = 18.0, 1.0 / 12.0, 3.0
-"""Without a browser: how much time passes, in what steps, and from when on figures count [s]."""
+"""Duration and time step without a browser, and the time from which the quality counts [s]."""
 
 LONGEST = 3600.0
-"""The most time that may be asked for [s]."""
+"""The longest duration [s]."""
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -81,7 +82,10 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "--picture", metavar="PATH", default="demo.png", help="with --headless, a .png (demo.png)"
     )
     parser.add_argument(
-        "--stranger", choices=("chest", "crate", "stool"), default="chest", help="what is learned"
+        "--stranger",
+        choices=("chest", "crate", "stool"),
+        default="chest",
+        help="the mechanism of unknown type",
     )
     parser.add_argument(
         "--seconds", type=float, default=SECONDS, metavar="S", help=f"with --headless: how long ({SECONDS:g})"
@@ -91,7 +95,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def run(arguments: argparse.Namespace) -> int:
-    """Show the scene that is asked for, or compute it."""
+    """Run ``kineverse demo``."""
     from kineverse.view.pictures import check_png_name
 
     check_png_name(arguments.picture)
@@ -104,26 +108,26 @@ def run(arguments: argparse.Namespace) -> int:
         arguments.sliders = True
     if arguments.sliders:
         return _show_sliders(arguments)
-    from living_kitchen.simulation import Life
+    from living_kitchen.simulation import Simulation
 
     if arguments.headless:
         return _simulate(arguments)
-    from living_kitchen.page import LivingPage
+    from living_kitchen.page import SimulationPage
 
     with (
         handle_interrupts(),
-        LivingPage(
-            Life(stranger=arguments.stranger), label="Kineverse demo", **page_options(arguments)
+        SimulationPage(
+            Simulation(mechanism=arguments.stranger), label="Kineverse demo", **page_options(arguments)
         ) as page,
     ):
         print_address(page, browser=not arguments.no_browser)
-        print(f"{page.life.kitchen}, tracked; a {page.life.stranger.name}, learned", flush=True)
+        print(f"{page.simulation.kitchen}, tracked; a {page.simulation.mechanism.name}, learned", flush=True)
         page.wait()
     return 0
 
 
 def _find_example() -> bool:
-    """Make the package ``living_kitchen`` importable; return whether this is a checkout that has it."""
+    """Make the package ``living_kitchen`` importable; return True if this is a checkout that has it."""
     folder = Path(kineverse.__file__).resolve().parents[2] / "examples"
     if not (folder / "living_kitchen" / "__init__.py").is_file():
         return False
@@ -133,30 +137,30 @@ def _find_example() -> bool:
 
 
 def _simulate(arguments: argparse.Namespace) -> int:
-    """Let the scene live for a while without a browser, say how it went, and write a picture of its end."""
+    """Run the simulation without a browser, print its results, and write a picture of its end."""
     from living_kitchen.picture import save
-    from living_kitchen.report import table_of_learning, table_of_tracking
-    from living_kitchen.simulation import Life
+    from living_kitchen.report import tabulate_identification, tabulate_tracking
+    from living_kitchen.simulation import Simulation
     from living_kitchen.track import average
 
     steps = _count_steps(arguments.seconds)
-    life = Life(stranger=arguments.stranger)
-    # First: a path that cannot be written to should not be found out at the end.
+    simulation = Simulation(mechanism=arguments.stranger)
+    # First, so that an unwritable path is reported before the work.
     _try_to_write(arguments.picture)
-    figures: list[Figures] = []
+    qualities: list[TrackingQuality] = []
     for _ in show_progress(range(steps), "living", "step"):
-        life.step(STEP)
-        if life.time > SETTLED or not figures:
-            figures.append(life.now)
-    print(format_table(*table_of_tracking(life, average(figures)), "<>"), end="\n\n")
-    print(format_table(*table_of_learning(life), "<>"))
-    save(arguments.picture, life)
+        simulation.step(STEP)
+        if simulation.time > SETTLED or not qualities:
+            qualities.append(simulation.quality)
+    print(format_table(*tabulate_tracking(simulation, average(qualities)), "<>"), end="\n\n")
+    print(format_table(*tabulate_identification(simulation), "<>"))
+    save(arguments.picture, simulation)
     print(f"picture: {arguments.picture}")
     return 0
 
 
 def _try_to_write(path: str) -> None:
-    """Open a file for writing, and leave none that was not there: who interrupts finds nothing empty."""
+    """Check that a file can be written, without leaving an empty one if the run is interrupted."""
     new = not os.path.lexists(path)
     open(path, "ab").close()
     if new:
@@ -164,7 +168,7 @@ def _try_to_write(path: str) -> None:
 
 
 def _count_steps(seconds: float) -> int:
-    """Return in how many steps so much time passes."""
+    """Return the number of steps of a duration."""
     if not STEP <= seconds <= LONGEST:
         raise InvalidValueError(f"--seconds is between {STEP:.2g} and {LONGEST:g}, not {seconds!r}")
     return round(seconds / STEP)
@@ -194,7 +198,7 @@ def _show_sliders(arguments: argparse.Namespace) -> int:
 
 
 def _initial_state(model: kv.Model) -> dict[str, float]:
-    """Return the opening scene, of which those symbols count that the models have."""
+    """Return the initial values of those symbols that the models have."""
     known = {str(symbol) for symbol in model.symbols}
     return {name: value for name, value in STATE.items() if name in known}
 
@@ -206,7 +210,7 @@ def _camera() -> Camera:
 
 
 def _contents(model: kv.Model) -> str:
-    """Return the table of what is shown."""
+    """Return a table of the models."""
     rows = []
     for name in MODELS:
         inside = f"{name}/"
@@ -222,11 +226,11 @@ def _contents(model: kv.Model) -> str:
 
 
 def _exercise_models(model: kv.Model, path: str) -> int:
-    """Drive everything through its range, check it, write a picture, and say how it went."""
+    """Drive all coordinates through their ranges, write a picture, and report problems."""
     from kineverse.cli.exercise import exercise_model
     from kineverse.view import save_picture
 
-    # First: a path that cannot be written to should not be found out at the end.
+    # First, so that an unwritable path is reported before the work.
     save_picture(path, model, _initial_state(model), camera=_camera())
     print(_contents(model), flush=True)
     result = exercise_model(model)

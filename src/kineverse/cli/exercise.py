@@ -44,7 +44,7 @@ def exercise_model(model: ModelView) -> ExerciseResult:
     values = complete(model)
     poses, ranges = FramePoses(model), Ranges(model)
     unit = infer_units(model, values, ranges.names)
-    limits = ranges.at(values)
+    limits = ranges.limits_at(values)
     base = np.array([values[name] for name in poses.inputs])
     count, seconds, violated, problems = 0, 0.0, set(), []
     for name in show_progress(ranges.names, "driving", "DoF"):

@@ -118,14 +118,14 @@ def summarize_model(name: str, model: ModelView) -> ModelSummary:
     """Return the summary of a model; reads its meshes for the size."""
     values = complete(model)
     poses = FramePoses(model)
-    places = poses.at(values)
+    places = poses.evaluate(values)
     unplaced = poses.unplaced(places)
     at = dict(zip(poses.names, places, strict=True))
     for frame in unplaced:
         del at[frame]
     shown = collect_drawables(model)
     loaded = [part for part in shown if not part.placeholder and part.frame in at]
-    corners = TriangleSoup.of(loaded, at).corners.reshape(-1, 3)
+    corners = TriangleSoup.from_drawables(loaded, at).corners.reshape(-1, 3)
     if not len(corners):
         corners = np.array([pose[:3, 3] for pose in at.values()])
     low, high = corners.min(axis=0), corners.max(axis=0)

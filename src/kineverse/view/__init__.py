@@ -1,20 +1,19 @@
-"""Looking at models: a page in the browser, and pictures without one.
+"""Viewer of models: a page in the browser, and pictures without one.
 
 >>> import kineverse as kv
->>> from kineverse.view import picture, save, view
+>>> from kineverse.view import picture, save_picture, view
 >>> pixels = picture(kv.load("kitchen"), {"kitchen/fridge_door": 0.8})    # needs numpy only
->>> save("kitchen.png", kv.load("kitchen"))
+>>> save_picture("kitchen.png", kv.load("kitchen"))
 >>> with view(kv.load("kitchen")) as page:                                # needs the extra "view"
 ...     print(page.address)
 >>> kv.show(kv.load("kitchen"))                                           # the same, until Ctrl-C
 
-Pictures are drawn by numpy; the page is served by viser to this computer alone, unless it is told otherwise.
+Pictures are drawn by numpy. The page is served by viser, to this computer alone unless a host is given.
 """
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 from kineverse.state import StateLike
 from kineverse.view.camera import Camera
@@ -38,7 +37,7 @@ def view(
     host: str = "127.0.0.1",
     degrees: bool = False,
 ) -> Viewer:
-    """Put a model on a web page and go on; :func:`kineverse.show` waits, and opens the browser.
+    """Show a model on a web page and return at once; :func:`kineverse.show` waits, and opens the browser.
 
     Parameters, result and errors are those of :class:`kineverse.view.viewer.Viewer`.
     """

@@ -1,8 +1,8 @@
 """Access control of the page: the Host, the Origin and the token of a request.
 
-A page of this computer can be asked for by every other page that is open in its browser: by a WebSocket,
-which browsers open across origins, or under a name that has come to point to this computer (DNS rebinding).
-Such requests say so in their headers, Host and Origin (RFC 6454; RFC 6455, 10.2), and are refused.
+Any other page that is open in the browser can send requests to this computer: by a WebSocket, which browsers
+open across origins, or under a name that has been pointed to this computer (DNS rebinding). The headers Host
+and Origin of such requests tell them apart (RFC 6454; RFC 6455, 10.2), and they are refused.
 """
 
 from __future__ import annotations
@@ -30,7 +30,7 @@ _POLICY = (
 
 @dataclass(frozen=True, slots=True)
 class AccessControl:
-    """The rule by which requests are answered or refused.
+    """Rule by which requests are answered or refused.
 
     Attributes
     ----------
@@ -44,7 +44,7 @@ class AccessControl:
     token: str = field(repr=False)
 
     @staticmethod
-    def of(host: str) -> AccessControl:
+    def from_host(host: str) -> AccessControl:
         """Return the rule for a host: without a token on this computer, with a random one elsewhere."""
         alone = host in ("localhost", "::1") or host.startswith("127.")
         return AccessControl(host, "" if alone else secrets.token_urlsafe(24))
@@ -57,7 +57,7 @@ class AccessControl:
         return f"http://{name}:{port}/{self.token}".rstrip("/")
 
     def inner_path(self, path: str) -> str | None:
-        """Return a path without the token in front; None if that is another or none."""
+        """Return a path without the token in front; None if the token is wrong or missing."""
         if not self.token:
             return path
         where, question, query = path.partition("?")
@@ -68,7 +68,7 @@ class AccessControl:
     def refusal(
         self, path: str, hosts: Iterable[str], origins: Iterable[str], port: int, websocket: bool
     ) -> str:
-        """Return why a request is refused, empty if it is not.
+        """Return the reason to refuse a request, empty if it is accepted.
 
         Parameters
         ----------
@@ -79,7 +79,7 @@ class AccessControl:
         port
             The port that the request came to.
         websocket
-            Whether it asks for a WebSocket.
+            True if it asks for a WebSocket.
         """
         host = _authority(hosts)
         if host is None or host[1] != port or not self._is_own(host[0]):
@@ -95,7 +95,7 @@ class AccessControl:
         return self._refused_query(path, host)
 
     def headers(self, host: str) -> dict[str, str]:
-        """Return what the page is sent with: it connects to nothing but the host it came from."""
+        """Return the headers of the page, which allow it to connect to its own host only."""
         return {
             "Content-Security-Policy": _POLICY.format(host=host),
             "Cross-Origin-Resource-Policy": "same-origin",
@@ -108,12 +108,12 @@ class AccessControl:
             return True
         if not self.token:
             return False
-        # A name can be pointed to this computer by whoever owns it; a number cannot.
+        # The owner of a name can point it to this computer; a number cannot be.
         own = socket.gethostname().lower()
         return name in (own, f"{own}.local") or _is_number(name)
 
     def _refused_query(self, path: str, host: tuple[str, int]) -> str:
-        """Return why a query is refused: those that have viser's page show what comes from elsewhere."""
+        """Return the reason to refuse a query that has the page show data from elsewhere, else empty."""
         where = path.partition("?")[0].rstrip("/")
         for key, value in parse_qsl(path.partition("?")[2], keep_blank_values=True):
             address, _, rest = value.removeprefix("ws://").partition("/")
@@ -128,7 +128,7 @@ class AccessControl:
 
 
 def _authority(texts: Iterable[str]) -> tuple[str, int] | None:
-    """Return the name and the port of the only text, None if it has not this form or there are several."""
+    """Return name and port of the only text, None if it has another form or there are several."""
     found = list(texts)
     match = _AUTHORITY.fullmatch(found[0].lower()) if len(found) == 1 else None
     return (match[1], int(match[2] or 80)) if match else None
@@ -143,11 +143,11 @@ def _is_number(name: str) -> bool:
 
 
 def _own_address(host: str) -> str:
-    """Return an address under which others reach a server that listens on all of them."""
+    """Return an address under which others reach a server that listens on all addresses."""
     family = socket.AF_INET6 if ":" in host else socket.AF_INET
     try:
         with socket.socket(family, socket.SOCK_DGRAM) as probe:
-            # Nothing is sent: this only asks which address would be. The target is one of documentation.
+            # Nothing is sent: this only selects an address. The target is one reserved for documentation.
             probe.connect(("2001:db8::1" if ":" in host else "192.0.2.1", 9))
             return str(probe.getsockname()[0])
     except OSError:

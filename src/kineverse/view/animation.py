@@ -12,11 +12,11 @@ PERIOD = 8.0
 """Time from one limit to the other and back [s]."""
 
 FADE_IN = 1.5
-"""Time in which the motion grows out of the posture in which it starts [s]."""
+"""Time in which the motion grows from the initial posture [s]."""
 
 
 class RangeAnimation:
-    """All degrees of freedom swinging between their limits, each a little behind the one before.
+    """Oscillation of all degrees of freedom between their limits, each a little behind the one before.
 
     Parameters
     ----------
@@ -35,7 +35,7 @@ class RangeAnimation:
         self._limits = dict(limits)
         self._begin = now
 
-    def at(self, now: float) -> dict[str, float]:
+    def values_at(self, now: float) -> dict[str, float]:
         """Return the values at a time [s]; continuous, and inside the limits if the start is."""
         elapsed = now - self._begin
         weight = min(elapsed / FADE_IN, 1.0)
@@ -55,21 +55,21 @@ def select_animated(
     values: Mapping[str, float],
     units: Mapping[str, str],
 ) -> dict[str, tuple[float, float]]:
-    """Return what a show moves, and how far.
+    """Return the ranges through which an animation moves, by name.
 
-    What has no limits has no range to be moved through, and a robot would drive off the page; but where
-    nothing else moves, it is what there is to see.
+    Coordinates without limits have no range, and a robot would drive off the page. They are animated only if
+    nothing else can move.
 
     Parameters
     ----------
     model
         The model.
     limits
-        Of its degrees of freedom, by name, possibly infinite [m], [rad].
+        Limits of its degrees of freedom, by name, possibly infinite [m], [rad].
     angles
-        The names of the angles by which quaternions are turned.
+        The names of the angles of its quaternions.
     values, units
-        Of the degrees of freedom, by name.
+        Values and units of the degrees of freedom, by name.
     """
     found = {name: (low, high) for name, (low, high) in limits.items() if high - low < 1e6}
     if found:

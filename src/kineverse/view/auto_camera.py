@@ -19,19 +19,19 @@ from kineverse.view.triangle_mesh import Floats
 ELEVATION = 0.42
 
 FRONT = 0.62
-"""The direction preferred when all are as good: before the model and a little to its left [rad]."""
+"""The direction preferred among equally good ones: in front of the model and a little to its left [rad]."""
 
 TRIALS = 12
 
 TRIAL_HEIGHT = 80
-"""Pixels along the height of the trial pictures: enough to see a handle, small enough to make a dozen."""
+"""Height of the trial pictures [pixels]: enough to show a handle, small enough to draw a dozen."""
 
 MOVING_WEIGHT = 4.0
-"""How much more a part that moves is worth seeing than one that does not."""
+"""Weight of a part that moves, relative to one that does not."""
 
 
 def weigh_drawables(model: ModelView, items: Sequence[Drawable]) -> Floats:
-    """Return how much each part is worth seeing: what moves counts more."""
+    """Return the weight of each part in the choice of a camera: parts that move count more."""
     moves = {frame: bool(model.fk(frame).symbols) for frame in {part.frame for part in items}}
     return np.array([MOVING_WEIGHT if moves[part.frame] else 1.0 for part in items])
 
@@ -43,16 +43,16 @@ def choose_camera(
     aspect: float,
     field_of_view: float = 0.6,
 ) -> Camera:
-    """Return the camera from which a scene is best seen.
+    """Return the camera that shows most of a scene.
 
     Parameters
     ----------
     scene
         The triangles.
     weights
-        How much each of its parts is worth seeing.
+        The weight of each of its parts.
     poses
-        The poses of the frames, looked at if there are no triangles.
+        The poses of the frames, framed instead if there are no triangles.
     aspect
         Width of the picture divided by its height.
     field_of_view
@@ -67,10 +67,10 @@ def choose_camera(
     for k in range(TRIALS):
         azimuth = FRONT + 2 * np.pi * k / TRIALS
         camera = fit_camera(extreme, azimuth, ELEVATION, aspect, field_of_view)
-        projection = Projection.of(camera, max(int(TRIAL_HEIGHT * aspect), 8), TRIAL_HEIGHT)
+        projection = Projection.from_camera(camera, max(int(TRIAL_HEIGHT * aspect), 8), TRIAL_HEIGHT)
         seen, _ = rasterize(projection, corners, scene.closed)
         area = np.bincount(scene.source[seen[seen >= 0]], minlength=len(weights))
-        # The logarithm makes many parts in view worth more than one large wall; the cosine breaks ties.
+        # The logarithm weighs many visible parts above one large wall; the cosine breaks ties.
         score = float(weights @ np.log1p(area)) * (1.0 + 0.06 * np.cos(azimuth - FRONT))
         trials.append((score, -k))
     azimuth = FRONT - 2 * np.pi * max(trials)[1] / TRIALS
@@ -78,7 +78,7 @@ def choose_camera(
 
 
 def reframe(camera: Camera, points: Floats, aspect: float) -> Camera:
-    """Return the nearest camera of the same direction that sees points (N, 3), for another aspect."""
+    """Return the nearest camera of the same direction that has points (N, 3) in view, for another aspect."""
     away = np.subtract(camera.position, camera.target)
     azimuth = float(np.arctan2(away[1], away[0]))
     elevation = float(np.arctan2(away[2], np.hypot(away[0], away[1])))
@@ -86,7 +86,7 @@ def reframe(camera: Camera, points: Floats, aspect: float) -> Camera:
 
 
 def find_extreme_points(points: Floats) -> Floats:
-    """Return those of many points that lie farthest out in some hundred directions."""
+    """Return the points that lie farthest out in some hundred directions."""
     k = np.arange(128)
     z, angle = 1.0 - (2.0 * k + 1.0) / len(k), 2.399963 * k
     flat = np.sqrt(1.0 - z * z)
@@ -98,46 +98,46 @@ def find_extreme_points(points: Floats) -> Floats:
 logger = logging.getLogger(__name__)
 
 CAMERA_TOLERANCE = 1e-3
-"""Poses of cameras that differ by less are the same, as a part of the distance to what is looked at."""
+"""Tolerance for equal camera poses, as a fraction of the distance to the target."""
 
 
 class ClientCameras:
-    """Places the cameras of all browsers that show a page, for the shape of each window.
+    """Cameras of all browsers that show a page, each fitted to the shape of its window.
 
     Parameters
     ----------
     server
         A viser server.
     first
-        Where the server puts the cameras of new browsers.
-    framed
+        The camera of new browsers on the server.
+    framing
         Returns the camera for an aspect, the width of a picture divided by its height.
     """
 
-    def __init__(self, server: Any, first: Camera, framed: Callable[[float], Camera]) -> None:
+    def __init__(self, server: Any, first: Camera, framing: Callable[[float], Camera]) -> None:
         self._lock = threading.Lock()
-        self._first, self._framed = first, framed
+        self._first, self._framing = first, framing
         self._placed: dict[int, Camera] = {}
-        server.on_client_connect(self._meet)
+        server.on_client_connect(self._add_client)
         server.on_client_disconnect(lambda client: self._placed.pop(client.client_id, None))
 
-    def follow(self, first: Camera, framed: Callable[[float], Camera]) -> None:
-        """Frame something else from now on."""
+    def set_framing(self, first: Camera, framing: Callable[[float], Camera]) -> None:
+        """Replace the first camera and the framing of later placements."""
         with self._lock:
-            self._first, self._framed = first, framed
+            self._first, self._framing = first, framing
 
-    def _meet(self, client: Any) -> None:
+    def _add_client(self, client: Any) -> None:
         client.camera.on_update(self._place)
         self._place(client.camera)
 
     def _place(self, camera: Any) -> None:
-        """Move a camera to where it sees everything, if nobody has moved it from where it was put."""
+        """Move a camera to the framing of its window, unless a user has moved it."""
         try:
             with self._lock:
                 if not camera.image_height or not camera.image_width:
                     return
                 client = camera.client
-                wanted = self._framed(camera.image_width / camera.image_height)
+                wanted = self._framing(camera.image_width / camera.image_height)
                 ours = (self._first, self._placed.get(client.client_id, self._first))
                 if any(_is_at(camera, place) for place in ours) and not _is_at(camera, wanted):
                     self._placed[client.client_id] = wanted
@@ -145,7 +145,7 @@ class ClientCameras:
                         camera.position = np.array(wanted.position)
                         camera.look_at = np.array(wanted.target)
         except Exception:
-            # The browser may be going away; whoever looks can still move the camera.
+            # The browser may be closing; its user can still move the camera.
             logger.debug("a camera could not be placed", exc_info=True)
 
 

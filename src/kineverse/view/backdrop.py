@@ -19,12 +19,19 @@ SKY_LIGHT = np.array([0.86, 0.92, 1.0]) * 0.80
 GROUND_LIGHT = np.array([0.84, 0.80, 0.75]) * 0.50
 
 WHITE_LEVEL = 1.75
-"""The light that is shown as pure white."""
+"""The radiance that is displayed as pure white."""
+
+
+PICTURE_BACKGROUND = (np.array([0.93, 0.945, 0.96]), np.array([0.70, 0.745, 0.80]))
+"""Display colours of the background of pictures, at the lower and the upper edge, in [0, 1]."""
+
+PAGE_BACKGROUND = ((240, 243, 246), (196, 207, 219))
+"""Colours of the background of the page, at the lower and the upper edge, in [0, 255]."""
 
 
 @dataclass(frozen=True, slots=True)
 class DirectionalLight:
-    """A lamp infinitely far away, and what it sees: its depth picture is the shadow.
+    """Infinitely distant lamp with a shadow map: a depth picture from the direction of the lamp.
 
     Attributes
     ----------
@@ -38,8 +45,8 @@ class DirectionalLight:
     bias: float
 
     @staticmethod
-    def over(corners: Floats, azimuth: float, elevation: float) -> DirectionalLight:
-        """Return the lamp that stands in a direction [rad] over (T, 3, 3) triangles [m]."""
+    def from_direction(corners: Floats, azimuth: float, elevation: float) -> DirectionalLight:
+        """Return the lamp in a direction [rad] above (T, 3, 3) triangles [m]."""
         toward = np.array(
             [np.cos(elevation) * np.cos(azimuth), np.cos(elevation) * np.sin(azimuth), np.sin(elevation)]
         )
@@ -54,32 +61,32 @@ class DirectionalLight:
         _, depth = rasterize(projection, corners)
         return DirectionalLight(toward, projection, depth, bias=2.5 * spread / SHADOW_PIXELS)
 
-    def reaches(self, points: Singles, normals: Singles, pixel: Integers) -> Singles:
-        """Return (N,) how much of the lamp is seen from points, in [0, 1].
+    def lit_fraction(self, points: Singles, normals: Singles, pixel: Integers) -> Singles:
+        """Return the (N,) fraction of the lamp that is visible from points, in [0, 1].
 
-        Each pixel of the picture looks at slightly different places of the shadow, so that the pixels that
-        make up one of the final picture average to a soft border.
+        Each pixel samples slightly different places of the shadow map, so that the pixels that are averaged
+        into one of the final picture make a soft border.
         """
         steep = np.clip(1.0 - normals @ self.toward.astype(np.float32), 0.0, 1.0)
         offset = (np.float32(self.bias) * (np.float32(0.5) + np.float32(2.0) * steep))[:, None]
-        xy, near = self.projection.pixels(self.projection.local(points + normals * offset))
+        xy, near = self.projection.to_pixels(self.projection.to_camera(points + normals * offset))
         lit = np.zeros(len(points), dtype=np.float32)
         for dx, dy in _shadow_samples():
             x = (xy[:, 0] + dx[pixel % _SHADOW_SAMPLES]).astype(np.int32)
             y = (xy[:, 1] + dy[pixel % _SHADOW_SAMPLES]).astype(np.int32)
-            # The outermost pixels of the map are empty by construction: outside is as lit as they are.
+            # The outermost pixels of the map are empty by construction: points outside are lit like them.
             index = np.clip(y, 0, SHADOW_PIXELS - 1) * SHADOW_PIXELS + np.clip(x, 0, SHADOW_PIXELS - 1)
             lit += self.depth[index] <= near
         return np.asarray(lit / np.float32(3.0))
 
 
 _SHADOW_SAMPLES = 61
-"""Number of different scatters: prime, so that no line of pixels repeats them in step."""
+"""Number of sampling patterns: prime, so that no line of pixels repeats them in step."""
 
 
 @lru_cache(maxsize=1)
 def _shadow_samples() -> list[tuple[Singles, Singles]]:
-    """Return three rings of places around a pixel of the shadow, by golden angles: no pattern shows."""
+    """Return sampling patterns of three rings around a pixel of the shadow map, rotated by golden angles."""
     angle = 2.399963 * np.arange(_SHADOW_SAMPLES)
     return [
         ((ring * np.cos(angle + turn)).astype(np.float32), (ring * np.sin(angle + turn)).astype(np.float32))
@@ -88,7 +95,7 @@ def _shadow_samples() -> list[tuple[Singles, Singles]]:
 
 
 def shade(colors: Singles, normals: Singles, lamp: DirectionalLight, lit: Singles) -> Singles:
-    """Return the light (N, 3) that comes from matt surfaces, linear.
+    """Return the light (N, 3) reflected by matt surfaces, linear.
 
     Parameters
     ----------
@@ -99,7 +106,7 @@ def shade(colors: Singles, normals: Singles, lamp: DirectionalLight, lit: Single
     lamp
         The lamp.
     lit
-        (N,) how much of the lamp reaches the surface.
+        (N,) fraction of the lamp that reaches the surface.
 
     Notes
     -----
@@ -115,12 +122,12 @@ def shade(colors: Singles, normals: Singles, lamp: DirectionalLight, lit: Single
 
 
 def to_linear(srgb: Floats) -> Floats:
-    """Return light from display values in [0, 1]."""
+    """Convert display values in [0, 1] to linear light."""
     return np.asarray(np.clip(srgb, 0.0, 1.0) ** 2.2)
 
 
 def to_display(light: Singles) -> Singles:
-    """Return display values in [0, 1], with a soft shoulder so that bright white keeps its shape."""
+    """Convert linear light to display values in [0, 1], with a soft shoulder that keeps white shaded."""
     curved = light * (1.0 + light / WHITE_LEVEL**2) / (1.0 + light)
     return np.asarray(_GAMMA[np.clip(curved * 4095.0, 0.0, 4095.0).astype(np.int16)])
 
@@ -129,14 +136,14 @@ _GAMMA = ((np.arange(4096) / 4095.0) ** (1 / 2.2)).astype(np.float32)
 
 
 OUTLINE, CREASE = 0.42, 0.25
-"""How much darker the border of a part, and a sharp edge inside of it, is drawn."""
+"""Darkening of the border of a part, and of a sharp edge inside of it."""
 
 CREASE_COSINE = 0.75
-"""Cosine of the angle from which on an edge is drawn."""
+"""Cosine of the smallest angle at which an edge is drawn."""
 
 
 DEPTH_STEP = 0.02
-"""How far, as a part of the distance, a surface has to lie behind another to be set off by a line."""
+"""Smallest step of depth that is outlined, as a fraction of the distance."""
 
 
 def compute_outlines(
@@ -147,9 +154,9 @@ def compute_outlines(
     Parameters
     ----------
     group
-        (N,) what is seen at each covered pixel: shapes of one frame and colour are one thing.
+        (N,) the group visible at each covered pixel: shapes of one frame and colour are one thing.
     normals
-        (N, 3) the normal there.
+        (N, 3) the normals there.
     near
         (height·width,) the nearness of all pixels.
     covered
@@ -165,15 +172,23 @@ def compute_outlines(
     facing[covered] = normals
     darker = np.zeros(size, dtype=np.float32)
     for step in (1, projection.width):
-        # The last pixel of a row is compared with the first of the next: a speck at the rim nobody sees.
+        # The last pixel of a row is compared with the first of the next: an invisible speck at the rim.
         other = part[:-step] != part[step:]
-        with np.errstate(invalid="ignore"):  # Where nothing is seen, the nearness is infinitely small.
+        with np.errstate(invalid="ignore"):  # The nearness of the background is infinitely small.
             gap = np.abs(near[:-step] - near[step:])
             other |= gap > limit * np.maximum(near[:-step], near[step:])
         crease = ~other & (dot_rows(facing[:-step], facing[step:]) < CREASE_COSINE) & (part[:-step] >= 0)
         np.maximum(darker[:-step], np.float32(OUTLINE) * other, out=darker[:-step])
         np.maximum(darker[:-step], np.float32(CREASE) * crease, out=darker[:-step])
     return np.asarray(np.float32(1.0) - darker[covered])
+
+
+def draw_background(projection: Projection) -> Singles:
+    """Return display values (height·width, 3) of the background of a picture."""
+    rows = np.linspace(1.0, 0.0, projection.height)[:, None]
+    below, above = PICTURE_BACKGROUND
+    column = (below + (above - below) * rows**1.5).astype(np.float32)
+    return np.repeat(column, projection.width, axis=0)
 
 
 def draw_ground(
@@ -186,7 +201,7 @@ def draw_ground(
     image
         (height·width, 3) display values, changed in place.
     empty
-        The pixels where nothing of the scene is seen.
+        The pixels in which nothing of the scene is visible.
     corners
         (T, 3, 3) triangles of the scene [m]; the floor lies under the lowest of them.
     projection, lamp
@@ -194,7 +209,7 @@ def draw_ground(
     """
     low, high = corners.reshape(-1, 3).min(axis=0), corners.reshape(-1, 3).max(axis=0)
     drop = np.float32(low[2] - projection.origin[2])
-    rays = projection.rays(empty)
+    rays = projection.pixel_rays(empty)
     down = np.flatnonzero(rays[:, 2] < -1e-6)
     if drop >= 0 or not len(down):
         return
@@ -210,7 +225,7 @@ def draw_ground(
     depth = np.sqrt(dot_rows(floor, floor))
     floor += projection.origin.astype(np.float32)
     up = np.broadcast_to(np.array([0.0, 0.0, 1.0], dtype=np.float32), floor.shape)
-    lit = lamp.reaches(floor, up, pixel)
+    lit = lamp.lit_fraction(floor, up, pixel)
     cell = np.float32(1.0 if radius > 0.8 else 0.1)
     u, v = (np.abs((floor[:, k] / cell + np.float32(0.5)) % 1.0 - np.float32(0.5)) for k in (0, 1))
     line = np.clip(1.5 - np.minimum(u, v) * cell * np.float32(projection.focal) / depth, 0.0, 1.0)
@@ -218,16 +233,11 @@ def draw_ground(
     image[pixel] = np.clip(image[pixel] * tone.astype(np.float32)[:, None], 0.0, 1.0)
 
 
-BELOW, ABOVE = (240, 243, 246), (196, 207, 219)
-"""The background, from the lower to the upper edge."""
-
-
 def set_up(server: Any) -> None:
     """Light the page: a lamp with a shadow from above the left shoulder, and a sky without one.
 
-    viser's own lights wash out white furniture; these are those of :mod:`kineverse.view.backdrop`. There is no
-    picture of surroundings to light the scene by, because a computer without a graphics card takes many
-    seconds to prepare one.
+    viser's own lights wash out white furniture; these are the lights of the pictures. There is no environment
+    map, because a computer without a graphics card takes many seconds to prepare one.
     """
     scene = server.scene
     scene.configure_default_lights(enabled=False)
@@ -239,12 +249,13 @@ def set_up(server: Any) -> None:
         "/light/fill", color=(235, 240, 255), intensity=0.35, position=(-4.0, -3.0, 5.0)
     )
     rows = np.linspace(0.0, 1.0, 128)[:, None, None] ** 0.7
-    gradient = np.array(ABOVE) + (np.array(BELOW) - np.array(ABOVE)) * rows
+    below, above = map(np.array, PAGE_BACKGROUND)
+    gradient = above + (below - above) * rows
     scene.set_background_image(np.repeat(gradient, 8, axis=1).astype(np.uint8), format="png")
 
 
 def set_lamp(server: Any, azimuth: float) -> None:
-    """Put the lamp a little to the side of a camera that looks from a direction around z [rad]."""
+    """Place the lamp a little to the side of a camera that looks from a direction around z [rad]."""
     angle = azimuth + 0.6
     server.scene.add_light_directional(
         "/light/key",
@@ -256,7 +267,7 @@ def set_lamp(server: Any, azimuth: float) -> None:
 
 
 def set_floor(server: Any, height: float, extent: float, shown: bool) -> None:
-    """Put a floor with lines 1 m apart at a height under a scene of an extent [m]; it takes shadows."""
+    """Place a floor with lines 1 m apart at a height under a scene of an extent [m]; it receives shadows."""
     server.scene.add_grid(
         "/floor",
         infinite_grid=True,

@@ -1,4 +1,4 @@
-"""Where a picture is taken from."""
+"""Pinhole cameras."""
 
 from __future__ import annotations
 
@@ -13,16 +13,16 @@ from kineverse.view.triangle_mesh import Floats
 
 @dataclass(frozen=True, slots=True)
 class Camera:
-    """A pinhole camera in the world.
+    """Pinhole camera in the world.
 
     Attributes
     ----------
     position
-        Where it stands [m].
+        The position of the camera [m].
     target
         The point in the middle of the picture [m].
     up
-        The direction that is up in the picture.
+        The upward direction of the picture.
     field_of_view
         The angle between the upper and the lower edge of the picture [rad].
     """
@@ -41,7 +41,7 @@ class Camera:
 
     @property
     def height(self) -> float:
-        """How much of the plane through the target is in the picture, from edge to edge [m]."""
+        """Visible height of the plane through the target, from edge to edge [m]."""
         distance = np.linalg.norm(np.subtract(self.target, self.position))
         return float(2.0 * distance * np.tan(self.field_of_view / 2))
 
@@ -51,7 +51,7 @@ class Camera:
         ahead = np.subtract(self.target, self.position)
         ahead = ahead / np.linalg.norm(ahead)
         right = np.cross(ahead, self.up)
-        if np.linalg.norm(right) < 1e-9:  # Looking along "up": any direction to the right will do.
+        if np.linalg.norm(right) < 1e-9:  # The view is along "up": any direction to the right is valid.
             right = np.cross(ahead, np.roll(self.up, 1) + np.array([0.3, 0.1, 0.2]))
         right = right / np.linalg.norm(right)
         return np.array([right, np.cross(right, ahead), ahead])
@@ -65,14 +65,14 @@ def fit_camera(
     field_of_view: float = 0.6,
     margin: float = 0.08,
 ) -> Camera:
-    """Return the nearest camera of a given direction that has all points in the picture.
+    """Return the nearest camera of a given direction that has all points in view.
 
     Parameters
     ----------
     points
-        (N, 3) points to be seen [m].
+        (N, 3) points [m].
     azimuth, elevation
-        Where the camera stands as seen from the points, from x around z, and above the horizon [rad].
+        The direction from the points to the camera: from x around z, and above the horizon [rad].
     aspect
         Width of the picture divided by its height.
     field_of_view
@@ -101,7 +101,7 @@ def fit_camera(
         depths.append((right + left) / (2 * t))
         centre[k] = (left - right) / 2
     spread = float(np.linalg.norm(p.max(axis=0) - p.min(axis=0)))
-    # A single point would be looked at from no distance at all.
+    # The distance to a single point would be zero.
     centre[2] = min(*depths, float(seen[:, 2].min()) - 0.05 - 0.1 * spread)
     position = centre @ axes
     ahead = float(np.median(seen[:, 2])) - centre[2]

@@ -24,16 +24,16 @@ from kineverse.view.triangle_mesh import Floats, TriangleMesh, build_creased_mes
 
 
 def load_hull(mesh: Mesh) -> LoadedMesh:
-    """Return the hull of a mesh that distances are computed to, and what is wrong if there is none [m].
+    """Return the convex hull of a mesh that distances are computed to [m], or the problem if there is none.
 
-    Without the extra ``geometry``, or where a mesh has no hull, that is the mesh itself, or its placeholder.
+    Without the extra ``geometry``, or for a mesh without a hull, that is the mesh itself, or its placeholder.
     """
     return _load_hull(mesh, mesh.root)
 
 
 @lru_cache(maxsize=4096)
 def _load_hull(mesh: Mesh, root: str | None) -> LoadedMesh:
-    """Return the hull of a mesh; what may be opened is no part of what makes two meshes equal."""
+    """Return the hull of a mesh; the root is part of the key, since equal meshes may have different ones."""
     as_seen = load_mesh(mesh)
     if as_seen.problem or not is_installed():
         return as_seen
@@ -44,7 +44,7 @@ def _load_hull(mesh: Mesh, root: str | None) -> LoadedMesh:
 
 
 def load_hulls(mesh: Mesh) -> list[LoadedMesh]:
-    """Return the hulls that ``kineverse decompose`` made of a mesh, or :func:`load_hull` if it did not."""
+    """Return the hulls that ``kineverse decompose`` computed for a mesh, else that of :func:`load_hull`."""
     if is_installed():
         with suppress(KineverseError, OSError):
             hulls = decomposition.find_hulls(mesh)
@@ -63,15 +63,15 @@ Kind = Literal["visual", "collision"]
 Rgba = tuple[float, float, float, float]
 
 MISSING: Rgba = (0.91, 0.12, 0.55, 1.0)
-"""The colour of what could not be loaded: one that no kitchen has."""
+"""Colour of placeholders: one that no kitchen has."""
 
 COLLISION: Rgba = (0.95, 0.55, 0.15, 0.35)
 
 STAND_IN: Rgba = (0.25, 0.62, 0.66, 0.35)
-"""The colour of what stands for the collision shapes of a body that has none."""
+"""Colour of the collision shapes of a body that has none of its own."""
 
 HULL_SHADES = (1.0, 0.7, 0.85, 0.55)
-"""How bright the hulls of one mesh are, in turns."""
+"""Brightness of the hulls of one mesh, in turns."""
 
 UNPAINTED: tuple[Rgba, ...] = (
     (0.72, 0.74, 0.77, 1.0),
@@ -80,12 +80,12 @@ UNPAINTED: tuple[Rgba, ...] = (
     (0.63, 0.71, 0.62, 1.0),
     (0.76, 0.66, 0.66, 1.0),
 )
-"""Colours of bodies that have none: muted, and different enough to tell neighbours apart."""
+"""Colours of bodies without a colour: muted, and different enough to tell neighbours apart."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Drawable:
-    """One shape of one body.
+    """Shape of a body, with its frame and colour.
 
     Attributes
     ----------
@@ -94,13 +94,13 @@ class Drawable:
     surface
         Its triangles in that frame [m].
     color
-        Red, green, blue, alpha in [0, 1]; colours that the surface brings count more, as in RViz.
+        Red, green, blue, alpha in [0, 1]; colours of the surface take precedence, as in RViz.
     kind
-        Whether it is there to be seen or to be touched.
+        ``"visual"`` or ``"collision"``.
     problem
-        What could not be loaded, and why; empty if nothing.
+        The mesh that could not be loaded, and the reason; empty if there is none.
     placeholder
-        Whether the surface only marks the place of what could not be loaded.
+        True if the surface only marks the place of a mesh that could not be loaded.
     """
 
     frame: str
@@ -112,18 +112,18 @@ class Drawable:
 
 
 def collect_drawables(model: ModelView, kind: Kind = "visual", decomposed: bool = False) -> list[Drawable]:
-    """Return everything a model has to show, in the order of its bodies.
+    """Return all shapes of a model, in the order of its bodies.
 
     Parameters
     ----------
     model
         The model.
     kind
-        ``"visual"``: what is meant to be seen; of a model where nothing is, the collision shapes.
-        ``"collision"``: what is meant to be touched, or of a body without it, what is seen; meshes as the
+        ``"visual"``: the visual shapes; of a model without any, the collision shapes.
+        ``"collision"``: the collision shapes, or of a body without any, the visual ones; meshes as the
         hulls that distances are computed to.
     decomposed
-        Whether meshes to be touched are the hulls that they were decomposed into, as far as they were.
+        True to show collision meshes as the hulls of their decomposition, as far as there is one.
     """
     found: list[Drawable] = []
     bare = kind == "visual" and not any(body.visuals for body in model.bodies.values())
@@ -160,7 +160,7 @@ def _build_drawable(frame: str, shape: Shape, kind: Kind, fallback: Rgba) -> Dra
         problem = load_mesh(shape.geometry).problem
     if problem:
         color = MISSING
-    return Drawable(frame, surface.moved(shape.origin.matrix), color, kind, problem, bool(problem))
+    return Drawable(frame, surface.transform(shape.origin.matrix), color, kind, problem, bool(problem))
 
 
 def _build_collision_drawables(frame: str, shape: Shape, color: Rgba, decomposed: bool) -> list[Drawable]:
@@ -171,7 +171,7 @@ def _build_collision_drawables(frame: str, shape: Shape, color: Rgba, decomposed
     found = []
     for number, (surface, problem) in enumerate((one.surface, one.problem) for one in loaded):
         own = MISSING if problem else _shade_hull(color, number)
-        placed = surface.without_colors().moved(shape.origin.matrix)
+        placed = surface.without_colors().transform(shape.origin.matrix)
         found.append(Drawable(frame, placed, own, "collision", problem, bool(problem)))
     return found
 
@@ -187,7 +187,7 @@ AXIS_COLORS = ((0.86, 0.16, 0.16, 1.0), (0.13, 0.62, 0.20, 1.0), (0.16, 0.33, 0.
 
 
 def choose_axis_length(corners: Floats, poses: Mapping[str, Floats]) -> float:
-    """Return a length for axes that suits the size of a scene, in [0.02, 0.5] [m]."""
+    """Return a length of axes for the size of a scene, in [0.02, 0.5] [m]."""
     origins = np.array([pose[:3, 3] for pose in poses.values()]).reshape(-1, 3)
     points = np.concatenate([corners.reshape(-1, 3), origins])
     spread = float(np.linalg.norm(points.max(axis=0) - points.min(axis=0))) if len(points) else 1.0
@@ -203,5 +203,5 @@ def create_axes(model: ModelView, corners: Floats, poses: Mapping[str, Floats]) 
         size = np.full(3, width)
         size[axis] = length
         shift = translation(0.5 * length * np.eye(3)[axis])
-        bars.append((mesh_geometry(Box((size[0], size[1], size[2]))).moved(shift), color))
+        bars.append((mesh_geometry(Box((size[0], size[1], size[2]))).transform(shift), color))
     return [Drawable(name, surface, color, "visual") for name in poses for surface, color in bars]

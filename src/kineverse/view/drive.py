@@ -10,14 +10,14 @@ from kineverse.model.model_view import ModelView
 from kineverse.state import State
 
 UNLIMITED_SPEED = 2.0
-"""The fastest that is offered where the model sets no limit [m/s], [rad/s]."""
+"""The largest speed on offer if the model sets no limit [m/s], [rad/s]."""
 
 LONGEST_STEP = 0.2
-"""Longest time between two pictures that is made up for [s]; after a pause nothing jumps."""
+"""The longest time step that is integrated [s]; after a pause nothing jumps."""
 
 
 class VelocityDrive:
-    """The speeds by which coordinates with rates move: wheels, drives, angular velocities.
+    """Speeds of coordinates with rates: wheels, drives, angular velocities.
 
     Parameters
     ----------
@@ -27,9 +27,9 @@ class VelocityDrive:
     Attributes
     ----------
     speeds
-        How fast each goes now, by name [m/s], [rad/s].
+        The present speeds, by name [m/s], [rad/s].
     limits
-        How fast each may go, finite.
+        The limits of the speeds, by name, finite.
     """
 
     def __init__(self, model: ModelView) -> None:
@@ -47,15 +47,15 @@ class VelocityDrive:
 
     @property
     def running(self) -> bool:
-        """Whether anything goes."""
+        """True if any speed is not 0."""
         return any(self.speeds.values())
 
     def stop(self) -> None:
         """Set all speeds to 0."""
         self.speeds = dict.fromkeys(self.speeds, 0.0)
 
-    def after(self, values: Mapping[str, float], seconds: float) -> dict[str, float]:
-        """Return the values that are others after a time [s]; stop where a constraint would be broken."""
+    def step(self, values: Mapping[str, float], seconds: float) -> dict[str, float]:
+        """Integrate values over a time [s]; return those that change, and stop at a violated constraint."""
         try:
             moved = self._model.integrate(State(values), self.speeds, min(seconds, LONGEST_STEP))
             changed = {name: moved[name] for name in values if moved[name] != values[name]}

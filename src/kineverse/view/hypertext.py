@@ -1,6 +1,6 @@
-"""HTML whose text is escaped: the one place where names and messages become part of the page.
+"""HTML with escaped text: the only place in which names and messages become part of the page.
 
-Whoever writes a file chooses the names in it. Only :class:`Html` is put on the page as it is, and only
+The names in a file are chosen by its author. Only :class:`Html` is put on the page unchanged, and only
 :func:`element` makes it.
 """
 
@@ -17,14 +17,14 @@ class Html(str):
 
 
 def element(tag: str, *content: str, style: str = "", **attributes: object) -> Html:
-    """Return an element of HTML; what it contains is escaped, unless it is :class:`Html`.
+    """Return an HTML element; its content is escaped, unless it is :class:`Html`.
 
     Parameters
     ----------
     tag
         Its name, such as ``div``.
     content
-        What is in it, in this order.
+        Its content, in this order.
     style
         Its CSS.
     attributes
@@ -38,19 +38,19 @@ def element(tag: str, *content: str, style: str = "", **attributes: object) -> H
 
 
 def join_html(*content: str) -> Html:
-    """Return content one after the other; what is not :class:`Html` is escaped."""
+    """Concatenate content; text that is not :class:`Html` is escaped."""
     return Html("".join(text if isinstance(text, Html) else html.escape(text) for text in content))
 
 
 class HtmlBox:
-    """HTML on a page, which can be exchanged.
+    """Exchangeable HTML on a page.
 
     Parameters
     ----------
     gui
         The gui of a viser server.
     content
-        What it shows at first.
+        The initial content.
     """
 
     def __init__(self, gui: Any, content: Html) -> None:
@@ -58,11 +58,11 @@ class HtmlBox:
 
     @property
     def content(self) -> str:
-        """What it shows."""
+        """The present content."""
         return str(self._handle.content)
 
     def show(self, content: Html) -> None:
-        """Show something else, which is sent if it is something else."""
+        """Replace the content; it is sent only if it differs."""
         if self._handle.content != content:
             self._handle.content = str(content)
 

@@ -26,7 +26,7 @@ logger = logging.getLogger(__name__)
 
 @dataclass(frozen=True, slots=True)
 class LoadedMesh:
-    """A mesh that was asked for: its surface, or a placeholder and what was wrong."""
+    """A mesh read from its file, or a placeholder and the problem."""
 
     surface: TriangleMesh
     problem: str = ""
@@ -40,7 +40,7 @@ _reported: set[tuple[str, str]] = set()
 def load_mesh(mesh: Mesh) -> LoadedMesh:
     """Return the triangles of a mesh file, scaled, in the frame of the mesh [m].
 
-    Files of equal content are parsed once, whatever name led to them. What cannot be loaded becomes a
+    Files of equal content are parsed once, under any name. A mesh that cannot be loaded becomes a
     placeholder; the reason is logged once a file and kept in ``problem``.
 
     Parameters
@@ -54,13 +54,13 @@ def load_mesh(mesh: Mesh) -> LoadedMesh:
             _by_reference[key] = LoadedMesh(_read(mesh))
         except (KineverseError, OSError) as error:
             _by_reference[key] = _substitute_placeholder(mesh, str(error))
-        except Exception as error:  # Parsers of other people's formats raise anything at all.
+        except Exception as error:  # Parsers of mesh files may raise any error.
             _by_reference[key] = _substitute_placeholder(mesh, f"{type(error).__name__}: {error}")
     return _by_reference[key]
 
 
 def list_visual_meshes(model: ModelView) -> list[Mesh]:
-    """Return the meshes by which a model is seen, each once."""
+    """Return the meshes of the visual shapes of a model, each once."""
     shapes = (shape.geometry for body in model.bodies.values() for shape in body.visuals)
     return list(dict.fromkeys(geometry for geometry in shapes if isinstance(geometry, Mesh)))
 
@@ -83,32 +83,32 @@ def _read(mesh: Mesh) -> TriangleMesh:
         return _by_content[source]
     scaled = (*source, mesh.scale)
     if scaled not in _by_content:
-        _by_content[scaled] = _by_content[source].scaled(mesh.scale)
+        _by_content[scaled] = _by_content[source].scale(mesh.scale)
     return _by_content[scaled]
 
 
 def _parse(file: MeshFile) -> TriangleMesh:
-    """Return the triangles of a file in metres, with the colours it brings."""
+    """Return the triangles of a file in metres, with the colours of the file."""
     pieces = [piece for part in load_mesh_parts(file) if len((piece := _convert_piece(part)).faces)]
     if not pieces:
         raise OSError(f"{file.path} holds no triangles")
     if any(piece.colors is not None for piece in pieces):
         pieces = [_colored(piece) for piece in pieces]
-    return concatenate_meshes(pieces).scaled(unit_length(file.path))
+    return concatenate_meshes(pieces).scale(unit_length(file.path))
 
 
 def _convert_piece(mesh: Any) -> TriangleMesh:
     surface, kept = build_creased_mesh(mesh.vertices, mesh.faces)
     try:
         colors = _face_colors(mesh)
-    except Exception:  # A picture that cannot be decoded is no reason not to show the shape.
+    except Exception:  # The shape is shown even if its texture cannot be decoded.
         logger.debug("no colours from %s", mesh, exc_info=True)
         colors = None
-    return surface if colors is None else surface.painted(colors[kept])
+    return surface if colors is None else surface.with_colors(colors[kept])
 
 
 def _face_colors(mesh: Any) -> Floats | None:
-    """Return (F, 4) colours of the faces of a trimesh, or None where the file says nothing."""
+    """Return (F, 4) colours of the faces of a trimesh, or None if the file has none."""
     visual = mesh.visual
     if visual.kind != "texture":
         return np.asarray(visual.face_colors, dtype=float) / 255.0 if visual.defined else None
@@ -131,13 +131,13 @@ def _colored(
     """Return the piece with colours, so that pieces with and without can be joined."""
     if piece.colors is not None:
         return piece
-    return piece.painted(np.tile(fallback, (len(piece.faces), 1)))
+    return piece.with_colors(np.tile(fallback, (len(piece.faces), 1)))
 
 
 def mesh_geometry(geometry: Geometry) -> TriangleMesh:
-    """Return the surface of a piece of geometry, in its own frame [m].
+    """Return the surface of a shape, in its own frame [m].
 
-    A mesh is read here, and only here; one that cannot be read becomes a marked placeholder (see
-    :mod:`kineverse.view.meshes`), so this never fails for a missing file.
+    A mesh that cannot be read becomes a placeholder (see :func:`load_mesh`), so that a missing file is no
+    error.
     """
     return load_mesh(geometry).surface if isinstance(geometry, Mesh) else mesh_primitive(geometry)

@@ -1,4 +1,4 @@
-"""The controls of the page: a slider a degree of freedom, what is violated, what is shown."""
+"""Controls of the page: a slider for each degree of freedom, the constraint report, and switches."""
 
 from __future__ import annotations
 
@@ -15,13 +15,13 @@ from kineverse.view.sliders import QuaternionAngles, Ranges, choose_slider_range
 from kineverse.view.violations import format_missing_meshes, format_significant, format_violations
 
 BEYOND = 0.2
-"""How much wider sliders get on demand, as a part of their range, so that limits can be crossed."""
+"""Fraction of their range by which sliders are widened on demand, to violate limits."""
 
 MOST_UNFOLDED = 100
 """With at most so many degrees of freedom all groups are unfolded at first."""
 
 DEGREES = {"rad": ("°", math.degrees(1.0)), "rad/s": ("°/s", math.degrees(1.0))}
-"""What angles are shown in on demand: another unit, and how many of it one radian is."""
+"""The unit of angles in degrees, by unit, and the factor from radians."""
 
 STYLE = """
 .mantine-Slider-markLabel { display: none }
@@ -33,65 +33,65 @@ STYLE = """
 .mantine-Flex-root:has(> div > p > label):has(.mantine-Checkbox-root) > div:first-child {
   width: auto !important; min-width: 6.5em; white-space: nowrap }
 """
-"""Sliders below their names, which do not fit beside them; the names say the range."""
+"""Sliders below their names, which do not fit beside them; the names include the range."""
 
 
 class Panel:
-    """The controls of one model.
+    """Controls of one model.
 
     Parameters
     ----------
     gui
         The gui of a viser server.
     scene
-        What is switched on and off.
-    collisions
-        What adds a folder of its own.
+        The scene that is switched on and off.
+    proximity
+        The proximity panel, which adds a folder of its own.
     ranges
         The limits of the degrees of freedom.
-    orientations
-        The quaternions among them, in whose place there are sliders of angles.
-    driving
+    quaternions
+        The quaternions among them, which have sliders for three angles instead.
+    drive
         The speeds that have sliders.
     units
         Their units, by name.
     values
-        Their values at first, by name.
-    moved
-        Called with the name and value of a slider that somebody moved.
-    driven
-        Called with the name and value of a speed that somebody set.
-    reset, play
-        Called when somebody wants the initial state, or starts (True) and stops (False) the show.
+        Their initial values, by name.
+    on_move
+        Called with the name and value of a slider that a user moved.
+    on_drive
+        Called with the name and value of a speed that a user set.
+    on_reset, on_play
+        Called when a user asks for the initial state, or starts (True) and stops (False) the animation.
     degrees
-        Whether angles are shown in degrees; somebody may switch that.
+        True to show angles in degrees at first; users can switch that.
     """
 
     def __init__(
         self,
         gui: Any,
         scene: ViewerScene,
-        collisions: ProximityPanel,
+        proximity: ProximityPanel,
         ranges: Ranges,
-        orientations: QuaternionAngles,
-        driving: VelocityDrive,
+        quaternions: QuaternionAngles,
+        drive: VelocityDrive,
         units: Mapping[str, str],
         values: Mapping[str, float],
         *,
-        moved: Callable[[str, float], None],
-        driven: Callable[[str, float], None],
-        reset: Callable[[], None],
-        play: Callable[[bool], None],
+        on_move: Callable[[str, float], None],
+        on_drive: Callable[[str, float], None],
+        on_reset: Callable[[], None],
+        on_play: Callable[[bool], None],
         degrees: bool = False,
     ) -> None:
-        self._gui, self._ranges, self._units, self._moved = gui, ranges, dict(units), moved
-        self._shown: Mapping[str, float] = {**values, **orientations.angles}
+        self._gui, self._ranges, self._units, self._on_move = gui, ranges, dict(units), on_move
+        self._shown: Mapping[str, float] = {**values, **quaternions.angles}
         self._locked: dict[str, bool] = {}
-        # Switches on the page and the motion of the model come from different threads.
+        # Events of the page and the motion of the model come from different threads.
         self._changing = threading.RLock()
         self._in_degrees = degrees
-        self._orientations, self._driving, self._collisions = orientations, driving, collisions
-        self._limits = {**ranges.at(values), **orientations.limits}
+        self._quaternions, self._drive, self._proximity = quaternions, drive, proximity
+        self._limits = {**ranges.limits_at(values), **quaternions.limits}
         self._sliders: dict[str, Any] = {}
         self._speeds: dict[str, Any] = {}
         self._folders: dict[str, Any] = {}
@@ -99,71 +99,73 @@ class Panel:
         with self._root:
             HtmlBox(gui, element("style", Html(STYLE)))
             self._status = HtmlBox(gui, format_violations(()))
-            collisions.add_folder(gui)
+            proximity.add_folder(gui)
             tabs = gui.add_tab_group()
             with tabs.add_tab("Move"):
-                self._add_controls(reset, play)
-                self._add_sliders({**values, **orientations.angles})
-                if driving.speeds:
-                    self._add_speeds(driven)
+                self._add_controls(on_reset, on_play)
+                self._add_sliders({**values, **quaternions.angles})
+                if drive.speeds:
+                    self._add_speeds(on_drive)
                 self._lock(values)
             with tabs.add_tab("Show"):
                 self._add_switches(scene)
 
     def remove(self) -> None:
-        """Take everything off the page."""
-        self._collisions.forget_folder()
+        """Remove the panel from the page."""
+        self._proximity.forget_folder()
         self._root.remove()
 
     def show(self, status: Html) -> None:
-        """Show HTML above the sliders: what is violated, or what went wrong."""
+        """Show HTML above the sliders: the violated constraints, or a failure."""
         self._status.show(status)
 
-    def update(self, values: Mapping[str, float], driven: Iterable[str] = ()) -> None:
-        """Set sliders to values that did not come from them, and all ranges to what the values allow.
+    def update(self, values: Mapping[str, float], set_by_program: Iterable[str] = ()) -> None:
+        """Set the ranges of all sliders for a state, and the values of some of them.
 
         Parameters
         ----------
         values
             The values of all symbols, by name [m], [rad].
-        driven
-            The names of those that were set by a program.
+        set_by_program
+            The names of the values that were set by a program, not by their slider.
         """
         with self._changing:
-            self._update({**values, **self._orientations.angles}, values, driven)
+            self._update({**values, **self._quaternions.angles}, values, set_by_program)
 
     @property
     def beyond(self) -> bool:
-        """Whether limits and locks may be crossed."""
+        """True if limits and locks may be violated."""
         return bool(self._beyond.value)
 
     @property
     def degrees(self) -> bool:
-        """Whether angles are shown in degrees."""
+        """True if angles are shown in degrees."""
         return self._in_degrees
 
-    def _update(self, shown: Mapping[str, float], values: Mapping[str, float], driven: Iterable[str]) -> None:
+    def _update(
+        self, shown: Mapping[str, float], values: Mapping[str, float], set_by_program: Iterable[str]
+    ) -> None:
         self._shown = shown
-        for name in self._orientations.slider_names(driven):
+        for name in self._quaternions.slider_names(set_by_program):
             slider = self._sliders.get(name)
             if slider is not None:
                 if not slider.min <= self._to_shown(name, shown[name]) <= slider.max:
                     self._fit(name, shown[name])
                 slider.value = self._to_shown(name, shown[name])
         if self._ranges.varying:
-            self._limits.update(self._ranges.at(values))
+            self._limits.update(self._ranges.limits_at(values))
             for name in self._ranges.varying:
                 self._fit(name, self._value(name))
         self._lock(values)
-        for name, speed in self._driving.speeds.items():
+        for name, speed in self._drive.speeds.items():
             if self._speeds[name].value != self._to_shown(name, speed):
                 self._speeds[name].value = self._to_shown(name, speed)
 
-    def _add_controls(self, reset: Callable[[], None], play: Callable[[bool], None]) -> None:
+    def _add_controls(self, on_reset: Callable[[], None], on_play: Callable[[bool], None]) -> None:
         gui = self._gui
         find = gui.add_text("find", "", hint="Show only the sliders whose name contains this.")
         find.on_update(lambda event: self._find(event.target.value))
-        gui.add_button("Reset", hint="Back to the state at the start.").on_click(lambda _: reset())
+        gui.add_button("Reset", hint="Back to the state at the start.").on_click(lambda _: on_reset())
         self._beyond = gui.add_checkbox(
             "beyond limits",
             False,
@@ -175,11 +177,13 @@ class Panel:
         )
         degrees.on_update(lambda event: self._convert(event.target.value))
         self.playing = gui.add_checkbox("play", False, hint="Move everything through its range.")
-        self.playing.on_update(lambda event: play(event.target.value) if event.client is not None else None)
+        self.playing.on_update(
+            lambda event: on_play(event.target.value) if event.client is not None else None
+        )
 
     def _add_sliders(self, values: Mapping[str, float]) -> None:
         groups: dict[str, list[str]] = {}
-        for name in self._orientations.slider_names(self._ranges.names):
+        for name in self._quaternions.slider_names(self._ranges.names):
             groups.setdefault(name.rpartition("/")[0], []).append(name)
         few = len(self._ranges.names) <= MOST_UNFOLDED
         for number_, (group, names) in enumerate(groups.items()):
@@ -189,30 +193,31 @@ class Panel:
                 for name in names:
                     self._sliders[name] = self._slider(name, values[name])
 
-    def _add_speeds(self, driven: Callable[[str, float], None]) -> None:
-        """Add a slider for each speed: what it moves goes on until it is 0 again."""
-        gui, limits = self._gui, self._driving.limits
+    def _add_speeds(self, on_drive: Callable[[str, float], None]) -> None:
+        """Add a slider for each speed, which acts until it is 0 again."""
+        gui, limits = self._gui, self._drive.limits
         with gui.add_folder("drive"):
-            for name in self._driving.speeds:
+            for name in self._drive.speeds:
                 path = name.removesuffix(":velocity")
                 self._units[name] = f"{self._units[path]}/s" if self._units.get(path) else ""
                 low, high = (self._to_shown(name, limit) for limit in limits[name])
+                slowest, fastest = map(format_significant, limits[name])
                 slider = gui.add_slider(
                     self._label(name, limits[name]),
                     min=low,
                     max=high,
                     step=choose_slider_step((low, high)),
                     initial_value=0.0,
-                    hint=f"{name}, from {format_significant(limits[name][0])} to {format_significant(limits[name][1])} "
-                    f"{self._units[name]}; it goes on until this is 0",
+                    hint=f"{name}, from {slowest} to {fastest} {self._units[name]}; "
+                    "it goes on until this is 0",
                 )
                 slider.precision = _count_digits(low, high)
-                slider.on_update(lambda event, name=name: self._set(driven, name, limits[name], event))
+                slider.on_update(lambda event, name=name: self._set(on_drive, name, limits[name], event))
                 self._speeds[name] = slider
 
             def stop(_: Any) -> None:
                 for name in self._speeds:
-                    driven(name, 0.0)
+                    on_drive(name, 0.0)
 
             gui.add_button("Stop", hint="Set all speeds to 0.").on_click(stop)
 
@@ -230,7 +235,7 @@ class Panel:
             hint=f"{name}, limits {format_significant(lower)} to {format_significant(upper)} {unit}".rstrip(),
         )
         slider.precision = _count_digits(low, high)
-        slider.on_update(lambda event: self._set(self._moved, name, self._limits[name], event))
+        slider.on_update(lambda event: self._set(self._on_move, name, self._limits[name], event))
         return slider
 
     def _label(self, name: str, range_: tuple[float, float], locked: bool = False) -> str:
@@ -245,7 +250,7 @@ class Panel:
         return DEGREES[unit][0] if self.degrees and unit in DEGREES else unit
 
     def _factor(self, name: str) -> float:
-        """Return what values are multiplied by to be shown."""
+        """Return the factor from the units of the model to the units shown."""
         unit = self._units.get(name, "")
         return DEGREES[unit][1] if self.degrees and unit in DEGREES else 1.0
 
@@ -253,24 +258,24 @@ class Panel:
         return float(value) * self._factor(name)
 
     def _value(self, name: str) -> float:
-        """Return what a slider is set to, in the units of the model."""
+        """Return the value of a slider in the units of the model."""
         return float(self._sliders[name].value) / self._factor(name)
 
     def _set(
         self, call: Callable[[str, float], None], name: str, limits: tuple[float, float], event: Any
     ) -> None:
-        # Values that this program has set come back without a client.
+        # Values set by this program come back as events without a client.
         if event.client is None:
             return
         value = float(event.target.value) / self._factor(name)
-        # There and back between units a limit is no longer quite itself, and would be violated.
+        # A limit that is converted between units and back changes by rounding, and would be violated.
         near = [limit for limit in limits if abs(value - limit) < 1e-12]
         call(name, near[0] if near else value)
 
     def _lock(self, values: Mapping[str, float]) -> None:
-        """Show what cannot move at these values, and keep its slider from being moved."""
-        for name, held in self._ranges.held(values).items():
-            locked, slider = all(held), self._sliders[name]
+        """Mark the coordinates that are locked at these values, and disable their sliders."""
+        for name, directions in self._ranges.locked_directions(values).items():
+            locked, slider = all(directions), self._sliders[name]
             self._locked[name] = locked
             self._relabel(name)
             if slider.disabled != (locked and not self.beyond):
@@ -287,7 +292,7 @@ class Panel:
         return choose_slider_range(self._limits[name], value, self._units.get(name, ""), beyond)
 
     def _fit(self, name: str, value: float) -> None:
-        """Give a slider the range it should have now."""
+        """Set the range of a slider for a value."""
         _set_range(self._sliders[name], *(self._to_shown(name, end) for end in self._range(name, value)))
         self._relabel(name)
 
@@ -306,9 +311,9 @@ class Panel:
                 self._fit(name, self._shown[name])
                 slider.value = self._to_shown(name, self._shown[name])
             for name, slider in self._speeds.items():
-                _set_range(slider, *(self._to_shown(name, limit) for limit in self._driving.limits[name]))
-                slider.value = self._to_shown(name, self._driving.speeds[name])
-                slider.label = self._label(name, self._driving.limits[name])
+                _set_range(slider, *(self._to_shown(name, limit) for limit in self._drive.limits[name]))
+                slider.value = self._to_shown(name, self._drive.speeds[name])
+                slider.label = self._label(name, self._drive.limits[name])
 
     def _find(self, text: str) -> None:
         shown = {name: text.lower() in name.lower() for name in self._sliders}
@@ -337,7 +342,7 @@ class Panel:
 
 
 def _count_digits(low: float, high: float) -> int:
-    """Return the decimals shown of a value in a range: as many as its steps have."""
+    """Return the number of decimals of the steps of a range."""
     return max(0, len(f"{choose_slider_step((low, high)):.9f}".rstrip("0").partition(".")[2]))
 
 
@@ -348,7 +353,7 @@ def _set_range(slider: Any, low: float, high: float) -> None:
 
 
 def _format_short(value: float) -> str:
-    """Return a number with two decimals, or as many as a small one needs to have two digits."""
+    """Format a number with two decimals, or with two significant digits if it is small."""
     digits = 2 if abs(value) >= 0.1 or value == 0.0 else 1 - math.floor(math.log10(abs(value)))
     text = f"{value:.{digits}f}" if abs(value) < 1e6 else f"{value:.3g}"
     text = text.rstrip("0").rstrip(".") if "." in text and "e" not in text else text

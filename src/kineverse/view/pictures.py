@@ -18,6 +18,7 @@ from kineverse.view.auto_camera import choose_camera, weigh_drawables
 from kineverse.view.backdrop import (
     DirectionalLight,
     compute_outlines,
+    draw_background,
     draw_ground,
     shade,
     to_display,
@@ -39,19 +40,19 @@ def write_png(path: str | Path, pixels: npt.NDArray[np.uint8]) -> None:
     ShapeError
         If the array is not an image of 8 bits a channel.
     FormatError
-        If the name says that it is a file of another kind, see :func:`check_png_name`.
+        If the name has the suffix of another format, see :func:`check_png_name`.
     """
     check_png_name(path)
     Path(path).write_bytes(encode_png(pixels))
 
 
 def check_png_name(path: str | Path) -> None:
-    """Look whether a file may be called so: it ends in .png, or says nothing about its kind.
+    """Check that the name of a file ends in .png, or has no suffix.
 
     Raises
     ------
     FormatError
-        If it ends in something else.
+        If it has another suffix.
     """
     suffix = Path(path).suffix
     if suffix.lower() not in ("", ".png"):
@@ -65,7 +66,7 @@ def encode_png(pixels: npt.NDArray[np.uint8]) -> bytes:
         raise ShapeError(f"an image is (height, width, 3 or 4) of uint8, not {image.shape} of {image.dtype}")
     height, width, channels = image.shape
     header = struct.pack(">IIBBBBB", width, height, 8, 2 if channels == 3 else 6, 0, 0, 0)
-    # Each row as its difference to the row above (filter 2): pictures of rooms shrink to a third by it.
+    # Filter 2, the difference to the row above, shrinks pictures of rooms to a third.
     rows = image.reshape(height, width * channels)
     lines = np.empty((height, 1 + width * channels), dtype=np.uint8)
     lines[:, 0] = 2
@@ -81,13 +82,10 @@ def _chunk(kind: bytes, body: bytes) -> bytes:
 
 
 SAMPLES = 2
-"""Pixels computed along each edge of one that is shown."""
-
-BACKGROUND_COLORS = (np.array([0.93, 0.945, 0.96]), np.array([0.70, 0.745, 0.80]))
-"""Display colours of the background below and above."""
+"""Number of computed pixels along each edge of a final one."""
 
 ARROW = 0.07
-"""The length of an arrow where bodies touch, as a part of the height of the picture."""
+"""Length of arrows at contacts, as a fraction of the height of the picture."""
 
 LARGEST = 64_000_000
 """Most pixels of one picture, computed ones included."""
@@ -108,23 +106,23 @@ def picture(
     Parameters
     ----------
     model
-        What to draw.
+        The model to draw.
     state
         Values by symbol or name [m], [rad]; the default state for the others.
     size
         Width and height in pixels.
     camera
-        Where to stand; None for a place from which the model, and as much as possible of what moves, is seen.
+        The camera; None for one that shows the model and as much as possible of its moving parts.
     frames
-        Whether to draw the axes of all frames (x red, y green, z blue), also through the bodies.
+        True to draw the axes of all frames (x red, y green, z blue), also through the bodies.
     collisions
-        Whether to draw the collision shapes instead of the visual ones; of a body without any, hulls of what
-        is seen of it.
+        True to draw the collision shapes instead of the visual ones; of a body without any, the hulls of
+        its visual shapes.
     near
-        Within what distance to draw lines between bodies that are near to each other [m], green to red by the
-        distance, with arrows where they touch; through the bodies. None for no lines.
+        The distance within which to draw lines between bodies [m], green to red by the distance, with
+        arrows at contacts; through the bodies. None for no lines.
     decomposed
-        Whether collision shapes and lines are those of the hulls that meshes were decomposed into.
+        True to use the hulls of decomposed meshes for collision shapes and lines.
 
     Raises
     ------
@@ -139,10 +137,10 @@ def picture(
     if width < 1 or height < 1 or width * height * SAMPLES**2 > LARGEST:
         raise InvalidValueError(f"a picture of {width} x {height} pixels cannot be made")
     poses, values = FramePoses(model), complete(model, state)
-    at = dict(zip(poses.names, poses.at(values), strict=True))
-    found = None if near is None else ProximityQuery(model, decomposed).at(values, near)
+    at = dict(zip(poses.names, poses.evaluate(values), strict=True))
+    found = None if near is None else ProximityQuery(model, decomposed).evaluate(values, near)
     items = collect_drawables(model, "collision" if collisions else "visual", decomposed)
-    scene = TriangleSoup.of(items, at)
+    scene = TriangleSoup.from_drawables(items, at)
     if camera is None:
         camera = choose_camera(scene, weigh_drawables(model, items), at, width / height)
     over: list[Drawable] = []
@@ -150,8 +148,8 @@ def picture(
         over += create_axes(model, scene.corners, at)
     if found is not None:
         length = ARROW * camera.height
-        over += create_marker_drawables(ProximityMarkers.of(found, length), length)
-    return _draw(scene, TriangleSoup.of(over, at), size, camera)
+        over += create_marker_drawables(ProximityMarkers.from_result(found, length), length)
+    return _draw(scene, TriangleSoup.from_drawables(over, at), size, camera)
 
 
 def draw_picture(
@@ -166,23 +164,24 @@ def draw_picture(
     Parameters
     ----------
     items
-        What to draw, on a floor.
+        The parts, on a floor.
     poses
-        Where the frames of all parts are, 4×4.
+        The poses of the frames of all parts, 4×4.
     size
         Width and height in pixels.
     camera
-        Where to stand.
+        The camera.
     over
-        What is drawn over that, also where it is behind.
+        Parts that are drawn over the others, even if they are behind them.
     """
-    return _draw(TriangleSoup.of(items, poses), TriangleSoup.of(over, poses), size, camera)
+    scene, overlay = (TriangleSoup.from_drawables(parts, poses) for parts in (items, over))
+    return _draw(scene, overlay, size, camera)
 
 
 def _draw(
     scene: TriangleSoup, over: TriangleSoup, size: tuple[int, int], camera: Camera
 ) -> npt.NDArray[np.uint8]:
-    projection = Projection.of(camera, size[0] * SAMPLES, size[1] * SAMPLES)
+    projection = Projection.from_camera(camera, size[0] * SAMPLES, size[1] * SAMPLES)
     image = _render(scene, projection, camera)
     _overlay(image, over, projection)
     return _downsample(image, SAMPLES)
@@ -195,42 +194,35 @@ def save_picture(path: str | Path, model: ModelView, state: StateLike | None = N
 
 def _render(scene: TriangleSoup, projection: Projection, camera: Camera) -> Singles:
     """Return (height, width, 3) display values of a scene on its ground."""
-    image = _background(projection)
+    image = draw_background(projection)
     if len(scene.corners):
         seen, near = rasterize(projection, scene.corners, scene.closed, scene.colors[:, 3])
         away = np.subtract(camera.position, camera.target)
-        lamp = DirectionalLight.over(scene.corners, float(np.arctan2(away[1], away[0])) + 0.6, 0.85)
+        lamp = DirectionalLight.from_direction(scene.corners, float(np.arctan2(away[1], away[0])) + 0.6, 0.85)
         covered = np.flatnonzero(seen >= 0)
         if len(covered):
             triangle = seen[covered]
             points, normals = _surface_points(scene, projection, covered, triangle)
             colors = to_linear(scene.colors[:, :3]).astype(np.float32)[triangle]
-            display = to_display(shade(colors, normals, lamp, lamp.reaches(points, normals, covered)))
+            display = to_display(shade(colors, normals, lamp, lamp.lit_fraction(points, normals, covered)))
             display *= compute_outlines(scene.group[triangle], normals, near, covered, projection)[:, None]
             image[covered] = display
         draw_ground(image, np.flatnonzero(seen < 0), scene.corners, projection, lamp)
     return image.reshape(projection.height, projection.width, 3)
 
 
-def _background(projection: Projection) -> Singles:
-    rows = np.linspace(1.0, 0.0, projection.height)[:, None]
-    below, above = BACKGROUND_COLORS
-    column = (below + (above - below) * rows**1.5).astype(np.float32)
-    return np.repeat(column, projection.width, axis=0)
-
-
 def _surface_points(
     scene: TriangleSoup, projection: Projection, pixel: Integers, triangle: Integers
 ) -> tuple[Singles, Singles]:
-    """Return the points (N, 3) and normals (N, 3), toward the camera, that pixels look at."""
-    rays = projection.rays(pixel)
-    # Seen from the camera all coordinates are small, and single precision is good for a hair.
+    """Return the points (N, 3) and normals (N, 3), toward the camera, that pixels show."""
+    rays = projection.pixel_rays(pixel)
+    # In camera coordinates all numbers are small, and single precision is exact to a tenth of a millimetre.
     a = scene.corners[:, 0] - projection.origin
     u, v = scene.corners[:, 1] - scene.corners[:, 0], scene.corners[:, 2] - scene.corners[:, 0]
     flat = np.cross(u, v)
     square = np.maximum(dot_rows(flat, flat), 1e-300)
     reach = dot_rows(flat, a)
-    # A ray r meets the plane n·p = d at p = r d / (n·r); planes through the camera are never seen.
+    # A ray r meets the plane n·p = d at p = r d / (n·r); planes through the camera are never visible.
     edge_on = np.abs(reach) < 1e-12 * np.sqrt(square)
     planes = np.where(edge_on[:, None], 0.0, flat / np.where(edge_on, 1.0, reach)[:, None])
     along = dot_rows(rays, _to_single(planes)[triangle])
@@ -245,7 +237,7 @@ def _surface_points(
     normals += (n[:, 1] - n[:, 0])[triangle] * b
     normals += (n[:, 2] - n[:, 0])[triangle] * c
     normals /= np.sqrt(np.maximum(dot_rows(normals, normals), 1e-12))[:, None]
-    # An open surface seen from behind is lit like one seen from the front.
+    # The back of an open surface is lit like its front.
     normals *= np.where(dot_rows(normals, rays) > 0.0, np.float32(-1.0), np.float32(1.0))[:, None]
     return np.asarray(points + _to_single(projection.origin), dtype=np.float32), normals
 
@@ -261,7 +253,7 @@ def _downsample(image: Singles, samples: int) -> npt.NDArray[np.uint8]:
 
 
 def _overlay(image: Singles, scene: TriangleSoup, projection: Projection) -> None:
-    """Draw axes over everything, faintly shaded, so that frames inside of bodies are seen too."""
+    """Draw parts over everything, faintly shaded, so that frames inside of bodies are visible."""
     if not len(scene.corners):
         return
     seen, _ = rasterize(projection, scene.corners, scene.closed, scene.colors[:, 3])

@@ -22,7 +22,7 @@ def to_wxyz(matrices: npt.ArrayLike) -> Floats:
 
 
 def roll_pitch_yaw(matrix: npt.ArrayLike) -> Floats:
-    """Return the angles (3,) about fixed x, y, z of a rotation, as URDF writes them [rad].
+    """Return the angles (3,) about fixed x, y, z of a rotation, as in URDF [rad].
 
     At a pitch of a quarter turn, where only a sum of roll and yaw is defined, the roll is 0.
     """
@@ -37,21 +37,21 @@ WORLD_FRAME = "world"
 
 
 class FramePoses:
-    """The poses of frames in the world, as a function of the values of symbols.
+    """Poses of frames in the world, as a compiled function of the values of symbols.
 
     Parameters
     ----------
     model
         The model.
     names
-        The frames wanted, in this order; all of the model, the world first, if None.
+        The frames, in this order; all of the model, the world first, if None.
 
     Attributes
     ----------
     names
-        The frames, in the order of the results of :meth:`at`.
+        The frames, in the order of the results of :meth:`evaluate`.
     moving
-        Those among them that are compiled, in the order of the results of :meth:`batch`: all but the world.
+        The compiled frames, in the order of the results of :meth:`batch`: all but the world.
     inputs
         The names of the symbols that the poses depend on.
     """
@@ -60,12 +60,12 @@ class FramePoses:
         everything = (WORLD_FRAME, *(name for name in model.frames if name != WORLD_FRAME))
         self.names = everything if names is None else tuple(names)
         self._index = {name: k for k, name in enumerate(self.names)}
-        # The world stands still, and a compiled function without outputs is no use to anyone.
+        # The world does not move, and a function without outputs cannot be compiled.
         self.moving = tuple(name for name in self.names if name != WORLD_FRAME)
         self._function = kv.compile([model.fk(name) for name in self.moving]) if self.moving else None
         self.inputs = tuple(map(str, self._function.inputs)) if self._function else ()
 
-    def at(self, values: Mapping[str, float]) -> Floats:
+    def evaluate(self, values: Mapping[str, float]) -> Floats:
         """Return (N, 4, 4) poses; ``values`` may hold more symbols than are needed [m], [rad]."""
         poses = np.tile(np.eye(4), (len(self.names), 1, 1))
         if self._function is not None:
@@ -79,11 +79,11 @@ class FramePoses:
         return [] if self._function is None else list(self._function.batch(rows))
 
     def unplaced(self, poses: Floats) -> list[str]:
-        """Return the frames of :attr:`names` that are nowhere: their poses have NaN or infinities in them."""
+        """Return the frames of :attr:`names` whose poses are not finite."""
         return [self.names[k] for k in np.flatnonzero(~np.isfinite(poses).all(axis=(1, 2)))]
 
     def index(self, name: str) -> int:
-        """Return the place of a frame in the results."""
+        """Return the index of a frame in the results."""
         if name not in self._index:
             raise UnknownNameError(f"There is no frame '{name}'. {suggest(name, self.names, 'frame')}")
         return self._index[name]
@@ -97,13 +97,13 @@ def complete(model: ModelView, state: StateLike | None = None) -> dict[str, floa
     model
         The model.
     state
-        Values by symbol or name; a :class:`kineverse.State` may know more than the model, a mapping of names
-        may not.
+        Values by symbol or name; a :class:`kineverse.State` may have more symbols than the model, a mapping
+        of names may not.
 
     Raises
     ------
     UnknownNameError
-        For a name the model does not know.
+        For a name that the model does not have.
     """
     values = {str(symbol): float(value) for symbol, value in model.default_state().items()}
     known = values.keys() | {str(symbol) for symbol in model.symbols}
@@ -123,6 +123,6 @@ def complete(model: ModelView, state: StateLike | None = None) -> dict[str, floa
 
 
 def keep_known(model: ModelView, values: Mapping[str, float]) -> dict[str, float]:
-    """Return those of values by name that a model has symbols for."""
+    """Return those values by name whose symbols a model has."""
     known = {str(symbol) for symbol in model.symbols}
     return {name: value for name, value in values.items() if name in known}

@@ -24,29 +24,29 @@ from kineverse.view.meshes import mesh_geometry
 from kineverse.view.triangle_mesh import Floats, TriangleMesh, mesh_placeholder
 
 RADIUS = 0.1
-"""Within what distance pairs are shown unless somebody says otherwise [m]."""
+"""Default distance within which pairs are shown [m]."""
 
 MOST_PAIRS = 40
-"""Pairs that are shown: more than these are counted, not drawn."""
+"""Most pairs that are shown; further ones are counted, not drawn."""
 
 
 @dataclass(frozen=True, slots=True)
 class ProximityResult:
-    """What was found at a state.
+    """Nearest pairs of bodies at a state.
 
     Attributes
     ----------
     radius
-        Within what distance was looked [m].
+        The distance within which pairs were searched [m].
     pairs
         The nearest pairs, nearest first, at most :data:`MOST_PAIRS` of them.
     found, touching
-        How many pairs there are within the radius, and how many of them touch or penetrate.
+        The number of pairs within the radius, and of those that touch or penetrate.
     ignored
-        Pairs within the radius that are not looked at although they can move with respect to each other, with
-        the reason, nearest first; at most :data:`MOST_PAIRS`.
-    looked_at, not_looked_at
-        How many pairs of bodies there are of either kind.
+        Pairs within the radius that are excluded from checking although they can move with respect to each
+        other, with the reason, nearest first; at most :data:`MOST_PAIRS`.
+    checked_pairs, unchecked_pairs
+        The numbers of pairs of bodies that are checked, and that are excluded.
     """
 
     radius: float
@@ -54,24 +54,24 @@ class ProximityResult:
     found: int = 0
     touching: int = 0
     ignored: Sequence[tuple[DistanceResult, str]] = field(default=())
-    looked_at: int = 0
+    checked_pairs: int = 0
     unchecked_pairs: int = 0
 
 
 class ProximityQuery:
-    """Distances in a model, for one thread; shapes that cannot be used are left out.
+    """Distance queries in a model, for one thread; unusable shapes are excluded.
 
     Parameters
     ----------
     model
-        The model; after an edit :meth:`follow` has to be called.
+        The model; after an edit :meth:`refresh` has to be called.
     decomposed
-        Whether meshes are the hulls that they were decomposed into, as far as they were.
+        True to take meshes as the hulls of their decomposition, as far as there is one.
 
     Attributes
     ----------
     problems
-        Why bodies, or shapes of bodies, are left out, by what people call them.
+        The reasons for which bodies, or shapes of bodies, are excluded, by their label.
 
     Raises
     ------
@@ -95,14 +95,14 @@ class ProximityQuery:
         decomposed = ("*",) if self.decomposed else ()
         return Scene(self._model, rules=rules, decomposed=decomposed, leave_out=self._unusable)
 
-    def follow(self) -> None:
-        """Look at the model as it is now."""
+    def refresh(self) -> None:
+        """Take over edits of the model."""
         if find_unusable_shapes(self._model) != self._unusable:
             self._make()
         else:
             self._ignored = ExcludedPairs(self._model, self._scene.bodies)
 
-    def at(
+    def evaluate(
         self,
         values: Mapping[str, float],
         radius: float = RADIUS,
@@ -110,35 +110,35 @@ class ProximityQuery:
         containing: str = "",
         ignored: bool = False,
     ) -> ProximityResult:
-        """Return what is near at values of all symbols, by name.
+        """Return the nearest pairs at values of all symbols, by name.
 
         Parameters
         ----------
         values
             [m], [rad].
         radius
-            How near [m].
+            The distance within which to search [m].
         containing
-            Only pairs of which a name contains this, whatever its case.
+            Only pairs of which a name contains this, in any case.
         ignored
-            Whether to look at ignored pairs as well.
+            True to search among excluded pairs as well.
 
         Raises
         ------
         KineverseError
             If there are no distances at these values, as where a pose is not finite.
         """
-        # A state, for the values may be of more symbols than the scene has.
+        # A state, because the values may include symbols that the scene does not have.
         self._scene.update(State(values))
         found = _filter_by_name(self._scene.pairs_within(radius), containing)
-        looked_at, unchecked_pairs = self._ignored.counts
+        checked_pairs, unchecked_pairs = self._ignored.counts
         return ProximityResult(
             radius,
             found[:MOST_PAIRS],
             len(found),
-            sum(1 for _ in takewhile(lambda pair: pair.touches, found)),  # they come first
+            sum(1 for _ in takewhile(lambda pair: pair.touches, found)),  # contacts come first
             self._find_unchecked_pairs(values, radius, containing) if ignored else (),
-            looked_at,
+            checked_pairs,
             unchecked_pairs,
         )
 
@@ -165,23 +165,23 @@ CONTACT = (0.86, 0.04, 0.10)
 IGNORED = (0.45, 0.48, 0.52)
 
 BALL, LINE, SHAFT, HEAD, TIP = 0.1, 0.05, 0.05, 0.12, 0.35
-"""Radii of the ends and middles of lines and arrows, and how long tips are, as parts of an arrow's length."""
+"""Radii of ends, lines, shafts and heads, and length of tips, as fractions of an arrow's length."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class ProximityMarkers:
-    """What is drawn of nearest points.
+    """Lines and arrows at nearest points.
 
     Attributes
     ----------
     lines
-        (N, 2, 3) from a to b, of all pairs [m]. Between bodies that are apart that is along the normal.
+        (N, 2, 3) from a to b, of all pairs [m]; between separate bodies along the normal.
     colors
         (N, 3) red, green, blue in [0, 1].
     arrows
-        (M, 2, 3) along the normal, out of a where that is deepest in b, of the pairs that touch [m].
+        (M, 2, 3) along the normal, from the point of a that is deepest in b, of the pairs that touch [m].
     depths
-        M texts: how deep these are.
+        M texts: the penetration depths of these.
     """
 
     lines: Floats
@@ -190,8 +190,8 @@ class ProximityMarkers:
     depths: tuple[str, ...]
 
     @staticmethod
-    def of(found: ProximityResult, length: float) -> ProximityMarkers:
-        """Return the marks of what was found, with arrows of a length [m]."""
+    def from_result(found: ProximityResult, length: float) -> ProximityMarkers:
+        """Return the markers of a result, with arrows of a length [m]."""
         touching = [pair for pair in found.pairs if pair.touches]
         pairs = [*found.pairs, *(pair for pair, _ in found.ignored)]
         colors = [distance_color(pair.distance, found.radius) for pair in found.pairs]
@@ -204,7 +204,7 @@ class ProximityMarkers:
 
 
 def distance_color(distance: float, radius: float) -> tuple[float, float, float]:
-    """Return green at a radius [m], over yellow to orange the nearer it is; red in contact."""
+    """Return the colour of a distance: green at a radius [m], orange at 0, red in contact."""
     if distance <= 0.0:
         return CONTACT
     share = min(distance / radius, 1.0) if radius > 0.0 else 1.0
@@ -214,7 +214,7 @@ def distance_color(distance: float, radius: float) -> tuple[float, float, float]
 
 
 def format_millimetres(distance: float) -> str:
-    """Return a distance [m] in millimetres, with no more digits than one can make use of."""
+    """Format a distance [m] in millimetres, without insignificant digits."""
     value = 1000.0 * distance
     digits = 0 if abs(value) >= 99.5 else 1 if abs(value) >= 0.95 else 2
     rounded = round(value, digits) + 0.0  # and no minus sign before a zero
@@ -222,12 +222,12 @@ def format_millimetres(distance: float) -> str:
 
 
 def create_marker_drawables(marks: ProximityMarkers, length: float) -> list[Drawable]:
-    """Return marks as parts in the world, for a picture with arrows of a length [m]."""
+    """Return markers as parts in the world, with arrows of a length [m]."""
     found = []
     for ends, shade in zip(marks.lines, marks.colors, strict=True):
         rgba = (float(shade[0]), float(shade[1]), float(shade[2]), 1.0)
-        ball = mesh_placeholder().scaled(length * BALL / 0.05)  # which is 0.05 m large
-        surfaces = [ball.moved(translation(end)) for end in ends]
+        ball = mesh_placeholder().scale(length * BALL / 0.05)  # which is 0.05 m large
+        surfaces = [ball.transform(translation(end)) for end in ends]
         if (rod := _rod(ends, length * LINE)) is not None:
             surfaces.append(rod)
         found += [Drawable(WORLD, surface, rgba, "visual") for surface in surfaces]
@@ -246,12 +246,12 @@ def _arrow(ends: Floats, length: float) -> list[TriangleMesh]:
     pose[:3, 3] = ends[0] + (1.0 - TIP / 2) * (ends[1] - ends[0])
     shaft = np.array([ends[0], ends[0] + (1.0 - TIP) * (ends[1] - ends[0])])
     rod = _rod(shaft, length * SHAFT)
-    return [tip.moved(pose), *([rod] if rod is not None else [])]
+    return [tip.transform(pose), *([rod] if rod is not None else [])]
 
 
 def _rod(ends: Floats, radius: float) -> TriangleMesh | None:
     length = float(np.linalg.norm(ends[1] - ends[0]))
-    return mesh_geometry(Cylinder(radius, length)).moved(_pose_along(ends)) if length > 1e-6 else None
+    return mesh_geometry(Cylinder(radius, length)).transform(_pose_along(ends)) if length > 1e-6 else None
 
 
 def _pose_along(ends: Floats) -> Floats:
@@ -262,20 +262,20 @@ def _pose_along(ends: Floats) -> Floats:
 logger = logging.getLogger(__name__)
 
 QUERY_PERIOD = 1.0 / 20.0
-"""Least time between two looks [s]."""
+"""Least time between two queries [s]."""
 
 PAUSE_FACTOR = 3.0
-"""How many times as long as a look took is waited for the next one: python threads slow each other down."""
+"""Pause after a query as a multiple of its duration: Python threads slow each other down."""
 
 
 @dataclass(frozen=True, slots=True)
 class ProximityRequest:
-    """What to look for: whether at all, within what radius [m], names containing what, what else.
+    """Request for proximity queries: enabled or not, the radius [m], and a text that names contain.
 
-    ``ignored``: also pairs that are not looked at. ``decomposed``: meshes as the hulls of their parts.
+    ``ignored``: also excluded pairs. ``decomposed``: meshes as the hulls of their parts.
     """
 
-    on: bool = False
+    enabled: bool = False
     radius: float = RADIUS
     containing: str = ""
     ignored: bool = False
@@ -284,32 +284,32 @@ class ProximityRequest:
 
 @dataclass(frozen=True, slots=True)
 class ProximityStatus:
-    """What was seen last: what is near, why bodies and shapes are left out, and what went wrong if it did."""
+    """Latest result, the reasons for which bodies and shapes are excluded, and the failure if any."""
 
-    nearness: ProximityResult | None = None
+    result: ProximityResult | None = None
     problems: Mapping[str, str] | None = None
     failure: str = ""
 
 
 class ProximityWorker:
-    """Looks at the newest values whenever there are some, and hands on what it sees.
+    """Background thread that evaluates proximity queries at the newest values.
 
     Parameters
     ----------
     model
         The model.
     values
-        The values of all symbols at first, by name [m], [rad].
+        The initial values of all symbols, by name [m], [rad].
     show
-        Called by the thread with what it sees; nothing of it while nothing is wanted.
+        Called by the thread with each status; with an empty one while requests are disabled.
     """
 
     def __init__(
         self, model: ModelView, values: Mapping[str, float], show: Callable[[ProximityStatus], None]
     ) -> None:
         self._model, self._values, self._show = model, dict(values), show
-        self._wanted = ProximityRequest()
-        self._near: ProximityQuery | None = None
+        self._request = ProximityRequest()
+        self._query: ProximityQuery | None = None
         self._edited = False
         self._asked, self._done, self._stopping = 0, 0, False
         self._change = threading.Condition()
@@ -317,27 +317,27 @@ class ProximityWorker:
         self._thread.start()
 
     @property
-    def wanted(self) -> ProximityRequest:
-        """What it looks for."""
-        return self._wanted
+    def request(self) -> ProximityRequest:
+        """The present request."""
+        return self._request
 
-    def set_request(self, wanted: ProximityRequest) -> None:
-        """Look for something else from now on."""
+    def set_request(self, request: ProximityRequest) -> None:
+        """Replace the request."""
         with self._change:
-            if wanted != self._wanted:
-                self._wanted = wanted
+            if request != self._request:
+                self._request = request
                 self._ask()
 
     def update(self, values: Mapping[str, float], edited: bool = False) -> None:
-        """Look at other values, and if it was edited, at a model that has changed."""
+        """Evaluate other values, and an edited model if ``edited``."""
         with self._change:
             self._values = dict(values)
             self._edited |= edited
-            if self._wanted.on:
+            if self._request.enabled:
                 self._ask()
 
-    def settled(self, timeout: float) -> bool:
-        """Wait at most ``timeout`` [s] for all that was asked for; return whether it was seen."""
+    def wait_until_idle(self, timeout: float) -> bool:
+        """Wait at most ``timeout`` [s] for all pending queries; return True if they are done."""
         with self._change:
             return self._change.wait_for(lambda: self._done >= self._asked, timeout)
 
@@ -358,30 +358,34 @@ class ProximityWorker:
                 self._change.wait_for(lambda: self._stopping or self._asked > self._done)
                 if self._stopping:
                     return
-                asked, values, wanted = self._asked, self._values, self._wanted
-                edited, self._edited = self._edited and wanted.on, self._edited and not wanted.on
+                asked, values, request = self._asked, self._values, self._request
+                edited, self._edited = self._edited and request.enabled, self._edited and not request.enabled
             begin = time.monotonic()
             try:
-                self._show(self._look(values, wanted, edited))
+                self._show(self._evaluate(values, request, edited))
             except Exception:
-                # The page may be going away, and the thread outlives whatever it is shown.
-                logger.exception("what is near could not be shown")
+                # The page may be closing; the thread survives any error of its display.
+                logger.exception("proximity could not be shown")
             took = time.monotonic() - begin
             with self._change:
                 self._done = max(self._done, asked)
                 self._change.notify_all()
                 self._change.wait_for(lambda: self._stopping, timeout=max(QUERY_PERIOD, PAUSE_FACTOR * took))
 
-    def _look(self, values: Mapping[str, float], wanted: ProximityRequest, edited: bool) -> ProximityStatus:
-        if not wanted.on:
+    def _evaluate(
+        self, values: Mapping[str, float], request: ProximityRequest, edited: bool
+    ) -> ProximityStatus:
+        if not request.enabled:
             return ProximityStatus()
         try:
-            if self._near is None or self._near.decomposed != wanted.decomposed:
-                self._near = ProximityQuery(self._model, wanted.decomposed)
+            if self._query is None or self._query.decomposed != request.decomposed:
+                self._query = ProximityQuery(self._model, request.decomposed)
             elif edited:
-                self._near.follow()
-            found = self._near.at(values, wanted.radius, containing=wanted.containing, ignored=wanted.ignored)
-            return ProximityStatus(found, self._near.problems)
+                self._query.refresh()
+            found = self._query.evaluate(
+                values, request.radius, containing=request.containing, ignored=request.ignored
+            )
+            return ProximityStatus(found, self._query.problems)
         except KineverseError as error:
             return ProximityStatus(failure=str(error))
         except Exception as error:

@@ -35,19 +35,19 @@ from kineverse.view.scene import ViewerScene
 from kineverse.view.violations import format_significant
 
 LINES = 12
-"""Lines of the list: more than these are counted, not listed."""
+"""Lines of the list; further pairs are counted, not listed."""
 
 EXCLUDED_LINES = 5
-"""Bodies, and shapes of them, that are left out and named with the reason; more are counted."""
+"""Excluded bodies and shapes that are named with the reason; further ones are counted."""
 
 TOUCHING = 5e-6
-"""What is less deep than this is said to touch, not to be 0.00 mm deep [m]."""
+"""Contacts less deep than this are said to touch, instead of being 0.00 mm deep [m]."""
 
 _GREY = "#868e96"
 
 
 def format_proximity(found: ProximityResult, problems: Mapping[str, str]) -> Html:
-    """Return HTML: how many pairs are near, the nearest of them with their distances, what is left out."""
+    """Return HTML: the number of near pairs, the nearest with their distances, and excluded shapes."""
     lines = [element("b", _summary(found))]
     lines += [_line(pair, distance_color(pair.distance, found.radius)) for pair in found.pairs[:LINES]]
     lines += _more(found.found - LINES)
@@ -56,13 +56,13 @@ def format_proximity(found: ProximityResult, problems: Mapping[str, str]) -> Htm
         lines += [_line(pair, None, why) for pair, why in found.ignored[:LINES]]
         lines += _more(len(found.ignored) - LINES)
     lines += _excluded_lines(problems)
-    pairs = f"{found.looked_at} pairs are looked at, {found.unchecked_pairs} are not"
+    pairs = f"{found.checked_pairs} pairs are looked at, {found.unchecked_pairs} are not"
     lines.append(element("div", pairs, style=f"color:{_GREY};margin-top:5px"))
     return wrap_report(*lines)
 
 
 def format_proximity_failure(message: str) -> Html:
-    """Return HTML that says why there are no distances."""
+    """Return HTML: the reason why there are no distances."""
     return wrap_report(element("b", "There are no distances now.", style="color:#c92a2a"), BREAK, message)
 
 
@@ -111,28 +111,28 @@ def _excluded_lines(problems: Mapping[str, str]) -> list[Html]:
 
 
 LARGEST_RADIUS = 0.5
-"""The largest radius that is offered [m]."""
+"""The largest radius on offer [m]."""
 
 LONGEST_ARROW = 0.2
-"""Length of an arrow on the page at most [m]: contacts are about hands, also in a large kitchen."""
+"""Largest length of an arrow on the page [m]: contacts are as large as hands, also in a large kitchen."""
 
 LABELS = 8
-"""Depths that are written beside their arrows; more would cover what they are about."""
+"""Depths that are written beside their arrows; more would cover the scene."""
 
 WAITING = wrap_report(element("b", "Reading shapes …"))
 
 
 class ProximityPanel:
-    """What touches, and what nearly does.
+    """Contacts and nearest pairs of bodies on the page, with their controls.
 
     Parameters
     ----------
     server
         A viser server.
     scene
-        What the marks are drawn in.
+        The scene in which the markers are drawn.
     model, values
-        The model, and the values of all symbols at first, by name [m], [rad].
+        The model, and the initial values of all symbols, by name [m], [rad].
     """
 
     def __init__(
@@ -144,35 +144,35 @@ class ProximityPanel:
         self._shapes: Any = None
         self._controls: tuple[Any, ...] = ()
         self._drawn: dict[str, Any] = {}
-        self.seen = ProximityStatus()
-        # Programs, controls and the thread that looks all write to a folder that edits of the model replace.
+        self.status = ProximityStatus()
+        # Programs, controls and the background thread write to a folder that edits of the model replace.
         self._lock = threading.RLock()
-        self.watch = ProximityWorker(model, values, self._show)
+        self.worker = ProximityWorker(model, values, self._show)
 
     def add_folder(self, gui: Any) -> None:
-        """Add the controls to a panel; what is switched on stays on."""
+        """Add the controls to a panel, with their present settings."""
         with self._lock:
-            self._add_controls(gui, self.watch.wanted)
-            self._tell()
+            self._add_controls(gui, self.worker.request)
+            self._write_report()
 
     def forget_folder(self) -> None:
-        """Take note that the folder is about to be removed with its panel."""
+        """Drop the controls before their panel is removed."""
         with self._lock:
             self._report, self._shapes, self._controls = None, None, ()
 
     def show_near(
         self, radius: float | None = RADIUS, *, containing: str = "", ignored: bool = False
     ) -> None:
-        """Show which bodies are near to each other, as the controls do.
+        """Show nearest pairs of bodies, as the controls do.
 
         Parameters
         ----------
         radius
-            Within what distance [m]; None to show nothing.
+            The distance within which pairs are shown [m]; None to show nothing.
         containing
             Only pairs of which a name contains this.
         ignored
-            Also pairs that are joined by an articulation, or excepted by rules.
+            Also pairs that are joined by an articulation, or excluded by rules.
 
         Raises
         ------
@@ -182,12 +182,13 @@ class ProximityPanel:
             If the extra ``geometry`` is not installed.
         """
         if radius is None:
-            self._set(replace(self.watch.wanted, on=False))
+            self._apply(replace(self.worker.request, enabled=False))
             return
         if not 0.0 <= radius < float("inf"):
             raise InvalidValueError(f"A radius is a distance from 0 on [m], not {radius!r}.")
         import_coal()
-        self._set(ProximityRequest(True, float(radius), containing, ignored, self.watch.wanted.decomposed))
+        decomposed = self.worker.request.decomposed
+        self._apply(ProximityRequest(True, float(radius), containing, ignored, decomposed))
 
     def show_shapes(self, shown: bool = True) -> None:
         """Show or hide the collision shapes, half transparent."""
@@ -197,9 +198,9 @@ class ProximityPanel:
                 self._shapes.value = shown
 
     def show_decomposed(self, shown: bool = True) -> None:
-        """Take meshes as the hulls that ``kineverse decompose`` made of them, for shapes and distances.
+        """Take meshes as the hulls of ``kineverse decompose``, for shapes and distances.
 
-        Those that it has not seen stay one hull; the log says which.
+        Meshes that were not decomposed stay one hull; the log names them.
 
         Raises
         ------
@@ -207,19 +208,19 @@ class ProximityPanel:
             If the extra ``geometry`` is not installed.
         """
         import_coal()
-        self._set(replace(self.watch.wanted, decomposed=shown))
+        self._apply(replace(self.worker.request, decomposed=shown))
 
     @property
-    def nearness(self) -> ProximityResult | None:
-        """What is near, as shown last; None if nothing is looked for, or if there are no distances."""
-        return self.seen.nearness
+    def result(self) -> ProximityResult | None:
+        """The result shown last; None if there is no request, or if there are no distances."""
+        return self.status.result
 
     def stop(self) -> None:
-        """End what goes on in the background."""
-        self.watch.stop()
+        """Stop the background thread."""
+        self.worker.stop()
 
-    def _add_controls(self, gui: Any, wanted: ProximityRequest) -> None:
-        self._folder = gui.add_folder("Collisions", expand_by_default=wanted.on)
+    def _add_controls(self, gui: Any, request: ProximityRequest) -> None:
+        self._folder = gui.add_folder("Collisions", expand_by_default=request.enabled)
         with self._folder:
             self._shapes = gui.add_checkbox(
                 "collision shapes",
@@ -230,70 +231,71 @@ class ProximityPanel:
             if not is_installed():
                 self._report = HtmlBox(gui, Html())
                 return
-            near = gui.add_checkbox("nearest pairs", wanted.on, hint="Lines where bodies are nearest.")
+            near = gui.add_checkbox("nearest pairs", request.enabled, hint="Lines where bodies are nearest.")
             radius = gui.add_slider(
                 "within [m]",
                 min=0.0,
-                max=max(LARGEST_RADIUS, wanted.radius),
+                max=max(LARGEST_RADIUS, request.radius),
                 step=0.005,
-                initial_value=wanted.radius,
+                initial_value=request.radius,
                 hint="Green lines are that long; the nearer, the redder.",
             )
-            only = gui.add_text("only", wanted.containing, hint="Only pairs with a name that contains this.")
+            only = gui.add_text("only", request.containing, hint="Only pairs with a name that contains this.")
             ignored = gui.add_checkbox(
-                "ignored pairs", wanted.ignored, hint="Also pairs that are joined, or excepted by rules."
+                "ignored pairs", request.ignored, hint="Also pairs that are joined, or excepted by rules."
             )
             decomposed = gui.add_checkbox(
-                "decomposed meshes", wanted.decomposed, hint="Meshes as the hulls of kineverse decompose."
+                "decomposed meshes", request.decomposed, hint="Meshes as the hulls of kineverse decompose."
             )
             self._report = HtmlBox(gui, Html())
         self._controls = near, radius, only, ignored, decomposed
         for control in self._controls:
-            control.on_update(self._set_by_hand)
+            control.on_update(self._apply_controls)
 
-    def _set_by_hand(self, event: Any) -> None:
-        # Values that this program has set come back without a client.
+    def _apply_controls(self, event: Any) -> None:
+        # Values set by this program come back as events without a client.
         if event.client is not None:
-            wanted = ProximityRequest(*(control.value for control in self._controls))
-            self._scene.decompose(wanted.decomposed)
-            self.watch.set_request(wanted)
-            self._tell()
+            request = ProximityRequest(*(control.value for control in self._controls))
+            self._scene.decompose(request.decomposed)
+            self.worker.set_request(request)
+            self._write_report()
 
-    def _set(self, wanted: ProximityRequest) -> None:
+    def _apply(self, request: ProximityRequest) -> None:
         with self._lock:
-            self._scene.decompose(wanted.decomposed)
-            self.watch.set_request(wanted)
+            self._scene.decompose(request.decomposed)
+            self.worker.set_request(request)
             if self._controls:
                 near, radius, only, ignored, decomposed = self._controls
-                self._folder.expand_by_default = wanted.on  # for whoever opens the page from now on
-                radius.max = max(LARGEST_RADIUS, wanted.radius)
-                near.value, radius.value = wanted.on, wanted.radius
-                only.value, ignored.value = wanted.containing, wanted.ignored
-                decomposed.value = wanted.decomposed
-            self._tell()
+                self._folder.expand_by_default = request.enabled  # for browsers that open the page later
+                radius.max = max(LARGEST_RADIUS, request.radius)
+                near.value, radius.value = request.enabled, request.radius
+                only.value, ignored.value = request.containing, request.ignored
+                decomposed.value = request.decomposed
+            self._write_report()
 
-    def _show(self, seen: ProximityStatus) -> None:
-        """Draw what was seen; called by the thread that looks."""
-        self._tell(seen)
-        self._scene.show_through(self.watch.wanted.on)
+    def _show(self, status: ProximityStatus) -> None:
+        """Draw a status; called by the background thread."""
+        self._write_report(status)
+        self._scene.show_transparent(self.worker.request.enabled)
         with self._server.atomic():
             before = self._drawn
-            marks = None if seen.nearness is None else ProximityMarkers.of(seen.nearness, self._length)
+            result = status.result
+            marks = None if result is None else ProximityMarkers.from_result(result, self._length)
             self._drawn = self._draw(marks) if marks is not None and len(marks.lines) else {}
-            # What is added under the name of another takes its place, and does not flicker.
+            # A node that is added under the name of another replaces it without flicker.
             for name in before.keys() - self._drawn.keys():
                 before[name].remove()
 
-    def _tell(self, new: ProximityStatus | None = None) -> None:
-        """Write the report of what was seen last, which is ``new`` if given."""
+    def _write_report(self, new: ProximityStatus | None = None) -> None:
+        """Write the report of the latest status, which is ``new`` if given."""
         with self._lock:
-            self.seen = seen = new or self.seen
+            self.status = status = new or self.status
             text = Html() if is_installed() else _format_missing_extra()
-            if seen.failure:
-                text = format_proximity_failure(seen.failure)
-            elif seen.nearness is not None:
-                text = format_proximity(seen.nearness, seen.problems or {})
-            elif self.watch.wanted.on:
+            if status.failure:
+                text = format_proximity_failure(status.failure)
+            elif status.result is not None:
+                text = format_proximity(status.result, status.problems or {})
+            elif self.worker.request.enabled:
                 text = WAITING
             if self._report is not None:
                 self._report.show(text)
@@ -303,7 +305,7 @@ class ProximityPanel:
         return min(self._scene.length, LONGEST_ARROW)
 
     def _draw(self, marks: ProximityMarkers) -> dict[str, Any]:
-        """Add marks to the page, and return their nodes by name."""
+        """Add markers to the page, and return their nodes by name."""
         scene, length = self._server.scene, self._length
         colors = np.repeat(np.round(255 * marks.colors).astype(np.uint8)[:, None], 2, axis=1)
         nodes = [

@@ -1,7 +1,7 @@
 """Software rasterizer with a z-buffer, in numpy.
 
-There is no graphics library behind this, so it works on any machine the core works on. Rows of triangles are
-laid out as one long list of pixels, so that the work is proportional to what is covered and no loop runs over
+It needs no graphics library, so it runs on any machine on which the core runs. Rows of triangles are laid out
+as one long list of pixels, so that the work is proportional to the covered area and no loop runs over
 triangles.
 """
 
@@ -24,7 +24,7 @@ FRAGMENTS = 1_500_000
 
 @dataclass(frozen=True, slots=True)
 class Projection:
-    """A pinhole (or, with ``scale`` set, parallel) projection on a grid of pixels.
+    """Pinhole (or, with ``scale`` set, parallel) projection on a grid of pixels.
 
     ``axes`` are right, up and ahead as rows; x of a pixel grows to the right, y downwards.
     """
@@ -37,21 +37,21 @@ class Projection:
     parallel: bool = False
 
     @staticmethod
-    def of(camera: Camera, width: int, height: int) -> Projection:
-        """Return the projection of a camera to a picture of so many pixels."""
+    def from_camera(camera: Camera, width: int, height: int) -> Projection:
+        """Return the projection of a camera to a picture of a width and height [pixels]."""
         focal = 0.5 * height / np.tan(camera.field_of_view / 2)
         return Projection(np.asarray(camera.position, dtype=float), camera.axes, width, height, float(focal))
 
-    def local(self, points: npt.NDArray[Any]) -> npt.NDArray[Any]:
+    def to_camera(self, points: npt.NDArray[Any]) -> npt.NDArray[Any]:
         """Return world points (..., 3) in the axes right, up, ahead from the origin [m]."""
         x, y, z = (points[..., k] - points.dtype.type(self.origin[k]) for k in range(3))
         local = np.empty_like(points)
-        # By hand: a matrix product this thin costs several times as much, most of all on a busy computer.
+        # Term by term: a matrix product with so short an axis costs several times as much.
         for k, (a, b, c) in enumerate(self.axes.astype(points.dtype)):
             local[..., k] = a * x + b * y + c * z
         return local
 
-    def pixels(self, local: npt.NDArray[Any]) -> tuple[npt.NDArray[Any], npt.NDArray[Any]]:
+    def to_pixels(self, local: npt.NDArray[Any]) -> tuple[npt.NDArray[Any], npt.NDArray[Any]]:
         """Return pixel coordinates (..., 2) and a nearness (...) that is linear over the picture."""
         ahead = local[..., 2]
         nearness = -ahead if self.parallel else 1.0 / ahead
@@ -60,7 +60,7 @@ class Projection:
         xy = local[..., :2] * factor * np.array([1.0, -1.0], dtype=kind)
         return xy + np.array([self.width / 2, self.height / 2], dtype=kind), nearness
 
-    def rays(self, pixel: Integers) -> npt.NDArray[np.float32]:
+    def pixel_rays(self, pixel: Integers) -> npt.NDArray[np.float32]:
         """Return world directions (N, 3) through pixels given as y·width + x, one metre ahead."""
         y, x = np.divmod(pixel.astype(np.int32), np.int32(self.width))
         right = (x.astype(np.float32) + np.float32(0.5 - self.width / 2)) / np.float32(self.focal)
@@ -79,7 +79,7 @@ def rasterize(
     opacity: Floats | None = None,
     near: float = 0.01,
 ) -> tuple[Integers, npt.NDArray[np.float32]]:
-    """Return, for each pixel, the triangle seen there and its nearness.
+    """Return the visible triangle of each pixel and its nearness.
 
     Parameters
     ----------
@@ -88,27 +88,27 @@ def rasterize(
     corners
         (T, 3, 3) corners of the triangles in the world [m], in single or double precision.
     one_sided
-        (T,) whether a triangle is seen only where its corners run counter-clockwise.
+        (T,) True for triangles that are visible only if their corners run counter-clockwise.
     opacity
         (T,) in [0, 1]: a triangle covers this part of its pixels, in a fine regular pattern.
     near
-        What is nearer than this is cut away [m].
+        Distance of the near plane, in front of which all is cut away [m].
 
     Returns
     -------
     (height·width,) index of the triangle or -1, and (height·width,) nearness, -inf where there is none.
     """
-    local, owner = projection.local(corners), np.arange(len(corners))
+    local, owner = projection.to_camera(corners), np.arange(len(corners))
     if not projection.parallel:
         local, owner = _clip(local, owner, near)
-    xy, nearness = projection.pixels(local)
+    xy, nearness = projection.to_pixels(local)
     u, v = xy[:, 1] - xy[:, 0], xy[:, 2] - xy[:, 0]
     area = u[:, 0] * v[:, 1] - u[:, 1] * v[:, 0]
     (left, right), (top, bottom) = _extremes(xy[:, :, 0]), _extremes(xy[:, :, 1])
     keep = (np.abs(area) > 1e-9) & (right > 0) & (bottom > 0)
     keep &= (left < projection.width) & (top < projection.height)
     if one_sided is not None:
-        # y grows downwards, so what is counter-clockwise in the world has a negative area here.
+        # y grows downwards, so counter-clockwise triangles have a negative area here.
         keep &= ~one_sided[owner] | (area < 0)
     kept = np.flatnonzero(keep)
     # From near to far: later pixels are then mostly hidden and dropped at once.
@@ -211,7 +211,7 @@ def _fill(
 
 
 def _spans(edges: Floats, y: Integers, width: int) -> tuple[Integers, Integers]:
-    """Return first and one past the last pixel of rows whose centres lie inside all three edges."""
+    """Return the first and one past the last pixel of rows whose centres lie inside all three edges."""
     a, rest = edges[:, :, 0], edges[:, :, 1] * (y + 0.5)[:, None] + edges[:, :, 2]
     with np.errstate(divide="ignore", invalid="ignore"):
         crossing = -rest / a
@@ -240,11 +240,11 @@ def _dither(pixel: npt.NDArray[np.int32], x: npt.NDArray[np.int32], width: int) 
 
 @dataclass(frozen=True, slots=True)
 class TriangleSoup:
-    """All triangles of a scene in the world, each with its colour and where it comes from.
+    """All triangles of a scene in the world, each with its colour and its part.
 
     ``corners`` (T, 3, 3) [m], ``normals`` (T, 3, 3), ``colors`` (T, 4), ``source`` (T,) the number of the
-    part, ``group`` (T,) of the frame and colour it belongs to, ``closed`` (T,) whether the inside is never
-    seen.
+    part, ``group`` (T,) of the frame and colour it belongs to, ``closed`` (T,) True if the inside is never
+    visible.
     """
 
     corners: Floats
@@ -255,13 +255,13 @@ class TriangleSoup:
     closed: npt.NDArray[np.bool_]
 
     @staticmethod
-    def of(items: Sequence[Drawable], poses: Mapping[str, Floats]) -> TriangleSoup:
+    def from_drawables(items: Sequence[Drawable], poses: Mapping[str, Floats]) -> TriangleSoup:
         """Place parts by the poses of their frames."""
         empty = np.zeros((0, 3, 3))
         corners, normals, colors, source, group, closed = [empty], [empty], [np.zeros((0, 4))], [], [], []
         groups: dict[object, int] = {}
         for number, part in enumerate(items):
-            surface = part.surface.moved(poses[part.frame])
+            surface = part.surface.transform(poses[part.frame])
             count = len(surface.faces)
             corners.append(surface.vertices[surface.faces])
             normals.append(surface.normals[surface.faces])

@@ -1,4 +1,4 @@
-"""The three-dimensional half of the page: bodies, frames and floor of a model."""
+"""Three-dimensional scene of the page: bodies, frames and floor of a model."""
 
 from __future__ import annotations
 
@@ -27,12 +27,12 @@ from kineverse.view.triangle_mesh import Floats, Integers, TriangleMesh
 FIELD_OF_VIEW, ASPECT = 0.8, 1.25
 ROOT = "/model"
 
-SEE_THROUGH = 0.45
-"""How opaque bodies are while what is shown lies inside of them: frames, nearest points."""
+FADED_OPACITY = 0.45
+"""Opacity of bodies while frames or nearest points inside of them are shown."""
 
 
 class ViewerScene:
-    """What the page shows of a model, kept up to date by sending only what moved.
+    """Scene of a model on the page; an update sends only poses that changed.
 
     Parameters
     ----------
@@ -41,20 +41,20 @@ class ViewerScene:
     model
         The model to show.
     values
-        The values of all symbols at first, by name [m], [rad].
+        The initial values of all symbols, by name [m], [rad].
     camera
-        Where the page is seen from at first; None for a place from which much of what moves is seen.
+        The initial camera; None for one that shows as much as possible of the moving parts.
 
     Attributes
     ----------
     poses
-        (N, 4, 4): where the frames of :attr:`names` were put last.
+        (N, 4, 4): the poses of the frames :attr:`names` that were drawn last.
     problems
-        What could not be loaded, one line each.
+        The meshes that could not be loaded, one line each.
     length
-        A length that suits the size of the scene, for axes and arrows [m].
+        A length for the size of the scene, for axes and arrows [m].
     unplaced
-        The frames whose pose is not finite at the present values; what is attached to them is hidden.
+        The frames whose pose is not finite at the present values; the bodies attached to them are hidden.
     """
 
     def __init__(
@@ -62,21 +62,21 @@ class ViewerScene:
     ) -> None:
         self._server, self._camera = server, camera
         self._cameras: ClientCameras | None = None
-        # Switches on the page and the motion of the model come from different threads.
+        # Events of the page and the motion of the model come from different threads.
         self._lock = threading.RLock()
         self._frames_shown, self._labels_shown, self._filter = False, False, ""
         self._visuals_shown, self._collisions_shown, self._ground_shown = True, False, True
-        self._decomposed, self._through = False, False
+        self._decomposed, self._transparent = False, False
         backdrop.set_up(server)
         self.refresh(model, values)
 
     def refresh(self, model: ModelView, values: Mapping[str, float]) -> None:
-        """Show another model, or this one after an edit; what is switched on stays on."""
+        """Show another model, or this one after an edit, with the same settings."""
         with self._lock:
             self._model = model
             self._kinematics = FramePoses(model)
             self.names = self._kinematics.names
-            self.poses = self._placed(self._kinematics.at(values), np.eye(4))
+            self.poses = self._replace_non_finite(self._kinematics.evaluate(values), np.eye(4))
             visuals = collect_drawables(model)
             self.problems = sorted({f"{part.frame}: {part.problem}" for part in visuals if part.problem})
             with self._server.atomic():
@@ -93,10 +93,10 @@ class ViewerScene:
                 self.show_frames(True, True)
 
     def update(self, values: Mapping[str, float]) -> int:
-        """Move everything to where it is at given values of all symbols; return how many frames moved."""
+        """Move all frames to their poses at values of all symbols; return the number of frames that moved."""
         with self._lock:
             hidden = set(self.unplaced)
-            poses = self._placed(self._kinematics.at(values), self.poses)
+            poses = self._replace_non_finite(self._kinematics.evaluate(values), self.poses)
             for frame in hidden.symmetric_difference(self.unplaced):
                 if frame in self._nodes:
                     self._nodes[frame].visible = frame in hidden
@@ -104,26 +104,26 @@ class ViewerScene:
             self.poses = poses
             if not len(moved):
                 return 0
-            turned = to_wxyz(poses[moved])
+            quaternions = to_wxyz(poses[moved])
             with self._server.atomic():
-                for k, wxyz in zip(moved, turned, strict=True):
+                for k, wxyz in zip(moved, quaternions, strict=True):
                     node = self._nodes.get(self.names[k])
                     if node is not None:
                         node.position, node.wxyz = poses[k, :3, 3], wxyz
                 self._move_frames()
             return len(moved)
 
-    def _placed(self, poses: Floats, instead: Floats) -> Floats:
-        """Return poses, with others instead of those that are not finite; note whose these are."""
+    def _replace_non_finite(self, poses: Floats, replacements: Floats) -> Floats:
+        """Return poses, with others in place of those that are not finite; note the frames of these."""
         self.unplaced = self._kinematics.unplaced(poses)
-        return np.where(np.isfinite(poses).all(axis=(1, 2), keepdims=True), poses, instead)
+        return np.where(np.isfinite(poses).all(axis=(1, 2), keepdims=True), poses, replacements)
 
     def pose(self, frame: str) -> Floats:
-        """Return where a frame was put last, 4×4."""
+        """Return the pose of a frame that was drawn last, 4×4."""
         return np.array(self.poses[self._kinematics.index(frame)])
 
     def show_frames(self, axes: bool, labels: bool = False, containing: str = "") -> None:
-        """Show or hide the axes and the names of those frames whose name contains a text."""
+        """Show or hide the axes and the names of the frames whose name contains a text."""
         with self._lock:
             self._frames_shown, self._labels_shown, self._filter = axes, labels, containing
             for name in ("/axes", "/labels"):
@@ -148,7 +148,7 @@ class ViewerScene:
                 ]
 
     def show_collisions(self, shown: bool) -> None:
-        """Show or hide the collision shapes, half transparent; they are built when first asked for."""
+        """Show or hide the collision shapes, half transparent; they are built on first use."""
         with self._lock:
             self._collisions_shown = shown
             if shown and not self._collisions:
@@ -158,7 +158,7 @@ class ViewerScene:
                 node.visible = shown
 
     def decompose(self, wanted: bool) -> None:
-        """Show meshes to be touched as the hulls that they were decomposed into, or as one hull again."""
+        """Show collision meshes as the hulls of their decomposition, or as one hull again."""
         with self._lock:
             if wanted == self._decomposed:
                 return
@@ -170,17 +170,17 @@ class ViewerScene:
 
     @property
     def collisions_shown(self) -> bool:
-        """Whether the collision shapes are shown."""
+        """True if the collision shapes are shown."""
         return self._collisions_shown
 
-    def show_through(self, shown: bool) -> None:
-        """Make bodies half transparent, or opaque again, for what a caller shows inside of them."""
+    def show_transparent(self, shown: bool) -> None:
+        """Make bodies half transparent, or opaque again, for markers inside of them."""
         with self._lock:
-            self._through = shown
+            self._transparent = shown
             self._fade()
 
     def show_visuals(self, shown: bool) -> None:
-        """Show or hide what is meant to be seen."""
+        """Show or hide the visual shapes."""
         with self._lock:
             self._visuals_shown = shown
             for node, _ in self._visuals:
@@ -192,17 +192,17 @@ class ViewerScene:
         backdrop.set_floor(self._server, self._floor, self._extent, shown)
 
     def _fade(self) -> None:
-        through = self._frames_shown or self._through
+        transparent = self._frames_shown or self._transparent
         for node, opacity in self._visuals:
-            wanted = min(opacity or 1.0, SEE_THROUGH) if through else opacity
+            wanted = min(opacity or 1.0, FADED_OPACITY) if transparent else opacity
             if node.opacity != wanted:
                 node.opacity = wanted
-            if node.cast_shadow == through:
-                # Shadows know no opacity: half transparent bodies would throw black ones into themselves.
-                node.cast_shadow = node.receive_shadow = not through
+            if node.cast_shadow == transparent:
+                # Shadows ignore opacity: half transparent bodies would cast black ones onto themselves.
+                node.cast_shadow = node.receive_shadow = not transparent
 
     def _add(self, items: Iterable[Drawable], kind: Kind) -> list[tuple[Any, float | None]]:
-        """Add shapes below the nodes of their frames; return their nodes and how opaque they are."""
+        """Add shapes below the nodes of their frames; return their nodes and opacities."""
         added = []
         for number, part in enumerate(items):
             frame = self._node(part.frame)
@@ -247,7 +247,7 @@ class ViewerScene:
             name: pose for name, pose in zip(self.names, self.poses, strict=True) if name not in self.unplaced
         }
         visuals = [part for part in visuals if part.frame in at]
-        surfaces = TriangleSoup.of(visuals, at)
+        surfaces = TriangleSoup.from_drawables(visuals, at)
         self.length = choose_axis_length(surfaces.corners, at)
         points = (
             surfaces.corners.reshape(-1, 3)
@@ -264,26 +264,26 @@ class ViewerScene:
                 if len(surfaces.corners)
                 else np.concatenate([points, points + 0.2])
             )
-            self._follow(camera, partial(reframe, camera, shown))
+            self._set_framing(camera, partial(reframe, camera, shown))
         start = self._server.initial_camera
         start.position, start.look_at = np.array(camera.position), np.array(camera.target)
         start.fov = camera.field_of_view
         away = np.subtract(camera.position, camera.target)
         backdrop.set_lamp(self._server, float(np.arctan2(away[1], away[0])))
 
-    def _follow(self, first: Camera, framed: Callable[[float], Camera]) -> None:
+    def _set_framing(self, first: Camera, framing: Callable[[float], Camera]) -> None:
         if self._cameras is None:
-            self._cameras = ClientCameras(self._server, first, framed)
+            self._cameras = ClientCameras(self._server, first, framing)
         else:
-            self._cameras.follow(first, framed)
+            self._cameras.set_framing(first, framing)
 
 
 def _split_by_color(part: Drawable) -> list[tuple[TriangleMesh, tuple[float, ...]]]:
-    """Return a surface in pieces of one colour each: the page knows one colour a mesh."""
+    """Split a surface into pieces of one colour each, because a mesh of the page has one colour."""
     surface = part.surface
     if surface.colors is None:
         return [(surface, part.color)]
-    # Pictures on surfaces are reduced to a few dozen tones.
+    # Textures are reduced to a few dozen tones.
     tones, which = np.unique(np.round(surface.colors * 12.0) / 12.0, axis=0, return_inverse=True)
     pieces = []
     for k in range(len(tones)):

@@ -1,4 +1,4 @@
-"""The web server behind the page: for its own page only, and silent."""
+"""Web server of the page, which answers requests of its own page only and prints nothing."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ _TITLE = b"<title>Viser</title>"
 
 
 def start(port: int | None = None, label: str = "", host: str = HOST) -> Any:
-    """Start a viser server that answers its own page alone.
+    """Start a viser server that answers requests of its own page only.
 
     Parameters
     ----------
@@ -40,7 +40,7 @@ def start(port: int | None = None, label: str = "", host: str = HOST) -> Any:
         The title of the page.
     host
         The address to listen on. Unless it is this computer's own (127.0.0.1, localhost, ::1), the address of
-        the page has a random token in it, and whoever does not know that is refused.
+        the page includes a random token, and requests without it are refused.
 
     Returns
     -------
@@ -53,7 +53,7 @@ def start(port: int | None = None, label: str = "", host: str = HOST) -> Any:
     InvalidValueError
         If the given port is taken or not a port, or if the host is not one of this computer.
     KineverseError
-        If this version of viser cannot be kept from answering others.
+        If requests to this version of viser cannot be checked.
     """
     try:
         import viser
@@ -63,17 +63,17 @@ def start(port: int | None = None, label: str = "", host: str = HOST) -> Any:
             f"the page in the browser needs viser: {install_command('view')}"
         ) from error
 
-    access = AccessControl.of(host)
-    gate = _Gate(access, label)
+    access = AccessControl.from_host(host)
+    gate = _GuardedWebsockets(access, label)
 
     class GuardedWebsockServer(infra.WebsockServer):
-        _background_worker = _seeing(infra.WebsockServer._background_worker, "websockets", gate)
+        _background_worker = _replace_global(infra.WebsockServer._background_worker, "websockets", gate)
 
     class LocalServer(viser.ViserServer):
-        """A server that cannot be told, by whoever opens the page, to publish itself on the internet."""
+        """Server that a browser cannot tell to publish itself on the internet."""
 
-        __init__ = _seeing(
-            viser.ViserServer.__init__, "infra", _Instead(infra, WebsockServer=GuardedWebsockServer)
+        __init__ = _replace_global(
+            viser.ViserServer.__init__, "infra", _PatchedModule(infra, WebsockServer=GuardedWebsockServer)
         )
 
         def request_share_url(self, verbose: bool = True) -> str | None:
@@ -83,7 +83,7 @@ def start(port: int | None = None, label: str = "", host: str = HOST) -> Any:
         def address(self) -> str:
             return access.address(self.get_port())
 
-    with quiet():
+    with suppress_console():
         server = LocalServer(host=host, port=_free_port(host, port), label=label, verbose=False)
     if not gate.installed:
         stop(server)
@@ -95,14 +95,14 @@ def start(port: int | None = None, label: str = "", host: str = HOST) -> Any:
 
 
 def stop(server: Any) -> None:
-    """Stop a server, and wait until it has let go of its port."""
-    with quiet():
+    """Stop a server, and wait until it has released its port."""
+    with suppress_console():
         server.stop()
 
 
 @contextlib.contextmanager
-def quiet() -> Any:
-    """Keep viser from printing: standard output, and what is below a cell of a notebook, are the caller's."""
+def suppress_console() -> Any:
+    """Keep viser from printing to standard output, which belongs to the caller."""
     import rich
 
     console = rich.get_console()
@@ -113,8 +113,8 @@ def quiet() -> Any:
         console.quiet = before
 
 
-class _Instead:
-    """A module with other things under some of its names."""
+class _PatchedModule:
+    """Module with other objects under some of its names."""
 
     def __init__(self, module: Any, **names: Any) -> None:
         self.__dict__.update(names, _module=module)
@@ -123,18 +123,18 @@ class _Instead:
         return getattr(self._module, name)
 
 
-class _Gate(_Instead):
-    """The module ``websockets`` as one server sees it: what it serves passes through access control.
+class _GuardedWebsockets(_PatchedModule):
+    """Module ``websockets`` for one server, whose requests pass access control.
 
-    viser has no hook for that. What is replaced is what the functions of one server of ours see under a
-    global name; viser and websockets remain what they are for everybody else.
+    viser has no hook for that. The functions of this server get another global ``websockets``; viser and
+    websockets stay unchanged for all other servers.
     """
 
     def __init__(self, access: AccessControl, title: str) -> None:
         import websockets.asyncio.server
 
-        server = _Instead(websockets.asyncio.server, serve=self._serve)
-        super().__init__(websockets, asyncio=_Instead(websockets.asyncio, server=server))
+        server = _PatchedModule(websockets.asyncio.server, serve=self._serve)
+        super().__init__(websockets, asyncio=_PatchedModule(websockets.asyncio, server=server))
         self.installed = False
         self._access, self._title = access, title
 
@@ -146,7 +146,7 @@ class _Gate(_Instead):
         return websockets.asyncio.server.serve(*arguments, process_request=checked, **options)
 
     def _checked(self, process_request: Callable[[Any, Any], Any]) -> Callable[[Any, Any], Any]:
-        """Return a handler that refuses requests, or hands them on without the token."""
+        """Return a handler that refuses requests, or passes them on without the token."""
         from websockets.http11 import Response
 
         access = self._access
@@ -161,7 +161,7 @@ class _Gate(_Instead):
                 text = f"Refused: {reason}.\n".encode()
                 about = {"Content-Type": "text/plain; charset=utf-8", "Content-Length": str(len(text))}
                 return Response(403, "Forbidden", type(headers)(about), text)
-            # The page is changed below, which it cannot be when it is compressed.
+            # The page is changed below, which requires that it is not compressed.
             headers.pop("Accept-Encoding", None)
             inner = dataclasses.replace(request, path=access.inner_path(request.path), headers=headers)
             response = process_request(connection, inner)
@@ -177,8 +177,8 @@ class _Gate(_Instead):
         return process
 
 
-def _seeing(function: Any, name: str, thing: Any) -> Any:
-    """Return a copy of a function that sees another thing under one global name."""
+def _replace_global(function: Any, name: str, thing: Any) -> Any:
+    """Return a copy of a function with another object under one global name."""
     seen = {**function.__globals__, name: thing}
     copy = FunctionType(
         function.__code__, seen, function.__name__, function.__defaults__, function.__closure__

@@ -1,4 +1,4 @@
-"""Showing a model from Python: in a script until Ctrl-C, at a prompt and in a notebook beside it."""
+"""Show a model from Python: in a script until Ctrl-C, at a prompt and in a notebook without waiting."""
 
 from __future__ import annotations
 
@@ -26,12 +26,12 @@ def show(
     camera: Camera | None = None,
     degrees: bool = False,
 ) -> Viewer:
-    """Show a model on a web page, with a slider for everything that moves.
+    """Show a model on a web page, with a slider for each degree of freedom.
 
-    In a script this opens the browser and blocks until Ctrl-C, upon which the page is taken down and the
-    script goes on; shutting the page in the browser changes nothing. At a prompt it returns at once. So it
-    does in a notebook, in which the result of a cell is the page itself. The address is written to standard
-    error, for without it nobody could look.
+    In a script this opens the browser and blocks until Ctrl-C; then the page is taken down and the script
+    goes on. Closing the page in the browser changes nothing. At a prompt it returns at once. So it does in a
+    notebook, in which the result of a cell is the page itself. The address of the page is written to standard
+    error.
 
     Parameters
     ----------
@@ -40,20 +40,21 @@ def show(
     state
         Values by symbol or name [m], [rad]; the default state for the others.
     block
-        Whether to wait for Ctrl-C; None for scripts only.
+        True to wait for Ctrl-C; None to wait in scripts only.
     open_browser
-        Whether to open the page in the browser, where there is a screen and it is no notebook.
+        True to open the page in the browser, if there is a screen and this is no notebook.
     port
         The port, 0 for any free one; None for 8080 or any free one.
     host
         The address to listen on: this computer alone, unless another one is given. Then the address of the
-        page has a random token in it, and whoever has it may look and move.
+        page includes a random token, and everybody who has it may look and move.
     label
         The title of the page; None for the names in front of all frames.
     camera
-        Where the page is seen from at first; None for a place from which all is seen, and much of what moves.
+        The initial camera; None for one that shows all of the model, and as much as possible of its moving
+        parts.
     degrees
-        Whether angles are shown in degrees at first.
+        True to show angles in degrees at first.
 
     Returns
     -------
@@ -64,7 +65,7 @@ def show(
     MissingDependencyError
         If viser is not installed.
     UnknownNameError
-        If the state names what the model does not have.
+        If the state has a name that the model does not have.
     InvalidValueError
         If the model is none, the port is taken or no port, or the host is not one of this computer.
     """
@@ -86,28 +87,28 @@ def show(
         page.stop()
         if not (waits and isinstance(error, KeyboardInterrupt)):
             raise
-        print(file=sys.stderr)  # where the terminal has written ^C
+        print(file=sys.stderr)  # the terminal has written ^C on this line
     return page
 
 
 def in_notebook() -> bool:
-    """Return whether this runs in a kernel of IPython, whose front end shows results of cells as HTML."""
+    """Return True in a kernel of IPython, whose front end shows results of cells as HTML."""
     return getattr(_ipython(), "kernel", None) is not None
 
 
 def at_prompt() -> bool:
-    """Return whether somebody types commands one after the other, or will when the script has ended."""
+    """Return True in an interactive session, and in a script that ends in one."""
     return hasattr(sys, "ps1") or bool(sys.flags.interactive) or _ipython() is not None
 
 
 def _ipython() -> Any:
-    """Return the shell of IPython if this runs in one; what is not imported yet is not running."""
+    """Return the shell of IPython if there is one; if IPython is not imported yet, there is none."""
     ipython = sys.modules.get("IPython")
     return ipython.get_ipython() if ipython is not None else None
 
 
 def open_page(address: str) -> None:
-    """Open an address in the browser, if there is a screen to open it on."""
+    """Open an address in the browser, if there is a screen."""
     screens = ("DISPLAY", "WAYLAND_DISPLAY", "BROWSER")
     if sys.platform in ("win32", "darwin") or any(os.environ.get(name) for name in screens):
         import webbrowser

@@ -1,8 +1,8 @@
 """Ranges, units and quaternion angles of the sliders.
 
-A model says by mathematics alone what its coordinates do, so their units are read off the motion: a
-coordinate that turns some frame by one radian a unit is an angle, one that shifts a frame by one metre a unit
-is a length, and of the others (a door lifted by a rope, a screw) nothing is claimed.
+Models do not declare units of coordinates, so they are derived from the motion. A coordinate that rotates
+some frame by one radian a unit is an angle, one that shifts a frame by one metre a unit is a length. Others
+(a door lifted by a rope, a screw) have no unit.
 """
 
 from __future__ import annotations
@@ -21,18 +21,18 @@ from kineverse.view.poses import roll_pitch_yaw
 from kineverse.view.triangle_mesh import Floats
 
 UNLIMITED_RANGE = {"rad": np.pi, "m": 2.0, "": 2.0}
-"""Half of the range offered where the model sets no limit [rad], [m]."""
+"""Half of the range of a slider without limits [rad], [m]."""
 
 
 STANDSTILL_SPEED = 1e-6
-"""What is slower than this does not move [rad/s], [m/s]: a lock is as sharp as its logic is."""
+"""Largest speed that counts as standstill [rad/s], [m/s]; locks are as sharp as their logic."""
 
 
 class Ranges:
-    """The limits of all degrees of freedom of a model, evaluated at states.
+    """Limits of all degrees of freedom of a model, evaluated at states.
 
-    Limits that are numbers are asked for once; those whose bounds are expressions (a drawer that opens only
-    as far as the door beside it) are asked for again at every state.
+    Numeric limits are evaluated once. Limits that are expressions (a drawer that opens only as far as the
+    door beside it) are evaluated at each state.
 
     Attributes
     ----------
@@ -62,14 +62,14 @@ class Ranges:
 
     @property
     def lockable(self) -> list[str]:
-        """The degrees of freedom that the state may keep from moving one way or both."""
+        """The degrees of freedom that the state may keep from moving in a direction."""
         return [str(symbol) for symbol in self._locked]
 
-    def held(self, values: Mapping[str, float]) -> dict[str, tuple[bool, bool]]:
-        """Return, for each that is lockable, whether it cannot go down, and whether it cannot go up.
+    def locked_directions(self, values: Mapping[str, float]) -> dict[str, tuple[bool, bool]]:
+        """Return a pair for each lockable coordinate: True if it cannot decrease, True if it cannot increase.
 
-        Locks are limits of speeds. At a limit of its own it cannot go on either, which counts if it is locked
-        the other way.
+        Locks are limits of speeds. A coordinate at its own limit cannot go on either, which counts if it is
+        locked in the other direction.
         """
         found = {}
         state = State(values) if self._locked else None
@@ -81,7 +81,7 @@ class Ranges:
             found[str(symbol)] = (down or at_end[1], up or at_end[0])
         return found
 
-    def at(self, values: Mapping[str, float]) -> dict[str, tuple[float, float]]:
+    def limits_at(self, values: Mapping[str, float]) -> dict[str, tuple[float, float]]:
         """Return lower and upper limit of each degree of freedom, -inf and inf where there is none."""
         limits = dict(self._limits)
         state = State(values) if self._dependent else None
@@ -100,11 +100,11 @@ def choose_slider_range(
     limits
         Lower and upper limit, possibly infinite.
     value
-        The current value, which is always inside of what is returned.
+        The current value, which is always inside of the range.
     unit
         ``"rad"``, ``"m"`` or ``""``, which decides the range where there is no limit.
     beyond
-        The part of the range by which it is widened at either end.
+        The fraction of the range by which it is widened at either end.
     """
     reach = UNLIMITED_RANGE.get(unit, 2.0)
     lower, upper = limits
@@ -112,10 +112,10 @@ def choose_slider_range(
         lower = -reach if upper > -reach else upper - 2 * reach
     if not np.isfinite(upper):
         upper = reach if lower < reach else lower + 2 * reach
-    if upper < lower:  # No value is allowed at this state; the slider stays where it is.
+    if upper < lower:  # No value is allowed at this state; the slider keeps its value.
         lower = upper = value
     wider = beyond * max(upper - lower, 1e-3)
-    # Limits are shown to the last digit; what lies beyond them may as well be a round number.
+    # Limits are shown to the last digit; the ends beyond them are rounded.
     wider = float(f"{wider:.1g}")
     if wider:
         lower, upper = round(lower - wider, 6), round(upper + wider, 6)
@@ -126,17 +126,17 @@ def choose_slider_range(
 
 
 def choose_slider_step(limits: tuple[float, float]) -> float:
-    """Return a power of ten of which a range has at least a thousand."""
+    """Return the largest power of ten that divides a range into at least a thousand steps."""
     return float(10.0 ** np.floor(np.log10(max(limits[1] - limits[0], 1e-6) / 999.0)))
 
 
 DIFFERENCE_STEP = 1e-4
-"""Step of the differences; their error is its square [unit of the coordinate]."""
+"""Step of the finite differences; their error is its square [unit of the coordinate]."""
 
 UNIT_TOLERANCE = 1e-5
 
 PROBE_DISTANCES = (0.0, 1.0, -1.0, 0.1, -0.1)
-"""Where to look, from the given values on; the later ones are for where nothing is found in the others."""
+"""Distances of the probed states from the given values; the later ones are used if earlier ones fail."""
 
 
 def infer_units(model: ModelView, values: Mapping[str, float], names: Iterable[str]) -> dict[str, str]:
@@ -145,14 +145,14 @@ def infer_units(model: ModelView, values: Mapping[str, float], names: Iterable[s
     Parameters
     ----------
     model
-        The model; its transforms from parent to child are what is looked at.
+        The model, whose transforms from parent to child are probed.
     values
-        Values of all symbols at which to look, by name [rad], [m].
+        Values of all symbols near which to probe, by name [rad], [m].
     names
-        The symbols wanted.
+        The symbols.
     """
     wanted = list(names)
-    # In terms of what is free: the angles of a closed loop follow its crank.
+    # In terms of free coordinates: the angles of a closed loop follow its crank.
     moving = [t for frame in model.frames.values() if (t := model.rates.carry(frame.transform)).symbols]
     if not moving:
         return dict.fromkeys(wanted, "")
@@ -166,14 +166,14 @@ def infer_units(model: ModelView, values: Mapping[str, float], names: Iterable[s
         return _rates(np.array(function(place - offset)), np.array(function(place + offset)))
 
     found = dict.fromkeys(wanted, "")
-    # A second place, a little off: what is one radian a unit only by chance is not so there.
+    # A second state excludes coordinates that move by one radian a unit only by chance.
     off = 0.1 + 0.01 * np.arange(len(base))
     for name in wanted:
         if name not in inputs:
             continue
         seen = []
         for distance in PROBE_DISTANCES:
-            # Where a loop does not close there is nothing to look at; two places are enough.
+            # Loops do not close everywhere; two states are enough.
             with suppress(NoSolutionError):
                 seen.append(rates(base + distance * off, inputs.index(name)))
             if len(seen) == 2:
@@ -189,13 +189,13 @@ def infer_units(model: ModelView, values: Mapping[str, float], names: Iterable[s
 
 
 def _rates(before: Floats, after: Floats) -> tuple[Floats, Floats]:
-    """Return the (N,) rates of turning [rad] and shifting [m] a unit, from poses two steps apart."""
-    with np.errstate(invalid="ignore"):  # A frame that is nowhere does not turn or shift by one a unit.
+    """Return the (N,) rates of rotation [rad] and translation [m] a unit, from poses two steps apart."""
+    with np.errstate(invalid="ignore"):  # Frames without a finite pose have no rates.
         return _differences(before, after)
 
 
 def _differences(before: Floats, after: Floats) -> tuple[Floats, Floats]:
-    # The part of R_before' R_after that is antisymmetric is the sine of the angle between them.
+    # The antisymmetric part of R_before' R_after is the sine of the angle between them.
     change = np.einsum("nji,njk->nik", before[:, :3, :3], after[:, :3, :3])
     sine = np.stack([change[:, 2, 1], change[:, 0, 2], change[:, 1, 0]], axis=1)
     turn = np.linalg.norm(
@@ -209,11 +209,11 @@ ANGLES = ("roll", "pitch", "yaw")
 ELEMENTS = ("qx", "qy", "qz", "qw")
 
 ANGLE_REACH = {"roll": math.pi, "pitch": math.pi / 2, "yaw": math.pi}
-"""How far each angle goes either way [rad]; within that there is one rotation for each of them."""
+"""Limits of the angles in both directions [rad], within which they are unique."""
 
 
 class QuaternionAngles:
-    """The quaternions among the coordinates of a model, each shown as three angles about fixed x, y and z.
+    """Quaternions among the coordinates of a model, each as three angles about fixed x, y and z.
 
     A quaternion is four coordinates ``name/qx`` to ``name/qw`` that are moved by the same three speeds. Its
     angles are ``name/roll``, ``name/pitch`` and ``name/yaw`` [rad].
@@ -228,8 +228,8 @@ class QuaternionAngles:
     Attributes
     ----------
     angles
-        What the angles are now, by name [rad]. They may be others than those of the quaternion, where two of
-        them turn the same way: a slider keeps what it was set to.
+        The present angles, by name [rad]. At a singularity, where two of them rotate about the same axis,
+        they may differ from those of the quaternion: a slider keeps its value.
     """
 
     def __init__(self, model: ModelView, values: Mapping[str, float]) -> None:
@@ -240,7 +240,7 @@ class QuaternionAngles:
             if len(speeds) == 1 and len(speeds.pop()) == 3:
                 self._names.append(name)
         self.angles: dict[str, float] = {}
-        self.read(values)
+        self.update(values)
 
     @property
     def coordinates(self) -> frozenset[str]:
@@ -249,7 +249,7 @@ class QuaternionAngles:
 
     @property
     def limits(self) -> dict[str, tuple[float, float]]:
-        """How far the angles go [rad]."""
+        """The limits of the angles, by name [rad]."""
         return {
             f"{name}/{angle}": (-ANGLE_REACH[angle], ANGLE_REACH[angle])
             for name in self._names
@@ -257,7 +257,7 @@ class QuaternionAngles:
         }
 
     def slider_names(self, names: Iterable[str]) -> list[str]:
-        """Return names of coordinates with the angles where the elements of quaternions were."""
+        """Return names of coordinates, with angles in place of the elements of quaternions."""
         found: dict[str, None] = {}
         for name in names:
             stem = name.rpartition("/")[0]
@@ -265,7 +265,7 @@ class QuaternionAngles:
                 found[shown] = None
         return list(found)
 
-    def turned(self, angle: str, value: float) -> dict[str, float]:
+    def set_angle(self, angle: str, value: float) -> dict[str, float]:
         """Set an angle [rad] and return the quaternion's elements, by name."""
         self.angles[angle] = value
         name = angle.rpartition("/")[0]
@@ -280,8 +280,8 @@ class QuaternionAngles:
         )
         return {f"{name}/{e}": value for e, value in zip(ELEMENTS, elements, strict=True)}
 
-    def read(self, values: Mapping[str, float]) -> None:
-        """Set the angles to those of the quaternions; of one that is zero, to none."""
+    def update(self, values: Mapping[str, float]) -> None:
+        """Set the angles from the quaternions in values; those of a zero quaternion become 0."""
         for name in self._names:
             q = np.array([values[f"{name}/{element}"] for element in ELEMENTS])
             size = float(np.linalg.norm(q))

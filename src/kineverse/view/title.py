@@ -1,4 +1,4 @@
-"""The name of what a page shows."""
+"""Title of the page."""
 
 from __future__ import annotations
 
@@ -15,24 +15,24 @@ from kineverse.model.model_view import ModelView
 UNNAMED = "Kineverse"
 
 MOST = 3
-"""Names in a title: there may be more models in one."""
+"""Most names in a title of several models."""
 
 LONGEST = 60
-"""The most characters of one of them."""
+"""Most characters of one of them."""
 
 SUFFIXES = (".urdf", ".xml", ".mjcf", ".sdf", ".world")
-"""Those of files that give what they describe a name."""
+"""Suffixes of files that declare the name of a model."""
 
 NAMED_BY = {"robot": "name", "mujoco": "model", "model": "name", "world": "name"}
-"""The attributes in which elements of URDF, MJCF and SDF have the name of what they describe."""
+"""The attributes of elements of URDF, MJCF and SDF that declare the name of a model."""
 
 
 class _NamedError(Exception):
-    """Ends the reading of a file whose name is known."""
+    """End of reading a file, raised once its name is known."""
 
 
 def choose_title(model: ModelView) -> str:
-    """Return the names that are in front of all frames, such as ``kitchen, pr2``, or ``Kineverse``."""
+    """Return the prefixes of all frames, such as ``kitchen, pr2``, or ``Kineverse``."""
     frames = [name for name in model.frames if name != WORLD]
     prefixes = list(dict.fromkeys(name.partition("/")[0] for name in frames))
     if not frames or not all("/" in name for name in frames):
@@ -41,7 +41,7 @@ def choose_title(model: ModelView) -> str:
 
 
 def read_title(source: str) -> str:
-    """Return the name that a description has in its file, or that of the file.
+    """Return the name of a model that its file declares, or the name of the file.
 
     Parameters
     ----------
@@ -59,7 +59,7 @@ def read_title(source: str) -> str:
 
 
 def _read_declared_name(content: bytes, source: str) -> str:
-    """Return the name that a document of XML gives to what it describes, empty if it gives none."""
+    """Return the name of a model that an XML document declares, empty if it declares none."""
     names: list[str] = []
 
     def note(element: Element) -> None:

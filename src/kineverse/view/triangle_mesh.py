@@ -19,7 +19,7 @@ Integers = npt.NDArray[np.int64]
 
 @dataclass(frozen=True, slots=True, eq=False)
 class TriangleMesh:
-    """A surface of triangles, counter-clockwise seen from outside.
+    """Surface of triangles, counter-clockwise as seen from outside.
 
     A vertex is repeated where the surface has a crease, so that ``normals`` are smooth inside a patch and
     sharp at its border.
@@ -33,9 +33,9 @@ class TriangleMesh:
     normals
         (V, 3) unit normals.
     colors
-        (F, 4) red, green, blue, alpha in [0, 1] where the surface brings its own colours, else None.
+        (F, 4) red, green, blue, alpha in [0, 1] if the surface has its own colours, else None.
     closed
-        Whether nothing is ever seen from inside, so that faces turned away need not be drawn.
+        True if the inside is never visible, so that back faces need not be drawn.
     """
 
     vertices: Floats
@@ -46,12 +46,12 @@ class TriangleMesh:
 
     @property
     def bounds(self) -> Floats:
-        """(2, 3) least and greatest coordinates [m]; zeros where there is no vertex."""
+        """(2, 3) least and greatest coordinates [m]; zeros if there is no vertex."""
         if not len(self.vertices):
             return np.zeros((2, 3))
         return np.array([self.vertices.min(axis=0), self.vertices.max(axis=0)])
 
-    def moved(self, a_T_b: npt.ArrayLike) -> TriangleMesh:
+    def transform(self, a_T_b: npt.ArrayLike) -> TriangleMesh:
         """Return the surface, given in b, in the coordinates of a (a 4×4 rigid transform)."""
         matrix = np.asarray(a_T_b, dtype=float)
         return TriangleMesh(
@@ -62,7 +62,7 @@ class TriangleMesh:
             closed=self.closed,
         )
 
-    def painted(self, colors: Floats) -> TriangleMesh:
+    def with_colors(self, colors: Floats) -> TriangleMesh:
         """Return the surface with (F, 4) colours of its faces."""
         return replace(self, colors=colors)
 
@@ -70,11 +70,11 @@ class TriangleMesh:
         """Return the surface without colours of its own."""
         return self if self.colors is None else replace(self, colors=None)
 
-    def scaled(self, scale: npt.ArrayLike) -> TriangleMesh:
-        """Return the surface stretched along x, y, z; a mirrored one keeps its outside outside."""
+    def scale(self, scale: npt.ArrayLike) -> TriangleMesh:
+        """Return the surface scaled along x, y, z; a mirrored one keeps its outside outside."""
         factors = np.broadcast_to(np.asarray(scale, dtype=float), (3,))
         safe = np.where(factors == 0.0, 1e-12, factors)
-        # Normals are covectors: they stretch by the inverse.
+        # Normals are covectors: they scale by the inverse.
         normals = normalize_rows(self.normals / safe)
         faces = self.faces
         if np.prod(np.sign(safe)) < 0:
@@ -89,7 +89,7 @@ def normalize_rows(vectors: Floats) -> Floats:
 
 
 def dot_rows(a: npt.NDArray[Any], b: npt.NDArray[Any]) -> npt.NDArray[Any]:
-    """Return the (N,) products of two (N, 3) arrays of vectors; several times as fast as ``einsum``."""
+    """Return the (N,) dot products of two (N, 3) arrays; several times as fast as ``einsum``."""
     return np.asarray(a[:, 0] * b[:, 0] + a[:, 1] * b[:, 1] + a[:, 2] * b[:, 2])
 
 
@@ -111,7 +111,7 @@ def concatenate_meshes(surfaces: Sequence[TriangleMesh]) -> TriangleMesh:
 def build_creased_mesh(
     vertices: npt.ArrayLike, faces: npt.ArrayLike, angle: float = 0.6
 ) -> tuple[TriangleMesh, Integers]:
-    """Return a surface whose vertices are split where neighbouring faces meet sharply.
+    """Return a surface whose vertices are split along the sharp edges between faces.
 
     Parameters
     ----------
@@ -124,7 +124,7 @@ def build_creased_mesh(
 
     Returns
     -------
-    The surface, and which of the given faces its faces are.
+    The surface, and the indices of its faces among the given ones.
 
     Notes
     -----
@@ -135,7 +135,7 @@ def build_creased_mesh(
     indices = np.asarray(faces, dtype=np.int64).reshape(-1, 3)
     if not len(points) or not len(indices):
         return concatenate_meshes([]), np.zeros(0, dtype=np.int64)
-    # Corners closer than anyone can see are one; files repeat them with other last digits.
+    # Corners at an invisible distance are one; files repeat them with other last digits.
     grain = 1e-8 * max(float(np.ptp(points, axis=0).max()), 1e-12)
     _, first, merged = np.unique(np.round(points / grain), axis=0, return_index=True, return_inverse=True)
     points, indices = points[first], merged.reshape(-1)[indices]
@@ -146,7 +146,7 @@ def build_creased_mesh(
     if not len(indices):
         return concatenate_meshes([]), np.flatnonzero(solid)
     normals = _corner_normals(indices, areas, len(points), np.cos(angle))
-    # Corners that agree in place and (rounded) normal become one vertex again.
+    # Corners with equal position and (rounded) normal become one vertex again.
     flat = indices.reshape(-1)
     keys = np.concatenate([flat[:, None].astype(float), np.round(normals, 3)], axis=1)
     _, first, inverse = np.unique(keys, axis=0, return_index=True, return_inverse=True)
@@ -160,7 +160,7 @@ def _corner_normals(faces: Integers, areas: Floats, count: int, cosine: float) -
     order = np.argsort(flat, kind="stable")
     degree = np.bincount(flat, minlength=count)
     start = np.concatenate([[0], np.cumsum(degree)[:-1]])
-    # All pairs (corner, face that touches the same vertex).
+    # All pairs of a corner and a face at the same vertex.
     repeats = degree[flat]
     corner = np.repeat(np.arange(len(flat)), repeats)
     step = np.arange(len(corner)) - np.repeat(np.cumsum(repeats) - repeats, repeats)
@@ -174,28 +174,28 @@ def _corner_normals(faces: Integers, areas: Floats, count: int, cosine: float) -
 
 
 CIRCLE_SEGMENTS = 40
-"""Around a full turn: at this number a silhouette looks round at the sizes of rooms and robots."""
+"""Segments of a circle: with so many a silhouette looks round at the sizes of rooms and robots."""
 
 
 @lru_cache(maxsize=4096)
 def mesh_primitive(geometry: Box | Cylinder | Capsule | Sphere | Ellipsoid | Cone) -> TriangleMesh:
-    """Return the surface of a primitive, in its own frame [m]; equal ones share it."""
+    """Return the surface of a primitive, in its own frame [m]; equal primitives share it."""
     if isinstance(geometry, Box):
-        return _unit_box().scaled(geometry.size)
+        return _unit_box().scale(geometry.size)
     if isinstance(geometry, Cylinder):
-        return _unit_cylinder().scaled((geometry.radius, geometry.radius, geometry.length))
+        return _unit_cylinder().scale((geometry.radius, geometry.radius, geometry.length))
     if isinstance(geometry, Sphere):
-        return _unit_sphere().scaled(geometry.radius)
+        return _unit_sphere().scale(geometry.radius)
     if isinstance(geometry, Ellipsoid):
-        return _unit_sphere().scaled(geometry.radii)
+        return _unit_sphere().scale(geometry.radii)
     if isinstance(geometry, Cone):
-        return _unit_cone().scaled((geometry.radius, geometry.radius, geometry.length))
+        return _unit_cone().scale((geometry.radius, geometry.radius, geometry.length))
     return _capsule(geometry.radius, geometry.length)
 
 
 @lru_cache(maxsize=1)
 def _unit_box() -> TriangleMesh:
-    """Return the cube of edge length 1, four vertices of its own for each face."""
+    """Return the cube of edge length 1, with four vertices for each face."""
     corners: list[Floats] = []
     for axis in range(3):
         for sign in (-0.5, 0.5):
@@ -238,7 +238,7 @@ def _unit_cone() -> TriangleMesh:
     ring, up = _ring(), np.array([0.0, 0.0, 0.5])
     i = np.arange(CIRCLE_SEGMENTS)
     outward = (ring + 2.0 * up) / np.sqrt(2.0)
-    between = outward + np.roll(outward, -1, axis=0)  # at the tip each triangle has a direction of its own
+    between = outward + np.roll(outward, -1, axis=0)  # at the tip each triangle has a normal of its own
     wall = TriangleMesh(
         vertices=np.concatenate([ring - up, np.tile(up, (CIRCLE_SEGMENTS, 1))]),
         faces=np.stack([i, (i + 1) % CIRCLE_SEGMENTS, i + CIRCLE_SEGMENTS], axis=1),
@@ -254,7 +254,7 @@ def _ring() -> Floats:
 
 
 def _disc(centre: Floats) -> TriangleMesh:
-    """Return the disc of radius 1 around a point above or below the origin, seen from outside."""
+    """Return the disc of radius 1 around a point above or below the origin, facing outwards."""
     i = np.arange(CIRCLE_SEGMENTS)
     fan = np.stack([np.zeros(CIRCLE_SEGMENTS - 2, dtype=np.int64), i[1:-1], i[2:]], axis=1)
     way = np.array([0.0, 0.0, np.sign(centre[2])])
@@ -293,7 +293,7 @@ def _profile(latitudes: Floats, radius: float, half: float) -> TriangleMesh:
 
 @lru_cache(maxsize=1)
 def mesh_placeholder() -> TriangleMesh:
-    """Return the surface that stands in for a mesh that cannot be read: a small octahedron [m]."""
+    """Return the surface that replaces a mesh that cannot be read: a small octahedron [m]."""
     tips = 0.05 * np.concatenate([np.eye(3), -np.eye(3)])
     faces = [[0, 1, 2], [1, 3, 2], [3, 4, 2], [4, 0, 2], [1, 0, 5], [3, 1, 5], [4, 3, 5], [0, 4, 5]]
     return build_creased_mesh(tips, faces, angle=0.1)[0]

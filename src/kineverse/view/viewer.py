@@ -1,4 +1,4 @@
-"""The page in the browser: a model, its sliders, and one thread that keeps both in step."""
+"""Page of a model in the browser: its scene, its sliders, and a thread that keeps both up to date."""
 
 from __future__ import annotations
 
@@ -29,17 +29,17 @@ from kineverse.view.violations import format_failure, format_violations
 logger = logging.getLogger(__name__)
 
 PERIOD = 1.0 / 30.0
-"""Least time between two updates of the page [s]; what happens in between is drawn once."""
+"""Least time between two updates of the page [s]; requests in between are drawn together."""
 
-EMBEDDED = 600
+EMBEDDED_HEIGHT = 600
 """Height of the page in a notebook [pixels]."""
 
-PANEL = 380
+PANEL_WIDTH = 380
 """Width of the controls: room for the names of joints [pixels]."""
 
 
 class Viewer:
-    """A model shown on a web page of this computer.
+    """Web page that shows a model, with sliders.
 
     The page is up when the constructor returns. Use it as a context, or call :meth:`stop`.
 
@@ -54,24 +54,24 @@ class Viewer:
     label
         The title of the page; None for the names in front of all frames.
     camera
-        Where the page is seen from at first; None for a place from which all is seen.
+        The initial camera; None for one that shows all of the model.
     host
-        The address to listen on. Unless it is this computer's own, :attr:`address` has a token in it, and
-        only who knows that sees the page.
+        The address to listen on. Unless it is this computer's own, :attr:`address` includes a token, and
+        requests without it are refused.
     degrees
-        Whether angles are shown in degrees at first.
+        True to show angles in degrees at first.
 
     Attributes
     ----------
     collisions
-        What touches, and what nearly does.
+        Contacts and nearest pairs of bodies.
 
     Raises
     ------
     MissingDependencyError
         If viser is not installed.
     UnknownNameError
-        If the state names what the model does not have.
+        If the state has a name that the model does not have.
     InvalidValueError
         If the model is none, the port is taken or no port, or the host is not one of this computer.
     """
@@ -89,10 +89,10 @@ class Viewer:
     ) -> None:
         if not isinstance(model, ModelView):
             hint = f" Read it first: kv.load({model!r})." if isinstance(model, str | os.PathLike) else ""
-            raise InvalidValueError(f"A page shows a kineverse.Model, not {_kind(model)}.{hint}")
+            raise InvalidValueError(f"A page shows a kineverse.Model, not {_describe(model)}.{hint}")
         self.model = model
-        # What the page is made of stays what it is while the model is edited, and is exchanged as a whole.
-        self._shown = _fixed(model)
+        # The page is built from a snapshot, which is exchanged as a whole after an edit.
+        self._shown = _freeze(model)
         self._initial = complete(self._shown, state)
         self._values = dict(self._initial)
         self._change = threading.Condition()
@@ -100,7 +100,7 @@ class Viewer:
         self._stopping, self._edited = False, False
         self._driven: set[str] = set()
         self._ended = threading.Event()
-        self._show: RangeAnimation | None = None
+        self._animation: RangeAnimation | None = None
         self._drawn = 0.0
         self._server = web.start(port, label or choose_title(model), host)
         try:
@@ -108,14 +108,14 @@ class Viewer:
                 show_logo=False, show_share_button=False, brand_color=(34, 104, 172)
             )
             self._server.gui.main_panel.dock_right()
-            self._server.gui.main_panel.set_width(PANEL)
+            self._server.gui.main_panel.set_width(PANEL_WIDTH)
             self._scene = ViewerScene(self._server, self._shown, self._values, camera)
             self.collisions = ProximityPanel(self._server, self._scene, model, self._values)
             self._panel = self._build_panel(degrees)
         except BaseException:
             web.stop(self._server)
             raise
-        listen = getattr(model, "listen", None)  # Snapshots never change and have none.
+        listen = getattr(model, "listen", None)  # Snapshots never change and have no listeners.
         self._listener = listen(lambda _: self.refresh()) if listen else None
         self._worker = threading.Thread(target=self._work, name="kineverse-view", daemon=True)
         self._worker.start()
@@ -133,41 +133,41 @@ class Viewer:
 
     @property
     def problems(self) -> list[str]:
-        """What could not be loaded, one line each."""
+        """The meshes that could not be loaded, one line each."""
         return list(self._scene.problems)
 
     @property
     def unplaced(self) -> list[str]:
-        """The frames whose pose is not finite at the values drawn last; nothing of them is shown."""
+        """The frames whose pose is not finite at the values drawn last; their bodies are hidden."""
         return list(self._scene.unplaced)
 
     def pose(self, frame: str) -> Floats:
-        """Return where a frame was drawn last, as a 4×4 transform to the world."""
+        """Return the pose of a frame in the world that was drawn last, 4×4."""
         return self._scene.pose(frame)
 
     def move(self, values: StateLike) -> None:
-        """Set the values of some symbols, by symbol or name, as if their sliders had been moved.
+        """Set the values of some symbols, by symbol or name, as their sliders do.
 
         Raises
         ------
         UnknownNameError
             If the model has no such symbol; nothing has moved then.
         """
-        # The model may have been edited since. It is not waited for with the lock held: whoever edits it may
-        # be waiting for the lock.
-        model = _fixed(self.model)
+        # The model may have been edited since. The lock is not held meanwhile, because the thread that edits
+        # may wait for it.
+        model = _freeze(self.model)
         given = {str(symbol): value for symbol, value in values.items()}
         with self._change:
             moved = complete(model, {**keep_known(model, self._values), **given})
-            # What has been removed from the model goes with the page that was made of it.
+            # Symbols that were removed from the model are dropped when the page is rebuilt.
             self._values = {**self._values, **moved}
-            self._orientations.read(self._values)
-            self._ask(str(name) for name in values)
+            self._quaternions.update(self._values)
+            self._request_update(str(name) for name in values)
 
     def drive(self, speeds: StateLike) -> None:
-        """Let the model move at speeds, by symbol or name, until they are 0 or break a constraint.
+        """Move the model at speeds, by symbol or name, until they are 0 or violate a constraint.
 
-        These are the speeds by which coordinates with rates move, as the wheels of a base do.
+        These are the speeds of coordinates with rates, such as wheel speeds.
 
         Raises
         ------
@@ -176,64 +176,65 @@ class Viewer:
         """
         with self._change:
             for name in map(str, speeds):
-                if name not in self._driving.speeds:
-                    known = suggest(name, self._driving.speeds, "speed")
+                if name not in self._drive.speeds:
+                    known = suggest(name, self._drive.speeds, "speed")
                     raise UnknownNameError(f"Nothing is driven by '{name}'. {known}")
-            self._driving.speeds.update({str(k): float(v) for k, v in speeds.items()})
+            self._drive.speeds.update({str(k): float(v) for k, v in speeds.items()})
             self._drawn = time.monotonic()
-            self._ask()
+            self._request_update()
 
     def reset(self) -> None:
-        """Go back to the state of the start, and stop."""
+        """Go back to the initial state, and stop."""
         with self._change:
-            self._show = None
-            self._driving.stop()
+            self._animation = None
+            self._drive.stop()
             self._values = dict(self._initial)
-            self._orientations.read(self._values)
-            self._ask(self._values)
+            self._quaternions.update(self._values)
+            self._request_update(self._values)
         self._panel.playing.value = False
 
     def play(self, running: bool = True) -> None:
-        """Start or stop moving everything through its range."""
+        """Start or stop the animation of all degrees of freedom through their ranges."""
         with self._change:
-            start = {**self._values, **self._orientations.angles}
-            self._show = RangeAnimation(start, self._animated_ranges(), time.monotonic()) if running else None
-            self._ask()
+            start = {**self._values, **self._quaternions.angles}
+            ranges = self._animated_ranges()
+            self._animation = RangeAnimation(start, ranges, time.monotonic()) if running else None
+            self._request_update()
         self._panel.playing.value = running
 
     def refresh(self) -> None:
-        """Show the model as it is now; values of symbols that remain are kept.
+        """Show the present model; values of symbols that remain are kept.
 
-        This happens by itself after every edit of the model that was given.
+        This happens by itself after every edit of the given model.
         """
         with self._change:
             self._edited = True
-            self._ask()
+            self._request_update()
 
     def settled(self, timeout: float = 10.0) -> bool:
-        """Wait at most ``timeout`` [s] for the page to be up to date; return whether it is."""
+        """Wait at most ``timeout`` [s] for the page to be up to date; return True if it is."""
         begin = time.monotonic()
         with self._change:
             drawn = self._change.wait_for(lambda: self._done >= self._asked, timeout)
-        return drawn and self.collisions.watch.settled(timeout - (time.monotonic() - begin))
+        return drawn and self.collisions.worker.wait_until_idle(timeout - (time.monotonic() - begin))
 
     def wait(self) -> None:
-        """Keep the page up until :meth:`stop` or Ctrl-C; shutting it in the browser changes nothing.
+        """Keep the page up until :meth:`stop` or Ctrl-C; closing it in the browser changes nothing.
 
         Raises
         ------
         KineverseError
-            If there is no page any more.
+            If the page has been taken down.
         """
         if self._stopping:
             raise KineverseError(web.TAKEN_DOWN)
-        # A join that Ctrl-C interrupts takes the thread for finished (Python 3.11), and a wait without a
-        # limit cannot be interrupted on every platform.
+        # After an interrupted join the thread counts as finished (Python 3.11), and a wait without a limit
+        # cannot be interrupted on every platform.
         while not self._ended.wait(timeout=0.5):
             pass
 
     def stop(self) -> None:
-        """Take the page down; calling it again does nothing."""
+        """Take the page down; further calls do nothing."""
         with self._change:
             if self._stopping:
                 return
@@ -253,7 +254,9 @@ class Viewer:
         """Return the page as a part of a notebook."""
         if self._stopping:
             return str(element("i", "This page has been taken down."))
-        return str(element("iframe", src=self.address, width="100%", height=EMBEDDED, style="border:none"))
+        return str(
+            element("iframe", src=self.address, width="100%", height=EMBEDDED_HEIGHT, style="border:none")
+        )
 
     def __enter__(self) -> Viewer:
         return self
@@ -263,57 +266,57 @@ class Viewer:
 
     def _build_panel(self, degrees: bool) -> Panel:
         self._ranges = Ranges(self._shown)
-        self._orientations = QuaternionAngles(self._shown, self._values)
-        self._driving = VelocityDrive(self._shown)
+        self._quaternions = QuaternionAngles(self._shown, self._values)
+        self._drive = VelocityDrive(self._shown)
         self._units = infer_units(self._shown, self._values, self._ranges.names)
-        self._units.update(dict.fromkeys(self._orientations.angles, "rad"))
+        self._units.update(dict.fromkeys(self._quaternions.angles, "rad"))
         return Panel(
             self._server.gui,
             self._scene,
             self.collisions,
             self._ranges,
-            self._orientations,
-            self._driving,
+            self._quaternions,
+            self._drive,
             self._units,
             self._values,
-            moved=self._moved,
-            driven=lambda name, speed: self.drive({name: speed}),
-            reset=self.reset,
-            play=self.play,
+            on_move=self._set_from_slider,
+            on_drive=lambda name, speed: self.drive({name: speed}),
+            on_reset=self.reset,
+            on_play=self.play,
             degrees=degrees,
         )
 
     def _animated_ranges(self) -> dict[str, tuple[float, float]]:
-        limits, angles = self._ranges.at(self._values), self._orientations.angles
+        limits, angles = self._ranges.limits_at(self._values), self._quaternions.angles
         return select_animated(self._shown, limits, angles, self._values, self._units)
 
-    def _moved(self, name: str, value: float) -> None:
-        """Take the value of a slider that somebody moved; what is locked stays and its slider goes back."""
+    def _set_from_slider(self, name: str, value: float) -> None:
+        """Take the value of a slider that a user moved; sliders of locked coordinates are moved back."""
         with self._change:
-            if name in self._orientations.angles:
-                self._values.update(self._orientations.turned(name, value))
-                self._ask()
+            if name in self._quaternions.angles:
+                self._values.update(self._quaternions.set_angle(name, value))
+                self._request_update()
             elif name in self._values:
                 down, up = (False, False)
                 if name in self._ranges.lockable and not self._panel.beyond:
-                    down, up = self._ranges.held(self._values)[name]
+                    down, up = self._ranges.locked_directions(self._values)[name]
                 stays = (down and value < self._values[name]) or (up and value > self._values[name])
                 if not stays:
                     self._values[name] = value
-                self._ask([name] if stays else ())
+                self._request_update([name] if stays else ())
 
-    def _ask(self, set_by_program: Iterable[str] = ()) -> None:
-        """Have the page updated; to be called with the lock held.
+    def _request_update(self, set_by_program: Iterable[str] = ()) -> None:
+        """Request an update of the page; the lock has to be held.
 
-        Only sliders of values that a program has set are moved: one that is being dragged is ahead of what is
-        drawn, and would be torn from the hand.
+        Only sliders of values that a program has set are moved: a slider that is being dragged is ahead of
+        the drawing, and would jump back.
         """
         self._asked += 1
         self._driven.update(set_by_program)
         self._change.notify_all()
 
     def _work(self) -> None:
-        """Draw what was asked for, newest first, until told to stop."""
+        """Draw the newest values until :meth:`stop`."""
         while True:
             with self._change:
                 self._change.wait_for(self._has_work)
@@ -329,66 +332,66 @@ class Viewer:
                 self._change.wait_for(lambda: self._stopping, timeout=PERIOD)
 
     def _has_work(self) -> bool:
-        running = self._show is not None or self._driving.running
+        running = self._animation is not None or self._drive.running
         return self._stopping or self._asked > self._done or running
 
     def _animate(self, now: float) -> None:
-        """Put values where the show and the speeds that are set have them at a time [s]."""
-        if self._show is not None:
-            for name, value in self._show.at(now).items():
-                turns = name in self._orientations.angles
-                changed = self._orientations.turned(name, value) if turns else {name: value}
+        """Set the values that the animation and the speeds give at a time [s]."""
+        if self._animation is not None:
+            for name, value in self._animation.values_at(now).items():
+                turns = name in self._quaternions.angles
+                changed = self._quaternions.set_angle(name, value) if turns else {name: value}
                 self._values.update(changed)
                 self._driven.update(changed)
-        if self._driving.running:
-            moved = self._driving.after(self._values, now - self._drawn)
+        if self._drive.running:
+            moved = self._drive.step(self._values, now - self._drawn)
             self._values.update(moved)
             self._driven.update(moved)
-            self._orientations.read(self._values)
+            self._quaternions.update(self._values)
         self._drawn = now
 
     def _rebuild(self) -> dict[str, float]:
-        """Build the page anew for a model that was edited, and return the values of its symbols."""
-        model = _fixed(self.model)
+        """Rebuild the page for an edited model, and return the values of its symbols."""
+        model = _freeze(self.model)
         with self._change:
-            # Not the values that were to be drawn: somebody may have moved something since.
+            # The present values, because a slider may have moved since the update was requested.
             current = complete(model, keep_known(model, self._values))
-            # After yet another edit there may be values of symbols that this model does not have yet.
+            # After a further edit there may be values of symbols that this model does not have yet.
             self._values = {**self._values, **current} if self._edited else dict(current)
             self._initial = complete(model, keep_known(model, self._initial))
             self._shown = model
-            self._show = None
+            self._animation = None
         self._scene.refresh(model, current)
         self._panel.remove()
         self._panel = self._build_panel(self._panel.degrees)
         return current
 
     def _draw(self, values: Mapping[str, float], driven: Iterable[str], edited: bool) -> None:
-        """Show values, or why they cannot be shown; then everything stays where it was drawn last."""
+        """Show values, or the reason why they cannot be shown; then the drawing stays as it was."""
         try:
             if edited:
                 values = self._rebuild()
             self._panel.update(values, driven)
             self._scene.update(values)
-            self.collisions.watch.update(values, edited)
+            self.collisions.worker.update(values, edited)
             if self.unplaced:
                 self._panel.show(format_failure(f"Not finite, and hidden: {', '.join(self.unplaced)}."))
                 return
-            # A mapping of nothing says nothing, a state of nothing is that of a model that cannot move.
+            # An empty mapping would lack values; an empty state is that of a model without symbols.
             violated = self._shown.violations(State(values))
             self._panel.show(format_violations(violated, violated.unchecked))
         except KineverseError as error:
             self._panel.show(format_failure(str(error)))
         except Exception as error:
-            # The thread outlives whatever one state of a model does to it, and says so.
+            # The thread survives any error at one state, and reports it.
             logger.exception("the page could not be updated")
             self._panel.show(format_failure(f"{type(error).__name__}: {error}"))
 
 
-def _kind(thing: object) -> str:
+def _describe(thing: object) -> str:
     return f"{thing!r:.60}" if isinstance(thing, str | os.PathLike) else f"a {type(thing).__name__}"
 
 
-def _fixed(model: ModelView) -> ModelView:
-    """Return a model as it is now, whatever edits come."""
+def _freeze(model: ModelView) -> ModelView:
+    """Return an immutable snapshot of a model."""
     return model.snapshot() if isinstance(model, Model) else model

@@ -1,4 +1,4 @@
-"""The constraints that a state does not satisfy, as text for the page."""
+"""HTML reports of violated constraints and failures."""
 
 from __future__ import annotations
 
@@ -8,20 +8,20 @@ from typing import Any
 from kineverse.view.hypertext import BREAK, Html, colored_box, element
 
 MOST_LINES = 12
-"""Lines of the panel: more than these are counted, not listed."""
+"""Lines of the panel; further constraints are counted, not listed."""
 
 _RED, _LIGHT_RED = "#c92a2a", "#fff5f5"
 
 
 def format_violations(violations: Iterable[Any], unchecked: Iterable[Any] = ()) -> Html:
-    """Return HTML: that all is well, or each violated constraint with its value, bounds and excess.
+    """Return HTML: each violated constraint with its value, bounds and excess, or that there is none.
 
     Parameters
     ----------
     violations
-        What :meth:`kineverse.Model.violations` returns: name, value, lower, upper, excess.
+        Result of :meth:`kineverse.Model.violations`: name, value, lower, upper, excess.
     unchecked
-        Names of constraints on speeds, about which a posture says nothing.
+        Names of constraints on speeds, which a posture does not determine.
     """
     found = sorted(violations, key=lambda v: -abs(v.excess))
     rest = len(list(unchecked))
@@ -35,7 +35,9 @@ def format_violations(violations: Iterable[Any], unchecked: Iterable[Any] = ()) 
             "div",
             element("b", v.name),
             BREAK,
-            f"{format_significant(v.value)} is not in [{format_significant(v.lower)}, {format_significant(v.upper)}], by {format_significant(v.excess)}",
+            "{} is not in [{}, {}], by {}".format(
+                *map(format_significant, (v.value, v.lower, v.upper, v.excess))
+            ),
             class_="kineverse-violation",
             style="margin-top:3px",
         )
@@ -47,12 +49,12 @@ def format_violations(violations: Iterable[Any], unchecked: Iterable[Any] = ()) 
 
 
 def format_failure(message: str) -> Html:
-    """Return HTML that says why the state on the page cannot be shown."""
+    """Return HTML: the reason why the state on the page cannot be shown."""
     return colored_box(_RED, _LIGHT_RED, element("b", "This state cannot be shown."), BREAK, message)
 
 
 def format_missing_meshes(problems: Sequence[str]) -> Html:
-    """Return HTML that lists what could not be loaded."""
+    """Return HTML: the meshes that could not be loaded."""
     lines = [element("div", line, style="margin-top:3px") for line in problems[:MOST_LINES]]
     if len(problems) > MOST_LINES:
         lines.append(element("div", f"and {len(problems) - MOST_LINES} more"))
@@ -61,6 +63,6 @@ def format_missing_meshes(problems: Sequence[str]) -> Html:
 
 
 def format_significant(value: float) -> str:
-    """Return a number in at most 4 significant digits, with a minus sign one can see."""
+    """Format a number with at most 4 significant digits and a legible minus sign."""
     text = f"{value:.4g}"
     return text.replace("-", "−").replace("inf", "∞")

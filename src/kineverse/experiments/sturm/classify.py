@@ -89,7 +89,7 @@ def draw_recordings(canvas: Canvas, classified: Sequence[Classification]) -> Non
         for place, family, shown in zip(
             part.subplots(1, 4), (families[0], *families, families[1]), (0, 1, 0, 1), strict=True
         ):
-            projection = FitProjection.at(item.result[family], item.recording.poses)
+            projection = FitProjection.from_fit(item.result[family], item.recording.poses)
             (draw_axial_view, draw_side_view)[shown](place, projection)
             place.set_title(
                 f"{family} {item.result[family].probability:.2g}: {place.get_title()}", fontsize="small"
@@ -98,11 +98,13 @@ def draw_recordings(canvas: Canvas, classified: Sequence[Classification]) -> Non
 
 
 def _draw_recording(axes: Axes, item: Classification) -> None:
-    projection = FitProjection.at(item.result.best, item.recording.poses)
+    projection = FitProjection.from_fit(item.result.best, item.recording.poses)
     right, up = (2, 0) if item.result.best.family == "prismatic" else (0, 1)
-    axes.plot(projection.seen[:, right], projection.seen[:, up], ".", markersize=2, color="tab:orange")
-    axes.plot(projection.way[:, right], projection.way[:, up], linewidth=0.8, color="tab:blue")
-    if projection.turns:
+    axes.plot(
+        projection.observed[:, right], projection.observed[:, up], ".", markersize=2, color="tab:orange"
+    )
+    axes.plot(projection.path[:, right], projection.path[:, up], linewidth=0.8, color="tab:blue")
+    if projection.has_axis:
         axes.plot(0.0, 0.0, "+", color="tab:blue", markersize=5)
     axes.set_aspect("equal", adjustable="datalim")
     axes.set_xticks([])
