@@ -35,7 +35,7 @@ _ASKED = 100
 
 @dataclass(frozen=True)
 class Measured(Operation):
-    """Writes a number."""
+    """Operation that writes a number."""
 
     name: str
     value: float
@@ -47,7 +47,7 @@ class Measured(Operation):
 
 @dataclass(frozen=True)
 class Doubled(Operation):
-    """Reads a number of another operation, and writes its double."""
+    """Operation that reads a number and writes its double."""
 
     name: str
     of: str

@@ -28,7 +28,7 @@ _Item = TypeVar("_Item", bound=tuple[Any, ...])
 
 @dataclass(frozen=True, kw_only=True)
 class CloseLoop(Operation, document_kind="CloseLoop"):
-    """Closes a loop between two frames: coordinates of the loop become functions of the free ones.
+    """Closure of a loop between two frames: coordinates of the loop become functions of the free ones.
 
     With ``to_T_frame = (R, p)``, the residual consists of the elements of p [m] and of the axis of R times
     the sine of its angle, ½(R - Rᵀ)^∨ [rad], that ``mask`` names, in axes of ``to``. Where they are zero, the
@@ -238,7 +238,7 @@ APART = 1e-9
 
 @dataclass(frozen=True, kw_only=True)
 class LoopConstraint(Operation, document_kind="LoopConstraint"):
-    """Closes a loop between two frames by equality constraints, one for each row of the residual.
+    """Closure of a loop between two frames by equality constraints, one for each row of the residual.
 
     It serves for loops that :class:`~kineverse.CloseLoop` cannot solve for dependent coordinates. All
     coordinates stay free. :meth:`kineverse.Model.violations` and velocity rows include the closure, and

@@ -20,7 +20,7 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class SetBody(Operation, document_kind="SetBody"):
-    """Sets the body of a frame: visual and collision shapes, and inertia."""
+    """Assignment of a body to a frame: visual and collision shapes, and inertia."""
 
     name: str
     body: Body
@@ -38,7 +38,7 @@ class SetBody(Operation, document_kind="SetBody"):
 
 @dataclass(frozen=True)
 class SetHome(Operation, document_kind="SetHome"):
-    """Sets the home of an articulation: default values of its coordinates [m], [rad]."""
+    """Assignment of the home of an articulation: default values of its coordinates [m], [rad]."""
 
     name: str
     home: tuple[float, ...]
@@ -54,7 +54,7 @@ class SetHome(Operation, document_kind="SetHome"):
 
 @dataclass(frozen=True)
 class AddFrame(Operation, document_kind="AddFrame"):
-    """Adds a frame to a parent, with an optional body."""
+    """New frame in a parent, with an optional body."""
 
     name: str
     frame: Frame
@@ -72,7 +72,7 @@ class AddFrame(Operation, document_kind="AddFrame"):
 
 @dataclass(frozen=True)
 class Constrain(Operation, document_kind="Constrain"):
-    """Adds a constraint."""
+    """New constraint."""
 
     name: str
     constraint: Constraint
@@ -88,7 +88,7 @@ class Constrain(Operation, document_kind="Constrain"):
 
 @dataclass(frozen=True)
 class SetRate(Operation, document_kind="SetRate"):
-    """Sets the rate of a coordinate as a linear function of speeds."""
+    """Assignment of the rate of a coordinate as a linear function of speeds."""
 
     coordinate: Symbol
     row: RateRow
@@ -104,7 +104,7 @@ class SetRate(Operation, document_kind="SetRate"):
 
 @dataclass(frozen=True)
 class SetData(Operation, document_kind="Write"):
-    """Stores data."""
+    """Assignment of a datum."""
 
     name: str
     value: Any
@@ -120,7 +120,7 @@ class SetData(Operation, document_kind="Write"):
 
 @dataclass(frozen=True)
 class Attach(Operation, document_kind="Attach"):
-    """Attaches an existing frame, with all frames below it, to another parent."""
+    """Move of an existing frame, with all frames below it, to another parent."""
 
     name: str
     frame: Frame
@@ -138,7 +138,7 @@ class Attach(Operation, document_kind="Attach"):
 
 @dataclass(frozen=True)
 class Override(Operation, document_kind="Override"):
-    """Applies an operation with permission to overwrite values of earlier ones."""
+    """Operation with permission to overwrite values of earlier ones."""
 
     overrides = True
 
@@ -160,7 +160,7 @@ class Override(Operation, document_kind="Override"):
 
 @dataclass(frozen=True)
 class SoftLimits(Operation, document_kind="SoftLimits"):
-    """Limits a joint to the range of its safety controller, which is inside the hard limits.
+    """Limits of a joint by its safety controller, inside the hard limits.
 
     Attributes
     ----------

@@ -116,7 +116,7 @@ def to_mjcf(
 
 
 class MjcfWriter:
-    """Writes one description.
+    """Writer of one description.
 
     ``home`` is the home position of every coordinate, by its path, which becomes the key ``home``.
     ``excluded_files`` are references to mesh files that are left out.
