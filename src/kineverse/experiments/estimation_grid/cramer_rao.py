@@ -19,12 +19,9 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
-import numpy.typing as npt
 
 from kineverse.experiments.estimation_grid.samples import Cell, JointSamples, joint_motions
-from kineverse.lie import retract
-
-Array = npt.NDArray[np.float64]
+from kineverse.lie import Array, retract
 
 STEP = 1e-5
 """Of the central differences [m], [rad]: their error is its square."""

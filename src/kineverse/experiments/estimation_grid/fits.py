@@ -12,7 +12,6 @@ from contextlib import contextmanager
 from itertools import product
 
 import numpy as np
-import numpy.typing as npt
 
 from kineverse.errors import KineverseError
 from kineverse.estimation import identify, pose_covariance
@@ -21,8 +20,7 @@ from kineverse.experiments.estimation_grid.cramer_rao import Bound, compute_atta
 from kineverse.experiments.estimation_grid.results import CellResult
 from kineverse.experiments.estimation_grid.samples import Cell, Joint, JointSamples, draw_samples
 from kineverse.experiments.registry import Progress
-
-Array = npt.NDArray[np.float64]
+from kineverse.lie import Array
 
 SEED = 2011
 SAMPLES = 50

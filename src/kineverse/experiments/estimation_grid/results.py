@@ -10,8 +10,8 @@ import numpy as np
 import numpy.typing as npt
 
 from kineverse.experiments.estimation_grid.samples import Cell
+from kineverse.lie import Array
 
-Array = npt.NDArray[np.float64]
 Flags = npt.NDArray[np.bool_]
 
 NEAR, TELLING = 10.0, 5.0

@@ -13,11 +13,9 @@ from dataclasses import dataclass
 from typing import Literal
 
 import numpy as np
-import numpy.typing as npt
 
-from kineverse.lie import exp_so3, quaternion, retract, transform, translation, unit_vector
+from kineverse.lie import Array, exp_so3, quaternion, retract, transform, translation, unit_vector
 
-Array = npt.NDArray[np.float64]
 Joint = Literal["prismatic", "revolute"]
 
 TO_AXIS, LEVER = 0.5, 0.4

@@ -13,14 +13,11 @@ from pathlib import Path
 from types import MappingProxyType
 from typing import Literal
 
-import numpy as np
-import numpy.typing as npt
-
 from kineverse.errors import FormatError
 from kineverse.estimation.noise import pose_covariance
 from kineverse.estimation.recordings import read_recording
+from kineverse.lie import Array
 
-Array = npt.NDArray[np.float64]
 Label = Literal["revolute", "prismatic"]
 
 FOLDER = "sturm_tracks"
