@@ -108,13 +108,13 @@ def test_documented_commands_print_the_documented_output(page, at_the_root, page
     assert pages == [(200, True)] * opened
 
 
-def test_the_demo_is_opened_and_answers(at_the_root, pages, capsys):
+def test_the_demo_serves_its_page(at_the_root, pages, capsys):
     """``make demo`` calls this."""
     assert main(["demo"]) == 0
     assert pages == [(200, True)]
 
 
-def test_the_helps_show_commands_that_can_be_said(capsys):
+def test_commands_in_help_texts_parse(capsys):
     """Each line that begins with ``kineverse`` below a heading "examples"."""
     shown = [make_parser().format_help()]
     for name in COMMANDS:

@@ -154,7 +154,7 @@ MADE = {
 
 
 @pytest.mark.parametrize("mistake", PYTHON, ids=lambda m: m.name)
-def test_a_newcomers_code_works_or_names_the_alternative(mistake, monkeypatch):
+def test_code_for_other_libraries_works_or_names_the_equivalent(mistake, monkeypatch):
     if "coal" in mistake.name:
         monkeypatch.setitem(sys.modules, "coal", None)
         assert kv.geometry
@@ -169,7 +169,7 @@ def test_a_newcomers_code_works_or_names_the_alternative(mistake, monkeypatch):
 
 
 @pytest.mark.parametrize("call", [f"m.{method}" for method in METHODS] + CALLS)
-def test_numpy_idioms_work_or_name_the_alternative(call):
+def test_numpy_idioms_work_or_name_the_equivalent(call):
     said = ""
     try:
         assert eval(call, {}, Names()) is not None
@@ -204,7 +204,7 @@ COMMANDS = [
 
 
 @pytest.mark.parametrize("mistake", COMMANDS, ids=lambda m: m.name)
-def test_a_wrong_command_names_the_alternative(mistake, tmp_path, monkeypatch):
+def test_an_unknown_command_names_a_similar_one(mistake, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     (tmp_path / "robot.urdf.xacro").write_text(
         '<robot name="r" xmlns:xacro="http://ros.org/wiki/xacro"><xacro:include filename="a.xacro"/></robot>'
@@ -223,10 +223,10 @@ def test_a_wrong_command_names_the_alternative(mistake, tmp_path, monkeypatch):
     assert status == (0 if "--set kitchen/" in mistake.code else 2)
 
 
-def test_comparing_with_a_number_is_warned_of_in_the_docs():
+def test_docs_warn_of_comparing_an_expression_with_a_number():
     """``if q == 0.3`` compares what is written, so that it is False; nothing can say so when it happens."""
     assert any("if q == 0.3" in page.read_text(encoding="utf-8") for page in (ROOT / "docs").glob("*.md"))
 
 
-def test_the_walk_is_long_enough():
+def test_the_table_of_mistakes_is_long_enough():
     assert len(PYTHON) + len(COMMANDS) >= 25

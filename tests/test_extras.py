@@ -25,12 +25,12 @@ def pip() -> str:
     return f"{HERE.with_name('pip')}" if HERE.with_name("pip").is_file() else f"{HERE} -m pip"
 
 
-def test_a_checkout_is_installed_again_with_the_extra(tmp_path, monkeypatch):
+def test_install_command_of_a_checkout_is_editable_with_the_extra(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     assert install_command("figures") == f"{pip()} install -e '{ROOT}[figures]'"
 
 
-def test_in_the_checkout_the_line_is_short(tmp_path, monkeypatch):
+def test_install_command_in_the_checkout_is_relative(tmp_path, monkeypatch):
     root = tmp_path / "clone"
     (root / "src" / "kineverse").mkdir(parents=True)
     (root / ".venv" / "bin").mkdir(parents=True)
@@ -68,14 +68,14 @@ def test_install_command_of_an_installed_copy_lists_the_extra(tmp_path):
     assert "extra" not in said[1]
 
 
-def test_a_folder_on_the_path_is_told_to_look_for_a_checkout(tmp_path, monkeypatch):
+def test_install_command_without_metadata_asks_for_a_checkout(tmp_path, monkeypatch):
     monkeypatch.setattr(_extras, "__file__", str(tmp_path / "a" / "kineverse" / "_extras.py"))
     monkeypatch.setattr(_extras, "DISTRIBUTION", "no-such-distribution")
     assert install_command("view").endswith("install -e '.[view]' in a checkout")
 
 
 @pytest.mark.parametrize("extra", [name for name in EXTRAS if name != "all"])
-def test_metadata_list_each_extra(extra):
+def test_requirements_of_each_extra_are_in_the_metadata(extra):
     declared = metadata.requires(DISTRIBUTION)
     found = requirements(extra, declared)
     assert [line.partition(";")[0].strip() for line in found] == [
@@ -83,7 +83,7 @@ def test_metadata_list_each_extra(extra):
     ]
 
 
-def test_every_place_that_misses_an_extra_says_the_same_line():
+def test_every_missing_extra_names_the_same_install_command():
     """No message names the distribution to pip, and each names an extra that there is."""
     named = set()
     for file in sorted((ROOT / "src").rglob("*.py")):

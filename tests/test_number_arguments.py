@@ -36,7 +36,7 @@ NUMBERS = [0.5, 1, np.float32(0.5), np.float64(0.5), np.int8(1), np.array(0.5), 
 
 @pytest.mark.parametrize("value", NO_NUMBERS, ids=repr)
 @pytest.mark.parametrize("taker", TAKERS)
-def test_values_that_are_no_real_numbers_are_refused(taker, value) -> None:
+def test_values_that_are_not_real_numbers_are_refused(taker, value) -> None:
     with warnings.catch_warnings(), pytest.raises(kv.errors.InvalidValueError, match="number"):
         warnings.simplefilter("ignore")  # numpy's own, which a user may not look at
         TAKERS[taker](value)

@@ -108,7 +108,8 @@ def __getattr__(name: str) -> object:
         return importlib.import_module(f"kineverse.{name}")
     if name == "show":
         return importlib.import_module("kineverse.view.show").show
-    from ._synonyms import MODULE_SYNONYMS, unknown_attribute_error
+    from ._synonyms import MODULE_SYNONYMS
+    from .errors import unknown_attribute_error
 
     below: dict[str, str] = {}
     for package in (expressions, spatial, logic, errors, loops, formats, model, articulations):

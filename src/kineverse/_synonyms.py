@@ -2,10 +2,7 @@
 
 from __future__ import annotations
 
-import difflib
-from collections.abc import Iterable, Mapping
-
-from .errors import UnknownAttributeError
+from collections.abc import Mapping
 
 MODULE_SYNONYMS: Mapping[str, str] = {
     "Hinge": "kv.Revolute",
@@ -168,32 +165,3 @@ STATE_SYNONYMS: Mapping[str, str] = {
     "symbols": "state.keys()",
     "to_dict": "dict(state)",
 }
-
-
-def unknown_attribute_error(
-    owner: str, name: str, available: Iterable[str], elsewhere: Mapping[str, str]
-) -> UnknownAttributeError:
-    """Return the error for an unknown attribute, with similar names or the equivalent of a foreign name.
-
-    Parameters
-    ----------
-    owner
-        The object, as the subject of a sentence.
-    name
-        The unknown attribute.
-    available
-        The known attributes.
-    elsewhere
-        From names in other libraries to their equivalents here.
-    """
-    problem = f"{owner} has no {name!r}."
-    if name.startswith("_"):
-        return UnknownAttributeError(problem)
-    if name in elsewhere:
-        return UnknownAttributeError(f"{problem} Here that is {elsewhere[name]}.")
-    public = sorted({one for one in available if not one.startswith("_")})
-    by_lower: dict[str, str] = {one.lower(): one for one in public}
-    close = [by_lower[match] for match in difflib.get_close_matches(name.lower(), by_lower, n=3, cutoff=0.6)]
-    if close:
-        return UnknownAttributeError(f"{problem} Did you mean {' or '.join(map(repr, close))}?")
-    return UnknownAttributeError(f"{problem} dir(...) lists what there is.")

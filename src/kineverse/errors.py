@@ -132,5 +132,34 @@ def suggest(name: str, available: Iterable[str], what: str = "name", limit: int 
     return f"Available: {', '.join(map(_shorten, names[:limit]))}{more}."
 
 
+def unknown_attribute_error(
+    owner: str, name: str, available: Iterable[str], elsewhere: Mapping[str, str]
+) -> UnknownAttributeError:
+    """Return the error for an unknown attribute, with similar names or the equivalent of a foreign name.
+
+    Parameters
+    ----------
+    owner
+        The object, as the subject of a sentence.
+    name
+        The unknown attribute.
+    available
+        The known attributes.
+    elsewhere
+        From names in other libraries to their equivalents here.
+    """
+    problem = f"{owner} has no {name!r}."
+    if name.startswith("_"):
+        return UnknownAttributeError(problem)
+    if name in elsewhere:
+        return UnknownAttributeError(f"{problem} Here that is {elsewhere[name]}.")
+    public = sorted({one for one in available if not one.startswith("_")})
+    by_lower: dict[str, str] = {one.lower(): one for one in public}
+    close = [by_lower[match] for match in difflib.get_close_matches(name.lower(), by_lower, n=3, cutoff=0.6)]
+    if close:
+        return UnknownAttributeError(f"{problem} Did you mean {' or '.join(map(repr, close))}?")
+    return UnknownAttributeError(f"{problem} dir(...) lists what there is.")
+
+
 def _shorten(name: str) -> str:
     return name if len(name) <= _LONGEST else f"{name[: _LONGEST - 1]}…"

@@ -8,7 +8,7 @@ from collections.abc import Iterable, Iterator, Mapping
 from typing import TYPE_CHECKING, Any, TypeAlias
 
 from ._checks import real_number
-from ._synonyms import STATE_SYNONYMS, unknown_attribute_error
+from ._synonyms import STATE_SYNONYMS
 from .errors import (
     DuplicateNameError,
     ExpressionError,
@@ -18,6 +18,7 @@ from .errors import (
     UnknownNameError,
     duplicate_value_error,
     suggest,
+    unknown_attribute_error,
 )
 from .expressions.printing import html_table
 from .symbols import Symbol, parse_symbol_name

@@ -13,7 +13,7 @@ from scipy.optimize import linprog
 from scipy.spatial.transform import Rotation
 
 import kineverse as kv
-import motion_law
+import time_derivative_checks
 from kineverse.formats.document import to_json
 
 Matrix = np.ndarray[Any, np.dtype[np.float64]]
@@ -79,7 +79,7 @@ def assert_motion_law(
     start = random_state(model, seed) if start is None else start
     rng = np.random.default_rng(seed + 1)
     speeds = {s: float(rng.uniform(-1, 1)) for s in model.speeds}
-    motion_law.assert_motion_law(model, expressions, start, speeds)
+    time_derivative_checks.assert_time_derivatives(model, expressions, start, speeds)
 
 
 def assert_rows_keep_limits(

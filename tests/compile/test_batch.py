@@ -118,7 +118,7 @@ def test_points_of_any_type_and_strides(function: kv.CompiledFunction) -> None:
         None,
     ],
 )
-def test_what_are_no_points_is_refused(function: kv.CompiledFunction, x: object) -> None:
+def test_invalid_points_are_refused(function: kv.CompiledFunction, x: object) -> None:
     with pytest.raises(kv.errors.ShapeError, match=r"shape \(N, 7\)"):
         function.batch(x)
 
@@ -141,7 +141,7 @@ def test_out_that_does_not_fit_is_refused() -> None:
     assert f.batch(x, out=[first, second])[1] is second
 
 
-def test_out_may_be_where_the_points_are() -> None:
+def test_out_may_share_memory_with_the_points() -> None:
     f = kv.compile(kv.array([b, a + b]), [a, b])
     x = np.arange(40.0).reshape(20, 2)
     wanted = f.batch(x.copy())
@@ -196,14 +196,14 @@ def collect(element: ca.SX, elements: dict[int, ca.SX]) -> None:
 
 
 @pytest.mark.compiler
-def test_every_operation() -> None:
+def test_every_operation_equals_single_calls() -> None:
     check_every_value(every_operation(depth=4), points(4003, 5))
 
 
 @pytest.mark.compiler
 @settings(max_examples=attempts(5), suppress_health_check=[HealthCheck.too_slow])
 @given(random_programs())
-def test_random_programs(program: RandomProgram) -> None:
+def test_random_programs_equal_single_calls(program: RandomProgram) -> None:
     check_every_value(program, points(1003, 5))
 
 
@@ -218,7 +218,7 @@ def test_programs_longer_than_one_c_function(monkeypatch: pytest.MonkeyPatch) ->
 
 
 @pytest.mark.parametrize("count", [0, 1, 5, 32, 33, 100])
-def test_the_interpreter_does_batches_too(count: int) -> None:
+def test_batches_by_the_interpreter(count: int) -> None:
     mechanism = arm()
     f = kv.compile([mechanism.pose, mechanism.jacobian], tier="interpreter")
     x = np.random.default_rng(0).uniform(-3, 3, (count, 7))
@@ -228,7 +228,7 @@ def test_the_interpreter_does_batches_too(count: int) -> None:
 
 
 @pytest.mark.compiler
-def test_small_batches_are_interpreted_and_add_up() -> None:
+def test_small_batches_are_interpreted_until_they_add_up() -> None:
     f = kv.compile([a * b * 3.375, kv.array([a, b])])
     x = np.ones((10, 2))
     f.batch(x)
@@ -286,7 +286,7 @@ def test_pieces_make_up_all_rows(monkeypatch: pytest.MonkeyPatch) -> None:
         assert sorted(done) == list(range(count))
 
 
-def test_memory_of_results_is_used_again_only_when_they_are_gone() -> None:
+def test_memory_is_reused_only_after_results_are_deleted() -> None:
     size = memory._SMALLEST_BUFFER // 8 + 1
     first = memory.allocate_aligned(size)
     assert first.ctypes.data % 64 == 0
@@ -307,7 +307,7 @@ def test_memory_of_results_is_used_again_only_when_they_are_gone() -> None:
     assert np.all(second == 2.0)
 
 
-def test_no_more_memory_is_kept_than_allowed(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_free_memory_is_bounded(monkeypatch: pytest.MonkeyPatch) -> None:
     memory._free_blocks.clear()
     size = memory._SMALLEST_BUFFER // 8 + 1
     monkeypatch.setattr(memory, "_LARGEST_TOTAL", 2 * 8 * size + 200)

@@ -58,7 +58,7 @@ def libraries(folder: Path) -> list[Path]:
 
 
 @pytest.mark.compiler
-def test_a_library_is_made_once(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_library_is_compiled_once(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     compiled()
     found = libraries(folder)
     assert found
@@ -71,7 +71,7 @@ def test_a_library_is_made_once(folder: Path, monkeypatch: pytest.MonkeyPatch) -
 
 @pytest.mark.compiler
 @pytest.mark.parametrize("damage", ["changed", "truncated", "empty", "text"])
-def test_a_damaged_library_is_made_anew(
+def test_a_damaged_library_is_compiled_again(
     folder: Path, elsewhere: Path, damage: str, caplog: pytest.LogCaptureFixture
 ) -> None:
     shutil.copytree(elsewhere, folder)
@@ -94,7 +94,7 @@ def test_a_damaged_library_is_made_anew(
 
 
 @pytest.mark.compiler
-def test_a_library_that_cannot_be_loaded_is_made_anew(folder: Path, elsewhere: Path) -> None:
+def test_a_library_that_cannot_be_loaded_is_compiled_again(folder: Path, elsewhere: Path) -> None:
     shutil.copytree(elsewhere, folder)
     path = next(p for p in libraries(folder) if p.stem == kv.compile(outputs(), tier="c")._library._key)
     content = b"whole, but no library"
@@ -168,7 +168,7 @@ def test_a_folder_that_others_can_write_to_is_refused(folder: Path, caplog: pyte
     assert library_cache().folder == folder
 
 
-def test_a_folder_of_someone_else_is_refused(
+def test_a_folder_of_another_user_is_refused(
     folder: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
 ) -> None:
     folder.mkdir(parents=True)
@@ -179,7 +179,7 @@ def test_a_folder_of_someone_else_is_refused(
     assert "belongs to another user" in caplog.text
 
 
-def test_what_was_used_longest_ago_makes_room(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_least_recently_used_libraries_are_removed(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     store = library_cache()
     monkeypatch.setattr(cache, "MAXIMUM_BYTES", 350)
     place = store.create_build_folder()
@@ -193,7 +193,7 @@ def test_what_was_used_longest_ago_makes_room(folder: Path, monkeypatch: pytest.
     assert [p.stem for p in libraries(folder)] == ["a", "d", "e"]
 
 
-def test_remains_of_killed_processes_are_removed(folder: Path) -> None:
+def test_build_folders_of_killed_processes_are_removed(folder: Path) -> None:
     store = library_cache()
     old, new = Path(store.create_build_folder()), Path(store.create_build_folder())
     (old / "library.so").write_text("half")
@@ -239,7 +239,7 @@ assert os.waitstatus_to_exitcode(os.waitpid(child, 0)[1]) == 0
     subprocess.run([sys.executable, "-W", "ignore", "-c", program], env=environment, timeout=120, check=True)
 
 
-def test_information() -> None:
+def test_compiler_information() -> None:
     found = compiler_information()
     assert found.cache_folder == str(library_cache().folder)
     assert found.vector_unit in ("avx512", "avx2", "avx", "sse2", "neon", "none")

@@ -47,7 +47,7 @@ def test_shapes_of_any_dimension_are_in_c_order() -> None:
     assert empty.shape == (0, 3)
 
 
-def test_a_function_of_nothing() -> None:
+def test_a_function_without_inputs() -> None:
     f = kv.compile(np.eye(3))
     assert f.inputs == ()
     assert np.array_equal(f([]), np.eye(3))
@@ -70,7 +70,7 @@ def test_calls_share_no_memory(tier: str, outputs: int) -> None:
 
 
 @in_each_tier
-def test_vectors_of_every_kind_are_the_same_vector(tier: str) -> None:
+def test_vectors_of_every_type_are_accepted(tier: str) -> None:
     f = kv.compile(kv.array([a, b, a * b]), tier=tier, wait=tier == "c")
     wanted = [1.0, -3.0, -3.0]
     strided = np.zeros((2, 4))
@@ -110,7 +110,7 @@ def test_missing_and_unknown_names_are_listed() -> None:
 
 
 @pytest.mark.parametrize("value", [np.nan, float("nan"), "0.3", None, [1.0, 2.0], a + 1, 1j, 10**400])
-def test_values_that_are_no_numbers_are_refused_by_name(value: object) -> None:
+def test_values_that_are_not_numbers_are_refused_by_name(value: object) -> None:
     f = kv.compile(a + b)
     with pytest.raises(kv.errors.InvalidValueError, match="door/a"):
         f({"door/a": value, "door/b": 1.0})
@@ -124,7 +124,7 @@ def test_values_that_are_no_numbers_are_refused_by_name(value: object) -> None:
         [a, b], [[1.0], [2.0, 3.0]], None, np.float64(1.0), np.zeros(2, dtype="m8[s]"), b"12345678" * 2, a,
     ],
 )  # fmt: skip
-def test_what_is_no_vector_of_that_length_is_refused(tier: str, x: object) -> None:
+def test_vectors_of_a_wrong_shape_are_refused(tier: str, x: object) -> None:
     f = kv.compile([a, a + b], tier=tier, wait=tier == "c")
     evaluator = f.bind()
     with pytest.raises(kv.errors.ShapeError, match=r"2 numbers \('door/a', 'door/b'\)"):
@@ -136,14 +136,14 @@ def test_what_is_no_vector_of_that_length_is_refused(tier: str, x: object) -> No
 
 
 @in_each_tier
-def test_nan_in_a_vector_goes_through(tier: str) -> None:
+def test_nan_in_a_vector_propagates(tier: str) -> None:
     f = kv.compile(kv.array([a + 1, b + 1]), tier=tier, wait=tier == "c")
     first, second = f([np.nan, 1.0])
     assert np.isnan(first)
     assert second == 2.0
 
 
-def test_inputs_that_are_no_symbols() -> None:
+def test_inputs_that_are_not_symbols_are_refused() -> None:
     for inputs in (a + b, [a, a + b], [a, "door/b"], "door/a", 3.0, a, [[a, b]]):
         with pytest.raises(kv.errors.ExpressionError, match="swapped"):
             kv.compile(a + b, inputs)  # type: ignore[arg-type]
@@ -151,7 +151,7 @@ def test_inputs_that_are_no_symbols() -> None:
         kv.compile([a, b], a * b)  # type: ignore[arg-type]
 
 
-def test_inputs_that_do_not_fit_the_outputs() -> None:
+def test_inputs_that_miss_a_symbol_are_refused() -> None:
     with pytest.raises(kv.errors.UnknownNameError, match="'door/a:velocity', 'door/b'"):
         kv.compile(a + b + c, [a])
     with pytest.raises(kv.errors.DuplicateNameError, match="'door/a' is given twice"):
@@ -181,7 +181,7 @@ def test_pickled_and_copied() -> None:
     assert all(same_bits(v, w) for v, w in zip(f(x), g(x), strict=True))
 
 
-def test_text_is_bounded() -> None:
+def test_repr_is_bounded() -> None:
     symbols = [kv.position(f"many/x{i}") for i in range(500)]
     assert len(repr(kv.compile(symbols, tier="interpreter"))) < 300
     assert "4 inputs" in repr(kv.compile(kv.array(symbols[:4])))
@@ -221,7 +221,7 @@ def test_an_evaluator_outlives_its_function(tier: str) -> None:
         assert evaluator.outputs[0] == 2.0 * i
 
 
-def test_a_function_of_constants_is_called_without_anything():
+def test_a_function_of_constants_is_called_without_arguments():
     for tier in ("interpreter", "auto"):
         f = kv.compile([kv.rotation_z(0.0), kv.array(3.0)], tier=tier)
         assert f.inputs == ()

@@ -63,7 +63,7 @@ def as_nobody(script: str, given: bytes) -> None:
     subprocess.run(["/bin/sh", "-ec", script], input=given, cwd="/", check=True, **nobody)  # type: ignore[call-overload]
 
 
-def test_what_was_stored_is_loaded_and_nobody_elses(folder: Path) -> None:
+def test_stored_libraries_are_private_and_loaded(folder: Path) -> None:
     before = os.umask(0o002)
     try:
         library = Path(library_cache().create_build_folder(), "library.so")
@@ -106,7 +106,7 @@ PLANTED = {
 
 
 @pytest.mark.parametrize("plant", PLANTED, ids=lambda plant: plant.__name__)
-def test_what_was_planted_is_removed_and_not_loaded(
+def test_planted_libraries_are_removed_and_not_loaded(
     folder: Path, tmp_path: Path, caplog: pytest.LogCaptureFixture, plant: Callable[[Path, Path], None]
 ) -> None:
     elsewhere = tmp_path / "elsewhere.so"
@@ -123,7 +123,7 @@ def test_what_was_planted_is_removed_and_not_loaded(
 
 
 @as_root
-def test_a_file_that_another_user_left_is_not_loaded(
+def test_a_file_of_another_user_is_not_loaded(
     open_place: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
 ) -> None:
     folder = open_place / "libraries"
@@ -139,7 +139,7 @@ def test_a_file_that_another_user_left_is_not_loaded(
 
 
 @as_root
-def test_a_folder_that_another_user_swaps_is_not_asked(open_place: Path) -> None:
+def test_a_folder_that_another_user_replaces_is_not_used(open_place: Path) -> None:
     """Even where the check of the way is left out: what was opened stays what is used."""
     folder = open_place / "libraries"
     folder.mkdir(mode=0o700)
@@ -154,7 +154,7 @@ def test_a_folder_that_another_user_swaps_is_not_asked(open_place: Path) -> None
         PrivateFolder(folder)
 
 
-def test_a_file_that_is_swapped_after_the_check_is_not_loaded(folder: Path) -> None:
+def test_a_file_that_is_replaced_after_the_check_is_not_loaded(folder: Path) -> None:
     found = library_cache()
     path = folder / f"{KEY}.so"
     path.write_bytes(whole(b"good"))
@@ -171,7 +171,7 @@ def test_a_file_that_is_swapped_after_the_check_is_not_loaded(folder: Path) -> N
 
 
 @as_root
-def test_a_link_of_another_user_on_the_way_is_refused(open_place: Path, tmp_path: Path) -> None:
+def test_a_link_of_another_user_on_the_path_is_refused(open_place: Path, tmp_path: Path) -> None:
     link = open_place / "link"
     (tmp_path / "mine").mkdir(mode=0o700)
     link.symlink_to(tmp_path / "mine")
@@ -183,7 +183,7 @@ def test_a_link_of_another_user_on_the_way_is_refused(open_place: Path, tmp_path
 
 
 @as_root
-def test_a_folder_of_another_user_on_the_way_is_refused(open_place: Path) -> None:
+def test_a_folder_of_another_user_on_the_path_is_refused(open_place: Path) -> None:
     (open_place / "theirs" / "mine").mkdir(parents=True)
     (open_place / "theirs" / "mine").chmod(0o700)
     os.chown(open_place / "theirs", NOBODY, NOBODY)
@@ -208,13 +208,13 @@ def test_a_parent_that_others_can_write_to_is_refused_unless_it_is_sticky(
         )
 
 
-def test_a_folder_that_is_opened_to_others_later_is_given_up(folder: Path) -> None:
+def test_a_folder_that_becomes_writable_by_others_is_not_used(folder: Path) -> None:
     assert library_cache().folder == folder
     folder.chmod(0o777)
     assert library_cache().folder != folder
 
 
-def test_a_folder_that_is_removed_is_made_anew(folder: Path) -> None:
+def test_a_removed_folder_is_created_again(folder: Path) -> None:
     assert library_cache().folder == folder
     folder.rmdir()
     assert library_cache().folder == folder
@@ -235,7 +235,7 @@ def test_the_advice_is_to_remove_a_folder_and_not_to_trust_it(
     ]
 
 
-def test_where_the_system_names_no_descriptors_a_private_copy_is_loaded(
+def test_a_private_copy_is_loaded_without_paths_of_descriptors(
     folder: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(cache, "_DESCRIPTORS", "/nowhere/")
@@ -248,7 +248,7 @@ def test_where_the_system_names_no_descriptors_a_private_copy_is_loaded(
     assert Path(paths[0]).parent.stat().st_mode & 0o777 == 0o700
 
 
-def test_no_two_libraries_are_loaded_by_the_same_name(folder: Path) -> None:
+def test_every_library_is_loaded_by_a_unique_path(folder: Path) -> None:
     found = library_cache()
     (folder / f"{KEY}.so").write_bytes(whole(b"good"))
     (folder / f"{KEY}.so").chmod(0o600)
@@ -282,7 +282,7 @@ def other_machine(library: bytes) -> bytes:
 
 @pytest.mark.compiler
 @pytest.mark.parametrize("what", ["another library", "another machine"])
-def test_a_library_without_the_function_is_made_anew(
+def test_a_library_without_the_function_is_compiled_again(
     folder: Path, another_library: bytes, what: str, caplog: pytest.LogCaptureFixture
 ) -> None:
     planted = whole(another_library if what == "another library" else other_machine(another_library))
@@ -307,7 +307,7 @@ def test_a_library_without_the_function_is_made_anew(
 
 
 @pytest.mark.compiler
-def test_c_by_hand_is_made_anew_where_the_cache_holds_another(folder: Path, another_library: bytes) -> None:
+def test_hand_written_c_is_compiled_again_if_the_cache_has_another_library(folder: Path, another_library: bytes) -> None:
     def declare(code: ctypes.CDLL) -> None:
         code.answer.restype = ctypes.c_int
 

@@ -58,7 +58,7 @@ def wanted(program: Program, inputs: np.ndarray) -> list[np.ndarray]:
 
 @pytest.mark.compiler
 @pytest.mark.parametrize("machine", MACHINES)
-def test_within_four_ulp(
+def test_simd_functions_are_within_four_ulp(
     program: Program, inputs: np.ndarray, wanted: list[np.ndarray], machine: str, tmp_path: Path
 ) -> None:
     compiler = toolchain()

@@ -74,7 +74,7 @@ def test_calls_through_casadi_and_through_the_extension_agree(monkeypatch: pytes
         assert all(same_bits(v, w) for v, w in zip(evaluator.outputs, slow.outputs, strict=True))
 
 
-def test_other_names_are_the_same_library() -> None:
+def test_renamed_symbols_share_the_library() -> None:
     first, second = arm("left"), arm("right")
     assert Program([first.pose], first.symbols).key() == Program([second.pose], second.symbols).key()
     assert Program([first.pose], first.symbols).key() != Program([first.jacobian], first.symbols).key()
@@ -90,7 +90,7 @@ def test_no_name_reaches_generated_code() -> None:
 
 
 @pytest.mark.compiler
-def test_c_takes_over_in_the_background_under_calls_from_many_threads() -> None:
+def test_switch_to_c_during_calls_from_many_threads() -> None:
     mechanism = arm("busy", joints=6)
     outputs = [mechanism.pose, mechanism.jacobian]
     reference = kv.compile(outputs, tier="interpreter")
@@ -128,7 +128,7 @@ def test_c_takes_over_in_the_background_under_calls_from_many_threads() -> None:
 
 
 @pytest.mark.compiler
-def test_evaluators_change_with_their_function() -> None:
+def test_evaluators_switch_to_c_with_their_function() -> None:
     f = kv.compile([a * 3.25 + b, b / a])
     evaluator = f.bind()
     outputs = evaluator.outputs
@@ -139,13 +139,13 @@ def test_evaluators_change_with_their_function() -> None:
     assert [float(v) for v in outputs] == [18.0, 1.25]
 
 
-def test_interpreter_stays_when_it_is_asked_for() -> None:
+def test_tier_interpreter_never_compiles() -> None:
     f = kv.compile(a * b * 2.125, tier="interpreter", wait=True)
     assert f.tier == "interpreter"
     assert not f.wait(0.0)
 
 
-def test_without_a_compiler(
+def test_functions_stay_interpreted_without_a_compiler(
     monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture, tmp_path: Path
 ) -> None:
     monkeypatch.setenv("PATH", str(tmp_path))
@@ -171,7 +171,7 @@ def broken_compiler(tmp_path: Path, script: str) -> str:
     return str(path)
 
 
-def test_a_compiler_that_fails(
+def test_functions_stay_interpreted_if_the_compiler_fails(
     monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture, tmp_path: Path
 ) -> None:
     monkeypatch.setenv("CC", broken_compiler(tmp_path, "echo 'cannot do that' >&2; exit 3"))
@@ -192,7 +192,7 @@ def test_a_compiler_that_fails(
         h.batch([[1.0, 2.0]])
 
 
-def test_a_compiler_that_never_ends(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+def test_functions_stay_interpreted_if_the_compiler_hangs(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
     # What hangs is a child of the compiler, as with gcc: both have to go.
     group = tmp_path / "group"
     script = f"(echo $$ > {group}; while :; do sleep 0.1; done) & wait"
@@ -206,7 +206,7 @@ def test_a_compiler_that_never_ends(monkeypatch: pytest.MonkeyPatch, tmp_path: P
     assert list((tmp_path / "libraries").iterdir()) == []
 
 
-def test_waiting_has_an_end(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+def test_wait_returns_after_its_timeout(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
     gate = tmp_path / "gate"
     script = f"echo >> {tmp_path}/runs; while [ ! -e {gate} ]; do sleep 0.01; done; exit 1"
     monkeypatch.setenv("CC", broken_compiler(tmp_path, script))

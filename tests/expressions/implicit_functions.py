@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-import law_oracle as oracle
+import gradient_oracle as oracle
 import numpy as np
 
 import kineverse as kv

@@ -15,7 +15,7 @@ door, bolt, length = kv.position("kitchen/door"), kv.position("kitchen/bolt"), k
 e = length * np.sin(door) + bolt
 
 
-def test_names_are_those_of_its_symbols() -> None:
+def test_unknown_names_are_refused() -> None:
     assert e({"kitchen/door": 0.0, "kitchen/bolt": 1.0}) == 1
     with pytest.raises(
         kv.errors.UnknownNameError,
@@ -28,7 +28,7 @@ def test_names_are_those_of_its_symbols() -> None:
         (2 * kv.position("lid"))(lid=1.0, drawer=2.0)
 
 
-def test_states_symbols_and_constants_may_know_more() -> None:
+def test_states_may_contain_more_symbols() -> None:
     world = kv.State({"kitchen/door": 0.5, "kitchen/bolt": 1.0, "drawer": 3.0})
     assert e(world) == 2 * math.sin(0.5) + 1
     entry = e.gradient()[door.derivative()]
@@ -37,14 +37,14 @@ def test_states_symbols_and_constants_may_know_more() -> None:
 
 
 @pytest.mark.parametrize("call", [math.sin, math.sqrt, math.floor, float, int, math.hypot])
-def test_functions_of_math_are_numpy_s(call) -> None:
+def test_math_functions_of_expressions_name_those_of_numpy(call) -> None:
     with pytest.raises(kv.errors.ExpressionError, match=r"np\.sin\(q\), not math\.sin\(q\)"):
         call(door)
     assert float(kv.array(2.5)) == 2.5
     assert int(kv.array(2.5)) == 2
 
 
-def test_columns_are_named_by_positions() -> None:
+def test_jacobian_by_speeds_is_refused() -> None:
     speeds = [door.derivative(), bolt.derivative()]
     with pytest.raises(
         kv.errors.ExpressionError,
@@ -64,7 +64,7 @@ def test_columns_are_named_by_positions() -> None:
     assert kv.array(1.0).jacobian(speeds)().tolist() == [0, 0]
 
 
-def test_gradients_print_in_bounds() -> None:
+def test_gradients_print_with_bounded_length() -> None:
     gradient = e.gradient()
     assert isinstance(gradient, Gradient)
     assert (
@@ -88,7 +88,7 @@ def test_gradients_print_in_bounds() -> None:
     assert "260 more" in page
 
 
-def test_expressions_show_in_bounds() -> None:
+def test_expressions_print_with_bounded_length() -> None:
     assert e._repr_latex_().startswith("$\\displaystyle ")
     assert e._repr_html_() is None
     for large in (

@@ -86,7 +86,7 @@ def check_division(functions, points):
 
 
 @pytest.mark.compiler
-def test_division_is_numpy_s_to_the_last_bit(divided):
+def test_division_equals_numpy_to_the_last_bit(divided):
     check_division(divided, np.array([(x, y) for x in SPECIAL for y in SPECIAL]))
     rng = np.random.default_rng(0)
     whole = rng.integers(-60, 60, (3000, 2)) / np.array([10.0, 20.0])
@@ -101,11 +101,11 @@ def test_division_is_numpy_s_to_the_last_bit(divided):
 @pytest.mark.compiler
 @settings(max_examples=attempts(40), deadline=None)
 @given(st.lists(st.tuples(*[st.floats(allow_nan=True)] * 2), min_size=1, max_size=5))
-def test_division_of_any_numbers(divided, points):
+def test_division_of_random_numbers_equals_numpy(divided, points):
     check_division(divided, np.array(points))
 
 
-def test_nine_tenths_go_into_one():
+def test_one_floor_divided_by_a_tenth_is_nine():
     assert (1.0 // b)({b: 0.1}) == 1.0 // 0.1 == 9
     assert (a % 0.1)({a: 1.0}) == 1.0 % 0.1
     assert [float(e({a: -7.0})) for e in divmod(a, 2)] == [-4, 1]
@@ -116,7 +116,7 @@ def test_nine_tenths_go_into_one():
 @pytest.mark.parametrize(
     ("x", "y"), [(7.0, 2.0), (-7.0, 2.0), (7.0, -2.0), (-7.0, -2.0), (0.5, 2.0), (6.0, 2.0), (1.0, 0.1)]
 )
-def test_a_remainder_moves_with_both(x, y):
+def test_remainder_has_a_gradient_by_both_operands(x, y):
     at = {a: x, b: y}
     assert (a % b).jacobian([a, b])(at).tolist() == pytest.approx([1, -(x // y)])
     assert np.fmod(a, b).jacobian([a, b])(at).tolist() == pytest.approx(
@@ -128,7 +128,7 @@ def test_a_remainder_moves_with_both(x, y):
 
 
 @pytest.mark.compiler
-def test_rounding_is_numpy_s():
+def test_rounding_equals_numpy():
     rng = np.random.default_rng(1)
     x = np.array(
         [
@@ -161,7 +161,7 @@ SIZES = st.sampled_from(
 
 @settings(max_examples=attempts(60), deadline=None)
 @given(st.lists(st.tuples(st.floats(-1, 1), SIZES).map(math.prod), min_size=3, max_size=3))
-def test_norms_of_any_size(numbers):
+def test_norms_neither_overflow_nor_underflow(numbers):
     at = dict(zip((a, b, c), numbers, strict=True))
     length = math.hypot(*numbers)
     assert kv.norm([a, b, c])(at) == pytest.approx(length, rel=4e-16 if length > 1e-300 else 1e-9, abs=LEAST)
@@ -184,7 +184,7 @@ def test_norms_are_the_same_in_every_tier(scale):
     assert np.isfinite(plain.batch(points)).all()
 
 
-def test_norms_at_the_ends():
+def test_norms_of_the_largest_and_smallest_numbers():
     at = {a: INF, b: -3.0}
     assert np.hypot(a, b)(at) == INF
     assert np.hypot(a, b)({a: MOST, b: 0.0}) == MOST
@@ -263,7 +263,7 @@ def test_splines_have_limits_at_infinity():
         assert np.isnan(found[4]).all()
 
 
-def test_logic_has_a_value_at_infinity():
+def test_less_of_infinities():
     ends = (-INF, -MOST, 0.0, MOST, INF)
     for x in ends:
         for y in ends:

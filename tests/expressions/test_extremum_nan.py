@@ -49,13 +49,13 @@ GRADIENTS = [
 ]  # fmt: skip
 
 
-def test_values_are_those_of_numpy() -> None:
+def test_extrema_of_nan_equal_numpy() -> None:
     f = kv.compile([kv.array(OUTPUTS)], [a, b], tier="interpreter")
     found = np.array([f(x)[0] for x in PAIRS])
     np.testing.assert_allclose(found, EXPECTED, rtol=1e-15)
 
 
-def test_gradients_of_nothing_are_nothing() -> None:
+def test_gradients_of_nan_are_nan() -> None:
     f = kv.compile([kv.array(GRADIENTS)], [a, b], tier="interpreter")
     found = np.array([f(x)[0] for x in PAIRS]).reshape(len(PAIRS), len(OUTPUTS), 2)
     for k, e in enumerate(OUTPUTS):
@@ -78,7 +78,7 @@ def test_the_review() -> None:
 
 
 @pytest.mark.parametrize("function", [np.fmin, np.fmax])
-def test_of_a_number_and_nothing_the_number(function) -> None:
+def test_fmin_of_a_number_and_nan_is_the_number(function) -> None:
     e = kv.array([function(np.sqrt(a), b), function(b, np.sqrt(a)), function(np.sqrt(a), np.sqrt(b))])
     with np.errstate(all="ignore"):
         for x, y in PAIRS:
@@ -91,7 +91,7 @@ def test_of_a_number_and_nothing_the_number(function) -> None:
     assert function(2 * a, b).gradient()[b.derivative()]({"a": 1.0, "b": 2.0}) == 0.5
 
 
-def test_casadi_leaves_the_question_alone() -> None:
+def test_casadi_keeps_the_test_for_nan() -> None:
     # and not of a function that is never negative, either
     for inner in (ca.sqrt, ca.fabs, ca.exp, ca.sumsqr):
         x = ca.SX.sym("x")

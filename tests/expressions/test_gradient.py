@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-import law_checks as lc
-import law_programs as lp
+import gradient_checks as lc
 import numpy as np
+import random_programs as lp
 from hypothesis import assume
 from hypothesis import strategies as st
 
@@ -13,7 +13,7 @@ from kineverse.expressions import array
 WORDS = lp.Vocabulary("law")
 
 
-def test_random_programs():
+def test_gradients_of_random_programs_equal_the_oracle():
     lc.law(lc.general(), WORDS, 100)()
 
 

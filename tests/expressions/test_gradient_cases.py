@@ -57,7 +57,7 @@ def test_operators_with_an_overridden_operand(g, make, slope):
     assert D(make(g)) == pytest.approx({"a:velocity": slope})
 
 
-def test_in_place_forms_are_the_plain_ones(g):
+def test_in_place_operators_equal_the_binary_ones(g):
     e = g
     e -= b
     e *= 2
@@ -128,7 +128,7 @@ def test_equal_augmentations_cancel():
     assert dict(difference.gradient(heuristic=False)) == {w: array(1.0)}
 
 
-def test_a_constant_is_one_only_without_a_gradient():
+def test_is_constant_is_false_with_a_gradient():
     assert array(3.0).is_constant
     assert not array(3.0).augment({w: 1}).is_constant
     assert array(3.0).augment({w: 1}).symbols == ()
@@ -170,7 +170,7 @@ def test_facts_and_heuristics():
     assert e.jacobian([a], heuristic=False)(AT) == pytest.approx([1])
 
 
-def test_the_tangent_is_a_matter_of_facts():
+def test_total_derivative_ignores_trends():
     e = array([a * b, b]).augment({w: [1, c]}).augment({da: 9}, heuristic=True) * (a < b)
     rate = total_derivative(e)
     at = {**AT, da: 2.0, db: 3.0, w: 5.0}
@@ -203,7 +203,7 @@ def test_gradient_keys_are_found_without_differentiating():
     assert gradient_keys(a.augment({w: 1}, heuristic=True), heuristic=False) == {da}
 
 
-def test_keys_come_sorted():
+def test_keys_are_sorted():
     z, y = position("z"), position("y")
     for e in (z * y * a, f.maximum(z * y, a), (z < y) & (a < 1), (z * a).augment({y.derivative(): 1})):
         assert list(e.gradient()) == sorted(e.gradient(), key=lambda s: s.sort_key)

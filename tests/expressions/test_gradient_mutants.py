@@ -1,6 +1,6 @@
 """The tests of the law are worth something: each way to get the law wrong that we could think of fails them.
 
-A mutant replaces one piece of the library by a wrong one and then runs programs of :mod:`law_programs` and a few
+A mutant replaces one piece of the library by a wrong one and then runs programs of :mod:`random_programs` and a few
 single cases. It is killed if anything disagrees with the oracle or raises. Every mutant has symbols of its own,
 because equal nodes are shared and remember their gradients.
 """
@@ -10,11 +10,11 @@ from __future__ import annotations
 import functools
 
 import casadi as ca
-import law_checks as lc
-import law_oracle as oracle
-import law_programs as lp
+import gradient_checks as lc
+import gradient_oracle as oracle
 import numpy as np
 import pytest
+import random_programs as lp
 
 from kineverse import logic
 from kineverse.errors import KineverseError
@@ -570,12 +570,12 @@ def _own(node, heuristic):
     return node.arguments[0].gradient(heuristic)
 
 
-def test_the_suite_holds_without_a_mutant():
+def test_the_checks_pass_without_a_mutant():
     suite(lp.Vocabulary("sound"))
 
 
 @pytest.mark.parametrize("name", MUTANTS)
-def test_the_suite_kills(name, monkeypatch):
+def test_the_checks_fail_with_a_mutant(name, monkeypatch):
     MUTANTS[name](monkeypatch.setattr)
     vocabulary = lp.Vocabulary(f"mutant/{name}")
     survived = True

@@ -19,7 +19,7 @@ def test_entries_by_symbol_and_by_name():
 
 
 @pytest.mark.parametrize("key", ["door", DOOR, "dor:velocity", kv.velocity("dor")], ids=str)
-def test_other_keys(key):
+def test_other_keys_are_refused(key):
     assert key not in GRADIENT
     with pytest.raises(kv.errors.UnknownNameError) as error:
         GRADIENT[key]
@@ -29,6 +29,6 @@ def test_other_keys(key):
     assert isinstance(error.value, KeyError)
 
 
-def test_constants_have_none():
+def test_gradient_of_a_constant_is_empty():
     with pytest.raises(kv.errors.UnknownNameError, match=r"no entry for 'door:velocity'.*no speed at all"):
         kv.array(1.0).gradient()["door:velocity"]

@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
+import gradient_checks as lc
+import gradient_oracle as oracle
 import implicit_functions as known
-import law_checks as lc
-import law_oracle as oracle
-import law_programs as lp
 import numpy as np
 import pytest
+import random_programs as lp
 from hypothesis import assume, given
 from hypothesis import strategies as st
 from implicit_functions import u, v, w
@@ -51,7 +51,7 @@ def slopes(of, point, step=1e-5):
 # -- values ------------------------------------------------------------------------------------------------
 
 
-def test_values_are_those_of_closed_forms():
+def test_values_equal_closed_forms():
     cubic = known.cubic().apply([u])
     for p in np.linspace(-30, 30, 61):
         assert_allclose(cubic({u: p}), [known.cubic_root(p)], rtol=0, atol=1e-14)
@@ -65,7 +65,7 @@ def test_values_are_those_of_closed_forms():
 
 
 @pytest.mark.parametrize("eccentricity", [0.0, 0.1, 0.6])
-def test_kepler_by_the_inverse(eccentricity):
+def test_kepler_equation_by_its_inverse(eccentricity):
     anomalies = np.linspace(-7, 7, 101)
     solve = kv.compile(known.kepler().apply([u, v]), tier="interpreter")
     means = anomalies - eccentricity * np.sin(anomalies)
@@ -73,7 +73,7 @@ def test_kepler_by_the_inverse(eccentricity):
     assert_allclose(found, anomalies, rtol=0, atol=1e-14)
 
 
-def test_residuals_vanish_where_inputs_are_expressions(function):
+def test_residuals_are_zero_with_expressions_as_inputs(function):
     arguments = [f.sin(a) * 0.3 + 0.9 + 0.1 * k * b for k in range(len(function.inputs))]
     if function.name == "Kepler":
         arguments[1] = 0.5 * f.cos(b)
@@ -103,7 +103,7 @@ def test_first_and_second_derivatives_by_finite_differences(function):
         )
 
 
-def test_the_theorem_in_numpy(function):
+def test_derivatives_equal_the_implicit_function_theorem_in_numpy(function):
     """x' = -A⁻¹ B, and x'' by differentiating r(x(u), u) = 0 twice."""
     n, k = len(function.unknowns), len(function.inputs)
     everything = [*function.unknowns, *function.inputs]
@@ -179,7 +179,7 @@ ARGUMENTS = st.one_of(lp.programs(lp.S, 2), lp.nested(lp.S, 2))
 
 @lc.examples(30)
 @given(st.sampled_from(["Kepler", "polar"]), ARGUMENTS, ARGUMENTS, st.booleans())
-def test_the_law_holds_for_augmented_inputs_and_heuristics(kind, first, second, wrapped):
+def test_gradients_with_augmented_inputs_and_trends(kind, first, second, wrapped):
     programs = (first, second)
     try:
         with np.errstate(all="ignore"):
@@ -232,7 +232,7 @@ def test_substitution_is_composition(kind, first, second):
     lc.check(array(ours).substitute(given_), theirs, WORDS.values)
 
 
-def test_functions_of_functions():
+def test_nested_implicit_functions():
     """A root of what another root is, in one step and by substitution afterwards."""
     cubic, kepler = known.cubic(), known.kepler()
     inner = cubic.apply([a * b])[0]

@@ -77,7 +77,7 @@ def test_batches_agree_with_single_calls():
             np.testing.assert_allclose(column[i], one, rtol=0, atol=200 * np.finfo(float).eps * scale)
 
 
-def test_values_do_not_depend_on_what_was_asked_before():
+def test_values_do_not_depend_on_earlier_calls():
     function = known.polar()
     evaluate = compiled([function.apply([u, v])], [u, v])
     points = np.random.default_rng(5).uniform((0.5, -2), (3, 2), (200, 2))
@@ -97,7 +97,7 @@ def test_values_do_not_depend_on_what_was_asked_before():
 @pytest.mark.parametrize(
     "e", [height, height * 2 + a, array([[a, height]]), height.jacobian([a]), height + f.log(b)]
 )
-def test_an_expression_at_numbers(e):
+def test_evaluation_without_a_solution_is_refused(e):
     at = dict.fromkeys(e.symbols, 1.5)
     with pytest.raises(kv.errors.NoSolutionError, match=WHERE):
         e(at)
@@ -105,7 +105,7 @@ def test_an_expression_at_numbers(e):
 
 
 @pytest.mark.parametrize("tier", TIERS)
-def test_compiled_functions(tier, extension):
+def test_compiled_function_without_a_solution_is_refused(tier, extension):
     for outs in (height, [height], [height, height.jacobian([a])], [a, a * b, height], [f.sin(height) * b]):
         function = compiled(outs, [a, b], tier)
         assert function.tier == tier
@@ -123,7 +123,7 @@ def test_compiled_functions(tier, extension):
 
 
 @pytest.mark.parametrize("tier", TIERS)
-def test_bound_functions(tier, extension):
+def test_evaluator_without_a_solution_is_refused(tier, extension):
     bound = compiled([height, a * b], [a, b], tier).bind()
     bound.input[:] = 1.5, 2.0
     for _ in range(2):
@@ -136,7 +136,7 @@ def test_bound_functions(tier, extension):
 
 
 @pytest.mark.compiler
-def test_a_bound_function_to_which_c_comes_later():
+def test_evaluator_without_a_solution_is_refused_after_the_switch_to_c():
     function = kv.compile([height * f.cos(a - 3 * b) ** 3], [a, b])
     bound = function.bind()
     with pytest.raises(kv.errors.NoSolutionError, match=WHERE):
@@ -150,7 +150,7 @@ def test_a_bound_function_to_which_c_comes_later():
 
 @pytest.mark.parametrize("tier", TIERS)
 @pytest.mark.parametrize("count", [1, 7, 40])
-def test_batches_name_the_first_row(tier, count):
+def test_batch_without_a_solution_names_the_first_row(tier, count):
     function = compiled([a + b, height], [a, b], tier)
     points = np.full((count, 2), 0.6)
     assert function.batch(points)[1] == pytest.approx(0.8, abs=1e-15)
@@ -165,7 +165,7 @@ def test_batches_name_the_first_row(tier, count):
         compiled(height, [a, b], tier).batch(points)
 
 
-def test_large_batches_in_pieces(monkeypatch):
+def test_large_batch_without_a_solution_names_the_first_row(monkeypatch):
     function = compiled([height], [a])
     monkeypatch.setattr(batch, "_STREAMED_BYTES", -1)
     points = np.linspace(-0.9, 0.9, 5001)[:, None]
@@ -186,7 +186,7 @@ def test_the_inner_one_of_nested_functions_is_named():
         outer({b: 1.5**3 + 1.5 + 1e-7})
 
 
-def test_all_inputs_are_said_parameters_too():
+def test_message_lists_all_inputs_and_parameters():
     function = known.radius_and_height()
     e = function.apply([a * 2, p])[0]
     assert e({a: 0.15}) == pytest.approx(0.4)
@@ -198,12 +198,12 @@ def test_all_inputs_are_said_parameters_too():
 
 
 @pytest.mark.parametrize("value", [np.inf, -np.inf, 1e300])
-def test_inputs_that_are_no_place(value):
+def test_nan_inputs_give_nan(value):
     with pytest.raises(kv.errors.NoSolutionError, match="'half circle' has no solution at input/u = "):
         compiled([height], [a])([value])
 
 
-def test_at_the_singular_end():
+def test_value_at_a_singular_configuration():
     """At the very end two roots meet and Newton's method crawls: an error, or a value that is one."""
     for x in (1.0, -1.0, 1 - 1e-15, 1 + 1e-15):
         try:
@@ -217,7 +217,7 @@ def test_at_the_singular_end():
 
 
 @pytest.mark.parametrize("tier", TIERS)
-def test_nan_stays_nan(tier, extension):
+def test_nan_of_other_functions_stays_nan(tier, extension):
     function = compiled([height, a + b], [a, b], tier)
     first, second = function([np.nan, 1.0])
     assert np.isnan([first, second]).all()
@@ -231,7 +231,7 @@ def test_nan_stays_nan(tier, extension):
 
 
 @pytest.mark.parametrize("tier", TIERS)
-def test_what_is_nan_elsewhere_stays_so(tier):
+def test_nan_from_elsewhere_is_returned(tier):
     function = compiled([f.log(b), height], [a, b], tier)
     logarithm, found = function([0.6, -1.0])
     assert np.isnan(logarithm)
@@ -261,7 +261,7 @@ HIDING = {
 
 @pytest.mark.parametrize("name", HIDING)
 @pytest.mark.parametrize("tier", TIERS)
-def test_comparisons_do_not_hide_it(name, tier):
+def test_comparisons_do_not_hide_a_missing_solution(name, tier):
     e = HIDING[name]
     inputs = [a, b]
     with pytest.raises(kv.errors.NoSolutionError, match=WHERE):
@@ -277,7 +277,7 @@ def test_comparisons_do_not_hide_it(name, tier):
 
 
 @pytest.mark.parametrize("tier", TIERS)
-def test_a_branch_that_is_not_taken_is_not_asked(tier):
+def test_where_ignores_the_branch_that_is_not_selected(tier):
     e = f.where(a < 1.0, height, 7.0)
     assert e({a: 1.5}) == 7.0
     function = compiled([e], [a], tier)
@@ -290,7 +290,7 @@ def test_a_branch_that_is_not_taken_is_not_asked(tier):
 
 
 @pytest.mark.parametrize("tier", TIERS)
-def test_nothing_is_chosen_by_what_has_no_solution(tier):
+def test_where_with_a_condition_without_a_solution_is_refused(tier):
     """NaN compares false with everything, so a choice by it looked like the second branch."""
     chosen = f.where(height > 0.5, 2 * a, 3 * a)
     parts = [chosen, chosen.jacobian([a]), f.where(height > 0.5, array([a, b]), 0.0)]

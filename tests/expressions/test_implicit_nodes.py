@@ -44,7 +44,7 @@ def _changed(function, **parts):
     return ImplicitFunction(**{n: parts.get(n, getattr(function, n)) for n in names})
 
 
-def test_what_is_about_the_function_alone_stays_inside():
+def test_symbols_of_the_definition_do_not_occur_outside():
     """Its unknowns and inputs are its own: the same symbols outside are others."""
     itself = known.polar().apply([x, y])
     assert set(itself.symbols) == {x, y}
@@ -69,7 +69,7 @@ def test_pickled_copied_and_deep_copied(function):
     assert again.key == function.key
 
 
-def test_it_prints():
+def test_an_implicit_node_prints_its_name():
     assert "polar" in repr(known.polar().apply([a, b])) or "implicit" in repr(known.polar().apply([a, b]))
     assert implicit_nodes([known.polar().apply([a, b])])[0].label == "polar"
     assert isinstance(implicit_nodes([known.cubic().apply([a])])[0], Implicit)

@@ -114,7 +114,7 @@ def test_contrast_is_one_over_the_width_of_the_change():
     assert less(a, b) == less(a, b, contrast=1e10)
 
 
-def test_equality_is_half_true():
+def test_less_is_half_at_equality():
     for e in (a < b, a > b, a <= b, a >= b, less(a, b, contrast=2), ~(a < b)):
         assert e({a: 0.7, b: 0.7}) == 0.5
         assert set(np.abs([*D(e, {a: 0.7, b: 0.7}).values()])) == {1}
@@ -228,7 +228,7 @@ def test_de_morgan_with_negations_anywhere(formula, point):
 
 @settings(max_examples=attempts(40))
 @given(formulas(SHARP, negated=True), SHARP_POINTS)
-def test_values_are_those_of_python(formula, point):
+def test_values_equal_those_of_python(formula, point):
     at = dict(zip(JOINTS, point, strict=False))
 
     def truth(f):
@@ -242,7 +242,7 @@ def test_values_are_those_of_python(formula, point):
 
 
 @pytest.mark.parametrize("truths", list(itertools.product([0.0, 1.0], repeat=3)), ids=str)
-def test_what_already_holds_is_left_alone(truths):
+def test_trend_of_and_ignores_true_operands(truths):
     at = dict(zip((a, b, c), truths, strict=True))
     for join, holding in ((logic_and, 1.0), (logic_or, 0.0)):
         trend = D(join(a, b, c), at)
@@ -261,7 +261,7 @@ def test_contrast_is_a_positive_number(contrast):
         less(a, b, contrast=contrast)
 
 
-def test_bad_operands():
+def test_operands_that_are_not_numbers_are_refused():
     for join, name in ((logic_and, "and"), (logic_or, "or")):
         with pytest.raises(ExpressionError, match=f"'{name}' needs at least one operand"):
             join()

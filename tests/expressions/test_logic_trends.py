@@ -62,7 +62,7 @@ def test_the_trend_locks_it_again(at):
     assert np.all(np.diff(way, axis=0) <= 0)
 
 
-def test_the_product_rule_would_be_stuck():
+def test_the_product_rule_does_not_open_the_lock():
     at = {a: -0.5, b: -0.5}
     blind = LATCH * BOLT
     assert set(D(blind, at).values()) == {0}

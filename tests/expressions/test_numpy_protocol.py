@@ -297,7 +297,7 @@ def call_quietly(function, x, axis):
 
 @few
 @given(arrays())
-def test_sums_and_their_kin(x):
+def test_reductions(x):
     x = x - 3
     axes = [None, *range(-x.ndim, x.ndim), tuple(range(x.ndim)), ()]
     for axis in axes:
@@ -374,7 +374,7 @@ def test_products_of_stacks(stacks, data):
     "ij->ji", "ij->", "ii", "ii->i", "ij,jk", "ij,kj->ik", "ij,ij->i", "ij,jk,kl->il", "i,j", "i,j->ji", "i,i", "ij,j,i->",
     "...i->...", "...i,...i", "...ij,...jk->...ik", "i...,i...->...", "ab, bc -> ca", "ii,ij->j", "ij,k->kij",
 ])  # fmt: skip
-def test_einstein(subscripts):
+def test_einsum(subscripts):
     operands = subscripts.split("->")[0].replace(" ", "").split(",")
     numbers = [
         filled((2,) * (len(o.replace("...", "")) + 2 * ("..." in o)), seed=k) for k, o in enumerate(operands)

@@ -25,7 +25,7 @@ def refused(call, message, error=ExpressionError):
     lambda: np.sin(e, out=out), lambda: np.add(e, 1, out=out), lambda: np.add(out, e, out), lambda: out.__iadd__(e),
     lambda: out.__imul__(a), lambda: np.add.reduce(m, axis=1, out=out),
 ])  # fmt: skip
-def test_nothing_is_written_into_arrays_of_numbers(call):
+def test_out_with_an_array_of_numbers_is_refused(call):
     refused(
         call, r"cannot write expressions into an existing array|reduce with the options \['axis', 'out'\]"
     )
@@ -36,12 +36,12 @@ def test_nothing_is_written_into_arrays_of_numbers(call):
     lambda: np.concatenate([e], 0, out), lambda: np.concatenate([e], out=out), lambda: np.stack([a, b], 0, out),
     lambda: np.concatenate([e], dtype=float), lambda: np.vstack([e, e], dtype=int), lambda: np.stack([e], casting="no"),
 ])  # fmt: skip
-def test_rearranging_takes_neither_out_nor_dtype(call):
+def test_rearranging_with_out_or_dtype_is_refused(call):
     refused(call, "neither out= nor dtype=")
 
 
 @pytest.mark.parametrize("name", ["where", "dtype", "casting", "order", "subok"])
-def test_options_of_ufuncs(name):
+def test_unknown_options_of_ufuncs_are_refused(name):
     refused(lambda: np.sin(e, **{name: {"where": [True, False], "dtype": float, "casting": "no", "order": "C", "subok": True}[name]}),
             f"np.sin of expressions takes no {name}=; leave it out")  # fmt: skip
 
@@ -52,7 +52,7 @@ def test_options_of_ufuncs(name):
     lambda: np.zeros_like(m, dtype=int), lambda: np.where(e), lambda: np.clip(e, 0, 1, out),
     lambda: np.prod(m, 0, float), lambda: np.einsum("i,i", e, e, out=out), lambda: np.trace(m, dtype=float),
 ])  # fmt: skip
-def test_options_of_functions(call):
+def test_unknown_options_of_functions_are_refused(call):
     refused(call, r"of expressions: .* Its parameters are \w+")
 
 
@@ -60,7 +60,7 @@ def test_options_of_functions(call):
     lambda: np.add.accumulate(e), lambda: np.add.outer(e, e), lambda: np.add.at(out, [0], a), lambda: np.hypot.reduce(e),
     lambda: np.add.reduceat(e, [0]), lambda: np.add.reduce(e, initial=1), lambda: np.multiply.outer(out, e),
 ])  # fmt: skip
-def test_methods_of_ufuncs(call):
+def test_unknown_methods_of_ufuncs_are_refused(call):
     refused(call, r"is not available for expressions; there is reduce, with axis= and keepdims=, of np\.add")
 
 
@@ -79,14 +79,14 @@ WITH_MORE = [
 
 
 @pytest.mark.parametrize("call", [*(lambda f=f: f(e) for f in UNAVAILABLE), *WITH_MORE])
-def test_what_is_not_available_says_what_to_do(call):
+def test_unavailable_functions_are_refused_with_an_alternative(call):
     refused(
         call,
         r"is not available for expressions(; write .*)?\. Of numbers it is: call the expression with values first",
     )
 
 
-def test_what_to_write_instead():
+def test_alternatives_in_messages_work():
     refused(lambda: np.interp(a, [0, 1], [0, 1]), r"; write kv\.spline\(x, knots, values\)\.")
     refused(lambda: np.any(e), r"; write logic, a \| b\.")
     refused(lambda: np.ma.array([1, 2]) * e, "is not an array of numbers")
@@ -99,7 +99,7 @@ def test_what_to_write_instead():
     lambda: np.ones(3)[e], lambda: np.sum([a, b]), lambda: np.roll(out, a), lambda: np.take([1, 2, 3], a),
     lambda: np.array([e, e], dtype=object), lambda: np.stack([[a, b], [1, 2]]),
 ])  # fmt: skip
-def test_expressions_do_not_become_arrays(call):
+def test_conversion_to_an_array_of_numbers_is_refused(call):
     refused(
         call,
         r"An expression is not an array of numbers\. Call it with values.*build arrays .* with kv\.array",
@@ -119,7 +119,7 @@ def test_elements_of_arrays_of_numbers_stay_numbers():
     lambda: e * 1j, lambda: np.array([1j, 2]) * e, lambda: np.array(["a", "b"]) + e, lambda: np.array([1, None]) * e,
     lambda: e + "1", lambda: e + None, lambda: np.array(["2020"], dtype="M8[Y]") + a,
 ])  # fmt: skip
-def test_arguments_that_do_not_fit(call):
+def test_wrong_arguments_are_refused(call):
     refused(call, "expression|one lower and one upper")
 
 
@@ -142,7 +142,7 @@ def test_arguments_that_do_not_fit(call):
     (lambda: np.linalg.norm(m, axis=2), "Axis 2"), (lambda: np.cumsum(m, axis=2), "Axis 2"), (lambda: np.diff(m, axis=2), "Axis 2"),
     (lambda: np.split(kv.array([a, b, 1.0]), 2), "equal division"), (lambda: np.block([[e], [m]]), r"\(2, 3\)"),
 ])  # fmt: skip
-def test_shapes_that_do_not_fit(call, message):
+def test_incompatible_shapes_are_refused(call, message):
     refused(call, message, ShapeError)
 
 
@@ -150,7 +150,7 @@ def test_shapes_that_do_not_fit(call, message):
     lambda: np.einsum("ij,jk->i1", m, m.T), lambda: np.einsum("ij->ii", m), lambda: np.einsum("ij->k", m), lambda: np.einsum("i,i,i", e, e),
     lambda: np.einsum(e, [0], e, [0]), lambda: np.einsum("i.j", m), lambda: np.linalg.matrix_power(m[:, :2], 0.5), lambda: np.diff(e, -1),
 ])  # fmt: skip
-def test_notations_that_are_none(call):
+def test_invalid_einsum_subscripts_are_refused(call):
     refused(call, "einsum|whole")
 
 
@@ -159,7 +159,7 @@ def test_notations_that_are_none(call):
     (np.ma.array([1, "x"], mask=[False, True], dtype=object), "masked array"), (np.ones((1, 2)).view(np.matrix), r"Write np\.asarray\(m\), and @"),
     (np.array([(1.0, 2)], dtype=[("x", float), ("y", int)]), "array of numbers"), (np.array([1j]), "array of numbers"),
 ])  # fmt: skip
-def test_arrays_that_mean_more_than_their_numbers(given, message):
+def test_masked_arrays_and_matrices_are_refused(given, message):
     """Nothing that an array says beside its numbers is dropped in silence."""
     for call in (
         lambda: kv.array(given),
@@ -170,7 +170,7 @@ def test_arrays_that_mean_more_than_their_numbers(given, message):
         refused(call, message)
 
 
-def test_masks_of_values():
+def test_masked_values_are_refused():
     masked = np.ma.array([1.0, 2.0], mask=[False, True])
     f = kv.compile(a + b, tier="interpreter")
     evaluator = f.bind()
@@ -194,14 +194,14 @@ def test_masks_of_values():
         ("inv", "np.linalg.inv(e)"),
     ],
 )
-def test_attributes_of_other_libraries(name, instead):
+def test_attributes_of_other_libraries_name_the_equivalent(name, instead):
     for e in (kv.position("x"), kv.rotation_z(kv.position("x")), kv.array([1.0, 2.0])):
         with pytest.raises(kv.errors.UnknownAttributeError) as error:
             getattr(e, name)
         assert str(error.value) == f"An expression has no {name!r}. Here that is {instead}."
 
 
-def test_attributes_that_nothing_has():
+def test_unknown_attributes_are_refused():
     e = kv.rotation_z(kv.position("x"))
     with pytest.raises(kv.errors.UnknownAttributeError, match=r"no 'gradiant'\. Did you mean 'gradient' or"):
         e.gradiant  # noqa: B018

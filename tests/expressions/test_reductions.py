@@ -24,7 +24,7 @@ def at(numbers: np.ndarray) -> dict[kv.Symbol, float]:
 
 @pytest.mark.parametrize("axis", AXES, ids=str)
 @pytest.mark.parametrize("function", [np.sum, np.prod, np.min, np.max, np.mean])
-def test_axes_are_those_of_numpy(function, axis) -> None:
+def test_reductions_along_axes_equal_numpy(function, axis) -> None:
     numbers = np.random.default_rng(1).normal(size=ARRAY.shape)
     wanted = function(numbers, axis=tuple(axis) if isinstance(axis, tuple) else axis)
     found = function(ARRAY, axis=axis)
@@ -32,7 +32,7 @@ def test_axes_are_those_of_numpy(function, axis) -> None:
     np.testing.assert_allclose(found(at(numbers)), wanted, rtol=1e-14)
 
 
-def test_ufuncs_reduce_along_an_axis_too() -> None:
+def test_ufunc_reduce_along_an_axis() -> None:
     numbers = np.random.default_rng(2).normal(size=ARRAY.shape)
     for ufunc in (np.add, np.multiply, np.minimum, np.maximum):
         np.testing.assert_allclose(ufunc.reduce(ARRAY)(at(numbers)), ufunc.reduce(numbers), rtol=1e-14)
@@ -42,7 +42,7 @@ def test_ufuncs_reduce_along_an_axis_too() -> None:
         np.subtract.reduce(ARRAY)
 
 
-def test_a_product_has_the_gradient_of_one() -> None:
+def test_prod_has_the_gradient_of_repeated_multiplication() -> None:
     a, b, c = SYMBOLS[:3]
     gradient = np.prod(kv.array([[a, b], [c, 2.0]]), axis=1).gradient()
     values = {a: 3, b: 5, c: 7}
@@ -53,13 +53,13 @@ def test_a_product_has_the_gradient_of_one() -> None:
 
 @pytest.mark.parametrize("function", [np.sum, np.prod, np.min])
 @pytest.mark.parametrize("axis", [3, "a", (0, 0), 1.5])
-def test_there_is_no_such_axis(function, axis) -> None:
+def test_unknown_axes_are_refused(function, axis) -> None:
     with pytest.raises(kv.KineverseError):
         function(ARRAY, axis=axis)
 
 
 @given(st.lists(st.sampled_from([0.0, 1.0, 2.0]), min_size=1, max_size=7), st.sampled_from([np.min, np.max]))
-def test_a_tie_of_any_number_is_the_mean(numbers, function) -> None:
+def test_gradient_of_a_tie_is_the_mean(numbers, function) -> None:
     symbols = SYMBOLS[: len(numbers)]
     e = function(kv.array([(k + 1) * s for k, s in enumerate(symbols)]))
     values = {s: x / (k + 1) for k, (s, x) in enumerate(zip(symbols, numbers, strict=True))}
@@ -70,7 +70,7 @@ def test_a_tie_of_any_number_is_the_mean(numbers, function) -> None:
         assert float(e.gradient()[s.derivative()](values)) == pytest.approx((k + 1) * wins / won.sum())
 
 
-def test_extrema_of_many_are_one_node_that_survives_everything() -> None:
+def test_extremum_of_many_is_one_node() -> None:
     a, b, c = SYMBOLS[:3]
     e = np.max(kv.array([a, 2 * b, c * c]))
     assert repr(e) == "maximum(x00, 2*x01, x02**2)"

@@ -139,7 +139,7 @@ def slopes(f, x, step=1e-4):
     return np.stack(columns, axis=-1)
 
 
-def test_every_public_function_is_here():
+def test_every_public_function_has_a_case():
     public = {
         name
         for name, f in vars(spatial).items()
@@ -164,7 +164,7 @@ def test_values_and_gradients(name):
 
 
 @ALL
-def test_numbers_and_lists_are_taken_as_they_come(name):
+def test_arrays_lists_and_expressions_are_accepted(name):
     size, function, numbers = CASES[name]
     for x in points(2, size):
         for given in (x, x.tolist(), array(x)):
@@ -215,7 +215,7 @@ def test_the_smallest_quaternion():
     assert spatial.quaternion(0, 0, 1e308, 1e308)()[1, 0] == 1
 
 
-def test_along_its_length_a_quaternion_does_not_turn():
+def test_quaternion_has_no_derivative_along_its_length():
     e = spatial.quaternion(*X[:4])
     q = np.array([0.3, -0.2, 0.7, 0.4])
     jacobian = e.jacobian(X[:4])(dict(zip(X, q, strict=False)))
@@ -267,13 +267,13 @@ OF_A_TRANSFORM = [
 
 
 @pytest.mark.parametrize(("bad", "message"), BAD)
-def test_shapes_that_do_not_fit(bad, message):
+def test_wrong_shapes_are_refused(bad, message):
     with pytest.raises(ShapeError, match=message):
         bad()
 
 
 @pytest.mark.parametrize("function", OF_A_TRANSFORM)
-def test_what_is_no_transform(function):
+def test_matrices_that_are_no_transforms_are_refused(function):
     for given in (FLAT, TALL, 1.0, np.zeros(16), array(X[:3])):
         with pytest.raises(ShapeError, match=r"A transform is a 4×4 matrix, not of shape"):
             function(given)
@@ -283,7 +283,7 @@ def test_what_is_no_transform(function):
         function("pose")
 
 
-def test_directions_of_nothing():
+def test_zero_vectors_are_refused():
     with pytest.raises(InvalidValueError, match="The axis of a rotation has length zero"):
         spatial.axis_angle([0, 0, 0], X[0])
     with pytest.raises(InvalidValueError, match="The vector has length zero"):
@@ -310,7 +310,7 @@ def test_nan_is_refused(name):
             function(x)
 
 
-def test_vectors_are_taken_apart():
+def test_components_as_one_vector():
     """What takes numbers one by one takes them as one vector too: list, tuple, array or expression."""
     a, b = kv.position("spatial/a"), kv.position("spatial/b")
     at = {a: 0.3, b: -0.4}
@@ -341,6 +341,6 @@ def test_vectors_are_taken_apart():
     (lambda: kv.spatial.point([1, 2]), r"A point .* shape \(2,\)"), (lambda: kv.spatial.vector(1), "A direction .* not as 1"),
     (lambda: kv.translation([1, 2, 3, 4]), r"A translation .* shape \(4,\)"),
 ])  # fmt: skip
-def test_another_number_of_numbers(call, message):
+def test_a_wrong_number_of_components_is_refused(call, message):
     with pytest.raises(kv.errors.ShapeError, match=message):
         call()

@@ -102,7 +102,7 @@ def matrix(v):
 
 
 @EACH_AXIS
-def test_exponential(axis):
+def test_exp_so3(axis):
     for angle in ANGLES + LARGE:
         v = angle * axis
         value, jacobian = EXPONENTIAL(v)
@@ -113,7 +113,7 @@ def test_exponential(axis):
 
 
 @EACH_AXIS
-def test_twist_exponential(axis):
+def test_exp_se3(axis):
     for angle in ANGLES[::2] + LARGE[::2]:
         xi = np.array([0.3, -2.0, 0.7, *angle * axis])
         value, jacobian = TWIST(xi)
@@ -135,7 +135,7 @@ def test_second_derivatives_at_zero():
 
 
 @EACH_AXIS
-def test_rotation_vector_and_angle(axis):
+def test_log_so3_and_rotation_angle(axis):
     for angle in ANGLES:
         v = angle * axis
         found, jacobian = ROTATION_VECTOR(matrix(v))
@@ -164,7 +164,7 @@ def test_half_turns(axis):
     np.testing.assert_allclose(slope, v / PI, atol=1e-12)
 
 
-def test_no_rotation_at_all():
+def test_log_so3_of_the_identity():
     for identity in (np.eye(3), np.eye(4)):
         assert spatial.log_so3(identity)().tolist() == [0, 0, 0]
         assert spatial.rotation_angle(identity)() == 0
@@ -181,7 +181,7 @@ def test_no_rotation_at_all():
 
 
 @EACH_AXIS
-def test_quaternions_in_every_branch(axis):
+def test_to_quaternion_in_every_branch(axis):
     """Angles around π make x, y or z the largest component, small ones w."""
     for angle in (0, 1e-9, 0.7, 2.0, PI - 0.1, PI - 1e-9, -PI + 1e-9, -2.5):
         q = Rotation.from_rotvec(angle * axis).as_quat()
@@ -217,7 +217,7 @@ def log(a_T_b):
 
 @settings(max_examples=attempts(50))
 @given(LENGTHS, DIRECTIONS, POSITIONS)
-def test_twists_there_and_back(angle, direction, position):
+def test_log_se3_inverts_exp_se3(angle, direction, position):
     xi = np.array([*position, *angle * direction / np.linalg.norm(direction)])
     there, _ = TWIST(xi)
     np.testing.assert_allclose(log(there), xi, atol=1e-8)  # near π the position suffers
@@ -226,7 +226,7 @@ def test_twists_there_and_back(angle, direction, position):
     np.testing.assert_allclose(back, there, atol=1e-12)
 
 
-def test_gradients_there_and_back():
+def test_gradients_of_inverse_functions_cancel():
     there_and_back = spatial.log_se3(spatial.exp_se3(X)).jacobian(X)
     f = kv.compile(there_and_back, X, tier="interpreter")
     for axis in AXES:
@@ -242,7 +242,7 @@ def test_gradients_there_and_back():
 @pytest.mark.parametrize(
     "pitch", [PI / 2, -PI / 2, PI / 2 - 1e-9, -PI / 2 + 1e-9, PI / 2 + 1e-9, PI / 2 - 1e-5, 1.5]
 )
-def test_gimbal_lock(pitch):
+def test_to_rpy_at_gimbal_lock(pitch):
     """Whatever roll and yaw come out, they are together those of the rotation."""
     for roll, yaw in [(0, 0), (0.3, 0.5), (-2.0, 1.0), (PI, -PI / 2), (0.1, 3.0)]:
         numbers = Rotation.from_euler("xyz", [roll, pitch, yaw]).as_matrix()
@@ -257,7 +257,7 @@ def test_gimbal_lock(pitch):
             np.testing.assert_allclose(spatial.rpy(*found)()[:3, :3], a_R_b[:3, :3], atol=2e-12)
 
 
-def test_angles_there_and_back():
+def test_to_rpy_inverts_rpy():
     e = spatial.to_rpy(spatial.rpy(*X[:3]))
     f = kv.compile([e, e.jacobian(X[:3])], X[:3], tier="interpreter")
     for roll in (-3.1, -0.4, 0, 1e-9, 2.0, PI):

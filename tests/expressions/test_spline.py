@@ -34,7 +34,7 @@ def derivatives(e: kv.Expression) -> list[kv.Expression]:
 
 @settings(max_examples=attempts(40), derandomize=True)
 @given(seed=st.integers(0, 10**6), n=st.integers(2, 40), periodic=st.booleans())
-def test_values_and_derivatives_are_those_of_scipy(seed: int, n: int, periodic: bool) -> None:
+def test_values_and_derivatives_equal_scipy(seed: int, n: int, periodic: bool) -> None:
     knots, values = profile(seed, n, periodic)
     oracle = CubicSpline(knots, values, bc_type="periodic" if periodic else "clamped")
     inside = np.random.default_rng(seed).uniform(knots[0], knots[-1], 50)
@@ -48,7 +48,7 @@ def test_values_and_derivatives_are_those_of_scipy(seed: int, n: int, periodic: 
         np.testing.assert_allclose(numbers.ravel(), expected.ravel(), rtol=0, atol=1e-11 * size)
 
 
-def test_it_goes_through_its_points_and_straight_on() -> None:
+def test_spline_interpolates_its_points_and_is_straight_outside() -> None:
     knots, values = profile(3, 6, False)
     e = kv.spline(x, knots, values)
     np.testing.assert_allclose([e({x: t}) for t in knots], values, atol=1e-15)
@@ -85,7 +85,7 @@ def test_compiled_code_gives_the_same_bits_as_the_interpreter() -> None:
             assert np.asarray(one).tobytes() == np.asarray(other).tobytes()
 
 
-def test_gradients_follow_the_law() -> None:
+def test_gradients_obey_the_chain_rule() -> None:
     knots, values = profile(5, 7, True)
     wheel = kv.velocity("wheel")
     oracle = CubicSpline(knots, values, bc_type="periodic")
@@ -142,6 +142,6 @@ WRONG: list[tuple[dict[str, Any], str]] = [
 
 
 @pytest.mark.parametrize(("given", "words"), WRONG)
-def test_bad_points_are_one_clear_error(given: dict[str, Any], words: str) -> None:
+def test_invalid_points_are_refused(given: dict[str, Any], words: str) -> None:
     with pytest.raises(kv.errors.InvalidValueError, match=words):
         kv.spline(x, **given)

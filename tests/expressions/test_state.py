@@ -61,7 +61,7 @@ def test_keys_are_symbols_or_names(values, named):
     assert State({str(s) if s in named else s: v for s, v in values.items()}) == State(values)
 
 
-def test_names_are_not_parts_of_names():
+def test_parts_of_names_are_no_keys():
     state = State({"arm/a": 1, "arm/a:velocity": 2, "arm/a:7": 3, "a%3Ab%25c": 4})
     assert [state[s] for s in SYMBOLS[:1] + SYMBOLS[2:5]] == [1, 2, 3, 4]
     for name in ("arm", "a", "arm/a:", "arm/a:acceleration", "a:b%c", "arm/", "", "ARM/A"):
@@ -89,7 +89,7 @@ def test_values_are_plain_numbers():
     assert State({a: math.inf, b: -math.inf})[b] == -math.inf
 
 
-def test_no_values_at_all():
+def test_an_empty_state():
     for nothing in (State(), State({}), State(None)):
         assert len(nothing) == 0
         assert list(nothing) == []
@@ -100,7 +100,7 @@ def test_no_values_at_all():
             nothing["x"]
 
 
-def test_what_it_was_made_from_may_change():
+def test_a_state_is_independent_of_its_argument():
     values = {a: 1.0}
     state = State(values)
     values[a] = 2.0
@@ -114,7 +114,7 @@ def test_what_it_was_made_from_may_change():
 @given(
     VALUES, VALUES, STAMPS, STAMPS, st.sampled_from(["", "encoder"]), st.sampled_from([None, "", "filter"])
 )
-def test_updated(values, changes, stamp, new_stamp, source, new_source):
+def test_updated_changes_values(values, changes, stamp, new_stamp, source, new_source):
     state = State(values, stamp=stamp, source=source)
     before = dict(state)
     known = {s: v for s, v in changes.items() if s in values}
@@ -133,7 +133,7 @@ def test_updated(values, changes, stamp, new_stamp, source, new_source):
     assert state.updated({}) == state
 
 
-def test_updated_by_name():
+def test_updated_by_name_changes_values():
     state = State({a: 1, b: 2}, stamp=3.5, source="encoder")
     expected = State({a: 1, b: 5, da: 6}, stamp=3.5, source="encoder")
     assert state.updated({"arm/b": 5}).extended({"arm/a:velocity": 6}) == expected
@@ -149,7 +149,7 @@ def test_updated_by_name():
     assert state["arm/b"] == 2
 
 
-def test_names_that_a_state_does_not_hold_are_no_update():
+def test_updated_with_unknown_names_is_refused():
     state = State({"kitchen/fridge_door": 0.0, "kitchen/oven_door": 0.0, kv.parameter("length", 2.0): 3.0})
     with pytest.raises(UnknownNameError) as error:
         state.updated({"fridge_door": 1.0})
@@ -175,7 +175,7 @@ def test_names_that_a_state_does_not_hold_are_no_update():
 
 
 @given(VALUES, VALUES, STAMPS)
-def test_a_state_and_another_one(values, others, stamp):
+def test_or_joins_two_states(values, others, stamp):
     state = State(values, stamp=stamp, source="encoder")
     union = state | State(others, stamp=7.0, source="camera")
     assert dict(union) == {**values, **others}
@@ -187,7 +187,7 @@ def test_a_state_and_another_one(values, others, stamp):
             state | others
 
 
-def test_a_state_on_the_other_side():
+def test_or_with_a_state_on_the_right_is_refused():
     with pytest.raises(
         ExpressionError, match=r"A state stands on the left of \|: state \| \{\.\.\.\} changes values"
     ):
@@ -196,7 +196,7 @@ def test_a_state_on_the_other_side():
         State({a: 2.0}) | 3
 
 
-def test_a_state_in_a_notebook():
+def test_html_of_a_state():
     shown = State({"<b>": 1.5, "x": 2}, stamp=3.0, source="encoder")._repr_html_()
     assert "<td>&lt;b&gt;</td><td>1.5</td>" in shown
     assert "2 values, at 3 s, from encoder" in shown
@@ -211,24 +211,24 @@ def test_a_state_in_a_notebook():
         ("zzz", "A state has no 'zzz'. dir(...) lists what there is."),
     ],
 )
-def test_attributes_that_a_state_lacks(name, message):
+def test_unknown_attributes_of_a_state_are_refused(name, message):
     with pytest.raises(kv.errors.UnknownAttributeError) as error:
         getattr(State({a: 1}), name)
     assert str(error.value) == message
     assert not hasattr(State(), name)
 
 
-def test_a_value_is_no_attribute():
+def test_a_symbol_as_an_attribute_names_the_item():
     with pytest.raises(kv.errors.UnknownAttributeError) as error:
         State({"door": 1}).door  # noqa: B018
     assert str(error.value) == "A state has no 'door'. Its value is state['door']."
 
 
-def test_no_similar_names_are_looked_for_while_a_state_is_made(monkeypatch):
+def test_construction_does_not_search_for_similar_names(monkeypatch):
     def looked(*_):
         raise AssertionError("names were compared")
 
-    monkeypatch.setattr("kineverse._synonyms.difflib.get_close_matches", looked)
+    monkeypatch.setattr("kineverse.errors.difflib.get_close_matches", looked)
     assert State({a: 1.0}, stamp=2.0).updated({a: 3.0})[a] == 3.0
     assert kv.position("never before").path == "never before"
 
@@ -247,7 +247,7 @@ def test_equal_states(values, stamp, source, random):
     assert {state: 1}[same] == 1
 
 
-def test_states_that_differ():
+def test_states_of_different_content_differ():
     state = State({a: 1, b: 2}, stamp=3.0, source="encoder")
     others = [
         State({a: 1, b: 2.5}, stamp=3.0, source="encoder"),
@@ -306,7 +306,7 @@ def test_repr_is_bounded():
 # -- states where values are wanted ------------------------------------------------------------------------
 
 
-def test_a_state_may_know_more_than_is_asked():
+def test_a_state_may_contain_more_symbols_than_needed():
     state = State({a: 2, b: 3, "elsewhere": 4})
     assert (a * a)(state) == 4
     assert kv.compile(a * b, tier="interpreter")(state) == 6
@@ -321,7 +321,7 @@ def test_parameters_have_their_own_values_unless_given():
     assert (a * length)(State({a: 3, length: 5})) == 15
 
 
-def test_a_name_that_several_symbols_have():
+def test_a_name_of_several_symbols_is_refused():
     short, long = kv.parameter("link", 1.0), kv.parameter("link", 2.0)
     state = State({short: 10, long: 20, a: 1})
     assert (state[short], state[long], state["arm/a"]) == (10, 20, 1)
@@ -351,7 +351,7 @@ def test_unknown_names_come_with_suggestions():
 
 
 @pytest.mark.parametrize("value", [None, "1", b"1", [1], [1, 2], 1j, {}, a, a + 1, np.array([1, 2]), 10**400])
-def test_values_that_are_no_numbers(value):
+def test_values_that_are_not_numbers_are_refused(value):
     for key in (a, "arm/a"):
         with pytest.raises(InvalidValueError, match="The value of 'arm/a' is not a number"):
             State({b: 1, key: value})
@@ -364,14 +364,14 @@ def test_nan_is_refused(value):
 
 
 @pytest.mark.parametrize("stamp", ["now", "3", math.nan, [1.0], 1j, a])
-def test_bad_stamps(stamp):
+def test_invalid_stamps_are_refused(stamp):
     with pytest.raises(InvalidValueError, match="stamp of a state is a time in seconds"):
         State({a: 1}, stamp=stamp)
     with pytest.raises(InvalidValueError, match="stamp of a state is a time in seconds"):
         State({a: 1}).updated({}, stamp=stamp)
 
 
-def test_bad_keys():
+def test_invalid_keys_are_refused():
     for key in (1, None, 2.5, a + b, kv.array([a]), ("arm/a",), b"arm/a"):
         with pytest.raises(ExpressionError, match="A state has symbols or their names as keys"):
             State({key: 1})
@@ -385,6 +385,6 @@ def test_bad_keys():
 
 
 @pytest.mark.parametrize("values", [[(a, 1)], a, 3, "arm/a", {a}, np.zeros(2)])
-def test_what_is_no_mapping(values):
+def test_values_that_are_not_a_mapping_are_refused(values):
     with pytest.raises(ExpressionError, match=r"A state is made from a mapping \{name: number\}"):
         State(values)

@@ -60,7 +60,7 @@ def test_equal_symbols_are_one_object():
     assert kv.translation(a, b)[1, 3] is b
 
 
-def test_what_differs_in_anything_is_another_symbol():
+def test_symbols_that_differ_in_a_field_differ():
     kinds = [
         Symbol("s"),
         Symbol("s", 1),
@@ -191,21 +191,21 @@ def test_names_of_orders():
 
 
 @given(PATHS, ORDERS)
-def test_names_are_read_back(path, order):
+def test_parse_symbol_name_inverts_symbol_name(path, order):
     name = symbol_name(path, order)
     assert parse_symbol_name(name) == (path, order)
     assert name.count(":") == (order > 0)
 
 
 @given(PATHS, ORDERS, PATHS, ORDERS)
-def test_names_tell_symbols_apart(path, order, other_path, other_order):
+def test_different_symbols_have_different_names(path, order, other_path, other_order):
     same = symbol_name(path, order) == symbol_name(other_path, other_order)
     assert same == ((path, order) == (other_path, other_order))
 
 
 @settings(max_examples=attempts(50))
 @given(PATHS, ORDERS)
-def test_names_stand_for_symbols_everywhere(path, order):
+def test_names_and_symbols_are_equivalent_keys(path, order):
     s = symbol(path, order)
     assert str(s) == symbol_name(path, order)
     assert Symbol(*parse_symbol_name(str(s))) is s
@@ -215,7 +215,7 @@ def test_names_stand_for_symbols_everywhere(path, order):
 
 
 @pytest.mark.parametrize("name", ["a:", "a:speed", "a:-1", "a:1.5", "a:velocity:velocity", "a: 1"])
-def test_names_with_an_order_that_is_none(name):
+def test_names_with_an_invalid_order_are_refused(name):
     with pytest.raises(ExpressionError, match="is not an order; write velocity, acceleration, jerk, snap or"):
         parse_symbol_name(name)
 
@@ -225,7 +225,7 @@ def test_names_with_an_order_that_is_none(name):
 
 @settings(max_examples=attempts(50))
 @given(PATHS, st.integers(0, 8), st.sampled_from([r for r in ROLES if r != "parameter"]))
-def test_up_and_down_the_orders(path, order, role):
+def test_derivative_and_integral(path, order, role):
     s = symbol(path, order, role)
     assert (s.path, s.order, s.role, s.value) == (path, order, role, None)
     assert s.derivative().integral() is s
@@ -242,7 +242,7 @@ def test_up_and_down_the_orders(path, order, role):
 
 
 @pytest.mark.parametrize("path", ["[", "[a", "[a,b]", "[]", "[[a", "[a/b"])
-def test_brackets_begin_no_list_of_names(path):
+def test_paths_with_brackets(path):
     """As they do for CasADi, to which "[a" is the name a."""
     x, plain = position(path), position("a")
     assert x.casadi.shape == (1, 1)
@@ -311,21 +311,21 @@ def test_zero_has_one_sign():
 @pytest.mark.parametrize(
     "path", ["", "/", "a/", "/a", "a//b", "a\n", "\x00", "a/\x1f", "\ud800", None, 3, b"a", ["a"], a]
 )
-def test_bad_paths(path):
+def test_invalid_paths_are_refused(path):
     for make in (position, velocity, symbol, lambda x: parameter(x, 1)):
         with pytest.raises(ExpressionError, match="path"):
             make(path)
 
 
 @pytest.mark.parametrize("order", [-1, 1.0, True, "1", None, np.int64(1), [1]])
-def test_bad_orders(order):
+def test_invalid_orders_are_refused(order):
     for path in ("a", "never seen before"):
         with pytest.raises(ExpressionError, match="order of a symbol is a whole number from 0 on"):
             symbol(path, order)
 
 
 @pytest.mark.parametrize("role", ["joint", "", None, 1, ["dof"], "DOF"])
-def test_bad_roles(role):
+def test_invalid_roles_are_refused(role):
     with pytest.raises(
         ExpressionError, match=r"Unknown role .*; roles are dof, parameter, contact, location"
     ):
@@ -333,7 +333,7 @@ def test_bad_roles(role):
 
 
 @pytest.mark.parametrize("value", [None, float("nan"), "2", b"2", True, [2.0], 1j, a, {}, 10**400])
-def test_bad_values_of_parameters(value):
+def test_invalid_parameter_values_are_refused(value):
     assert parameter("p", 1.0) is not None  # True is not it
     with pytest.raises(InvalidValueError, match="Parameter 'p' needs a number as its value"):
         parameter("p", value)
@@ -342,7 +342,7 @@ def test_bad_values_of_parameters(value):
             Symbol("p", 0, "parameter", value)
 
 
-def test_bad_combinations():
+def test_invalid_combinations_are_refused():
     for value in (1.0, True, "x", [1]):
         with pytest.raises(ExpressionError, match="Only parameters have a value of their own"):
             Symbol("a", 0, "dof", value)

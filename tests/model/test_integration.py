@@ -15,7 +15,7 @@ from scipy.integrate import solve_ivp
 from scipy.spatial.transform import Rotation
 
 import kineverse as kv
-import motion_law
+import time_derivative_checks
 from hypothesis_profiles import attempts
 from kineverse.errors import InvalidValueError, UnknownNameError
 from kineverse.model.rate_nodes import to_plain
@@ -205,7 +205,9 @@ def random_expression(rng: np.random.Generator, symbols: list[kv.Symbol], depth:
 
 
 def assert_motion_law(model: kv.Model, expressions: list[kv.Expression], seed: int) -> None:
-    motion_law.assert_motion_law(model, expressions, random_state(model, seed), random_speeds(model, seed))
+    time_derivative_checks.assert_time_derivatives(
+        model, expressions, random_state(model, seed), random_speeds(model, seed)
+    )
 
 
 @pytest.mark.parametrize("base", BASES)

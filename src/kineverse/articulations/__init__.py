@@ -1,6 +1,7 @@
 """Library of articulations: joints, transmissions, mobile bases, mechanisms and locks."""
 
-from kineverse._synonyms import MODULE_SYNONYMS, unknown_attribute_error
+from kineverse._synonyms import MODULE_SYNONYMS
+from kineverse.errors import unknown_attribute_error
 
 from .bases import Ackermann, Base, DifferentialDrive, Mecanum, OmniBase
 from .joint import Fixed, Joint, OneAxisMotion, OneDofJoint

@@ -8,12 +8,11 @@ from pathlib import Path
 import numpy as np
 
 from kineverse.geometry import Rule
+from kineverse.lie import Array
 from kineverse.model.body import Body, Box, Capsule, Geometry, Mesh, Pose, Shape
 from kineverse.model.model import Model
 from kineverse.spatial import rotation_x, rotation_y, rotation_z, translation
 from kineverse.symbols import position
-
-from .harness import Array
 
 LINKS, RADIUS = 20, 0.1
 """The links of the arm, and how near is near [m]."""

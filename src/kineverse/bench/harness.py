@@ -20,11 +20,11 @@ from types import MappingProxyType
 from typing import Any, TypeAlias
 
 import numpy as np
-import numpy.typing as npt
 
 from kineverse._extras import install_command
 from kineverse._gc import no_collection
 from kineverse.errors import KineverseError
+from kineverse.lie import Array
 
 from .result import Measurement
 
@@ -78,8 +78,6 @@ class BenchmarkSettings:
 QUICK = BenchmarkSettings(rounds=5, processes=3, steps=20, operations=1_000)
 """Enough to see an order of magnitude."""
 
-
-Array: TypeAlias = npt.NDArray[np.float64]
 
 EQUALITY_TOLERANCE = 1e-9
 """Tolerance of the comparison of poses and Jacobians [m], [rad]."""

@@ -10,8 +10,9 @@ from pathlib import Path
 import numpy as np
 
 from kineverse.compile import compile, compiler_information  # noqa: A004
+from kineverse.lie import Array
 
-from .harness import Array, BenchmarkSettings, Contender, Contenders, time_calls, time_contenders
+from .harness import BenchmarkSettings, Contender, Contenders, time_calls, time_contenders
 from .peers.casadi import BoundMap, NumpyGraph, compile_map, make_casadi_function
 from .result import BenchmarkResult, compare_speed
 from .workloads import BenchmarkRobot, find_robot

@@ -15,8 +15,9 @@ from kineverse.compile import CompiledFunction, Evaluator, compile  # noqa: A004
 from kineverse.compile.program import Program
 from kineverse.compile.toolchain import NO_UNDEFINED_FLAGS, optimisation_level, toolchain
 from kineverse.expressions import array
+from kineverse.lie import Array
 
-from .harness import Array, BenchmarkSettings, Contender, Contenders, time_calls, time_contenders
+from .harness import BenchmarkSettings, Contender, Contenders, time_calls, time_contenders
 from .result import BenchmarkResult, Measurement, bound_median, compare_speed
 from .workloads import BenchmarkRobot, find_robot
 

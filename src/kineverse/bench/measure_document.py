@@ -7,9 +7,10 @@ from functools import partial
 from typing import Any
 
 from kineverse.formats.document import from_bytes, to_bytes, to_json
+from kineverse.lie import Array
 from kineverse.model.model import Model
 
-from .harness import Array, BenchmarkSettings, Contender, Contenders, time_calls, time_contenders
+from .harness import BenchmarkSettings, Contender, Contenders, time_calls, time_contenders
 from .large_models import DocumentTimes, read_document, time_document
 from .result import Bar, BenchmarkResult, Comparison, Measurement, bound_median, compare_speed
 from .workloads import BenchmarkRobot, find_robot

@@ -11,9 +11,10 @@ from xml.etree import ElementTree
 import numpy as np
 
 from kineverse.articulations.joint import Joint
+from kineverse.lie import Array
 from kineverse.model import Pose
 
-from .harness import Array, BenchmarkSettings, Contender, Contenders, time_calls, time_contenders
+from .harness import BenchmarkSettings, Contender, Contenders, time_calls, time_contenders
 from .large_models import (
     COPY,
     READERS,

@@ -7,8 +7,9 @@ from collections.abc import Sequence
 import numpy as np
 
 from kineverse.compile import compile  # noqa: A004
+from kineverse.lie import Array
 
-from .harness import Array, BenchmarkSettings, Contender, Contenders, time_calls, time_contenders
+from .harness import BenchmarkSettings, Contender, Contenders, time_calls, time_contenders
 from .result import BenchmarkResult, compare_speed
 from .workloads import BenchmarkRobot, find_robot
 

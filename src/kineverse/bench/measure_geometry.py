@@ -12,10 +12,10 @@ import numpy as np
 
 from kineverse.geometry import Scene
 from kineverse.geometry.bindings import collision_library
+from kineverse.lie import Array
 
 from .clutter import LINKS, RADIUS, RULES, make_clutter
 from .harness import (
-    Array,
     BenchmarkSettings,
     Contender,
     Contenders,

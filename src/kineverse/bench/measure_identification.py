@@ -11,10 +11,9 @@ import numpy as np
 
 from kineverse.estimation import Identifier, identify, pose_covariance
 from kineverse.estimation.identification.solver import solver
-from kineverse.lie import exp_so3, inverse, log_so3, pose_difference, retract, transform, translation
+from kineverse.lie import Array, exp_so3, inverse, log_so3, pose_difference, retract, transform, translation
 
 from .harness import (
-    Array,
     BenchmarkSettings,
     Contender,
     Contenders,

@@ -9,7 +9,9 @@ from typing import Any
 
 import numpy as np
 
-from .harness import Array, BenchmarkSettings, Contender, Contenders, run_program, time_contenders
+from kineverse.lie import Array
+
+from .harness import BenchmarkSettings, Contender, Contenders, run_program, time_contenders
 from .result import BenchmarkResult, bound_median, compare_speed
 from .workloads import BenchmarkRobot, find_robot
 

@@ -10,13 +10,14 @@ import numpy as np
 
 from kineverse.articulations import Revolute
 from kineverse.compile import compile  # noqa: A004
+from kineverse.lie import Array
 from kineverse.loops import CloseLoop
 from kineverse.model.body import Pose
 from kineverse.model.frame import WORLD, Frame
 from kineverse.model.model import Model
 from kineverse.spatial import translation
 
-from .harness import Array, BenchmarkSettings, Contender, Contenders, time_calls, time_contenders
+from .harness import BenchmarkSettings, Contender, Contenders, time_calls, time_contenders
 from .result import BenchmarkResult, bound_median, compare_speed
 
 BOUND, PLAIN = "kineverse, bound call with input", "kineverse, plain call"

@@ -10,10 +10,10 @@ import numpy as np
 from kineverse.compile import compile  # noqa: A004
 from kineverse.estimation import ObservedPose, Tracker, pose_covariance
 from kineverse.formats import load
-from kineverse.lie import retract
+from kineverse.lie import Array, retract
 from kineverse.model.model import Model
 
-from .harness import Array, BenchmarkSettings, Contender, Contenders, time_calls, time_contenders
+from .harness import BenchmarkSettings, Contender, Contenders, time_calls, time_contenders
 from .peers.kalman_filter import Form, NumpyFilter
 from .result import BenchmarkResult, bound_median, compare_speed
 

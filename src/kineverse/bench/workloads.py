@@ -15,11 +15,12 @@ from kineverse.errors import InvalidValueError, KineverseError, UnknownNameError
 from kineverse.formats import load
 from kineverse.formats.locate import locate_model
 from kineverse.geometry import Rule, Scene
+from kineverse.lie import Array
 from kineverse.model.frame import WORLD
 from kineverse.model.model import Model
 from kineverse.symbols import Symbol
 
-from .harness import Array, BenchmarkSettings
+from .harness import BenchmarkSettings
 
 PR2 = ("pr2_description/robots/pr2.urdf", "pr2_description/urdf/pr2.urdf", "pr2")
 """A real PR2 from the model path or from example-robot-data, else the one that ships."""

@@ -8,18 +8,15 @@ import sys
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
-import numpy as np
-import numpy.typing as npt
-
 from kineverse.cli.arguments import parse_length, parse_value
 from kineverse.cli.output import show_activity
 from kineverse.errors import InvalidValueError
+from kineverse.lie import Array
 
 if TYPE_CHECKING:
     from kineverse.estimation import Fit, IdentificationResult
     from kineverse.estimation.recordings import RecordedPair
 
-Array = npt.NDArray[np.float64]
 
 HELP = """learn how a part moves from a table of its poses
 

@@ -8,13 +8,13 @@ from dataclasses import replace
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-import numpy.typing as npt
 
 from kineverse.cli.output import format_table
 from kineverse.errors import InvalidValueError
 from kineverse.estimation.identification.found_operations import joint_operation
 from kineverse.expressions.printing import format_number
 from kineverse.gallery import shapes
+from kineverse.lie import Array
 from kineverse.model.body import Body
 from kineverse.model.frame import WORLD
 from kineverse.model.model import Model
@@ -201,8 +201,6 @@ def _format_percent(probability: float) -> str:
     percent = 100.0 * probability
     return f"{min(percent, 99.99):.4g} %" if probability < 1.0 else "100 %"
 
-
-Array = npt.NDArray[np.float64]
 
 MOST_DOTS = 60
 """At most so many of the poses that were seen are in the model."""

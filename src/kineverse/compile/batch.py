@@ -17,10 +17,12 @@ import numpy as np
 import numpy.typing as npt
 
 from kineverse.errors import CompileError, NoSolutionError, ShapeError
+from kineverse.expressions.layout import ArrayShape
+from kineverse.lie import Array
 
 from .batch_codegen import BATCH_KIND, generate_batch_source, is_vectorizable
 from .c_library import ProgramLibrary
-from .evaluator import Array, OutputShape, bind
+from .evaluator import bind
 from .parallel import cores, parallel_rows
 from .program import CasadiFunction, Program
 from .signature import Signature, as_doubles
@@ -32,10 +34,10 @@ _LARGEST_TOTAL = 128 * 2**20
 
 # Longest free first. Accessed by atomic operations only: garbage collection may interrupt this code to return
 # a block.
-_free_blocks: list[npt.NDArray[np.float64]] = []
+_free_blocks: list[Array] = []
 
 
-def allocate_aligned(size: int) -> npt.NDArray[np.float64]:
+def allocate_aligned(size: int) -> Array:
     """Return an uninitialised vector that begins at a cache line.
 
     Its memory is reused only after this vector and all views of it are deleted.
@@ -60,15 +62,15 @@ class _Lease:
 
     __slots__ = ("__array_interface__", "__weakref__")
 
-    def __init__(self, block: npt.NDArray[np.float64]) -> None:
+    def __init__(self, block: Array) -> None:
         self.__array_interface__ = block.__array_interface__
 
 
-def _from_line(block: npt.NDArray[np.float64]) -> npt.NDArray[np.float64]:
+def _from_line(block: Array) -> Array:
     return block[-block.__array_interface__["data"][0] % _CACHE_LINE // 8 :]
 
 
-def _take_free_block(size: int) -> npt.NDArray[np.float64] | None:
+def _take_free_block(size: int) -> Array | None:
     """Return a free block of this size, if there is one."""
     for _ in range(len(_free_blocks)):
         try:
@@ -81,7 +83,7 @@ def _take_free_block(size: int) -> npt.NDArray[np.float64] | None:
     return None
 
 
-def _give_back(block: npt.NDArray[np.float64]) -> None:
+def _give_back(block: Array) -> None:
     _free_blocks.append(block)
     while sum(b.nbytes for b in _free_blocks[:]) > _LARGEST_TOTAL:
         try:
@@ -123,7 +125,7 @@ class Batch:
     """
 
     def __init__(
-        self, program: Program, signature: Signature, shapes: Sequence[OutputShape], single: bool, tier: str
+        self, program: Program, signature: Signature, shapes: Sequence[ArrayShape], single: bool, tier: str
     ) -> None:
         self._program = program
         self._signature = signature

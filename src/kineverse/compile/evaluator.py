@@ -13,18 +13,18 @@ from operator import call
 from typing import Any, TypeAlias
 
 import numpy as np
-import numpy.typing as npt
 
-from .program import CasadiFunction, Check, DoubleVector
+from kineverse.expressions.layout import ArrayShape
+from kineverse.lie import Array
 
-Array: TypeAlias = npt.NDArray[np.float64]
+from .program import CasadiFunction, Check
+
 BoundCall: TypeAlias = Callable[[], object]
 VectorCall: TypeAlias = Callable[[Any], Any]
-OutputShape: TypeAlias = tuple[int, ...]
 
 
 def bind(
-    function: CasadiFunction, vector: DoubleVector, outputs: Sequence[Array], check: Check | None
+    function: CasadiFunction, vector: Array, outputs: Sequence[Array], check: Check | None
 ) -> tuple[BoundCall, object]:
     """Bind a function of one vector to arrays.
 
@@ -61,7 +61,7 @@ def bind(
 def make_pooled_call(
     function: CasadiFunction,
     size: int,
-    shapes: Sequence[OutputShape],
+    shapes: Sequence[ArrayShape],
     single: bool,
     convert: VectorCall,
     check: Check | None,
@@ -137,12 +137,10 @@ class Evaluator(metaclass=ABCMeta):
 
     __slots__ = ("__weakref__", "_convert", "_references", "_run", "_view", "input", "outputs")
 
-    input: DoubleVector
+    input: Array
     outputs: tuple[Array, ...]
 
-    def __init__(
-        self, shapes: tuple[OutputShape, ...], size: int, convert: Callable[[Any], DoubleVector]
-    ) -> None:
+    def __init__(self, shapes: tuple[ArrayShape, ...], size: int, convert: Callable[[Any], Array]) -> None:
         assign = super().__setattr__
         assign("input", np.zeros(size))
         assign("outputs", tuple(np.zeros(shape) for shape in shapes))
@@ -187,7 +185,7 @@ class Evaluator(metaclass=ABCMeta):
     _references: list[object]
     _run: BoundCall
     _view: memoryview
-    _convert: Callable[[Any], DoubleVector]
+    _convert: Callable[[Any], Array]
 
     def __setattr__(self, name: str, value: object) -> None:
         raise AttributeError(

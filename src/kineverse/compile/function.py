@@ -16,13 +16,15 @@ import numpy.typing as npt
 
 from kineverse.errors import CompileError, InvalidValueError
 from kineverse.expressions import Expression, ExpressionLike, array
+from kineverse.expressions.layout import ArrayShape
+from kineverse.lie import Array
 from kineverse.symbols import Symbol
 
 from .batch import Batch
 from .c_library import ProgramLibrary
 from .call_extension import MOST_OUTPUTS, call_extension
-from .evaluator import Array, Evaluator, OutputShape, bind, make_pooled_call
-from .program import FUNCTION_NAME, SINGLE_KIND, CasadiFunction, DoubleVector, Program
+from .evaluator import Evaluator, bind, make_pooled_call
+from .program import FUNCTION_NAME, SINGLE_KIND, CasadiFunction, Program
 from .signature import make_signature
 
 if TYPE_CHECKING:
@@ -149,7 +151,7 @@ class CompiledFunction(Generic[Results]):
 
     inputs: tuple[Symbol, ...]
     names: tuple[str, ...]
-    shapes: tuple[OutputShape, ...]
+    shapes: tuple[ArrayShape, ...]
     tier: Tier
     _call: Callable[[Any], Results]
 
@@ -328,7 +330,7 @@ class CompiledFunction(Generic[Results]):
             check = self._program.checked
             evaluator._evaluate_by(*bind(self._function, evaluator.input, evaluator.outputs, check))
 
-    def _native_evaluator(self, vector: DoubleVector, outputs: tuple[Array, ...]) -> Evaluator:
+    def _native_evaluator(self, vector: Array, outputs: tuple[Array, ...]) -> Evaluator:
         lengthy = self._program.instructions > _LENGTHY
         evaluator: Evaluator = call_extension.module.Evaluator(
             self._native, vector, outputs, lengthy, self._signature.vector, self._program.checked

@@ -13,16 +13,15 @@ from typing import Any, TypeAlias
 
 import casadi as ca
 import numpy as np
-import numpy.typing as npt
 
 from kineverse.errors import CompileError
 from kineverse.expressions import Expression, layout
 from kineverse.expressions.implicit import explain_no_solution, implicit_nodes
+from kineverse.lie import Array
 from kineverse.symbols import Symbol
 
 CasadiFunction: TypeAlias = Any
-DoubleVector: TypeAlias = npt.NDArray[np.float64]
-Check: TypeAlias = Callable[[DoubleVector, DoubleVector | Sequence[DoubleVector]], None]
+Check: TypeAlias = Callable[[Array, Array | Sequence[Array]], None]
 
 FUNCTION_NAME = "kineverse_function"
 
@@ -83,7 +82,7 @@ class Program:
         digest.update(repr(details).encode())
         return digest.hexdigest()[:40]
 
-    def check(self, vector: DoubleVector, results: DoubleVector | Sequence[DoubleVector]) -> None:
+    def check(self, vector: Array, results: Array | Sequence[Array]) -> None:
         """Raise an error if results are NaN because an implicit function has no solution.
 
         Parameters

@@ -6,7 +6,6 @@ from collections.abc import Iterable, Mapping, Sequence
 from typing import Any
 
 import numpy as np
-import numpy.typing as npt
 
 from kineverse._checks import real_number
 from kineverse.errors import (
@@ -19,6 +18,7 @@ from kineverse.errors import (
     suggest,
 )
 from kineverse.expressions import Expression
+from kineverse.lie import Array
 from kineverse.state import State
 from kineverse.symbols import Symbol
 
@@ -49,7 +49,7 @@ class Signature:
             self._positions = {key: i for keys in (self.names, self.inputs) for i, key in enumerate(keys)}
         return self._positions
 
-    def vector(self, x: Any) -> npt.NDArray[np.float64]:
+    def vector(self, x: Any) -> Array:
         """Return the numbers of all inputs as a contiguous vector, shape (n,).
 
         Parameters
@@ -77,7 +77,7 @@ class Signature:
             )
         return np.ascontiguousarray(array) if array.flags.aligned else array.copy()
 
-    def _from_mapping(self, values: Mapping[Any, Any]) -> npt.NDArray[np.float64]:
+    def _from_mapping(self, values: Mapping[Any, Any]) -> Array:
         if isinstance(values, State):  # which may have more symbols
             held = [(s, values.given(s)) for s in self.inputs]
             return self._complete([s.value if value is None else value for s, value in held])
@@ -101,7 +101,7 @@ class Signature:
             )
         return self._complete(vector)
 
-    def _complete(self, vector: list[float | None]) -> npt.NDArray[np.float64]:
+    def _complete(self, vector: list[float | None]) -> Array:
         missing = [name for name, value in zip(self.names, vector, strict=True) if value is None]
         if missing:
             raise UnknownNameError(f"No value is given for {_listed(missing)}.")
@@ -162,7 +162,7 @@ def make_signature(outputs: Sequence[Expression], inputs: Iterable[Symbol] | Non
     return found
 
 
-def as_doubles(x: Any, wanted: str) -> npt.NDArray[np.float64]:
+def as_doubles(x: Any, wanted: str) -> Array:
     """Return real numbers as an array of doubles, of any shape and strides.
 
     Raises

@@ -5,7 +5,8 @@
 :mod:`kineverse.estimation.plausibility` tests a model against observations. Layer 5.
 """
 
-from kineverse._synonyms import MODULE_SYNONYMS, unknown_attribute_error
+from kineverse._synonyms import MODULE_SYNONYMS
+from kineverse.errors import unknown_attribute_error
 
 from .identification import Family, FamilyParameter, Fit, IdentificationResult, Identifier, identify
 from .identification.kinematic_graph.graph import KinematicEdge, KinematicGraph, RigidBody, identify_graph

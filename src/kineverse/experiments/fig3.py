@@ -12,10 +12,10 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 import numpy as np
-import numpy.typing as npt
 
 from kineverse.articulations import GarageDoor
 from kineverse.compile import compile  # noqa: A004
+from kineverse.lie import Array
 from kineverse.model.frame import WORLD
 from kineverse.model.model import Model
 from kineverse.spatial import point
@@ -26,7 +26,6 @@ from .report import Figure, Report, ReportTable
 if TYPE_CHECKING:
     from matplotlib.figure import Figure as Canvas
 
-Array = npt.NDArray[np.float64]
 
 OPTIONS = ()
 

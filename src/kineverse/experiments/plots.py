@@ -10,7 +10,8 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 import numpy as np
-import numpy.typing as npt
+
+from kineverse.lie import Array
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -18,7 +19,6 @@ if TYPE_CHECKING:
 
     from kineverse.estimation.identification.result import Fit
 
-Array = npt.NDArray[np.float64]
 
 SIZE = (13.0, 5.2)
 """Size of the picture of one joint [inch]."""

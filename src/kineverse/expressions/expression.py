@@ -16,8 +16,8 @@ import casadi as ca
 import numpy as np
 import numpy.typing as npt
 
-from kineverse._synonyms import EXPRESSION_SYNONYMS, unknown_attribute_error
-from kineverse.errors import ExpressionError, InvalidValueError, ShapeError
+from kineverse._synonyms import EXPRESSION_SYNONYMS
+from kineverse.errors import ExpressionError, InvalidValueError, ShapeError, unknown_attribute_error
 
 from . import layout
 from .array_methods import ArrayMethods

@@ -1,6 +1,7 @@
 """Collision geometry of a model (layer 4); a scene needs the extra ``geometry``."""
 
-from kineverse._synonyms import MODULE_SYNONYMS, unknown_attribute_error
+from kineverse._synonyms import MODULE_SYNONYMS
+from kineverse.errors import unknown_attribute_error
 
 from .collision_filter import RULES, Rule, rules_as_data
 from .distance_expressions import PairDistance

@@ -7,10 +7,10 @@ from collections.abc import Mapping
 
 import casadi as ca
 import numpy as np
-import numpy.typing as npt
 
 from kineverse.expressions.graph import expand_nodes
 from kineverse.expressions.implicit import ImplicitFunction
+from kineverse.lie import Array
 from kineverse.symbols import Symbol
 
 from .arithmetic import (
@@ -39,7 +39,6 @@ from .taylor import (
     taylor_unary,
 )
 
-RealMatrix = npt.NDArray[np.float64]
 _UNKNOWN: TaylorSeries = (REALS,)
 _REGULAR = 1e12
 _CONTRACTS = 0.9
@@ -134,8 +133,8 @@ class _Solver:
         return [tuple(u) for u in unknowns]
 
     def _krawczyk(
-        self, x: RealMatrix, middle: list[float], inputs: list[RealInterval]
-    ) -> tuple[list[RealInterval], RealMatrix, float] | None:
+        self, x: Array, middle: list[float], inputs: list[RealInterval]
+    ) -> tuple[list[RealInterval], Array, float] | None:
         """Return a box with one solution for each input, Y, and β/(1 - β) with β = |1 - Y ∂r/∂x|.
 
         The box is centred on the tangent D at the middle m, which is far closer to the solution than x is.
@@ -148,7 +147,7 @@ class _Solver:
         by_inputs = self._matrix(self._by_inputs, there, here)
         if slope is None or by_inputs is None or not np.linalg.cond(slope) < _REGULAR:
             return None
-        inverse: RealMatrix = np.asarray(np.linalg.inv(slope), dtype=np.float64)
+        inverse: Array = np.asarray(np.linalg.inv(slope), dtype=np.float64)
         tangent = -inverse @ by_inputs
         away = [round_outwards(u[0] - m, u[1] - m) for u, m in zip(inputs, middle, strict=True)]
         straight = _multiply_column(tangent, away)
@@ -199,7 +198,7 @@ class _Solver:
 
     def _matrix(
         self, roots: list[Term], unknowns: list[TaylorSeries], inputs: list[TaylorSeries]
-    ) -> RealMatrix | None:
+    ) -> Array | None:
         entries = [_middle(s[0]) for s in self._at(roots, unknowns, inputs)]
         matrix = np.reshape(entries, (-1, len(unknowns))).T
         return matrix if np.isfinite(matrix).all() else None
@@ -216,7 +215,7 @@ def _middle(a: RealInterval) -> float:
     return (a[0] + a[1]) / 2
 
 
-def _multiply_column(matrix: RealMatrix, column: list[RealInterval]) -> list[RealInterval]:
+def _multiply_column(matrix: Array, column: list[RealInterval]) -> list[RealInterval]:
     result = []
     for row in matrix.tolist():
         total = ZERO_INTERVAL

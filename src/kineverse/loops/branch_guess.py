@@ -18,10 +18,11 @@ import numpy.typing as npt
 from kineverse.errors import NoSolutionError
 from kineverse.expressions.expression import Expression, array
 from kineverse.expressions.functions import cos, sin
+from kineverse.lie import Array
 from kineverse.symbols import Symbol
 
 from .branches import continue_solution
-from .equations import Array, Equations
+from .equations import Equations
 
 FEW = 3
 """Largest number of inputs with all products as basis, and samples on a grid."""

@@ -8,7 +8,9 @@ from dataclasses import dataclass
 import numpy as np
 import numpy.typing as npt
 
-from .equations import CLOSURE_TOLERANCE, Array, Equations
+from kineverse.lie import Array
+
+from .equations import CLOSURE_TOLERANCE, Equations
 
 _TRIES = 60
 _SAME = 1e-4

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any, TypeAlias
+from typing import Any
 
 import numpy as np
 import numpy.typing as npt
@@ -12,6 +12,7 @@ import numpy.typing as npt
 from kineverse.compile import compile  # noqa: A004
 from kineverse.errors import InvalidValueError, NoSolutionError
 from kineverse.expressions.expression import Expression, array
+from kineverse.lie import Array
 from kineverse.symbols import Symbol
 
 AXES = ("x", "y", "z", "rx", "ry", "rz")
@@ -70,8 +71,6 @@ def upright_signs(pose: Expression, mask: Sequence[str]) -> list[Expression]:
         return [diagonal[axis] for axis in "xyz" if axis not in turning]
     return [sum((diagonal[axis] for axis in "xyz" if axis not in turning), array(0.0))]
 
-
-Array: TypeAlias = npt.NDArray[np.float64]
 
 CLOSURE_TOLERANCE = 1e-11
 """Largest residual of a closed loop during the analysis [m] or [rad]."""

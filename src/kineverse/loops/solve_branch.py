@@ -13,11 +13,12 @@ from kineverse.compile import compile  # noqa: A004
 from kineverse.errors import InvalidValueError, NoSolutionError
 from kineverse.expressions.expression import Expression
 from kineverse.expressions.implicit import ImplicitFunction
+from kineverse.lie import Array
 from kineverse.symbols import Symbol
 
 from .branch_guess import BranchGuess, BranchSamples, InputDomain, format_point, list_products
 from .branches import continue_solution, find_branches, find_nearest_closed
-from .equations import CLOSURE_TOLERANCE, Array, Equations, WorkBudget, find_periodic
+from .equations import CLOSURE_TOLERANCE, Equations, WorkBudget, find_periodic
 
 RANK = 1e-7
 """Singular value relative to the largest one, below which a direction counts as free."""

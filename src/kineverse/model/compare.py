@@ -10,9 +10,9 @@ from math import inf, isnan
 from typing import Any
 
 import numpy as np
-import numpy.typing as npt
 
 from kineverse.expressions.expression import Expression, as_expression
+from kineverse.lie import Array
 from kineverse.model.articulation import Articulation
 from kineverse.model.history import History
 
@@ -23,8 +23,6 @@ from .history import HistoryEntry
 from .model import Model, Snapshot
 from .operation import KINDS, RATES
 from .sampling import StateSamples
-
-Array = npt.NDArray[np.float64]
 
 
 @dataclass(frozen=True, slots=True)

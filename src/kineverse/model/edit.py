@@ -7,8 +7,8 @@ from typing import TYPE_CHECKING, Any
 
 from kineverse._checks import check_flag
 from kineverse._gc import no_collection
-from kineverse._synonyms import EDIT_SYNONYMS, unknown_attribute_error
-from kineverse.errors import DuplicateNameError, EditError
+from kineverse._synonyms import EDIT_SYNONYMS
+from kineverse.errors import DuplicateNameError, EditError, unknown_attribute_error
 from kineverse.expressions.expression import ExpressionLike
 from kineverse.symbols import Symbol
 

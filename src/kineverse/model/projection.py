@@ -18,20 +18,18 @@ from functools import cached_property
 from typing import Any
 
 import numpy as np
-import numpy.typing as npt
 
 from kineverse._checks import as_tolerance
 from kineverse.compile import compile  # noqa: A004
 from kineverse.errors import NoSolutionError, UnknownNameError, suggest
 from kineverse.expressions.expression import Expression, array
+from kineverse.lie import Array
 from kineverse.state import State
 from kineverse.symbols import Symbol
 
 from .articulation import Articulation
 from .constraint import Constraint
 from .rates import Rates
-
-Array = npt.NDArray[np.float64]
 
 _QUATERNION = ("qx", "qy", "qz", "qw")
 

@@ -6,9 +6,10 @@ import math
 from collections.abc import Iterator
 from dataclasses import dataclass
 
+from kineverse.lie import Array
 from kineverse.model.compare import measure_pose_distances
 from kineverse.model.model_view import ModelView
-from kineverse.model.sampling import Array, StateSamples
+from kineverse.model.sampling import StateSamples
 from kineverse.symbols import Symbol
 
 COMPARED_STATES = 100

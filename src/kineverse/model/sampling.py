@@ -8,15 +8,13 @@ from zlib import crc32
 
 import casadi as ca
 import numpy as np
-import numpy.typing as npt
 
 from kineverse.expressions.expression import SYMBOLS, Expression
 from kineverse.expressions.graph import lower
+from kineverse.lie import Array
 from kineverse.symbols import Symbol
 
 from .model_view import ModelView
-
-Array = npt.NDArray[np.float64]
 
 REACH = np.pi
 """Half width of the range of a symbol without limits, around its default value [rad], [m] and their rates."""

@@ -12,8 +12,8 @@ from typing import TYPE_CHECKING, Any, Literal
 import casadi as ca
 import numpy as np
 
-from kineverse._synonyms import EDIT_METHODS, MODEL_SYNONYMS, unknown_attribute_error
-from kineverse.errors import UnknownAttributeError, UnknownNameError
+from kineverse._synonyms import EDIT_METHODS, MODEL_SYNONYMS
+from kineverse.errors import UnknownAttributeError, UnknownNameError, unknown_attribute_error
 from kineverse.expressions.expression import NO_NODES, Expression, as_expression, from_casadi
 from kineverse.spatial import OneAxisTransform
 from kineverse.symbols import Symbol, check_symbols

@@ -1,6 +1,7 @@
 """Reasoning about models (layer 5): interlocks and their conditions."""
 
-from kineverse._synonyms import MODULE_SYNONYMS, unknown_attribute_error
+from kineverse._synonyms import MODULE_SYNONYMS
+from kineverse.errors import unknown_attribute_error
 
 from .boxes import Interval, IntervalBox
 from .certify import contradictions

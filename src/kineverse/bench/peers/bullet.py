@@ -6,8 +6,7 @@ import itertools
 from typing import Any
 
 from kineverse.bench.clutter import BOX_SIZE, CAPSULE_SIZE, CENTRE, LINK_LENGTH, LINKS, RADIUS, Clutter
-from kineverse.bench.harness import Array
-from kineverse.lie import to_quaternion
+from kineverse.lie import Array, to_quaternion
 
 from .clutter_search import PairDistances
 

@@ -11,10 +11,10 @@ from typing import Any
 import casadi as ca
 import numpy as np
 
-from kineverse.bench.harness import Array
 from kineverse.bench.workloads import BenchmarkRobot
 from kineverse.compile import compiler_information
 from kineverse.errors import CompileError
+from kineverse.lie import Array
 
 COMPILER_FLAGS = ("-O3", "-march=native", "-fPIC", "-shared")
 """Choice of a user of CasADi. The C of the map is faster than a map over the C of the function."""

@@ -9,9 +9,9 @@ from typing import Any, Protocol, TypeAlias
 import numpy as np
 
 from kineverse.bench.clutter import BOX_SIZE, CAPSULE_SIZE, CENTRE, LINK_LENGTH, LINKS, RADIUS, Clutter
-from kineverse.bench.harness import Array
 from kineverse.geometry import Scene
 from kineverse.geometry.shapes import import_coal
+from kineverse.lie import Array
 
 PairDistances: TypeAlias = Iterator[tuple[str, str, float]]
 

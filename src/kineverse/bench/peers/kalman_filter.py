@@ -6,8 +6,8 @@ from typing import Literal, TypeAlias
 
 import numpy as np
 
-from kineverse.bench.harness import Array
 from kineverse.compile import compile  # noqa: A004
+from kineverse.lie import Array
 from kineverse.model.model import Model
 
 Form: TypeAlias = Literal["gain", "information"]

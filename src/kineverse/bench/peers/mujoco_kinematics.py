@@ -8,9 +8,8 @@ from xml.etree import ElementTree
 import mujoco
 import numpy as np
 
-from kineverse.bench.harness import Array
 from kineverse.bench.workloads import BenchmarkRobot, strip_shapes
-from kineverse.lie import transform
+from kineverse.lie import Array, transform
 
 
 class MujocoRobot:

@@ -7,8 +7,8 @@ from typing import Any
 import numpy as np
 import pinocchio as pin
 
-from kineverse.bench.harness import Array
 from kineverse.bench.workloads import BenchmarkRobot
+from kineverse.lie import Array
 
 
 class PinocchioRobot:

@@ -7,9 +7,9 @@ from typing import Any
 import numpy as np
 
 from kineverse.bench.clutter import RADIUS
-from kineverse.bench.harness import Array
 from kineverse.geometry import Scene
 from kineverse.geometry.shapes import Solid
+from kineverse.lie import Array
 from kineverse.model.body import Box, Capsule, Cylinder, Ellipsoid, Sphere
 from kineverse.view.poses import to_wxyz
 

@@ -9,7 +9,6 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
-import numpy.typing as npt
 
 from kineverse.errors import FormatError
 from kineverse.estimation.recordings.columns import (
@@ -22,7 +21,7 @@ from kineverse.estimation.recordings.columns import (
 from kineverse.estimation.recordings.recording import Indices, RecordedTrack, Recording
 from kineverse.formats.files import read_file
 from kineverse.formats.xml_values import LARGEST
-from kineverse.lie import exp_so3, quaternion, rpy, transform
+from kineverse.lie import Array, exp_so3, quaternion, rpy, transform
 
 COMMENT = "#"
 
@@ -122,8 +121,6 @@ def _split_cells(text: str, separator: str | None) -> list[str]:
 def _count_text(count: int) -> str:
     return f"{count} cell{'' if count == 1 else 's'}"
 
-
-Array = npt.NDArray[np.float64]
 
 QUATERNION_TOLERANCE = 0.01
 """Largest accepted deviation of a quaternion's length from one; two digits suffice."""

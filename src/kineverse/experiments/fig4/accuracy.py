@@ -9,12 +9,12 @@ from typing import Any
 import numpy as np
 
 from kineverse.experiments.registry import Progress
+from kineverse.lie import Array
 
 from .protocol import (
     LEVELS,
     OBSERVATIONS,
     TRAINING,
-    Array,
     Directions,
     ObservedModel,
     PoseNoise,

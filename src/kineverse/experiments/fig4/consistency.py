@@ -17,11 +17,11 @@ import numpy as np
 import numpy.typing as npt
 
 from kineverse.experiments.registry import Progress
+from kineverse.lie import Array
 
 from .protocol import (
     OBSERVATIONS,
     TRAINING,
-    Array,
     FilterRun,
     ObservedModel,
     PoseNoise,

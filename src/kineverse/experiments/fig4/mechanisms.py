@@ -10,6 +10,7 @@ from kineverse.articulations import FoldingDoor, GarageDoor
 from kineverse.errors import InvalidValueError
 from kineverse.experiments.fig4.paper_ekf import PaperEkf
 from kineverse.experiments.registry import Progress
+from kineverse.lie import Array
 from kineverse.model.frame import WORLD
 from kineverse.model.model import Model
 from kineverse.model.operation import Operation
@@ -19,7 +20,6 @@ from .protocol import (
     DT,
     OBSERVATIONS,
     TRAINING,
-    Array,
     FilterRun,
     ObservedModel,
     PoseNoise,

@@ -17,10 +17,9 @@ import numpy.typing as npt
 from kineverse.compile import compile  # noqa: A004
 from kineverse.errors import InvalidValueError, ModelError, ShapeError, UnknownNameError, suggest
 from kineverse.expressions import Expression, array
+from kineverse.lie import Array
 from kineverse.model.model_view import ModelView
 from kineverse.symbols import Symbol
-
-Array = npt.NDArray[np.float64]
 
 STEPS = 10
 STEP_SIZE = 0.1

@@ -15,11 +15,10 @@ from kineverse.compile import CompiledFunction, compile  # noqa: A004
 from kineverse.errors import ModelError
 from kineverse.estimation import ObservedPose, Tracker, pose_covariance
 from kineverse.experiments.fig4.paper_ekf import SPREAD, STEPS, PaperEkf
-from kineverse.lie import exp_so3, retract, transform
+from kineverse.lie import Array, exp_so3, retract, transform
 from kineverse.model.model_view import ModelView
 from kineverse.symbols import Symbol
 
-Array: TypeAlias = npt.NDArray[np.float64]
 Generator: TypeAlias = np.random.Generator
 
 DT = 0.05

@@ -13,9 +13,10 @@ import numpy as np
 from kineverse._gc import no_collection
 from kineverse.experiments.fig4.paper_ekf import PaperEkf
 from kineverse.experiments.registry import Progress
+from kineverse.lie import Array
 
 from .accuracy import simulate_observations
-from .protocol import DT, LEVELS, Array, ObservedModel, PoseNoise, make_tracker
+from .protocol import DT, LEVELS, ObservedModel, PoseNoise, make_tracker
 
 Step: TypeAlias = Callable[[Array], None]
 

@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import itertools
 
-import law_oracle as oracle
-import law_programs as lp
+import gradient_oracle as oracle
 import numpy as np
+import random_programs as lp
 from hypothesis import HealthCheck, Phase, assume, given, settings
 from hypothesis import strategies as st
 

@@ -9,7 +9,7 @@ from __future__ import annotations
 import functools
 import operator
 
-import law_oracle as oracle
+import gradient_oracle as oracle
 import numpy as np
 from hypothesis import strategies as st
 

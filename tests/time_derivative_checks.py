@@ -9,7 +9,7 @@ import numpy as np
 import kineverse as kv
 
 
-def assert_motion_law(
+def assert_time_derivatives(
     model: kv.Model,
     expressions: Sequence[kv.Expression],
     start: Mapping[kv.Symbol, float],
