@@ -108,8 +108,10 @@ class Trace:
         }
         for (kind, _), value in written.items():
             if kind == CONSTRAINTS:
-                Constraint.of(value.lower, value.expression, value.upper)  # raises for an empty range
-        return Writes.of(written)
+                Constraint.from_expressions(
+                    value.lower, value.expression, value.upper
+                )  # raises for an empty range
+        return Writes.from_cells(written)
 
 
 def _check_size(reply: QueryResult) -> None:
