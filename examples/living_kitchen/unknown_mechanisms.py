@@ -150,7 +150,7 @@ def _between(point: Vector3) -> dict[str, Any]:
 
 
 def _at(x: float, y: float, z: float) -> Pose:
-    return Pose.of(translation(x, y, z))
+    return Pose.from_matrix(translation(x, y, z))
 
 
 def _walls(size: Vector3, wall: float, color: Rgba) -> tuple[Shape, ...]:

@@ -22,7 +22,12 @@ State = Mapping[kv.Symbol, float]
 ORIGIN = np.eye(4)
 ORIGIN[:3, :3] = Rotation.from_euler("xyz", [0.3, -0.8, 1.9]).as_matrix()
 ORIGIN[:3, 3] = [0.5, -0.25, 2.0]
-WHERE: dict[str, Any] = {"name": "j", "parent": "world", "child": "c", "origin": kv.model.Pose.of(ORIGIN)}
+WHERE: dict[str, Any] = {
+    "name": "j",
+    "parent": "world",
+    "child": "c",
+    "origin": kv.model.Pose.from_matrix(ORIGIN),
+}
 
 
 def model_of(*operations: kv.Operation) -> kv.Model:

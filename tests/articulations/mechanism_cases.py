@@ -11,7 +11,7 @@ from articulation_checks import ORIGIN, Matrix, homogeneous, model_of, turned
 import kineverse as kv
 from kineverse.articulations import Mechanism
 
-WHERE: dict[str, Any] = {"name": "m", "parent": "world", "origin": kv.model.Pose.of(ORIGIN)}
+WHERE: dict[str, Any] = {"name": "m", "parent": "world", "origin": kv.model.Pose.from_matrix(ORIGIN)}
 
 EVERY: dict[str, Mechanism] = {
     "garage door": kv.articulations.GarageDoor(**WHERE),

@@ -61,7 +61,7 @@ def test_only_the_regular_form_has_a_slope_where_it_is_closed() -> None:
 def test_its_constraints_are_those_of_the_papers() -> None:
     a, b = kv.position("m/door"), kv.position("m/bolt")
     constraints = model_of(PUBLISHED).constraints
-    assert constraints["m/door/position"] == kv.Constraint.of(0, a, 2)
+    assert constraints["m/door/position"] == kv.Constraint.from_expressions(0, a, 2)
     c2 = constraints["m/lock"]
     assert c2.expression is a.derivative()
     unlocked = ~((b < 0.3) & (a > 1.99))

@@ -30,7 +30,12 @@ AXES = [
     (0, 1e-200, 0),
     (1e200, 1e200, 0),
 ]
-WHERE: dict[str, Any] = {"name": "j", "parent": "world", "child": "c", "origin": kv.model.Pose.of(ORIGIN)}
+WHERE: dict[str, Any] = {
+    "name": "j",
+    "parent": "world",
+    "child": "c",
+    "origin": kv.model.Pose.from_matrix(ORIGIN),
+}
 numbers = st.floats(-4, 4)
 
 
@@ -331,7 +336,7 @@ def test_articulations_are_values(operation: Any) -> None:
 def test_axes_and_origins_given_as_arrays_are_values_too() -> None:
     given = kv.Revolute(name="j", parent="world", child="c", axis=np.array([0, 0, 2]), origin=ORIGIN)
     assert given == kv.Revolute(
-        name="j", parent="world", child="c", axis=(0.0, 0.0, 2.0), origin=kv.model.Pose.of(ORIGIN)
+        name="j", parent="world", child="c", axis=(0.0, 0.0, 2.0), origin=kv.model.Pose.from_matrix(ORIGIN)
     )
     assert hash(given) == hash(pickle.loads(pickle.dumps(given)))
 

@@ -186,7 +186,7 @@ def test_a_frame_in_another_parent_is_compared_in_the_world(run, files):
 def test_a_fixed_joint_is_no_difference_if_its_frames_are_there(run, tmp_path):
     for name in ("one", "two"):
         model = kv.Model()
-        origin = kv.model.Pose.of(kv.translation(1, 0, 0)())
+        origin = kv.model.Pose.from_matrix(kv.translation(1, 0, 0)())
         with model.edit() as edit:
             if name == "one":
                 edit.add_frame("f", parent="world", transform=origin)

@@ -198,10 +198,10 @@ def four_bar(crank=0.3, within=()):
     z = {"axis": (0, 0, 1), "velocity": 1, "lower": -3, "upper": 3}
     with model.edit() as edit:
         edit.apply(kv.Revolute(name="crank", parent="world", child="crank", **z))
-        origin = kv.model.Pose.of(kv.translation(crank, 0, 0)())
+        origin = kv.model.Pose.from_matrix(kv.translation(crank, 0, 0)())
         edit.apply(kv.Revolute(name="coupler", parent="crank", child="coupler", origin=origin, **z))
         edit.add_frame("end", parent="coupler", transform=kv.translation(0.9, 0, 0))
-        origin = kv.model.Pose.of(kv.translation(1, 0, 0)())
+        origin = kv.model.Pose.from_matrix(kv.translation(1, 0, 0)())
         edit.apply(kv.Revolute(name="rocker", parent="world", child="rocker", origin=origin, **z))
         edit.add_frame("pin", parent="rocker", transform=kv.translation(0.5, 0, 0))
         edit.apply(kv.CloseLoop(name="four_bar", frame="end", to="pin", mask=("x", "y"), within=within))

@@ -32,7 +32,7 @@ class Dressed(kv.Operation):
     frame: str
 
     def apply(self, model: ReadRecorder) -> kv.model.Writes:
-        origin = kv.model.Pose.of(kv.translation(1, 0.1, 0) @ kv.rotation_z(0.3))
+        origin = kv.model.Pose.from_matrix(kv.translation(1, 0.1, 0) @ kv.rotation_z(0.3))
         shapes = (
             kv.model.Shape(Box((1, 2, 0.3)), origin, "a box", (1, 0, 0.5, 1)),
             kv.model.Shape(Cylinder(0.1, 1 / 3)),

@@ -78,5 +78,5 @@ def test_transforms_that_are_motions_and_that_are_none() -> None:
 
 def test_a_motion_is_the_matrix_that_it_was() -> None:
     for transform in TRANSFORMS:
-        (factor,) = kv.model.Frame.of("world", transform).factors
+        (factor,) = kv.model.Frame.from_transform("world", transform).factors
         assert factor == transform

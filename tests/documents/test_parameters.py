@@ -26,7 +26,9 @@ def hand_made() -> kv.Model:
     q, v = kv.position("q"), kv.velocity("v")
     body = kv.model.Body(
         (
-            kv.model.Shape(Box((1, 2, 3)), kv.model.Pose.of(kv.rotation_x(0.3)), "box", (1, 0, 0, 1)),
+            kv.model.Shape(
+                Box((1, 2, 3)), kv.model.Pose.from_matrix(kv.rotation_x(0.3)), "box", (1, 0, 0, 1)
+            ),
             kv.model.Shape(Mesh("package://a/b.stl", (1, 1, 2), "/somewhere")),
         ),
         (kv.model.Shape(Cylinder(0.1, 0.2)), kv.model.Shape(Sphere(0.5), texture="wood.png")),

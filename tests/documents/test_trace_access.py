@@ -62,7 +62,7 @@ def upper(model: kv.model.ReadRecorder) -> kv.Expression:
 def is_pose(model: kv.model.ReadRecorder) -> bool:
     """Decide by whether something raises."""
     try:
-        kv.model.Pose.of(model.fk("car"))
+        kv.model.Pose.from_matrix(model.fk("car"))
     except kv.KineverseError:
         return False
     return True
@@ -113,7 +113,9 @@ DECIDING: dict[str, Code] = {
 FOLLOWED: dict[str, Code] = {
     "a limit": limited(lambda m: (0, KNOB, upper(m))),
     "a limit of data": limited(lambda m: (-5, KNOB, m.data["number"])),
-    "Constraint.of": limited(lambda m: kv.Constraint.of(-9, 2 * KNOB, upper(m) + 9)),
+    "Constraint.from_expressions": limited(
+        lambda m: kv.Constraint.from_expressions(-9, 2 * KNOB, upper(m) + 9)
+    ),
     "a constraint": limited(lambda m: m.constraints["range"]),
     "a frame": lambda m: kv.model.Writes(frames={"knob": m.frames["car"]}),
     "a frame elsewhere": lambda m: kv.model.Writes(frames={"knob": replace(m.frames["car"], parent="flap")}),
@@ -230,7 +232,9 @@ def test_a_name_that_was_missing_must_stay_missing(ask: Callable[[kv.model.ReadR
         pytest.raises(kv.errors.EditError, match=r"made from it: the names and kinds of \w+\("),
         read.edit() as edit,
     ):
-        edit.insert(kv.model.AddFrame("new", kv.model.Frame.of("world", np.eye(4))), before="custom")
+        edit.insert(
+            kv.model.AddFrame("new", kv.model.Frame.from_transform("world", np.eye(4))), before="custom"
+        )
 
 
 @pytest.mark.parametrize(

@@ -81,7 +81,7 @@ def test_queries_count_as_reads_even_if_the_document_omits_them(
     before = f"{prefix}/" if prefix else ""
     with model.edit() as edit:
         edit.replace(f"{before}data number", kv.model.SetData(f"{before}number", 2.25))
-        car = kv.model.Frame.of("world", kv.translation(0, 0, 7))
+        car = kv.model.Frame.from_transform("world", kv.translation(0, 0, 7))
         edit.replace(f"{before}frame car", kv.model.AddFrame(f"{before}car", car))
     at = {f"{before}{name}": 0.3 for name in ("lift", "hinge")}
     found = model.fk(f"{before}knob")(at)
@@ -97,7 +97,9 @@ def test_listed_names_count_as_reads_even_if_the_document_omits_them() -> None:
     with pytest.raises(kv.errors.EditError, match="the list of all bodies has changed"), model.edit() as edit:
         edit.insert(
             kv.model.AddFrame(
-                "new", kv.model.Frame.of("world", np.eye(4)), kv.model.Body((kv.model.Shape(Box((1, 1, 1))),))
+                "new",
+                kv.model.Frame.from_transform("world", np.eye(4)),
+                kv.model.Body((kv.model.Shape(Box((1, 1, 1))),)),
             ),
             before="custom",
         )

@@ -33,7 +33,7 @@ def test_nested_prefixes_follow() -> None:
     outer = kv.Model()
     _include(outer, to_json(model), "z")
     lift = kv.position("z/a/lift")
-    car = kv.model.Frame.of("world", kv.translation(0.3, 0, lift**2) @ kv.rotation_z(lift))
+    car = kv.model.Frame.from_transform("world", kv.translation(0.3, 0, lift**2) @ kv.rotation_z(lift))
     with outer.edit() as edit:
         edit.replace("z/a/frame car", kv.model.AddFrame("z/a/car", car))
     live = build(derived, car=kv.translation(0.3, 0, LIFT**2) @ kv.rotation_z(LIFT))
@@ -83,7 +83,7 @@ def test_an_open_loop_is_refused_and_closed_anew() -> None:
     read = reloaded(model)
     longer = kv.model.AddFrame(
         "board",
-        kv.model.Frame.of("world", kv.translation(0, 0, 0.01) @ model.fk("board")),
+        kv.model.Frame.from_transform("world", kv.translation(0, 0, 0.01) @ model.fk("board")),
     )
     before = read.snapshot()
     advice = r"'loop four_bar'.*CloseLoop\(\.\.\.\) made anew"

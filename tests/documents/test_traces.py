@@ -183,7 +183,8 @@ def test_names_that_it_listed_must_stay() -> None:
     assert (read.data["count"], read.data["at"]) == (2, 3.0)
     with pytest.raises(kv.errors.EditError, match="list of all frames"), read.edit() as edit:
         edit.insert(
-            kv.model.AddFrame("new", kv.model.Frame.of("world", kv.translation(1, 0, 0))), before="custom"
+            kv.model.AddFrame("new", kv.model.Frame.from_transform("world", kv.translation(1, 0, 0))),
+            before="custom",
         )
 
 
@@ -213,7 +214,7 @@ read = kv.load(sys.argv[1])
 assert not any(c.__name__ == "Custom" for c in kv.Operation.__subclasses__())
 with read.edit() as edit:
     car = kv.translation(0.3, 0, 5 * kv.position("lift")) @ kv.rotation_z(kv.position("lift"))
-    edit.replace("frame car", kv.model.AddFrame("car", kv.model.Frame.of("world", car)))
+    edit.replace("frame car", kv.model.AddFrame("car", kv.model.Frame.from_transform("world", car)))
 read.save(sys.argv[2])
 """
 

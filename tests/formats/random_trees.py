@@ -38,7 +38,12 @@ def trees(draw: st.DrawFn, kinds: tuple[str, ...] = KINDS) -> kv.Model:
             parent = draw(st.sampled_from(parents))
             place = kv.rpy(draw(angles), draw(angles), draw(angles))
             origin = kv.translation(draw(numbers), draw(numbers), draw(numbers)) @ place
-            common = {"name": name, "parent": parent, "child": name, "origin": kv.model.Pose.of(origin)}
+            common = {
+                "name": name,
+                "parent": parent,
+                "child": name,
+                "origin": kv.model.Pose.from_matrix(origin),
+            }
             axis, low = draw(axes), draw(numbers)
             limits = {"lower": low, "upper": low + 1.5, "velocity": 2.0}
             if kind == "mimic" and movers:

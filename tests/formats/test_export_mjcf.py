@@ -183,7 +183,9 @@ def test_home_position_becomes_a_key(tmp_path: Path) -> None:
     with model.edit() as edit:
         edit.apply(kv.Revolute(name="q", parent="world", child="q", lower=0.5, upper=1))
         edit.apply(
-            kv.Floating(name="fly", parent="world", child="fly", origin=kv.model.Pose.of(kv.rotation_x(1.0)))
+            kv.Floating(
+                name="fly", parent="world", child="fly", origin=kv.model.Pose.from_matrix(kv.rotation_x(1.0))
+            )
         )
     model.save(tmp_path / "m.xml")
     compiled = MujocoReference(tmp_path / "m.xml").model
@@ -203,8 +205,10 @@ def test_bodies_are_read_back_unchanged(tmp_path: Path) -> None:
             Shape(Box((1, 2, 3)), name="seen", color=(1, 0, 0.5, 1)),
             Shape(Mesh("a.stl", (1, 1, 2), str(tmp_path))),
         ),
-        (Shape(Ellipsoid((1, 2, 3)), kv.model.Pose.of(kv.translation(0, 0, 1)), name="touched"),),
-        Inertia(2, (3, 0.1, 0, 3, 0, 3), kv.model.Pose.of(kv.translation(0, 1, 0) @ kv.rotation_x(1.0))),
+        (Shape(Ellipsoid((1, 2, 3)), kv.model.Pose.from_matrix(kv.translation(0, 0, 1)), name="touched"),),
+        Inertia(
+            2, (3, 0.1, 0, 3, 0, 3), kv.model.Pose.from_matrix(kv.translation(0, 1, 0) @ kv.rotation_x(1.0))
+        ),
     )
     model = kv.Model()
     with model.edit() as edit:

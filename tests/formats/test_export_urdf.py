@@ -236,7 +236,7 @@ def test_frames_held_by_loops_are_refused_with_that_reason(tmp_path: Path) -> No
     model = kv.Model()
     with model.edit() as edit:
         for name, x in (("a", 0.0), ("b", 1.0)):
-            origin = kv.model.Pose.of(kv.translation(x, 0, 0))
+            origin = kv.model.Pose.from_matrix(kv.translation(x, 0, 0))
             edit.apply(kv.Revolute(name=name, parent="world", child=name, axis=(0, 0, 1), origin=origin))
             edit.add_frame(f"{name}_end", parent=name, transform=kv.translation(0.8, 0, 0))
         edit.close_loop("a_end", "b_end", home={"a": 1.0, "b": 2.0})
@@ -289,7 +289,7 @@ def test_bodies_are_read_back_from_another_folder(tmp_path: Path) -> None:
     body = Body(
         (Shape(Mesh("a.stl", (1, 1, -1), str(tmp_path / "meshes")), name="m"), Shape(Cone(0.1, 0.2))),
         (Shape(Box((1, 2, 3))),),
-        Inertia(1.5, (1, 0.1, 0, 1, 0, 1), kv.model.Pose.of(kv.translation(0, 1, 0))),
+        Inertia(1.5, (1, 0.1, 0, 1, 0, 1), kv.model.Pose.from_matrix(kv.translation(0, 1, 0))),
     )
     model = kv.Model()
     with model.edit() as edit:

@@ -146,7 +146,7 @@ def test_largest_double_is_no_limit(tmp_path):
 
 def test_pose_with_too_large_numbers_is_refused():
     with pytest.raises(kv.errors.InvalidValueError, match=r"all numbers finite, of at most 1e\+100"):
-        kv.model.Pose.of(kv.translation(1e200, 0, 0))
+        kv.model.Pose.from_matrix(kv.translation(1e200, 0, 0))
 
 
 @pytest.mark.parametrize("name", ["y" * 3000, INVISIBLE * 400, "é" * 100 + "\x85" * 100])

@@ -90,7 +90,7 @@ def test_loops_read_back_keep_their_branch(tmp_path: Path) -> None:
         model = kv.Model()
         with model.edit() as edit:
             for name, parent, x in (("a", "world", 0), ("b", "a", 0.4), ("c", "world", 1.0)):
-                origin = kv.model.Pose.of(kv.translation(x, 0, 0))
+                origin = kv.model.Pose.from_matrix(kv.translation(x, 0, 0))
                 limits = {"lower": -0.5, "upper": 0.5} if name == "a" else {}
                 edit.apply(
                     kv.Revolute(name=name, parent=parent, child=name, axis=(0, 0, 1), origin=origin, **limits)

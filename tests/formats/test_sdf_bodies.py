@@ -62,4 +62,6 @@ def test_sdf_poses_colours_and_inertia_are_read():
     (seen,) = body.visuals
     assert seen.origin.matrix[:3, 3].tolist() == [4, 1, 0]
     assert seen.color == (1, 0.5, 0, 0.5)
-    assert body.inertia == Inertia(2, (1, 0, 0, 1, 0.5, 1), kv.model.Pose.of(kv.translation(0, 0, 3)))
+    assert body.inertia == Inertia(
+        2, (1, 0, 0, 1, 0.5, 1), kv.model.Pose.from_matrix(kv.translation(0, 0, 3))
+    )

@@ -14,7 +14,7 @@ from kineverse.model.body import Body, Box, Capsule, Cylinder, Geometry, Pose, S
 
 
 def body(*geometries: Geometry, at: tuple[float, float, float] = (0, 0, 0)) -> Body:
-    origin = Pose.of(np.array(kv.translation(*at)()))
+    origin = Pose.from_matrix(np.array(kv.translation(*at)()))
     return Body(collisions=tuple(Shape(geometry, origin) for geometry in geometries))
 
 

@@ -19,7 +19,7 @@ def model(tmp_path, monkeypatch):
     """A ball of 1 cm that goes up from the floor of a tray, which is turned about z by a right angle."""
     monkeypatch.setenv("KINEVERSE_CACHE_DIR", str(tmp_path / "cache"))
     tray().export(tmp_path / "tray.stl")
-    turned = Pose.of(kv.rotation_z(np.pi / 2))
+    turned = Pose.from_matrix(kv.rotation_z(np.pi / 2))
     model = kv.Model()
     with model.edit() as edit:
         shape = Shape(Mesh("tray.stl", folder=str(tmp_path)), turned)

@@ -15,7 +15,7 @@ Z, Y, X = (0, 0, 1), (0, 1, 0), (1, 0, 0)
 
 
 def at(x: float, y: float = 0.0, z: float = 0.0) -> kv.model.Pose:
-    return kv.model.Pose.of(kv.translation(x, y, z))
+    return kv.model.Pose.from_matrix(kv.translation(x, y, z))
 
 
 def bar(

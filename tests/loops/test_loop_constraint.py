@@ -102,7 +102,9 @@ def test_a_loop_constraint_follows_earlier_edits_also_without_its_code(tmp_path)
     model.save(tmp_path / "bars.kv.json")
     copy = kv.load(tmp_path / "bars.kv.json")
     assert copy.snapshot() == model.snapshot()
-    longer = kv.model.AddFrame("coupler_tip", kv.model.Frame.of("coupler", kv.translation(1.2, 0.1, 0)))
+    longer = kv.model.AddFrame(
+        "coupler_tip", kv.model.Frame.from_transform("coupler", kv.translation(1.2, 0.1, 0))
+    )
     for either in (model, copy):
         with either.edit() as edit:
             edit.replace("frame coupler_tip", longer)
@@ -110,7 +112,9 @@ def test_a_loop_constraint_follows_earlier_edits_also_without_its_code(tmp_path)
         assert copy.constraints[name].expression(STATE) == constraint.expression(STATE)
     assert list(find_loops(copy)) == list(find_loops(model))
     # In a plane that is another one, other rows would move; what was recorded does not know them.
-    tilted = kv.model.AddFrame("coupler_tip", kv.model.Frame.of("coupler", kv.translation(1.2, 0, 0.3)))
+    tilted = kv.model.AddFrame(
+        "coupler_tip", kv.model.Frame.from_transform("coupler", kv.translation(1.2, 0, 0.3))
+    )
     with model.edit() as edit:
         edit.replace("frame coupler_tip", tilted)
     assert "four-bar/apart" in model.constraints

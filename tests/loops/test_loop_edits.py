@@ -219,7 +219,7 @@ def test_names_with_colons_have_limits_too():
     model = kv.Model()
     with model.edit() as edit:
         for name, parent, x in (("a:0", "world", 0.0), ("a:1", "a:0", 0.4), ("a:2", "world", 1.0)):
-            origin = kv.model.Pose.of(kv.translation(x, 0, 0))
+            origin = kv.model.Pose.from_matrix(kv.translation(x, 0, 0))
             limits = {"lower": -0.3, "upper": 0.3} if name == "a:0" else {}
             edit.apply(
                 kv.Revolute(name=name, parent=parent, child=name, axis=(0, 0, 1), origin=origin, **limits)

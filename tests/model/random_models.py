@@ -26,7 +26,7 @@ def random_pose(rng: np.random.Generator) -> kv.model.Pose:
     matrix = np.eye(4)
     matrix[:3, :3] = Rotation.random(rng=rng).as_matrix()
     matrix[:3, 3] = rng.uniform(-1, 1, 3)
-    return kv.model.Pose.of(matrix)
+    return kv.model.Pose.from_matrix(matrix)
 
 
 def joint(kind: str, name: str, parent: str, child: str, rng: np.random.Generator) -> kv.Operation:

@@ -45,7 +45,7 @@ def constrained(**triples: Any) -> kv.Model:
 )
 def test_invalid_constraints_are_refused(triple: Any, error: type[Exception], words: str | None) -> None:
     with pytest.raises(error, match=words):
-        kv.Constraint.of(*triple)
+        kv.Constraint.from_expressions(*triple)
     model = constrained(known=(0, a, 1))
     before = model.snapshot()
     with pytest.raises(error), model.edit() as edit:
@@ -61,11 +61,11 @@ def test_constraints_that_are_no_triples_are_refused(value: Any) -> None:
 
 def test_bounds_may_be_equal_infinite_or_expressions() -> None:
     for triple in ((1, a, 1), (-INF, a, INF), (b, a, 0), (0, a, -b), (b, a, b)):
-        constraint = kv.Constraint.of(*triple)
+        constraint = kv.Constraint.from_expressions(*triple)
         assert as_constraint(constraint) is constraint
         assert as_constraint(list(triple)) == constraint
-    assert kv.Constraint.of(b, a.derivative(), c).symbols == (a.derivative(), b, c)
-    assert kv.Constraint.of(0, a.derivative() + b, 1).order == 1
+    assert kv.Constraint.from_expressions(b, a.derivative(), c).symbols == (a.derivative(), b, c)
+    assert kv.Constraint.from_expressions(0, a.derivative() + b, 1).order == 1
 
 
 def test_a_constraint_made_of_bare_numbers_is_made_whole() -> None:
@@ -76,7 +76,7 @@ def test_a_constraint_made_of_bare_numbers_is_made_whole() -> None:
     model = kv.Model()
     with model.edit() as edit:
         edit.apply(Bare())
-    assert model.constraints["c"] == kv.Constraint.of(0, a, 1)
+    assert model.constraints["c"] == kv.Constraint.from_expressions(0, a, 1)
 
 
 # -- relevance -----------------------------------------------------------------------------------------

@@ -345,10 +345,10 @@ def test_lists_and_arrays_are_axes_and_origins() -> None:
     place = np.eye(4)
     place[0, 3] = 2.0
     expected = kv.Revolute(
-        name="d", parent="world", child="d", axis=(0, 0, 1), origin=kv.model.Pose.of(place)
+        name="d", parent="world", child="d", axis=(0, 0, 1), origin=kv.model.Pose.from_matrix(place)
     )
     for axis in ([0, 0, 1], np.array([0, 0, 1]), (0.0, 0.0, 1.0)):
-        for origin in (place, place.tolist(), kv.translation(2, 0, 0), kv.model.Pose.of(place)):
+        for origin in (place, place.tolist(), kv.translation(2, 0, 0), kv.model.Pose.from_matrix(place)):
             joint = kv.Revolute(name="d", parent="world", child="d", axis=axis, origin=origin)
             assert joint.axis == expected.axis
             model = kv.Model()

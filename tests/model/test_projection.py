@@ -21,7 +21,7 @@ Z = (0, 0, 1)
 
 
 def bar(edit: kv.model.Edit, name: str, parent: str, x: float, length: float, **limits: float) -> None:
-    hinge = kv.model.Pose.of(kv.translation(x, 0, 0))
+    hinge = kv.model.Pose.from_matrix(kv.translation(x, 0, 0))
     edit.apply(kv.Revolute(name=name, parent=parent, child=name, origin=hinge, axis=Z, **limits))
     edit.add_frame(f"{name}_end", name, kv.translation(length, 0, 0))
 
@@ -153,7 +153,7 @@ def test_quaternions_stay_of_unit_length():
         bar(edit, "left", "world", 0.0, 0.3, lower=-1, upper=1)
         edit.apply(kv.articulations.Ball(name="ball", parent="left_end", child="rod"))
         edit.add_frame("rod_end", "rod", kv.translation(0, 1.0, 0))
-        place = kv.model.Pose.of(kv.translation(0, 1.0, 0.1))
+        place = kv.model.Pose.from_matrix(kv.translation(0, 1.0, 0.1))
         edit.apply(
             kv.Revolute(
                 name="right", parent="world", child="right", origin=place, axis=(0, 1, 0), lower=-1, upper=1

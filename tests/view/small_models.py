@@ -24,7 +24,9 @@ def cabinet() -> kv.Model:
             parent="cabinet/corpus",
             transform=kv.translation(-drawer, 0, 0.2),
             body=Body(
-                visuals=(Shape(Box((0.4, 0.5, 0.2)), Pose.of(kv_translation(-0.02, 0, 0)), color=RED),),
+                visuals=(
+                    Shape(Box((0.4, 0.5, 0.2)), Pose.from_matrix(kv_translation(-0.02, 0, 0)), color=RED),
+                ),
                 collisions=(Shape(Box((0.4, 0.5, 0.2))),),
             ),
         )
@@ -33,7 +35,9 @@ def cabinet() -> kv.Model:
             parent="cabinet/corpus",
             transform=kv.translation(-0.2, 0.3, -0.2) @ kv.rotation_z(-door),
             body=Body(
-                visuals=(Shape(Box((0.02, 0.6, 0.5)), Pose.of(kv_translation(0, -0.3, 0)), color=BLUE),)
+                visuals=(
+                    Shape(Box((0.02, 0.6, 0.5)), Pose.from_matrix(kv_translation(0, -0.3, 0)), color=BLUE),
+                )
             ),
         )
         edit.add_frame(

@@ -44,7 +44,7 @@ def planar_loop():
     model = kv.Model()
     with model.edit() as edit:
         for name, parent, x in (("crank", "world", 0.0), ("coupler", "crank", 0.4), ("rocker", "world", 1.0)):
-            origin = kv.model.Pose.of(kv.translation(x, 0, 0))
+            origin = kv.model.Pose.from_matrix(kv.translation(x, 0, 0))
             edit.apply(kv.Revolute(name=name, parent=parent, child=name, origin=origin, axis=(0, 0, 1)))
         edit.add_frame("coupler_tip", "coupler", kv.translation(0.5, 0, 0))
         edit.add_frame("rocker_tip", "rocker", kv.translation(0.3, 0, 0))

@@ -24,7 +24,7 @@ class Rewritten(kv.Operation):
 
     def apply(self, model: ReadRecorder) -> kv.model.Writes:
         """Write it."""
-        return kv.model.Writes.of(dict(self.content))
+        return kv.model.Writes.from_cells(dict(self.content))
 
 
 def edits(model: kv.Model, seed: int, whole: Callable[[], object]) -> None:
@@ -88,7 +88,7 @@ def _other(kind: str, value: Any, random: Random) -> Any:
     symbol = random.choice((kv.position("a"), kv.velocity("b"), kv.position("new")))
     more = random.choice((number, number, symbol, symbol * number))
     if kind == FRAMES:
-        moved: Any = Pose.of(kv.translation(0.5, 0, number if number < 1e100 else 0))
+        moved: Any = Pose.from_matrix(kv.translation(0.5, 0, number if number < 1e100 else 0))
         if random.random() < 0.3:
             moved = kv.translation(more, 0, 0)
         return replace(value, factors=(*value.factors, moved))

@@ -174,7 +174,7 @@ def base(random: Random) -> list[kv.Operation]:
     """Return operations for others to read from; the same names with other values for another seed."""
     a, b, x = SYMBOLS
     number = round(random.uniform(-1, 1), 3)
-    pose = kv.model.Pose.of(kv.translation(number, 0, 1) @ kv.rotation_x(number))
+    pose = kv.model.Pose.from_matrix(kv.translation(number, 0, 1) @ kv.rotation_x(number))
     datum: Any = random.choice((number, 2, a + number, (number, b), "text", None))
     transform = random.choice((kv.rotation_y(b), kv.translation(0, x, number), kv.rotation_x(a * b)))
     lower, upper = sorted((number, random.uniform(-2, 2)))
@@ -196,7 +196,9 @@ def base(random: Random) -> list[kv.Operation]:
         SetData("n", number),
         SetData("e", a * number + np.sin(b)),
         SetData("t", datum),
-        Constrain("c", kv.Constraint.of(-1, a + number * b, random.choice((1, x, float("inf"))))),
+        Constrain(
+            "c", kv.Constraint.from_expressions(-1, a + number * b, random.choice((1, x, float("inf"))))
+        ),
         Rate(x, rate),
     ]
 
@@ -204,7 +206,7 @@ def base(random: Random) -> list[kv.Operation]:
 def program(random: Random, name: str) -> Program:
     """Return a program of some steps."""
     steps = [(random.choice(list(STEPS)), random.randrange(12), random.randrange(12)) for _ in range(6)]
-    pose = kv.model.Pose.of(kv.translation(1, 2, 3))
+    pose = kv.model.Pose.from_matrix(kv.translation(1, 2, 3))
     inside = random.choice(((1, "a"), ({"k": (1.0, None)},), (pose, SYMBOLS[1]), (float("inf"), 1 << 80)))
     return Program(name, tuple(steps[: random.randint(1, 6)]), Setting(0.5, pose, inside))
 

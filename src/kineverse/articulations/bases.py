@@ -44,7 +44,9 @@ class Base(Joint):
         """Frame of the base, by its name."""
         x, y, angle = self.coordinates
         return {
-            self.child: Frame.of(self.parent, (self.origin, translation(x, y, 0), rotation_z(angle))),
+            self.child: Frame.from_transform(
+                self.parent, (self.origin, translation(x, y, 0), rotation_z(angle))
+            ),
         }
 
     def check_wheels(self, paths: object, count: int) -> None:
@@ -69,7 +71,11 @@ class Base(Joint):
     def speed_limit(self, field: str, speed: Expression, name: str = "") -> dict[str, Constraint]:
         """Return the constraint -limit <= speed <= limit, if the field has a limit."""
         most = self.speed_bound(field)
-        return {} if most is None else {f"{self.name}/{name or field}": Constraint.of(-most, speed, most)}
+        return (
+            {}
+            if most is None
+            else {f"{self.name}/{name or field}": Constraint.from_expressions(-most, speed, most)}
+        )
 
     def speed_norm_limit(
         self, field: str, components: tuple[Expression, Expression]
@@ -77,7 +83,9 @@ class Base(Joint):
         """Return the constraint |velocity| <= limit, if the field has a limit."""
         most = self.speed_bound(field)
         return (
-            {} if most is None else {f"{self.name}/{field}": Constraint.of(0, norm(array(components)), most)}
+            {}
+            if most is None
+            else {f"{self.name}/{field}": Constraint.from_expressions(0, norm(array(components)), most)}
         )
 
 

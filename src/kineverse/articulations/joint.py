@@ -47,7 +47,7 @@ class PlacedOperation(Operation):
         ):
             return
         try:
-            object.__setattr__(self, "origin", Pose.of(self.origin))
+            object.__setattr__(self, "origin", Pose.from_matrix(self.origin))
         except (KineverseError, TypeError, ValueError) as error:
             raise InvalidValueError(
                 f"The origin of the {self.noun} '{self.name}' is not a pose. {error} It is a 4×4 transform: "

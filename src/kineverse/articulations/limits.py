@@ -66,7 +66,7 @@ def limit_constraints(
     """
     if (lower is not None or upper is not None) and q.symbols:
         try:
-            position_range = Constraint.of(
+            position_range = Constraint.from_expressions(
                 -math.inf if lower is None else lower, q, math.inf if upper is None else upper
             )
         except KineverseError as error:
@@ -76,7 +76,7 @@ def limit_constraints(
     if bound is not None:
         rate = total_derivative(q)
         if rate.symbols:
-            yield f"{name}/velocity", Constraint.of(-bound, rate, bound)
+            yield f"{name}/velocity", Constraint.from_expressions(-bound, rate, bound)
 
 
 def check_speed_limit(limit: object, what: str) -> float | None:

@@ -59,7 +59,7 @@ class Planar(Joint, document_kind="Planar"):
         """Write the child frame and the limits."""
         x, y, angle = (position(f"{self.name}/{c}") for c in ("x", "y", "angle"))
         turn = rotation_from_z(self.axis)
-        motion = (Pose.of(turn), translation(x, y, 0), rotation_z(angle), Pose.of(turn.T))
+        motion = (Pose.from_matrix(turn), translation(x, y, 0), rotation_z(angle), Pose.from_matrix(turn.T))
         constraints: dict[str, Constraint] = {}
         for q in (x, y):
             constraints.update(limit_constraints(str(q), q, self.lower, self.upper, self.velocity))
@@ -196,14 +196,16 @@ class Ball(Joint, document_kind="Ball"):
         constraints = {}
         if self.cone is not None:
             bound = 2 * math.sin(self.cone / 2) ** 2
-            constraints[f"{self.name}/cone"] = Constraint.of(-math.inf, 2 * (across @ across) / size, bound)
+            constraints[f"{self.name}/cone"] = Constraint.from_expressions(
+                -math.inf, 2 * (across @ across) / size, bound
+            )
         if self.twist is not None:
             c, s = math.cos(self.twist / 2), math.sin(self.twist / 2)
             excess = ((c * p) ** 2 - (s * w) ** 2) / size
-            constraints[f"{self.name}/twist"] = Constraint.of(-math.inf, excess, 0)
+            constraints[f"{self.name}/twist"] = Constraint.from_expressions(-math.inf, excess, 0)
         most = check_speed_limit(self.velocity, "")
         if most is not None:
-            constraints[f"{self.name}/velocity"] = Constraint.of(0, norm(array(omega)), most)
+            constraints[f"{self.name}/velocity"] = Constraint.from_expressions(0, norm(array(omega)), most)
         return Writes(
             frames={self.child: (self.parent, (self.origin, quaternion(*q)))},
             constraints=constraints,

@@ -152,4 +152,4 @@ def rotation_factors(axis: AxisLike, q: Expression) -> tuple[Pose | Expression, 
     first = np.cross(helper, a)
     first /= np.linalg.norm(first)
     to_axis = transform(round_exact(np.column_stack([first, np.cross(a, first), a])), np.zeros(3))
-    return Pose.of(to_axis), rotation_about(Z, q), Pose.of(to_axis.T)
+    return Pose.from_matrix(to_axis), rotation_about(Z, q), Pose.from_matrix(to_axis.T)

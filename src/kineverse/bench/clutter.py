@@ -149,4 +149,4 @@ def _round_to_float32(numbers: Array) -> Array:
 
 
 def _make_body(geometry: Geometry) -> Body:
-    return Body(collisions=(Shape(geometry, Pose.of(translation(*CENTRE)())),))
+    return Body(collisions=(Shape(geometry, Pose.from_matrix(translation(*CENTRE)())),))

@@ -72,7 +72,7 @@ def _middle_joint(robot: BenchmarkRobot) -> tuple[str, Joint]:
 def _shift_origin(origin: Pose, shift: float) -> Pose:
     matrix = np.array(origin.matrix)
     matrix[0, 3] += shift
-    return Pose.of(matrix)
+    return Pose.from_matrix(matrix)
 
 
 def _sampled_configurations(robot: BenchmarkRobot) -> dict[str, Array]:

@@ -57,10 +57,12 @@ def make_four_bar() -> Model:
             ("coupler", "crank", _CRANK),
             ("rocker", WORLD, _GROUND),
         ):
-            origin = Pose.of(translation(x, 0, 0))
+            origin = Pose.from_matrix(translation(x, 0, 0))
             edit.apply(Revolute(name=name, parent=parent, child=name, origin=origin, axis=(0.0, 0.0, 1.0)))
         for name, length in (("coupler", _COUPLER), ("rocker", _ROCKER)):
-            edit.add_frame(f"{name} end", name, Frame.of(name, translation(length, 0, 0)).transform)
+            edit.add_frame(
+                f"{name} end", name, Frame.from_transform(name, translation(length, 0, 0)).transform
+            )
         home = (("coupler", 1.0), ("rocker", 1.5))
         edit.apply(CloseLoop(name="four-bar", frame="coupler end", to="rocker end", home=home))
     return model

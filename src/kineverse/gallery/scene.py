@@ -53,7 +53,7 @@ class SceneBuilder:
 
         ``at`` is its origin in the parent: a point [m], or a transform.
         """
-        origin = Pose.of(at if isinstance(at, Expression) else translation(*at))
+        origin = Pose.from_matrix(at if isinstance(at, Expression) else translation(*at))
         for field in ("driver", "left", "right"):
             if isinstance(fields.get(field), str):
                 fields[field] = self.full_name(fields[field])
@@ -78,7 +78,9 @@ class SceneBuilder:
         """Add a frame with shapes that is fixed in its parent."""
         where = at if isinstance(at, Expression) else translation(*at)
         body = Body(visuals=sum(shapes, ())) if shapes else None
-        self.operations.append(AddFrame(self.full_name(name), Frame.of(self.full_name(parent), where), body))
+        self.operations.append(
+            AddFrame(self.full_name(name), Frame.from_transform(self.full_name(parent), where), body)
+        )
 
     def loop(
         self,

@@ -172,4 +172,4 @@ def _frame(axis: Point) -> npt.NDArray[np.float64]:
 
 
 def _pose(rotation: npt.NDArray[np.float64], at: Point) -> Pose:
-    return Pose.of(transform(rotation, np.asarray(at, dtype=float)))
+    return Pose.from_matrix(transform(rotation, np.asarray(at, dtype=float)))

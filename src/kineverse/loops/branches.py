@@ -116,16 +116,16 @@ def continue_solution(equations: Equations, x: Array, start: Array, end: Array) 
     Each step has a predictor along the tangent and a Newton corrector. It is accepted if the correction is
     small relative to the step, so that it stays on the branch.
     """
-    way = end - start
+    direction = end - start
     done, step = 0.0, _FIRST
     _, by_x, by_u = equations(x, start)
-    if not way.any():
+    if not direction.any():
         return ContinuationResult(x, 1.0)
     while done < 1.0:
         step = min(step, 1.0 - done)
-        tangent = -np.linalg.lstsq(by_x, by_u @ way, rcond=1e-12)[0]
+        tangent = -np.linalg.lstsq(by_x, by_u @ direction, rcond=1e-12)[0]
         predicted = x + step * tangent
-        u = start + (done + step) * way
+        u = start + (done + step) * direction
         found, gap = equations.close(predicted, u, 8)
         moved = float(np.linalg.norm(found - x))
         wrong = float(np.linalg.norm(found - predicted))

@@ -309,10 +309,10 @@ class LoopConstraint(Operation, document_kind="LoopConstraint"):
                 f"Loop '{self.name}' cannot move: nothing changes what its mask names between '{frame}' and "
                 f"'{to}'."
             )
-        found = {f"{name}/{axis}": Constraint.of(0.0, rows[axis], 0.0) for axis in moving}
+        found = {f"{name}/{axis}": Constraint.from_expressions(0.0, rows[axis], 0.0) for axis in moving}
         if any(abs(float(row)) > APART for axis, row in alone.items() if axis not in moving):
-            found[f"{name}/apart"] = Constraint.of(0.0, norm(array(list(rows.values()))), 0.0)
+            found[f"{name}/apart"] = Constraint.from_expressions(0.0, norm(array(list(rows.values()))), 0.0)
         for k, sign in enumerate(upright_signs(pose, self.mask)):
             if model.resolve(sign).symbols:
-                found[f"{name}/upright{k or ''}"] = Constraint.of(0.0, sign, math.inf)
+                found[f"{name}/upright{k or ''}"] = Constraint.from_expressions(0.0, sign, math.inf)
         return found

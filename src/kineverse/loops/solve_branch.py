@@ -280,12 +280,12 @@ def _margin_fractions(
             there, beyond = home.copy(), home.copy()
             there[k], beyond[k] = edge, end
             at_edge = continue_solution(equations, x, home, there).solution
-            way = continue_solution(equations, at_edge, there, beyond)
-            part = way.part
+            reached = continue_solution(equations, at_edge, there, beyond)
+            part = reached.part
             if part < 1.0:
                 # Branches meet at a dead centre; an earlier loop may end without one.
                 stop = there + part * (beyond - there)
-                meet = _regularity(equations, way.solution, stop) < 0.5 * _regularity(
+                meet = _regularity(equations, reached.solution, stop) < 0.5 * _regularity(
                     equations, at_edge, there
                 )
                 part *= _BEFORE_MEETING if meet else _BEFORE_ENDING

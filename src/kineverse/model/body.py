@@ -51,7 +51,7 @@ class Pose:
             )
 
     @staticmethod
-    def of(matrix: npt.ArrayLike | Expression) -> Pose:
+    def from_matrix(matrix: npt.ArrayLike | Expression) -> Pose:
         """Build a pose from a 4×4 homogeneous matrix, of numbers or a constant expression.
 
         Raises

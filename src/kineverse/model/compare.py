@@ -172,7 +172,7 @@ def transform_of(frame: Frame) -> Pose | Expression:
     product: Array = reduce(
         np.matmul, [factor.matrix for factor in frame.factors if isinstance(factor, Pose)], np.eye(4)
     )
-    return Pose.of(product)
+    return Pose.from_matrix(product)
 
 
 # -- measuring ---------------------------------------------------------------------------------------------

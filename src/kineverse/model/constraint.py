@@ -28,7 +28,9 @@ class Constraint:
     upper: Expression
 
     @staticmethod
-    def of(lower: ExpressionLike, expression: ExpressionLike, upper: ExpressionLike) -> Constraint:
+    def from_expressions(
+        lower: ExpressionLike, expression: ExpressionLike, upper: ExpressionLike
+    ) -> Constraint:
         """Build a constraint from expressions and numbers.
 
         Raises
@@ -94,10 +96,10 @@ def as_constraint(value: ConstraintLike) -> Constraint:
     if isinstance(value, Constraint):
         if all(isinstance(part, Expression) for part in (value.lower, value.expression, value.upper)):
             return value
-        return Constraint.of(value.lower, value.expression, value.upper)
+        return Constraint.from_expressions(value.lower, value.expression, value.upper)
     if isinstance(value, Expression) or not isinstance(value, Sequence) or len(value) != 3:
         raise InvalidValueError(f"A constraint is a triple (lower, expression, upper), not {value!r}.")
-    return Constraint.of(*value)
+    return Constraint.from_expressions(*value)
 
 
 def coordinates(*expressions: Expression) -> frozenset[str]:

@@ -146,7 +146,9 @@ class Edit:
         The default is the identity. The name of an existing frame is refused unless ``override`` is given;
         :meth:`attach` moves an existing frame.
         """
-        return self.apply(AddFrame(name, Frame.of(parent, transform), body), tag, override=override)
+        return self.apply(
+            AddFrame(name, Frame.from_transform(parent, transform), body), tag, override=override
+        )
 
     def constrain(
         self,
@@ -157,7 +159,7 @@ class Edit:
         tag: str | None = None,
     ) -> str:
         """Add a constraint ``lower <= expression <= upper``; bounds may be expressions or ±inf."""
-        return self.apply(Constrain(name, Constraint.of(lower, expression, upper)), tag)
+        return self.apply(Constrain(name, Constraint.from_expressions(lower, expression, upper)), tag)
 
     def close_loop(
         self,
@@ -195,7 +197,7 @@ class Edit:
         tag: str | None = None,
     ) -> str:
         """Attach a frame, with all frames below it, to another parent, as when a gripper grasps an object."""
-        return self.apply(Attach(frame, Frame.of(parent, transform)), tag)
+        return self.apply(Attach(frame, Frame.from_transform(parent, transform)), tag)
 
     def write(self, name: str, value: Any, tag: str | None = None) -> str:
         """Store an immutable value under ``data``, in place of an earlier one of that name."""

@@ -52,7 +52,7 @@ class Frame:
         return Frame, (self.parent, self.factors)
 
     @staticmethod
-    def of(parent: str, transform: TransformLike | Sequence[TransformLike]) -> Frame:
+    def from_transform(parent: str, transform: TransformLike | Sequence[TransformLike]) -> Frame:
         """Build a frame from a 4×4 transform, or from the factors of one.
 
         Raises
@@ -95,7 +95,7 @@ def _factor(transform: TransformLike) -> Pose | Expression:
     if access_listener(expression) is not None or not expression.is_constant:
         return expression
     matrix = np.array(ca.DM(expression.casadi))
-    return Pose.of(matrix)
+    return Pose.from_matrix(matrix)
 
 
 def _is_transform(part: Any) -> bool:

@@ -123,7 +123,7 @@ class Flow:
     ----------
     driven
         Coordinates with rows.
-    beside
+    others
         Free coordinates and parameters in the rows.
     speeds
         Speeds of the rows.
@@ -133,12 +133,12 @@ class Flow:
         self.driven = tuple(sorted(rates, key=lambda s: s.sort_key))
         self.speeds = tuple(sorted({v for row in rates.values() for v in row}, key=lambda s: s.sort_key))
         looked_at = {s for row in rates.values() for g in row.values() for s in g.symbols if s not in rates}
-        self.beside = tuple(sorted(looked_at, key=lambda s: s.sort_key))
+        self.others = tuple(sorted(looked_at, key=lambda s: s.sort_key))
         zero = Expression(0.0)
         rows = [sum((g * v for v, g in rates[x].items()), zero) for x in self.driven]
         entries = [g for x in self.driven for g in rates[x].values()]
         # A speed may be a column of a row and occur in its entries; it is one input.
-        inputs = dict.fromkeys((*self.driven, *self.beside, *self.speeds))
+        inputs = dict.fromkeys((*self.driven, *self.others, *self.speeds))
         self._inputs = tuple(inputs)
         self._function = compile([array(rows), array(entries)], self._inputs)
 
@@ -155,8 +155,8 @@ class Flow:
         evaluator = self._function.bind()
         evaluator.input[:] = symbol_values(self._inputs, State(known))
         moving = len(self.driven)
-        pace = np.array([speeds.get(s.derivative(), 0.0) if s.has_derivative else 0.0 for s in self.beside])
-        start = evaluator.input[: moving + len(self.beside)].copy()
+        pace = np.array([speeds.get(s.derivative(), 0.0) if s.has_derivative else 0.0 for s in self.others])
+        start = evaluator.input[: moving + len(self.others)].copy()
         flow, gains = evaluator.outputs
 
         def rate(q: Vector) -> Vector:

@@ -53,7 +53,7 @@ class Writes:
     Attributes
     ----------
     frames
-        :class:`Frame` values, or pairs (parent, transform) for :meth:`Frame.of`.
+        :class:`Frame` values, or pairs (parent, transform) for :meth:`Frame.from_transform`.
     constraints
         :class:`Constraint` values or triples (lower, expression, upper). They are removed with the operation.
     rates
@@ -75,7 +75,7 @@ class Writes:
     data: Mapping[str, Any] = field(default_factory=dict)
 
     @staticmethod
-    def of(writes: Mapping[tuple[str, str], Any]) -> Writes:
+    def from_cells(writes: Mapping[tuple[str, str], Any]) -> Writes:
         """Build writes from values by kind and name."""
         kinds: dict[str, dict[Any, Any]] = {kind: {} for kind in KINDS}
         for (kind, name), value in writes.items():
@@ -126,7 +126,7 @@ def _as_frame(name: str, frame: Frame | tuple[str, TransformLike | Sequence[Tran
             raise InvalidValueError(
                 f"Frame {name!r} is written as a pair (parent, transform), not as {frame!r}."
             )
-        frame = Frame.of(*frame)
+        frame = Frame.from_transform(*frame)
     if not isinstance(frame.parent, str):
         raise InvalidValueError(
             f"The parent of frame {name!r} is given by its name, not by {frame.parent!r}."
@@ -134,7 +134,7 @@ def _as_frame(name: str, frame: Frame | tuple[str, TransformLike | Sequence[Tran
     if not all(
         isinstance(f, Pose) or (isinstance(f, Expression) and f.shape == (4, 4)) for f in frame.factors
     ):
-        return Frame.of(frame.parent, frame.factors)
+        return Frame.from_transform(frame.parent, frame.factors)
     return frame
 
 

@@ -189,7 +189,7 @@ def project(
 ) -> State:
     """Project a state onto the manifold of equality constraints, see :meth:`ModelView.project`."""
     tolerance = as_tolerance(tolerance)
-    held = _fixed_coordinates(equalities, fixed)
+    fixed_symbols = _fixed_coordinates(equalities, fixed)
     symbols = equalities.symbols
     given = [state.given(s) for s in symbols]
     missing = [s for s, value in zip(symbols, given, strict=True) if value is None and s.value is None]
@@ -199,7 +199,7 @@ def project(
             "model.default_state().updated({...}) to have a value for everything."
         )
     at = np.array([s.value or 0.0 if v is None else v for s, v in zip(symbols, given, strict=True)])
-    search = _search(equalities, at, held, tolerance)
+    search = _search(equalities, at, fixed_symbols, tolerance)
     if search is None:
         return state
     found = search.nearest()
@@ -233,7 +233,7 @@ def _fixed_coordinates(equalities: EqualityConstraints, fixed: Iterable[Symbol |
 
 
 def _search(
-    equalities: EqualityConstraints, at: Array, held: frozenset[Symbol], tolerance: float
+    equalities: EqualityConstraints, at: Array, fixed_symbols: frozenset[Symbol], tolerance: float
 ) -> _Search | None:
     """Return the problem to solve: the violated rows, and all equalities that share their coordinates."""
     count = equalities.count
@@ -247,15 +247,17 @@ def _search(
     for symbol, lower, upper in zip(equalities.coordinates, *equalities.limits, strict=True):
         if not lower - tolerance <= at[equalities.symbols.index(symbol)] <= upper + tolerance:
             moved.add(symbol)
-    if not broken and not moved - held:
+    if not broken and not moved - fixed_symbols:
         return None
     chosen: set[int] = set()
-    while more := {i for i in range(count) if i not in chosen and (i in broken or about[i] & (moved - held))}:
+    while more := {
+        i for i in range(count) if i not in chosen and (i in broken or about[i] & (moved - fixed_symbols))
+    }:
         chosen |= more
         moved |= set[Symbol]().union(*(about[i] for i in more))
-    chosen |= {i for i in range(count, len(about)) if about[i] & (moved - held)}
-    columns = [i for i, s in enumerate(equalities.coordinates) if s in moved and s not in held]
-    return _Search(equalities, sorted(chosen), columns, at, tolerance, held)
+    chosen |= {i for i in range(count, len(about)) if about[i] & (moved - fixed_symbols)}
+    columns = [i for i, s in enumerate(equalities.coordinates) if s in moved and s not in fixed_symbols]
+    return _Search(equalities, sorted(chosen), columns, at, tolerance, fixed_symbols)
 
 
 class _Search:
@@ -268,10 +270,10 @@ class _Search:
         columns: list[int],
         at: Array,
         tolerance: float,
-        held: Collection[Symbol],
+        fixed_symbols: Collection[Symbol],
     ) -> None:
         self._equalities, self._rows, self._columns = equalities, rows, columns
-        self._tolerance, self._held = tolerance, held
+        self._tolerance, self._fixed = tolerance, fixed_symbols
         self._equal = np.array([equalities.rows[i].equality for i in rows], dtype=bool)
         place = {s: i for i, s in enumerate(equalities.symbols)}
         self._places = [place[equalities.coordinates[c]] for c in columns]
@@ -369,13 +371,15 @@ class _Search:
             there = self._evaluate_rows(x)
             if there is None or pull < 1e-3:
                 break
-            way, (values, by_x) = start - x, there
-            free = ~(((x <= self._lower) & (way < 0)) | ((x >= self._upper) & (way > 0)))
+            direction, (values, by_x) = start - x, there
+            free = ~(((x <= self._lower) & (direction < 0)) | ((x >= self._upper) & (direction > 0)))
             along = np.zeros(len(x))
             # A coordinate at a bound may only move inwards.
-            kept = self._equal | ((by_x @ way > 0) & (values > -_AT_BOUND))
+            kept = self._equal | ((by_x @ direction > 0) & (values > -_AT_BOUND))
             matrix = by_x[kept][:, free]
-            along[free] = way[free] - np.linalg.lstsq(matrix, matrix @ way[free], rcond=_SINGULAR)[0]
+            along[free] = (
+                direction[free] - np.linalg.lstsq(matrix, matrix @ direction[free], rcond=_SINGULAR)[0]
+            )
             if np.linalg.norm(along) <= 1e-9:
                 break
             tried, off = self._restore(self._unit(np.clip(x + pull * along, self._lower, self._upper)))
@@ -436,10 +440,10 @@ class _Search:
             np.isfinite(self._upper) & (x >= self._upper)
         )
         moved, stopped = self._names(range(len(x))), self._names(np.flatnonzero(ends).tolist())
-        held = sorted(str(s) for s in self._held if s in self._equalities.coordinates)
+        fixed_symbols = sorted(str(s) for s in self._fixed if s in self._equalities.coordinates)
         tried = [f"moved were {_format_names(moved)}" if moved else "nothing was free to move"]
         tried += [f"at their limits are {_format_names(stopped)}"] if stopped else []
-        tried += [f"fixed were {_format_names(held)}"] if held else []
+        tried += [f"fixed were {_format_names(fixed_symbols)}"] if fixed_symbols else []
         return NoSolutionError(
             f"The state cannot be projected: at best {listed}{more}, from {_STARTS + 1} starts. "
             f"{'; '.join(tried).capitalize()}. Begin nearer to where it closes, or let more coordinates move."

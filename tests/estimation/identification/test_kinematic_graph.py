@@ -31,7 +31,7 @@ def seen(model: kv.Model, frames: list[str], count: int, seed: int, reach: float
 
 def at(x: float, y: float, z: float) -> kv.model.Pose:
     """Return a place without a turn."""
-    return kv.model.Pose.of(kv.translation(x, y, z)())
+    return kv.model.Pose.from_matrix(kv.translation(x, y, z)())
 
 
 @pytest.fixture(scope="module")

@@ -85,7 +85,7 @@ def bar(
     edit: kv.model.Edit, name: str, parent: str, x: float, length: float, z: float = 0.0, **limits: float
 ) -> None:
     """Add a bar on a hinge with its sticker, and a frame at its end."""
-    hinge = kv.model.Pose.of(kv.translation(x, 0, 0)())
+    hinge = kv.model.Pose.from_matrix(kv.translation(x, 0, 0)())
     edit.apply(
         kv.Revolute(
             name=f"{name}_hinge", parent=parent, child=f"{name}_bar", origin=hinge, axis=(0, 0, 1), **limits
@@ -115,7 +115,7 @@ def slider_crank() -> kv.Model:
         edit.add_frame("stand", "world", kv.translation(0.3, -0.2, 0.5) @ kv.rpy(-0.4, 0.6, 0.8))
         bar(edit, "crank", "stand", 0.0, 0.2, 0.05)
         bar(edit, "rod", "crank_end", 0.0, 0.7)
-        rail = kv.model.Pose.of(kv.translation(0.6, 0.05, 0)())
+        rail = kv.model.Pose.from_matrix(kv.translation(0.6, 0.05, 0)())
         edit.apply(
             kv.Prismatic(name="slide", parent="stand", child="block", origin=rail, lower=-0.5, upper=0.5)
         )
@@ -132,7 +132,7 @@ def two_cylinders() -> kv.Model:
         for side, angle in (("left", 0.5), ("right", -0.9)):
             edit.add_frame(f"{side}_pin", "crank_bar", kv.rotation_z(angle) @ kv.translation(0.2, 0, 0))
             bar(edit, f"{side}_rod", f"{side}_pin", 0.0, 0.7)
-            rail = kv.model.Pose.of((kv.rotation_z(angle) @ kv.translation(0.6, 0, 0))())
+            rail = kv.model.Pose.from_matrix((kv.rotation_z(angle) @ kv.translation(0.6, 0, 0))())
             slide = kv.Prismatic(
                 name=f"{side}_slide", parent="world", child=side, origin=rail, lower=-0.5, upper=0.5
             )

@@ -38,4 +38,4 @@ def shift_origin(joint: kv.Joint, x: float = 0.0, y: float = 0.0) -> kv.model.Po
     """Return the shifted origin of a joint."""
     matrix = np.array(joint.origin.matrix)
     matrix[:2, 3] += (x, y)
-    return kv.model.Pose.of(matrix)
+    return kv.model.Pose.from_matrix(matrix)

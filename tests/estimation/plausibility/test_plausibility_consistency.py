@@ -161,7 +161,7 @@ def make_gripper(factor: float = -1.0, shift: float = 0.0) -> kv.Model:
     with model.edit() as edit:
         finger = kv.Prismatic(name="left", parent="world", child="left", axis=(0, 1, 0), lower=0, upper=0.4)
         edit.apply(finger, tag="left")
-        place = kv.model.Pose.of(kv.translation(0.1, shift, 0)())
+        place = kv.model.Pose.from_matrix(kv.translation(0.1, shift, 0)())
         other = replace(
             finger,
             name="right",
@@ -206,7 +206,7 @@ def test_replacement_of_a_mimic_joint_follows_an_unobserved_leader() -> None:
     served = make_gripper()
     truth = make_gripper()
     with truth.edit() as edit:
-        turned = kv.model.Pose.of((kv.translation(0.1, 0, 0) @ kv.rotation_z(0.4))())
+        turned = kv.model.Pose.from_matrix((kv.translation(0.1, 0, 0) @ kv.rotation_z(0.4))())
         edit.replace("right", replace(truth.history.operation("right"), origin=turned))
     observations = observe_frames(truth, ["right"], FINGERS, 9)
     report = check_plausibility(served, observations, noise=NOISE, families=SOME)
@@ -229,7 +229,7 @@ def make_linkage(pivot: float = 1.0, coupler: float = 1.1) -> kv.Model:
             ("rocker", "world", pivot, 0.9),
         ]
         for name, parent, x, length in bars:
-            hinge = kv.model.Pose.of(kv.translation(x, 0, 0)())
+            hinge = kv.model.Pose.from_matrix(kv.translation(x, 0, 0)())
             joint = kv.Revolute(name=name, parent=parent, child=name, origin=hinge, axis=(0, 0, 1))
             edit.apply(joint, tag=name)
             edit.add_frame(f"{name}_end", name, kv.translation(length, 0, 0))

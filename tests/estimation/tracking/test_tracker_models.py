@@ -169,7 +169,7 @@ def test_redundant_coordinates_and_multi_turn_joints_are_tracked(name, truth):
 
 def test_unknown_camera_pose_is_estimated_from_static_frames():
     model = kv.Model()
-    hinge = kv.model.Pose.of(kv.translation(1, 0, 0))
+    hinge = kv.model.Pose.from_matrix(kv.translation(1, 0, 0))
     with model.edit() as edit:
         edit.apply(kv.Floating(name="camera", parent="world", child="camera"))
         edit.apply(

@@ -28,7 +28,7 @@ def rod_shape(start: Vector3, end: Vector3, radius: float, color: Rgba) -> Shape
     along = np.subtract(end, start)
     pose = rotation_from_z((float(along[0]), float(along[1]), float(along[2])))
     pose[:3, 3] = np.add(start, end) / 2
-    return Shape(Cylinder(radius, math.dist(start, end)), Pose.of(pose), color=color)
+    return Shape(Cylinder(radius, math.dist(start, end)), Pose.from_matrix(pose), color=color)
 
 
 def panel(width: float, height: float, thickness: float, color: Rgba) -> Shape:

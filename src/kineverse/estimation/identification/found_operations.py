@@ -201,4 +201,4 @@ def rigid_pose(matrix: Array) -> Pose:
     """Return a pose with its rotation orthonormalised to double precision."""
     exact = matrix.copy()
     exact[:3, :3] = mean_rotation(matrix[None, :3, :3])
-    return Pose.of(exact)
+    return Pose.from_matrix(exact)

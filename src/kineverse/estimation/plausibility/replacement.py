@@ -173,7 +173,7 @@ class ReplacedJoint(Operation, document_kind="Relearned"):
                 (kind, self.record if kind == ARTICULATIONS else name): value
                 for (kind, name), value in writes.items()
             }
-        return Writes.of({**dict(self.kept), **writes})
+        return Writes.from_cells({**dict(self.kept), **writes})
 
     def default_tag(self) -> str:
         """Return the tag of the joint."""

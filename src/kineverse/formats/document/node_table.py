@@ -161,7 +161,7 @@ class NodeTable:
         if type(node) is ReadNode:
             shape = ",".join(map(str, node.shape))
             path = ",".join(f"[{self.ref(key)},{str(trends).lower()}]" for key, trends in node.path)
-            return self._shared(f'["read",{node.question},{node.part},[{shape}],[{path}]]')
+            return self._shared(f'["read",{node.query},{node.part},[{shape}],[{path}]]')
         if node.size * max(len(node.arguments), 1) > MAX_ELEMENTS:
             raise FormatError(
                 f"The model has a node '{node.label}' of shape {node.shape} with {len(node.arguments)} "

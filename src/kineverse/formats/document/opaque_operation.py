@@ -126,7 +126,7 @@ class OpaqueOperation(Operation):
 
     @cached_property
     def _effects(self) -> Writes:
-        return Writes.of(dict(self.writes))
+        return Writes.from_cells(dict(self.writes))
 
     def default_tag(self) -> str:
         """Return the kind and the name of the first write."""

@@ -37,7 +37,7 @@ _KIND_OF = {question: kind for kind, question in DATA_QUERIES.items()}
 
 def trace_expressions(trace: Trace) -> list[Expression]:
     """Return the expressions in the queries and writes of a trace."""
-    asked = [a for step in trace.steps for a in step.question.arguments if isinstance(a, Expression)]
+    asked = [a for step in trace.steps for a in step.query.arguments if isinstance(a, Expression)]
     return asked + [e for (kind, _), value in trace.writes for e in find_expressions(kind, value)]
 
 
@@ -45,9 +45,9 @@ def encode_queries(trace: Trace, ref: Ref) -> list[list[Any]]:
     """Encode the queries of a trace as JSON values."""
     return [
         [
-            step.question.kind,
-            int(step.look),
-            *(ref(a) if isinstance(a, Expression) else a for a in step.question.arguments),
+            step.query.kind,
+            int(step.access),
+            *(ref(a) if isinstance(a, Expression) else a for a in step.query.arguments),
         ]
         for step in trace.steps
     ]
@@ -87,7 +87,7 @@ def decode_queries(value: Any, graph: NodeGraph, cell: Callable[[str, Any], Cell
                 Query(kind, _decode_arguments(kind, arguments, graph, cell)), Access(check_integer(look, 2))
             )
         )
-        for expression in (a for a in steps[-1].question.arguments if isinstance(a, Expression)):
+        for expression in (a for a in steps[-1].query.arguments if isinstance(a, Expression)):
             check_read_nodes(expression, place)
     return tuple(steps)
 
@@ -101,9 +101,9 @@ def check_read_nodes(expression: Expression, questions: int) -> None:
         If one refers to a query that comes later, or never.
     """
     for answer in find_read_nodes(expression):
-        if answer.question >= questions:
+        if answer.query >= questions:
             raise InvalidDocumentError(
-                f"it is about the answer to question {answer.question}, which is not asked"
+                f"it is about the answer to question {answer.query}, which is not asked"
             )
 
 
@@ -182,7 +182,7 @@ class TraceConsistency:
         """Record the reads of all queries; return their results, or None if these are too much work."""
         replies: list[QueryResult] | None = []
         for step in trace.steps:
-            question = step.question
+            question = step.query
             if question.kind in EXPRESSION_QUERIES:
                 if replies is None or not self._spend(_size(question)):
                     replies = None

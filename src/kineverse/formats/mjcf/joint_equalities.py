@@ -76,7 +76,7 @@ class FollowerJoints:
             residual = self.position(coupling.follower) - coupling.rest - target
             if residual.symbols:
                 name = self._model_name(coupling.name)
-                yield Constrain(name, Constraint.of(0.0, residual, 0.0))
+                yield Constrain(name, Constraint.from_expressions(0.0, residual, 0.0))
             elif abs(float(residual)) > 1e-9:
                 warn(
                     [

@@ -178,4 +178,6 @@ def place_mesh(asset: MeshAsset, body_T_mesh: Pose, folder: str, root: str) -> t
         return None
     mesh_T_file = transform(turn.T, -scale @ turn.T @ asset.position)
     a, b, c = np.diag(along).tolist()
-    return Mesh(asset.uri, (a, b, c), folder, root), compose_poses(body_T_mesh, Pose.of(mesh_T_file + 0.0))
+    return Mesh(asset.uri, (a, b, c), folder, root), compose_poses(
+        body_T_mesh, Pose.from_matrix(mesh_T_file + 0.0)
+    )

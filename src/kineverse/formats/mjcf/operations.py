@@ -180,7 +180,7 @@ def _link(link: MjcfLink, model_name: NameMap, followers: FollowerJoints) -> Ite
             yield _angle_limit(model_name(joint.name), joint.upper)
         if joint.speed is not None and _velocity(joint) is None:
             q = followers.position(joint.name)
-            limit = Constraint.of(joint.speed[0], total_derivative(q), joint.speed[1])
+            limit = Constraint.from_expressions(joint.speed[0], total_derivative(q), joint.speed[1])
             yield Constrain(f"{model_name(joint.name)}/velocity", limit)
         x, y, z = joint.anchor
         parent_T_body, parent = _translation((-x, -y, -z)), moved
@@ -236,7 +236,8 @@ def _angle_limit(name: str, angle: float) -> Constrain:
     q, v = array([x, y, z, w]), array([x, y, z])
     one_minus_cos = 2 * (v @ v) / (q @ q)
     return Constrain(
-        f"{name}/angle", Constraint.of(-math.inf, one_minus_cos, 2 * math.sin(min(angle, math.pi) / 2) ** 2)
+        f"{name}/angle",
+        Constraint.from_expressions(-math.inf, one_minus_cos, 2 * math.sin(min(angle, math.pi) / 2) ** 2),
     )
 
 
@@ -251,7 +252,7 @@ def _translation(point: Vector3) -> Pose:
 def _motion_from_reference(joint: MjcfJoint) -> Pose:
     """Return the motion of a joint from its reference to 0."""
     if joint.kind == "hinge":
-        return Pose.of(axis_angle(joint.axis, -joint.reference))
+        return Pose.from_matrix(axis_angle(joint.axis, -joint.reference))
     x, y, z = (-joint.reference * a for a in joint.axis)
     return _translation((x, y, z))
 

@@ -64,7 +64,7 @@ class Tendon(Operation, document_kind="Tendon"):
         return Writes(
             data={name: to_plain(length)}
             | ({f"{self.name}/dynamics": self.dynamics} if self.dynamics else {}),
-            constraints={name: Constraint.of(lower, length, upper)} if bounded else {},
+            constraints={name: Constraint.from_expressions(lower, length, upper)} if bounded else {},
         )
 
 
@@ -97,4 +97,8 @@ class TendonCoupling(Operation, document_kind="TendonCoupling"):
         other = as_expression(0.0) if self.leader is None else model.data[f"{self.leader}/{LENGTH_KEY}"]
         along = quartic_expression(self.coefficients, other - self.leader_rest)
         residual = length - self.rest - along
-        return Writes(constraints={self.name: Constraint.of(0.0, residual, 0.0)} if residual.symbols else {})
+        return Writes(
+            constraints={self.name: Constraint.from_expressions(0.0, residual, 0.0)}
+            if residual.symbols
+            else {}
+        )

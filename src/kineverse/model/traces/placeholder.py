@@ -28,7 +28,7 @@ class Tracer(AccessListener, Protocol):
 
     serial: int
 
-    def look(self, question: int, how: Access) -> None:
+    def record_access(self, query: int, how: Access) -> None:
         """Record an access to the result of a query."""
 
 
@@ -48,19 +48,17 @@ class ReadNode(Node):
     kind = "read"
 
     @classmethod
-    def from_expression(
-        cls, expression: Expression, listener: Tracer, question: int, part: int
-    ) -> Expression:
+    def from_expression(cls, expression: Expression, listener: Tracer, query: int, part: int) -> Expression:
         """Return a placeholder that stands for an expression."""
-        return cls.from_arguments((expression,), expression.shape, (listener, question, part, ()))
+        return cls.from_arguments((expression,), expression.shape, (listener, query, part, ()))
 
     @classmethod
-    def empty(cls, shape: ArrayShape, question: int, part: int, path: GradientPath) -> Expression:
+    def empty(cls, shape: ArrayShape, query: int, part: int, path: GradientPath) -> Expression:
         """Return an empty placeholder."""
-        return cls.from_arguments((), shape, (None, question, part, path))
+        return cls.from_arguments((), shape, (None, query, part, path))
 
     @property
-    def question(self) -> int:
+    def query(self) -> int:
         """Index of the query."""
         return int(self.options[1])
 
@@ -93,16 +91,16 @@ class ReadNode(Node):
 
     @classmethod
     def _options_key(cls, options: tuple[Any, ...]) -> str:
-        listener, question, part, path = options
+        listener, query, part, path = options
         steps = [(symbol.sort_key, heuristic) for symbol, heuristic in path]
-        return repr((listener and listener.serial, question, part, steps))
+        return repr((listener and listener.serial, query, part, steps))
 
     def _look(self, how: Access) -> Expression:
         """Record an access, and return the expression it stands for."""
         if not self.arguments:
             raise ModelError("A trace has no value before it is run.")
         # The symbols of gradient entries do not follow from those of the expression.
-        self.options[0].look(self.question, Access.VALUE if self.path else how)
+        self.options[0].record_access(self.query, Access.VALUE if self.path else how)
         return self.arguments[0]
 
     @property
@@ -117,10 +115,10 @@ class ReadNode(Node):
 
     def gradient(self, heuristic: bool) -> Mapping[Symbol, Expression]:
         """Return the gradient, with placeholders as entries."""
-        listener, question, part, path = self.options
+        listener, query, part, path = self.options
         return {
             key: ReadNode.from_arguments(
-                (entry,), self.shape, (listener, question, part, (*path, (key, heuristic)))
+                (entry,), self.shape, (listener, query, part, (*path, (key, heuristic)))
             )
             for key, entry in self._look(Access.SYMBOLS).gradient(heuristic).items()
         }
@@ -156,7 +154,7 @@ def follow_gradient_path(expression: Expression, path: GradientPath) -> Expressi
     return expression
 
 
-def fill_read_nodes(expression: Expression, put: Callable[[ReadNode], Expression]) -> Expression:
+def fill_read_nodes(expression: Expression, replacement: Callable[[ReadNode], Expression]) -> Expression:
     """Replace the placeholders of an expression.
 
     Nodes are built again from their new arguments. Unlike in a substitution, overridden gradient entries stay
@@ -167,7 +165,7 @@ def fill_read_nodes(expression: Expression, put: Callable[[ReadNode], Expression
     images: dict[Node, Expression] = {}
     for node in topological_order(leaves(expression)[1], _below, images.__contains__):
         if isinstance(node, ReadNode):
-            images[node] = put(node)
+            images[node] = replacement(node)
             continue
         arguments = tuple(replace_nodes(part, images) for part in node.arguments)
         if any(new is not old for new, old in zip(arguments, node.arguments, strict=True)):

@@ -58,7 +58,7 @@ def _run_traced(operation: Operation, reader: _RecordingReader, writes: Mapping[
         traced = tuple(
             (cell, map_expressions(cell[0], value, _detach)) for cell, value in effects.writes().items()
         )
-        again = reader.trace(traced).written(reader.replies).writes()
+        again = reader.trace(traced).written(reader.results).writes()
     except UntraceableError:
         raise
     except Exception as error:  # user code, written for other types of values
@@ -68,17 +68,17 @@ def _run_traced(operation: Operation, reader: _RecordingReader, writes: Mapping[
         raise UntraceableError("it decides by what it reads in a way that leaves no trace")
 
     def is_followed(free: Collection[int]) -> bool:
-        return replay_agrees(reader.trace(traced), operation, reader.model, reader.replies, free)
+        return replay_agrees(reader.trace(traced), operation, reader.model, reader.results, free)
 
-    free = [i for i, step in enumerate(reader.steps()) if step.look is Access.NOT]
+    free = [i for i, step in enumerate(reader.steps()) if step.access is Access.NOT]
     if not is_followed(free):
         for place in free:
             if not is_followed([place]):
                 reader.decided_by(place)
-        if not is_followed([i for i in free if reader.steps()[i].look is Access.NOT]):
+        if not is_followed([i for i in free if reader.steps()[i].access is Access.NOT]):
             raise UntraceableError("it decides by what it reads in a way that leaves no trace")
     result = reader.trace(traced)
-    if all(step.look is Access.VALUE for step in result.steps):
+    if all(step.access is Access.VALUE for step in result.steps):
         raise UntraceableError("it looks at all the values that it reads")
     return result
 
@@ -93,16 +93,16 @@ class _RecordingReader(TracingReader):
     def __init__(self, model: ReadRecorder, plain_numbers: bool = False) -> None:
         super().__init__(model)
         self.serial = next(_SERIAL)
-        self.replies: list[QueryResult] = []
+        self.results: list[QueryResult] = []
         self._plain_numbers = plain_numbers
         self._places: dict[object, int] = {}
-        self._questions: list[Query] = []
-        self._looks: list[Access] = []
+        self._queries: list[Query] = []
+        self._accesses: list[Access] = []
 
     @property
     def gave_numbers(self) -> bool:
         """True if a query result has a number."""
-        return any(isinstance(part, float) for reply in self.replies for part in reply.parts)
+        return any(isinstance(part, float) for reply in self.results for part in reply.parts)
 
     def trace(self, writes: tuple[tuple[Cell, Any], ...]) -> Trace:
         """Return the trace of the recorded queries and of given writes."""
@@ -110,58 +110,60 @@ class _RecordingReader(TracingReader):
 
     def steps(self) -> tuple[TraceStep, ...]:
         """Return the recorded queries with their accesses."""
-        return tuple(TraceStep(_apart(q), look) for q, look in zip(self._questions, self._looks, strict=True))
+        return tuple(
+            TraceStep(_apart(q), access) for q, access in zip(self._queries, self._accesses, strict=True)
+        )
 
-    def look(self, question: int, how: Access) -> None:
+    def record_access(self, query: int, how: Access) -> None:
         if not self.done:
-            self._looks[question] = max(self._looks[question], how)
+            self._accesses[query] = max(self._accesses[query], how)
 
-    def decided_by(self, question: int) -> None:
+    def decided_by(self, query: int) -> None:
         """Record that the operation depends on the value of a query result."""
-        self._looks[question] = Access.VALUE
+        self._accesses[query] = Access.VALUE
 
     def notify(self, expression: Expression) -> Expression:
         return fill_read_nodes(expression, lambda answer: answer.value)
 
     def ask(self, kind: str, *arguments: Any) -> Any:
-        question = Query(kind, arguments)
-        place = self._places.get(question.key)
+        query = Query(kind, arguments)
+        place = self._places.get(query.key)
         if place is None:
-            place = self._ask(question)
-        rest, parts = self.replies[place]
+            place = self._ask(query)
+        rest, parts = self.results[place]
         if rest is FAILED:
-            question.ask(self.model)
+            query.ask(self.model)
         if self._plain_numbers and any(isinstance(part, float) for part in parts):
-            self.look(place, Access.VALUE)
-        return question.answer(rest, [self._given(place, i, part) for i, part in enumerate(parts)])
+            self.record_access(place, Access.VALUE)
+        return query.answer(rest, [self._given(place, i, part) for i, part in enumerate(parts)])
 
-    def _ask(self, question: Query) -> int:
+    def _ask(self, query: Query) -> int:
         try:
-            reply = substitute_results(question, self.replies).ask(self.model)
+            reply = substitute_results(query, self.results).ask(self.model)
         except KineverseError:
-            if any(isinstance(a, Expression) for a in question.arguments):
+            if any(isinstance(a, Expression) for a in query.arguments):
                 raise
             reply = QueryResult(FAILED, ())
-        place = self._places[question.key] = len(self.replies)
-        self.replies.append(reply)
-        self._questions.append(question)
-        self._looks.append(Access.NOT)
+        place = self._places[query.key] = len(self.results)
+        self.results.append(reply)
+        self._queries.append(query)
+        self._accesses.append(Access.NOT)
         return place
 
-    def _given(self, question: int, place: int, part: Expression | float) -> Expression | float:
+    def _given(self, query: int, place: int, part: Expression | float) -> Expression | float:
         if self._plain_numbers and isinstance(part, float):
             return part
-        return ReadNode.from_expression(as_expression(part), self, question, place)
+        return ReadNode.from_expression(as_expression(part), self, query, place)
 
 
 def _detach(expression: Expression) -> Expression:
     """Return an expression with empty placeholders, equal in every process."""
-    result = fill_read_nodes(expression, lambda a: ReadNode.empty(a.shape, a.question, a.part, a.path))
+    result = fill_read_nodes(expression, lambda a: ReadNode.empty(a.shape, a.query, a.part, a.path))
     if any(answer.arguments for answer in find_read_nodes(result)):
         raise UntraceableError("what it read is inside of an implicit function")
     return result
 
 
-def _apart(question: Query) -> Query:
-    arguments = (_detach(a) if isinstance(a, Expression) else a for a in question.arguments)
-    return Query(question.kind, tuple(arguments))
+def _apart(query: Query) -> Query:
+    arguments = (_detach(a) if isinstance(a, Expression) else a for a in query.arguments)
+    return Query(query.kind, tuple(arguments))

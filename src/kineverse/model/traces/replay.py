@@ -129,18 +129,18 @@ def replay_agrees(
     trace: Trace,
     operation: Operation,
     model: ReadRecorder,
-    replies: Sequence[QueryResult],
+    results: Sequence[QueryResult],
     free: Collection[int],
 ) -> bool:
     """Return whether a trace agrees with the code while the results of some queries are perturbed."""
     for change in (_perturb_value, partial(_perturb_motion, symbol=_symbol_of(trace))):
         others: list[QueryResult] = []
         try:
-            for place, (step, reply) in enumerate(zip(trace.steps, replies, strict=True)):
-                if step.question.kind in EXPRESSION_QUERIES:
-                    others.append(substitute_results(step.question, others).ask(model))
+            for place, (step, reply) in enumerate(zip(trace.steps, results, strict=True)):
+                if step.query.kind in EXPRESSION_QUERIES:
+                    others.append(substitute_results(step.query, others).ask(model))
                 else:
-                    others.append(_perturb(change, step.question, reply) if place in free else reply)
+                    others.append(_perturb(change, step.query, reply) if place in free else reply)
             traced = trace.written(others).writes()
         except KineverseError:
             continue  # the perturbation is not valid for the trace
@@ -158,15 +158,15 @@ def replay_agrees(
     return True
 
 
-def _perturb(change: Perturbation, question: Query, reply: QueryResult) -> QueryResult:
-    return QueryResult(reply.rest, tuple(change(question, i, part) for i, part in enumerate(reply.parts)))
+def _perturb(change: Perturbation, query: Query, reply: QueryResult) -> QueryResult:
+    return QueryResult(reply.rest, tuple(change(query, i, part) for i, part in enumerate(reply.parts)))
 
 
-def _perturb_value(question: Query, place: int, part: Expression | float) -> Expression | float:
+def _perturb_value(query: Query, place: int, part: Expression | float) -> Expression | float:
     """Replace a number by another one, and a moving expression by a constant."""
     if isinstance(part, float):
-        return math.floor(part) + 2 if question.kind == "datum" else 1.25 * part + 0.5
-    if question.kind == "constraint" and place == 1:
+        return math.floor(part) + 2 if query.kind == "datum" else 1.25 * part + 0.5
+    if query.kind == "constraint" and place == 1:
         return 2 * part  # the expression of a constraint is never constant
     random = np.random.default_rng(_PERTURBATION_SEED)
     try:
@@ -178,9 +178,7 @@ def _perturb_value(question: Query, place: int, part: Expression | float) -> Exp
     return as_expression(value if part.shape else 1.25 * value + 0.5)
 
 
-def _perturb_motion(
-    question: Query, place: int, part: Expression | float, symbol: Symbol
-) -> Expression | float:
+def _perturb_motion(query: Query, place: int, part: Expression | float, symbol: Symbol) -> Expression | float:
     """Replace a part by an expression in one symbol."""
     symbol = symbol if isinstance(part, float) or not part.symbols else part.symbols[0]
     if isinstance(part, float) or not part.shape:
@@ -200,18 +198,18 @@ def _symbol_of(trace: Trace) -> Symbol:
 class _ReplayReader(TracingReader):
     """Reader with given results for the queries of a trace; it refuses other queries."""
 
-    def __init__(self, model: ReadRecorder, trace: Trace, replies: Sequence[QueryResult]) -> None:
+    def __init__(self, model: ReadRecorder, trace: Trace, results: Sequence[QueryResult]) -> None:
         super().__init__(model)
         self._replies = {
-            substitute_results(step.question, replies).key: reply
-            for step, reply in zip(trace.steps, replies, strict=True)
+            substitute_results(step.query, results).key: reply
+            for step, reply in zip(trace.steps, results, strict=True)
         }
 
     def ask(self, kind: str, *arguments: Any) -> Any:
-        question = Query(kind, arguments)
-        reply = self._replies.get(question.key)
+        query = Query(kind, arguments)
+        reply = self._replies.get(query.key)
         if reply is None:
             raise UntraceableError("it asks for other things then")
         if reply.rest is FAILED:
-            question.ask(self.model)
-        return question.answer(reply.rest, reply.parts)
+            query.ask(self.model)
+        return query.answer(reply.rest, reply.parts)

@@ -30,8 +30,8 @@ class UntraceableError(ModelError):
 class TraceStep:
     """Query of an operation, with the access to its result."""
 
-    question: Query
-    look: Access
+    query: Query
+    access: Access
 
 
 @dataclass(frozen=True)
@@ -69,30 +69,30 @@ class Trace:
         old: list[QueryResult] = []
         new: list[QueryResult] = []
         for step in self.steps:
-            then = _ask(substitute_results(step.question, old), before)
-            now = _ask(substitute_results(step.question, new), model)
+            then = _ask(substitute_results(step.query, old), before)
+            now = _ask(substitute_results(step.query, new), model)
             if isinstance(now, KineverseError) and not isinstance(then, KineverseError):
                 raise now
             old.append(_reply(then))
             new.append(_like(_reply(now), old[-1]))
             _check_size(old[-1])
             _check_size(new[-1])
-            problem = _difference(step.look, old[-1], new[-1])
+            problem = _difference(step.access, old[-1], new[-1])
             if problem:
-                asked = ", ".join(str(a) for a in step.question.arguments if isinstance(a, str))
+                asked = ", ".join(str(a) for a in step.query.arguments if isinstance(a, str))
                 raise UntraceableError(
-                    f"{problem} of {step.question.kind}({asked}), which has changed, decides what it does."
+                    f"{problem} of {step.query.kind}({asked}), which has changed, decides what it does."
                 )
         return self.written(new)
 
-    def written(self, replies: Sequence[QueryResult]) -> Writes:
+    def written(self, results: Sequence[QueryResult]) -> Writes:
         """Return the writes for given query results."""
-        put = _into(replies)
+        fill = _into(results)
 
-        def put_datum(expression: Expression) -> Expression | float:
+        def fill_datum(expression: Expression) -> Expression | float:
             # An expression of numbers is converted back to a number.
-            parts = [replies[a.question].parts[a.part] for a in find_read_nodes(expression)]
-            result = put(expression)
+            parts = [results[a.query].parts[a.part] for a in find_read_nodes(expression)]
+            result = fill(expression)
             of_numbers = bool(parts) and all(isinstance(part, float) for part in parts)
             is_number = of_numbers and not result.shape and result.is_constant
             if not is_number:
@@ -103,13 +103,15 @@ class Trace:
             return number
 
         written = {
-            (kind, name): map_expressions(kind, value, put_datum if kind in (DATA, ARTICULATIONS) else put)
+            (kind, name): map_expressions(kind, value, fill_datum if kind in (DATA, ARTICULATIONS) else fill)
             for (kind, name), value in self.writes
         }
         for (kind, _), value in written.items():
             if kind == CONSTRAINTS:
-                Constraint.of(value.lower, value.expression, value.upper)  # raises for an empty range
-        return Writes.of(written)
+                Constraint.from_expressions(
+                    value.lower, value.expression, value.upper
+                )  # raises for an empty range
+        return Writes.from_cells(written)
 
 
 def _check_size(reply: QueryResult) -> None:
@@ -118,14 +120,14 @@ def _check_size(reply: QueryResult) -> None:
         raise UntraceableError(f"an answer on the way to it is made of more than {MAX_ANSWER:,} nodes.")
 
 
-def run_query(question: Query, model: ReadRecorder) -> QueryResult:
+def run_query(query: Query, model: ReadRecorder) -> QueryResult:
     """Return the result of a query; :data:`.trace_queries.FAILED` if it raises an error."""
-    return _reply(_ask(question, model))
+    return _reply(_ask(query, model))
 
 
-def _ask(question: Query, model: ReadRecorder) -> QueryResult | KineverseError:
+def _ask(query: Query, model: ReadRecorder) -> QueryResult | KineverseError:
     try:
-        return question.ask(model)
+        return query.ask(model)
     except KineverseError as error:
         return error
 
@@ -140,17 +142,17 @@ def _like(reply: QueryResult, before: QueryResult) -> QueryResult:
     return QueryResult(before.rest, (float(reply.rest),)) if is_whole else reply
 
 
-def substitute_results(question: Query, replies: Sequence[QueryResult]) -> Query:
+def substitute_results(query: Query, results: Sequence[QueryResult]) -> Query:
     """Return a query with earlier results in its arguments."""
-    if not any(isinstance(a, Expression) for a in question.arguments):
-        return question
-    put = _into(replies)
-    return Query(question.kind, tuple(put(a) if isinstance(a, Expression) else a for a in question.arguments))
+    if not any(isinstance(a, Expression) for a in query.arguments):
+        return query
+    fill = _into(results)
+    return Query(query.kind, tuple(fill(a) if isinstance(a, Expression) else a for a in query.arguments))
 
 
-def _into(replies: Sequence[QueryResult]) -> Callable[[Expression], Expression]:
+def _into(results: Sequence[QueryResult]) -> Callable[[Expression], Expression]:
     def place(answer: ReadNode) -> Expression:
-        parts = replies[answer.question].parts
+        parts = results[answer.query].parts
         part = as_expression(parts[answer.part]) if answer.part < len(parts) else None
         if part is None or part.shape != answer.shape:
             raise UntraceableError("it needs more than there is now.")
@@ -159,16 +161,16 @@ def _into(replies: Sequence[QueryResult]) -> Callable[[Expression], Expression]:
     return lambda expression: fill_read_nodes(expression, place)
 
 
-def _difference(look: Access, old: QueryResult, new: QueryResult) -> str | None:
+def _difference(access: Access, old: QueryResult, new: QueryResult) -> str | None:
     if old.rest != new.rest or len(old.parts) != len(new.parts):
         return "the names and kinds"
     for one, other in zip(old.parts, new.parts, strict=True):
         a, b = as_expression(one), as_expression(other)
         if a.shape != b.shape:
             return "the shape"
-        if look >= Access.VALUE and a != b:
+        if access >= Access.VALUE and a != b:
             return "the value"
-        if look >= Access.SYMBOLS and _symbols(a) != _symbols(b):
+        if access >= Access.SYMBOLS and _symbols(a) != _symbols(b):
             return "the symbols"
     return None
 

@@ -104,8 +104,8 @@ class LoopClosure:
     def operations(self, name: Callable[[str], str]) -> Iterator[Operation]:
         """Yield the operations that close the loop, with names of parts mapped to the model."""
         title = name(self.name)
-        yield AddFrame(f"{title}/seat", Frame.of(name(self.seat_in), rigid_pose(self.seat)))
-        yield AddFrame(f"{title}/pin", Frame.of(name(self.pin_in), rigid_pose(self.pin)))
+        yield AddFrame(f"{title}/seat", Frame.from_transform(name(self.seat_in), rigid_pose(self.seat)))
+        yield AddFrame(f"{title}/pin", Frame.from_transform(name(self.pin_in), rigid_pose(self.pin)))
         yield CloseLoop(
             name=f"{title}/loop",
             frame=f"{title}/pin",
