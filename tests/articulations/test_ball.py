@@ -37,13 +37,13 @@ def at(rotation: Rotation, length: float = 1.0) -> dict[str, float]:
 
 @settings(max_examples=attempts(30), derandomize=True)
 @given(seed=st.integers(0, 10**6), length=st.sampled_from([1.0, -1.0, 0.1, 7.0]))
-def test_it_turns_by_its_quaternion(seed: int, length: float) -> None:
+def test_ball_pose_is_the_rotation_of_its_quaternion(seed: int, length: float) -> None:
     rotation = Rotation.random(rng=np.random.default_rng(seed))
     pose = model_of(kv.articulations.Ball(**WHERE)).fk("c")(at(rotation, length))
     np.testing.assert_allclose(pose, ORIGIN @ homogeneous(rotation), atol=1e-14)
 
 
-def test_four_coordinates_and_three_speeds() -> None:
+def test_ball_has_four_coordinates_and_three_speeds() -> None:
     model = model_of(kv.articulations.Ball(**WHERE))
     record = model.articulations["j"]
     assert [str(s) for s in record.coordinates] == ["j/qx", "j/qy", "j/qz", "j/qw"]
@@ -56,11 +56,11 @@ def test_four_coordinates_and_three_speeds() -> None:
 
 @pytest.mark.parametrize("operation", EVERY)
 @pytest.mark.parametrize("seed", range(4))
-def test_jacobians_are_differences(operation: kv.Operation, seed: int) -> None:
+def test_ball_jacobian_equals_finite_differences(operation: kv.Operation, seed: int) -> None:
     assert_jacobian(model_of(operation), "c", seed)
 
 
-def test_it_moves_as_gradients_say() -> None:
+def test_ball_tangent_equals_motion_along_rates() -> None:
     model = model_of(FULL)
     limited = [c.expression for name, c in model.constraints.items() if name != "j/velocity"]
     assert_motion_law(model, [model.fk("c"), model.jacobian("c"), *limited], seed=3)
@@ -68,7 +68,7 @@ def test_it_moves_as_gradients_say() -> None:
 
 @settings(max_examples=attempts(60), derandomize=True)
 @given(seed=st.integers(0, 10**6), length=st.sampled_from([1.0, -2.0]))
-def test_cone_and_twist_are_the_angles_they_are_said_to_be(seed: int, length: float) -> None:
+def test_cone_and_twist_constraints_equal_swing_and_twist_angles(seed: int, length: float) -> None:
     rng = np.random.default_rng(seed)
     axis = np.array([1, 2, 3]) / math.sqrt(14)
     across = np.cross(axis, rng.normal(size=3))
@@ -80,7 +80,7 @@ def test_cone_and_twist_are_the_angles_they_are_said_to_be(seed: int, length: fl
     assert broken == {name for name, far in (("j/cone", tilt > 0.8), ("j/twist", abs(twist) > 0.5)) if far}
 
 
-def test_the_limits_are_smooth_at_rest() -> None:
+def test_cone_and_twist_are_smooth_at_rest() -> None:
     model = model_of(FULL)
     home = model.default_state()
     for name in ("j/cone", "j/twist"):
@@ -91,13 +91,13 @@ def test_the_limits_are_smooth_at_rest() -> None:
 
 
 @pytest.mark.parametrize(("cone", "twist"), [(math.pi, math.pi), (math.pi, None), (None, math.pi)])
-def test_a_cone_of_half_a_turn_limits_nothing(cone: float | None, twist: float | None) -> None:
+def test_cone_of_pi_limits_nothing(cone: float | None, twist: float | None) -> None:
     model = model_of(kv.articulations.Ball(**WHERE, cone=cone, twist=twist))
     for rotation in Rotation.random(50, rng=np.random.default_rng(1)):
         assert not model.violations(at(rotation))
 
 
-def test_the_speed_is_limited_in_every_direction() -> None:
+def test_ball_velocity_limits_the_norm_of_the_angular_velocity() -> None:
     model = model_of(kv.articulations.Ball(**WHERE, velocity=2))
     home = model.default_state()
     for direction in np.random.default_rng(1).normal(size=(20, 3)):
@@ -110,7 +110,7 @@ def test_the_speed_is_limited_in_every_direction() -> None:
 
 
 @pytest.mark.parametrize("wish", [(1, 0, 0), (0, -1, 0), (0.3, 0.5, 1), (0, 0, -1)])
-def test_rows_keep_cone_twist_and_speed(wish: tuple[float, ...]) -> None:
+def test_velocity_rows_keep_cone_twist_and_speed(wish: tuple[float, ...]) -> None:
     model = model_of(kv.articulations.Ball(**WHERE, cone=0.8, twist=0.5, velocity=2))
     names = dict(zip((f"j/w{c}:velocity" for c in "xyz"), wish, strict=True))
     dt = 0.02
@@ -120,7 +120,7 @@ def test_rows_keep_cone_twist_and_speed(wish: tuple[float, ...]) -> None:
 
 
 @pytest.mark.parametrize("operation", EVERY)
-def test_it_is_a_value_and_a_document(operation: kv.articulations.Ball, tmp_path: Path) -> None:
+def test_ball_is_hashable_and_survives_a_document(operation: kv.articulations.Ball, tmp_path: Path) -> None:
     assert_is_a_value(operation, model_of(operation), tmp_path)
 
 
@@ -141,7 +141,7 @@ BROKEN: list[tuple[dict[str, Any], str]] = [
 
 
 @pytest.mark.parametrize(("given", "words"), BROKEN)
-def test_bad_input_names_the_articulation_and_the_number(given: dict[str, Any], words: str) -> None:
+def test_invalid_ball_error_names_articulation_and_number(given: dict[str, Any], words: str) -> None:
     model = model_of(kv.Fixed(name="old", parent="world", child="old"))
     before = model.snapshot()
     with pytest.raises(kv.KineverseError, match=words), model.edit() as edit:

@@ -41,7 +41,7 @@ def wheels(*speeds: float) -> dict[str, float]:
 
 
 @pytest.mark.parametrize("base", EVERY, ids=lambda o: type(o).__name__)
-def test_where_they_are(base: Base) -> None:
+def test_base_poses_follow_their_coordinates(base: Base) -> None:
     kind, given = type(base), {**base.__dict__, **WHERE}
     pose = model_of(kind(**given)).fk("c")
     for x, y, angle in ((0, 0, 0), (1, -2, 0.7), (3, 1, -4)):
@@ -51,26 +51,26 @@ def test_where_they_are(base: Base) -> None:
 
 @pytest.mark.parametrize("base", EVERY, ids=lambda o: type(o).__name__)
 @pytest.mark.parametrize("seed", range(3))
-def test_jacobians_are_differences(base: Base, seed: int) -> None:
+def test_base_jacobians_equal_finite_differences(base: Base, seed: int) -> None:
     assert_jacobian(model_of(base), "c", seed)
 
 
 @pytest.mark.parametrize("base", EVERY, ids=lambda o: type(o).__name__)
-def test_they_move_as_gradients_say(base: Base) -> None:
+def test_base_tangents_equal_motion_along_rates(base: Base) -> None:
     arm = kv.Revolute(name="arm", parent="c", child="arm", axis=(1, 2, 3))
     model = model_of(base, arm)
     assert_motion_law(model, [model.fk("arm"), model.jacobian("arm"), model.fk("c", "arm")], seed=4)
 
 
 @pytest.mark.parametrize("base", EVERY, ids=lambda o: type(o).__name__)
-def test_they_are_values_and_documents(base: Any, tmp_path: Path) -> None:
+def test_bases_are_hashable_and_survive_a_document(base: Any, tmp_path: Path) -> None:
     assert_is_a_value(base, model_of(base), tmp_path)
 
 
 # -- the car -------------------------------------------------------------------------------------------
 
 
-def test_a_car_drives_a_circle_about_a_point_on_its_rear_axle() -> None:
+def test_ackermann_drives_a_circle_about_a_point_on_its_rear_axle() -> None:
     model = model_of(CAR)
     assert [str(s) for s in model.speeds] == ["j/drive:velocity", "j/steering:velocity"]
     assert [s.path for s in model.articulations["j"].coordinates] == ["j/x", "j/y", "j/angle", "j/steering"]
@@ -83,7 +83,7 @@ def test_a_car_drives_a_circle_about_a_point_on_its_rear_axle() -> None:
     assert after["j/y"] == pytest.approx(radius * (1 - math.cos(turned)))
 
 
-def test_a_car_steers_while_it_drives() -> None:
+def test_ackermann_steers_while_it_drives() -> None:
     """With δ = ct, the angle is -v/(Lc)·log cos(ct)."""
     model = model_of(CAR)
     after = model.integrate(model.default_state(), {"j/drive:velocity": 2.0, "j/steering:velocity": 0.3}, 1.5)
@@ -91,7 +91,7 @@ def test_a_car_steers_while_it_drives() -> None:
     assert after["j/angle"] == pytest.approx(-2 / (2.5 * 0.3) * math.log(math.cos(0.45)))
 
 
-def test_a_car_cannot_go_sideways() -> None:
+def test_ackermann_cannot_move_sideways() -> None:
     sideways = model_of(CAR).jacobian("c", form="body")[1]
     for angle, steering in ((0, 0), (1.0, 0.3), (-2.0, -0.5)):
         at = {"j/x": 1, "j/y": 2, "j/angle": angle, "j/steering": steering}
@@ -100,7 +100,7 @@ def test_a_car_cannot_go_sideways() -> None:
         )
 
 
-def test_the_limits_of_a_car() -> None:
+def test_ackermann_limits() -> None:
     model = model_of(CAR)
     assert model.limits("j/steering") == (-0.5, 0.5)
     assert model.limits("j/steering:velocity") == (-0.4, 0.4)
@@ -116,7 +116,7 @@ def test_the_limits_of_a_car() -> None:
 
 
 @pytest.mark.parametrize("angle", [0.0, 0.8, -2.0])
-def test_four_wheels_move_three_coordinates(angle: float) -> None:
+def test_mecanum_wheels_move_three_coordinates(angle: float) -> None:
     model = model_of(WHEELED)
     jacobian = model.jacobian("c", form="body")(kv.State({"j/x": 1.0, "j/y": 2.0, "j/angle": angle}))
     columns = {s: jacobian[:, i] for i, s in enumerate(map(str, model.speeds_of("c")))}
@@ -131,7 +131,7 @@ def test_four_wheels_move_three_coordinates(angle: float) -> None:
     np.testing.assert_allclose(twist(1, 1, -1, -1), 0, atol=1e-15)  # the wheels slip
 
 
-def test_wheels_that_roll_as_the_inverse_kinematics_says_do_what_was_wanted() -> None:
+def test_mecanum_inverse_kinematics_gives_the_requested_motion() -> None:
     """Each roller's axis is at 45°: ω r = v_x ∓ v_y ∓ (b + L)/2 θ̇."""
     model = model_of(WHEELED)
     vx, vy, turning, reach = 0.4, -0.3, 0.7, 0.6
@@ -148,7 +148,7 @@ def test_wheels_that_roll_as_the_inverse_kinematics_says_do_what_was_wanted() ->
     assert needed[0] + needed[1] == pytest.approx(needed[2] + needed[3])  # no slip
 
 
-def test_wheels_may_have_names_of_their_own() -> None:
+def test_mecanum_wheels_take_names() -> None:
     names = ("a", "b", "c/d", "e")
     model = model_of(kv.articulations.Mecanum(**FLAT, radius=0.1, track=1, wheelbase=1, wheels=names))
     assert [s.path for s in model.articulations["j"].speeds] == list(names)
@@ -159,7 +159,7 @@ def test_wheels_may_have_names_of_their_own() -> None:
 
 
 @pytest.mark.parametrize("heading", [0.0, 1.0, 4.0])
-def test_the_speed_of_a_mecanum_base_is_limited_in_every_direction(heading: float) -> None:
+def test_mecanum_speed_limit_holds_in_every_direction(heading: float) -> None:
     model = model_of(WHEELED)
     for direction in np.linspace(0, 6, 7):
         c, s = math.cos(direction), math.sin(direction)
@@ -174,7 +174,7 @@ def test_the_speed_of_a_mecanum_base_is_limited_in_every_direction(heading: floa
     assert [v.name for v in fast] == [f"j/{corner}_wheel_speed" for corner in sorted(CORNERS)]
 
 
-def test_a_differential_drive_may_have_limits_of_its_speed_and_of_its_turning() -> None:
+def test_differential_drive_limits_of_speed_and_turn() -> None:
     model = model_of(TWO_WHEELED)
 
     def broken(left: float, right: float) -> list[str]:
@@ -190,7 +190,7 @@ def test_a_differential_drive_may_have_limits_of_its_speed_and_of_its_turning() 
 
 @pytest.mark.parametrize("base", [WHEELED, TWO_WHEELED], ids=lambda o: type(o).__name__)
 @pytest.mark.parametrize("seed", range(3))
-def test_rows_keep_the_speeds(base: Base, seed: int) -> None:
+def test_velocity_rows_keep_speed_limits_of_bases(base: Base, seed: int) -> None:
     model = model_of(base)
     rng = np.random.default_rng(seed)
     wish = {str(s): float(rng.normal()) for s in model.speeds}
@@ -226,7 +226,7 @@ BROKEN: list[tuple[type[Any], dict[str, Any], str]] = [
 
 
 @pytest.mark.parametrize(("kind", "given", "words"), BROKEN)
-def test_bad_input_names_the_base_and_the_number(kind: type[Any], given: dict[str, Any], words: str) -> None:
+def test_invalid_base_error_names_base_and_number(kind: type[Any], given: dict[str, Any], words: str) -> None:
     model = model_of(kv.Fixed(name="old", parent="world", child="old"))
     before = model.snapshot()
     with pytest.raises(kv.KineverseError, match=words), model.edit() as edit:

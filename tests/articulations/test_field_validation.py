@@ -28,7 +28,7 @@ STRANGE = ["1", "two", float("nan"), -1, None, (), {}, (1, 2), object(), kv.posi
 TEXTS = {"name", "parent", "child", "driver", "left", "right"}
 
 
-def test_all_of_them_are_here() -> None:
+def test_every_articulation_is_covered() -> None:
     assert {
         kv.Fixed,
         kv.articulations.Ball,
@@ -41,7 +41,7 @@ def test_all_of_them_are_here() -> None:
 
 
 @pytest.mark.parametrize("kind", KINDS, ids=lambda k: k.__name__)
-def test_every_field_takes_what_it_can_use_or_says_whose_it_is(kind: type[Any]) -> None:
+def test_every_field_accepts_a_value_or_names_itself_in_the_error(kind: type[Any]) -> None:
     names = {field.name for field in fields(kind)}
     given = {"name": "thing", "parent": "world", **NEEDED.get(kind, {})}
     given |= {"child": "child of it"} if "child" in names else {}
@@ -64,7 +64,7 @@ def test_every_field_takes_what_it_can_use_or_says_whose_it_is(kind: type[Any]) 
 
 
 @pytest.mark.parametrize("kind", KINDS, ids=lambda k: k.__name__)
-def test_text_is_no_number(kind: type[Any]) -> None:
+def test_text_in_a_numeric_field_is_refused(kind: type[Any]) -> None:
     given = {"name": "thing", "parent": "world", **NEEDED.get(kind, {})}
     names = {field.name for field in fields(kind)}
     given |= {"child": "child of it"} if "child" in names else {}

@@ -30,7 +30,7 @@ def planar(part: str, angle: float, door: kv.articulations.FoldingDoor = DOOR) -
 
 
 @pytest.mark.parametrize(("angle", "upper", "lower", "handle", "between"), TABLE)
-def test_it_meets_the_table(
+def test_folding_door_matches_the_published_table(
     angle: float,
     upper: tuple[float, ...],
     lower: tuple[float, ...],
@@ -43,7 +43,7 @@ def test_it_meets_the_table(
     assert 180 - math.degrees(math.acos(outward[0] @ outward[1])) == pytest.approx(between, abs=6e-3)
 
 
-def test_the_arm_connects_cupboard_and_lower_panel_at_every_angle() -> None:
+def test_arm_connects_cupboard_and_lower_panel_at_every_angle() -> None:
     for angle in np.linspace(0, 1.84, 37):
         arm = pose(DOOR, "arm", {"m": angle})
         np.testing.assert_allclose(arm[[0, 2], 3], DOOR.arm_pivot, atol=1e-15)
@@ -51,7 +51,7 @@ def test_the_arm_connects_cupboard_and_lower_panel_at_every_angle() -> None:
         np.testing.assert_allclose(end[:3], pose(DOOR, "arm_end", {"m": angle})[:3, 3], atol=1e-14)
 
 
-def test_the_panels_are_rigid_and_share_a_hinge() -> None:
+def test_panels_are_rigid_and_share_a_hinge() -> None:
     for angle in np.linspace(0, 1.84, 13):
         e1, e2 = np.array([-np.sin(angle), -np.cos(angle)]), np.array([-np.cos(angle), np.sin(angle)])
         hinge = np.array(DOOR.top_hinge) + 0.37012 * e1 + 0.00039 * e2
@@ -65,7 +65,7 @@ def test_the_panels_are_rigid_and_share_a_hinge() -> None:
     np.testing.assert_allclose(-shut[[0, 2], 2], [0.009, -1], atol=5e-4)
 
 
-def test_it_opens_at_its_speed() -> None:
+def test_folding_door_opens_at_its_speed_limit() -> None:
     model = model_of(DOOR)
     assert model.limits("m") == (0.0, 1.84)
     assert model.limits("m:velocity") == (-0.25, 0.25)
@@ -73,7 +73,7 @@ def test_it_opens_at_its_speed() -> None:
     assert end[q] == pytest.approx(1.84)
 
 
-def test_another_size_is_the_same_door() -> None:
+def test_folding_door_of_another_size_is_similar() -> None:
     """Twice as large, everything is twice as far away."""
     fields = ("size", "panel", "top_hinge", "arm_pivot", "upper_middle", "panel_hinge", "lower_middle")
     fields += ("arm_end", "handle", "handle_size")
@@ -109,11 +109,11 @@ def test_another_size_is_the_same_door() -> None:
         ({"wall": 0}, "The wall of the folding door 'm' is a positive, finite number, not 0"),
     ],
 )
-def test_what_cannot_close_is_refused(given: dict[str, object], words: str) -> None:
+def test_folding_door_that_cannot_close_is_refused(given: dict[str, object], words: str) -> None:
     assert words in refused(kv.articulations.FoldingDoor, given)
 
 
-def test_the_angle_at_which_it_does_not_reach_may_lie_within_the_range() -> None:
+def test_arm_that_does_not_reach_at_an_inner_angle_is_refused() -> None:
     """The ends are within reach, and the farthest angle in between is not."""
     u, v = DOOR.panel_hinge
     (ax, az), (dx, dz) = DOOR.top_hinge, DOOR.arm_pivot
@@ -137,7 +137,7 @@ def test_the_angle_at_which_it_does_not_reach_may_lie_within_the_range() -> None
                 assert closes
 
 
-def test_its_spring_opens_it_beyond_a_point_and_shuts_it_before() -> None:
+def test_spring_torque_changes_sign_at_the_tipping_angle() -> None:
     model = model_of(DOOR)
     assert dict(model.articulations["m"].dynamics) == {"spring/stiffness": 4.0, "spring/tipping": 0.6}
     torque = model.data["m/spring"]

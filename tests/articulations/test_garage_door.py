@@ -24,7 +24,7 @@ def printed(a: float, length: float) -> Matrix:
 
 
 @pytest.mark.parametrize("length", [2.0, 2.4])
-def test_both_forms_are_the_same_door(length: float) -> None:
+def test_regular_and_published_form_have_equal_poses(length: float) -> None:
     regular = kv.articulations.GarageDoor(**WHERE, length=length)
     published = kv.articulations.GarageDoor(**WHERE, length=length, form="published")
     for angle in np.linspace(0, math.pi / 2, 20):
@@ -36,7 +36,7 @@ def test_both_forms_are_the_same_door(length: float) -> None:
         np.testing.assert_allclose(found, at(z=length * (1 - math.cos(angle))) @ about_y(angle), atol=1e-14)
 
 
-def test_its_edges_run_along_the_rails() -> None:
+def test_door_edges_move_along_the_rails() -> None:
     """Closed it stands, open it lies under the ceiling: a = 2 has A at z 0 and B at 2, a = 0 has B at (2, 0, 2)."""
     for door, closed, opened in ((REGULAR, 0.0, math.pi / 2), (PUBLISHED, 2.0, 0.0)):
         for q, lower, upper in ((closed, (0, 0, 0), (0, 0, 2)), (opened, (0, 0, 2), (2, 0, 2))):
@@ -47,7 +47,7 @@ def test_its_edges_run_along_the_rails() -> None:
         assert pose(REGULAR, "upper_edge", {"m/door": angle})[2, 3] == pytest.approx(2.0)
 
 
-def test_only_the_regular_form_has_a_slope_where_it_is_closed() -> None:
+def test_only_the_regular_form_has_a_finite_slope_when_closed() -> None:
     regular, published = model_of(REGULAR), model_of(PUBLISHED)
     # Closed, it begins to turn and nothing else.
     found = regular.jacobian("m/door")({"m/door": 0.0}).ravel()
@@ -58,7 +58,7 @@ def test_only_the_regular_form_has_a_slope_where_it_is_closed() -> None:
         assert np.isfinite(regular.jacobian("m/upper_edge")({"m/door": angle})).all()
 
 
-def test_its_constraints_are_those_of_the_papers() -> None:
+def test_garage_door_constraints_equal_those_of_the_papers() -> None:
     a, b = kv.position("m/door"), kv.position("m/bolt")
     constraints = model_of(PUBLISHED).constraints
     assert constraints["m/door/position"] == kv.Constraint.from_expressions(0, a, 2)
@@ -77,7 +77,7 @@ def test_its_constraints_are_those_of_the_papers() -> None:
 
 
 @BOTH
-def test_the_lock_forces_the_speed_to_zero_and_says_what_would_open_it(
+def test_lock_forces_speed_zero_and_its_gradient_shows_how_to_open(
     door: kv.articulations.GarageDoor,
 ) -> None:
     model = model_of(door)
@@ -96,7 +96,7 @@ def test_the_lock_forces_the_speed_to_zero_and_says_what_would_open_it(
 
 
 @BOTH
-def test_it_opens_once_the_bolt_is_back(door: kv.articulations.GarageDoor) -> None:
+def test_garage_door_opens_after_the_bolt_is_back(door: kv.articulations.GarageDoor) -> None:
     model = model_of(door)
     closed, opened, speed = (2.0, 0.0, -1.0) if door is PUBLISHED else (0.0, math.pi / 2, 1.0)
     q, b = kv.position("m/door"), kv.position("m/bolt")
@@ -107,7 +107,7 @@ def test_it_opens_once_the_bolt_is_back(door: kv.articulations.GarageDoor) -> No
 
 
 @BOTH
-def test_both_catch_within_the_same_play(door: kv.articulations.GarageDoor) -> None:
+def test_both_forms_lock_within_the_same_play(door: kv.articulations.GarageDoor) -> None:
     for a, shut in ((1.991, 1.0), (1.989, 0.0)):
         q = a if door is PUBLISHED else math.acos(a / 2)
         assert door.closed({"m/door": q}) == shut
@@ -125,5 +125,5 @@ def test_both_catch_within_the_same_play(door: kv.articulations.GarageDoor) -> N
         ({"bolt": kv.Limits(1, 0)}, "The limits of 'm/bolt' are no range"),
     ],
 )
-def test_what_cannot_be_is_refused(given: dict[str, object], words: str) -> None:
+def test_invalid_garage_door_is_refused(given: dict[str, object], words: str) -> None:
     assert words in refused(kv.articulations.GarageDoor, given)

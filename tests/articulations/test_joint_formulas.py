@@ -65,7 +65,7 @@ def unit(axis: Any) -> np.ndarray:
     return scaled / np.linalg.norm(scaled)
 
 
-def test_fixed() -> None:
+def test_fixed_joint_pose() -> None:
     np.testing.assert_allclose(pose(kv.Fixed(**WHERE)), ORIGIN, atol=1e-15)
     model = model_of(kv.Fixed(**WHERE))
     assert not model.constraints
@@ -75,14 +75,14 @@ def test_fixed() -> None:
 
 @pytest.mark.parametrize("axis", AXES)
 @pytest.mark.parametrize("kind", [kv.Revolute, kv.Continuous])
-def test_hinges(axis: Any, kind: type[kv.Revolute]) -> None:
+def test_revolute_and_continuous_joint_pose(axis: Any, kind: type[kv.Revolute]) -> None:
     for q in (0.0, 0.7, -2.0, np.pi, 9.0):
         expected = ORIGIN @ homogeneous(Rotation.from_rotvec(unit(axis) * q))
         np.testing.assert_allclose(pose(kind(**WHERE, axis=axis), j=q), expected, atol=1e-14)
 
 
 @pytest.mark.parametrize("axis", AXES)
-def test_prismatic(axis: Any) -> None:
+def test_prismatic_joint_pose(axis: Any) -> None:
     for q in (0.0, 0.7, -2.0):
         expected = ORIGIN @ homogeneous(position=unit(axis) * q)
         np.testing.assert_allclose(pose(kv.Prismatic(**WHERE, axis=axis), j=q), expected, atol=1e-14)
@@ -90,7 +90,7 @@ def test_prismatic(axis: Any) -> None:
 
 @given(st.tuples(numbers, numbers, numbers).filter(lambda v: max(map(abs, v)) > 1e-3), numbers)
 @settings(max_examples=attempts(40), derandomize=True)
-def test_any_axis(axis: Any, q: float) -> None:
+def test_joint_pose_about_any_axis(axis: Any, q: float) -> None:
     expected = homogeneous(Rotation.from_rotvec(unit(axis) * q))
     where = {"name": "j", "parent": "world", "child": "c"}
     np.testing.assert_allclose(pose(kv.Revolute(**where, axis=axis), j=q), expected, atol=1e-13)
@@ -100,7 +100,7 @@ def test_any_axis(axis: Any, q: float) -> None:
 @pytest.mark.parametrize(
     "axis", [*AXES, (0, 0, -1), (1e-8, 0, -1), (0, 1e-5, -1), (1e-13, 1e-13, -1), (1e-5, 0, 1)]
 )
-def test_planar(axis: Any) -> None:
+def test_planar_joint_pose(axis: Any) -> None:
     n = unit(axis)
     turn = np.diag([1.0, -1.0, -1.0])
     if n[:2].any() or n[2] > 0:
@@ -119,13 +119,13 @@ def test_planar(axis: Any) -> None:
     st.tuples(*[st.floats(-1, 1)] * 4).filter(lambda q: sum(v * v for v in q) > 0.1),
 )
 @settings(max_examples=attempts(40), derandomize=True)
-def test_floating(xyz: Any, q: Any) -> None:
+def test_floating_joint_pose(xyz: Any, q: Any) -> None:
     values = dict(zip(("x", "y", "z", "qx", "qy", "qz", "qw"), (*xyz, *q), strict=True))
     expected = ORIGIN @ homogeneous(Rotation.from_quat(q), xyz)
     np.testing.assert_allclose(pose(kv.Floating(**WHERE), **values), expected, atol=1e-13)
 
 
-def test_the_speeds_of_a_floating_joint_are_angular_velocities_in_the_child() -> None:
+def test_floating_joint_angular_velocity_is_in_child_axes() -> None:
     model = model_of(kv.Floating(name="j", parent="world", child="c"))
     q = Rotation.from_euler("xyz", [0.4, 1.1, -2.0])
     at = {
@@ -156,13 +156,13 @@ def test_the_speeds_of_a_floating_joint_are_angular_velocities_in_the_child() ->
     "base",
     [kv.articulations.OmniBase(**WHERE), kv.articulations.DifferentialDrive(**WHERE, radius=0.1, track=0.5)],
 )
-def test_bases(base: Joint) -> None:
+def test_base_pose(base: Joint) -> None:
     for x, y, angle in ((0, 0, 0), (1, -2, 0.7), (3, 1, -4)):
         expected = ORIGIN @ homogeneous(Rotation.from_euler("z", angle), (x, y, 0))
         np.testing.assert_allclose(pose(base, x=x, y=y, angle=angle), expected, atol=1e-14)
 
 
-def test_wheels() -> None:
+def test_differential_drive_rates() -> None:
     r, b = 0.1, 0.5
     model = model_of(
         kv.articulations.DifferentialDrive(
@@ -177,7 +177,7 @@ def test_wheels() -> None:
     assert [model.limits(s) for s in model.speeds] == [(-3, 3), (-3, 3)]
 
 
-def test_the_speed_of_an_omnidirectional_base_is_limited_in_every_direction() -> None:
+def test_omni_base_speed_limit_holds_in_every_direction() -> None:
     model = model_of(kv.articulations.OmniBase(name="j", parent="world", child="c", speed=1.0, turn=0.5))
     still = {"j/x": 30.0, "j/y": -40.0, "j/angle": 0.0}
     for direction in np.linspace(0, 6, 7):
@@ -195,7 +195,7 @@ def test_the_speed_of_an_omnidirectional_base_is_limited_in_every_direction() ->
 
 
 @pytest.mark.parametrize("kind", [kv.Revolute, kv.Continuous, kv.Prismatic])
-def test_limits_of_one_coordinate(kind: type[OneDofJoint]) -> None:
+def test_limits_become_position_and_velocity_constraints(kind: type[OneDofJoint]) -> None:
     def limits(**given: Any) -> dict[str, tuple[Any, ...]]:
         constraints = model_of(kind(**WHERE, **given)).constraints
         return {name: (c.lower, c.expression, c.upper) for name, c in constraints.items()}
@@ -213,7 +213,7 @@ def test_limits_of_one_coordinate(kind: type[OneDofJoint]) -> None:
     assert limits(position=kv.Expression(0.5), lower=0, upper=1, velocity=1) == {}
 
 
-def test_a_mimic_joint_has_no_coordinate_of_its_own() -> None:
+def test_mimic_joint_has_no_coordinate_of_its_own() -> None:
     bolt = kv.position("bolt")
     model = model_of(kv.Revolute(**WHERE, axis=(0, 0, 1), position=bolt**2))
     assert model.symbols == (bolt,)
@@ -224,7 +224,7 @@ def test_a_mimic_joint_has_no_coordinate_of_its_own() -> None:
     assert same.articulations["j"].coordinates == ()
 
 
-def test_planar_limits() -> None:
+def test_planar_joint_limits() -> None:
     model = model_of(kv.Planar(**WHERE, lower=-1, upper=2, velocity=3))
     assert model.limits("j/x") == model.limits("j/y") == (-1, 2)
     assert model.limits("j/x:velocity") == model.limits("j/y:velocity") == (-3, 3)
@@ -291,7 +291,7 @@ BROKEN: list[tuple[type[Joint], dict[str, Any], str]] = [
 
 
 @pytest.mark.parametrize(("kind", "given", "words"), BROKEN)
-def test_bad_input_is_one_clear_error_and_the_model_is_what_it_was(
+def test_invalid_joint_raises_and_leaves_the_model_unchanged(
     kind: type[Joint], given: dict[str, Any], words: str
 ) -> None:
     model = model_of(kv.Fixed(name="old", parent="world", child="old"))
@@ -316,7 +316,7 @@ EVERY = [
 
 
 @pytest.mark.parametrize("operation", EVERY, ids=lambda o: type(o).__name__)
-def test_articulations_are_values(operation: Any) -> None:
+def test_articulations_are_hashable_values(operation: Any) -> None:
     for other in (copy.copy(operation), copy.deepcopy(operation), pickle.loads(pickle.dumps(operation))):
         assert other == operation
         assert hash(other) == hash(operation)
@@ -333,7 +333,7 @@ def test_articulations_are_values(operation: Any) -> None:
     assert pickle.loads(pickle.dumps(model)).snapshot() == model.snapshot()
 
 
-def test_axes_and_origins_given_as_arrays_are_values_too() -> None:
+def test_axes_and_origins_given_as_arrays_are_hashable() -> None:
     given = kv.Revolute(name="j", parent="world", child="c", axis=np.array([0, 0, 2]), origin=ORIGIN)
     assert given == kv.Revolute(
         name="j", parent="world", child="c", axis=(0.0, 0.0, 2.0), origin=kv.model.Pose.from_matrix(ORIGIN)
@@ -341,7 +341,7 @@ def test_axes_and_origins_given_as_arrays_are_values_too() -> None:
     assert hash(given) == hash(pickle.loads(pickle.dumps(given)))
 
 
-def test_a_new_kind_of_articulation_in_ten_lines() -> None:
+def test_custom_articulation_in_ten_lines() -> None:
     class Door(kv.Operation):
         """A garage door: its lower edge rises while it turns."""
 

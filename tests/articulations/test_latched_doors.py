@@ -42,7 +42,7 @@ def room(model: kv.Model, values: dict[str, float]) -> tuple[float, float]:
 
 
 @each
-def test_shut_it_holds_and_away_from_there_it_does_not(
+def test_lock_holds_the_shut_door_and_frees_the_open_one(
     mechanism: Mechanism, key: str, lock: str, away: float
 ) -> None:
     model = model_of(mechanism)
@@ -56,7 +56,9 @@ def test_shut_it_holds_and_away_from_there_it_does_not(
 
 
 @each
-def test_the_lock_says_what_frees_the_door(mechanism: Mechanism, key: str, lock: str, away: float) -> None:
+def test_lock_gradient_shows_what_opens_the_door(
+    mechanism: Mechanism, key: str, lock: str, away: float
+) -> None:
     upper = model_of(mechanism).constraints[f"m/{lock}"].upper
     shut = {"m/door": 0.0, f"m/{key}": 0.0}
     trend = {str(s): float(e(shut)) for s, e in upper.gradient().items()}
@@ -66,7 +68,7 @@ def test_the_lock_says_what_frees_the_door(mechanism: Mechanism, key: str, lock:
 
 
 @each
-def test_it_opens_by_its_key_and_shuts_without(
+def test_door_opens_with_its_key_and_shuts_without(
     mechanism: Mechanism, key: str, lock: str, away: float
 ) -> None:
     model = model_of(mechanism)
@@ -83,7 +85,9 @@ def test_it_opens_by_its_key_and_shuts_without(
 
 
 @each
-def test_constraints_are_found_from_the_pose(mechanism: Mechanism, key: str, lock: str, away: float) -> None:
+def test_constraints_for_pose_include_the_lock(
+    mechanism: Mechanism, key: str, lock: str, away: float
+) -> None:
     model = model_of(mechanism)
     found = set(model.constraints_for(model.fk("m/door")))
     assert found - {"m/door/velocity"} == {"m/door/position", f"m/{lock}"}
@@ -91,7 +95,7 @@ def test_constraints_are_found_from_the_pose(mechanism: Mechanism, key: str, loc
 
 
 @pytest.mark.parametrize("angle", [0.0, 0.4, 1.9])
-def test_doors_turn_and_keys_move(angle: float) -> None:
+def test_doors_rotate_and_keys_move(angle: float) -> None:
     for mechanism in (HANDLE, LATCH, MICROWAVE):
         door = pose(mechanism, "door", {"m/door": angle})
         np.testing.assert_allclose(door, turned((0, 0, 1), angle), atol=1e-15)
@@ -107,7 +111,7 @@ def test_doors_turn_and_keys_move(angle: float) -> None:
     np.testing.assert_allclose(button[1], button[0] @ slid((1, 0, 0), 0.005), atol=1e-15)
 
 
-def test_springs_are_on_record() -> None:
+def test_spring_parameters_are_in_the_record() -> None:
     latch, oven = (model_of(m).articulations["m"].dynamics for m in (LATCH, MICROWAVE))
     assert latch == (("bolt/stiffness", 300.0), ("bolt/rest", -0.01))
     assert oven == (("button/stiffness", 500.0), ("button/rest", -0.004))
@@ -130,11 +134,11 @@ BROKEN: list[tuple[type[Mechanism], dict[str, Any], str]] = [
 
 
 @pytest.mark.parametrize(("kind", "given", "words"), BROKEN)
-def test_what_cannot_be_is_refused(kind: type[Mechanism], given: dict[str, Any], words: str) -> None:
+def test_invalid_latched_door_is_refused(kind: type[Mechanism], given: dict[str, Any], words: str) -> None:
     assert words in refused(kind, given)
 
 
-def test_limits_may_follow_something() -> None:
+def test_door_limits_may_be_expressions() -> None:
     wall = kv.position("wall")
     model = model_of(kv.articulations.Latch(**WHERE, door=kv.Limits(0.0, wall), bolt=kv.Limits(0.0)))
     assert not model.violations({"m/door": 0.3, "wall": 0.5, "m/bolt": 9.0})

@@ -48,14 +48,14 @@ def trend(e: kv.Expression, at: dict[str, float]) -> dict[str, float]:
 @pytest.mark.parametrize(
     ("blocks", "locked"), [("both", (0, 0)), ("forward", (-0.5, 0)), ("backward", (0, 0.5))]
 )
-def test_a_lock_holds_the_speed_in_its_directions(blocks: Any, locked: tuple[float, float]) -> None:
+def test_speed_lock_holds_the_speed_in_its_directions(blocks: Any, locked: tuple[float, float]) -> None:
     model = model_with(kv.articulations.speed_lock(door, open_if=BACK, max_speed=0.5, blocks=blocks))
     for q in (0.0, 1.0):
         assert row(model, {"door": q, "bolt": 0.0}) == locked
         assert row(model, {"door": q, "bolt": 0.02}) == (-0.5, 0.5)
 
 
-def test_a_lock_is_the_one_of_the_papers() -> None:
+def test_speed_lock_equals_equation_13_of_the_paper() -> None:
     """Values and trends of Eq. 13, written with & and ~."""
     lower, speed, upper = kv.articulations.speed_lock(door, open_if=bolt > 0.3, engaged_if=door > 1.99)
     unlocked = ~((bolt < 0.3) & (door > 1.99))
@@ -68,14 +68,14 @@ def test_a_lock_is_the_one_of_the_papers() -> None:
             assert trend(lower, at) == {s: -v for s, v in trend(unlocked, at).items()}
 
 
-def test_what_moves_may_be_a_speed_or_any_position() -> None:
+def test_speed_lock_takes_a_speed_or_a_position() -> None:
     of_speed = kv.articulations.speed_lock(door.derivative(), open_if=BACK)
     assert of_speed == kv.articulations.speed_lock(door, open_if=BACK)
     _, rate, _ = kv.articulations.speed_lock(door**2, open_if=BACK)
     assert rate({"door": 3.0, "door:velocity": 0.5}) == 3.0
 
 
-def test_bounds_of_locks_tell_what_would_unlock() -> None:
+def test_speed_lock_gradients_show_what_unlocks() -> None:
     lower, _, upper = kv.articulations.speed_lock(door, open_if=BACK, engaged_if=door < 0.01, max_speed=2.0)
     shut = {"door": 0.0, "bolt": 0.0}
     assert trend(upper, shut) == {"bolt:velocity": 2.0, "door:velocity": 2.0}
@@ -90,7 +90,7 @@ def test_bounds_of_locks_tell_what_would_unlock() -> None:
 BLOCK = kv.articulations.position_lock(door, open_if=BACK, upper=0)
 
 
-def test_a_block_holds_who_is_inside_and_nobody_else() -> None:
+def test_position_lock_holds_inside_its_bounds_only() -> None:
     model = model_with(BLOCK)
     for q, b, left in (
         (0.0, 0.0, (-inf, 0.0)),  # shut: it cannot open
@@ -104,7 +104,7 @@ def test_a_block_holds_who_is_inside_and_nobody_else() -> None:
     assert [v.name for v in model.violations({"door": 5e-4, "bolt": 0.0})] == ["lock"]
 
 
-def test_both_bounds_have_a_margin() -> None:
+def test_position_lock_has_a_margin_at_both_bounds() -> None:
     model = model_with(kv.articulations.position_lock(door, open_if=BACK, lower=0.5, upper=0.7, margin=0.01))
     for q, left in (
         (0.495, (0.05, 2.05)),
@@ -118,7 +118,7 @@ def test_both_bounds_have_a_margin() -> None:
 
 @pytest.mark.parametrize("q", [0.0, 1e-12, 5e-4, 9.99e-4, 1e-3, 0.2, 1.5, 2.0])
 @pytest.mark.parametrize("b", [0.0, 0.005, 0.01, 0.02])
-def test_rows_are_feasible_wherever_the_part_is(q: float, b: float) -> None:
+def test_position_lock_velocity_rows_are_feasible_everywhere(q: float, b: float) -> None:
     model = model_with(kv.articulations.position_lock(door, open_if=BACK, lower=0, upper=0))
     low, high = -inf, inf
     rows = model.velocity_rows(0.1)
@@ -129,7 +129,7 @@ def test_rows_are_feasible_wherever_the_part_is(q: float, b: float) -> None:
     assert low <= high
 
 
-def test_a_blocked_door_stays_and_a_free_one_opens() -> None:
+def test_locked_door_stays_and_free_door_opens() -> None:
     model = model_with(BLOCK)
     shut = dict.fromkeys(model.symbols, 0.0)
     wish = {"door:velocity": 1.0}
@@ -142,7 +142,7 @@ def test_a_blocked_door_stays_and_a_free_one_opens() -> None:
     assert assert_rows_keep_limits(model, back, wish, 5, 0.1)[door] == pytest.approx(0, abs=1e-12)
 
 
-def test_bounds_of_blocks_tell_what_would_free_it() -> None:
+def test_position_lock_gradients_show_what_unlocks() -> None:
     lower, _, upper = kv.articulations.position_lock(door, open_if=BACK, lower=-0.1, upper=0.1)
     at = {"door": 0.0, "bolt": 0.0}
     # Above and below are as near: only the bolt helps.
@@ -156,7 +156,7 @@ def test_bounds_of_blocks_tell_what_would_free_it() -> None:
     assert trend(one_sided, at)["bolt:velocity"] > 0
 
 
-def test_a_block_may_follow_something() -> None:
+def test_position_lock_bounds_may_be_expressions() -> None:
     model = model_with(kv.articulations.position_lock(door, open_if=bolt > 0.015, upper=10 * bolt))
     rows = model.velocity_rows(0.1)
     i = rows.names.index("lock")
@@ -172,7 +172,7 @@ def test_a_block_may_follow_something() -> None:
 POINTS = {0.0: 0.0, 0.01: 0.5, 0.02: 0.2}
 
 
-def test_a_table_is_straight_between_its_points() -> None:
+def test_tabulated_limit_is_linear_between_its_points() -> None:
     limit = kv.articulations.tabulated_limit(bolt, POINTS)
     knots, values = list(POINTS), list(POINTS.values())
     for b in (-1.0, 0.0, 0.004, 0.01, 0.0177, 0.02, 3.0):
@@ -182,12 +182,12 @@ def test_a_table_is_straight_between_its_points() -> None:
     assert kv.articulations.tabulated_limit(bolt, POINTS.items()) == limit
 
 
-def test_a_smooth_table_is_a_spline() -> None:
+def test_smooth_tabulated_limit_is_a_spline() -> None:
     smooth = kv.articulations.tabulated_limit(bolt, POINTS, smooth=True)
     assert smooth == kv.spline(bolt, tuple(POINTS), tuple(POINTS.values()))
 
 
-def test_rows_keep_a_limit_that_follows_a_table() -> None:
+def test_velocity_rows_keep_a_tabulated_limit() -> None:
     model = model_with((0, door, kv.articulations.tabulated_limit(bolt, {0.0: 0.0, 0.01: 0.5, 0.02: 0.6})))
     start = dict.fromkeys(model.symbols, 0.0)
     end = assert_rows_keep_limits(model, start, {"door:velocity": 1, "bolt:velocity": 0.02}, 40, 0.05)
@@ -199,7 +199,7 @@ def test_rows_keep_a_limit_that_follows_a_table() -> None:
 # -- documents and bad input ---------------------------------------------------------------------------
 
 
-def test_locks_are_data(tmp_path: Path) -> None:
+def test_locks_survive_a_document(tmp_path: Path) -> None:
     model = model_with(kv.articulations.speed_lock(door, open_if=BACK, engaged_if=door < 0.01))
     with model.edit() as edit:
         edit.constrain("block", *BLOCK)
@@ -248,6 +248,6 @@ BROKEN: list[tuple[Any, str]] = [
 
 
 @pytest.mark.parametrize(("make", "words"), BROKEN)
-def test_bad_input_is_one_clear_error(make: Any, words: str) -> None:
+def test_invalid_lock_raises_a_clear_error(make: Any, words: str) -> None:
     with pytest.raises(kv.errors.InvalidValueError, match=words):
         make()

@@ -27,7 +27,7 @@ def origin(mechanism: Mechanism, part: str, **values: float) -> np.ndarray:
 
 
 @pytest.mark.parametrize(("crank", "rod"), [(0.04, 0.13), (0.1, 0.1001)])
-def test_a_piston_follows_its_crank_all_the_way_round(crank: float, rod: float) -> None:
+def test_piston_position_over_a_whole_revolution(crank: float, rod: float) -> None:
     engine = kv.articulations.PistonAndRod(**WHERE, crank=crank, rod=rod)
     for angle in np.linspace(-7, 7, 29):
         height = crank * math.cos(angle) + math.sqrt(rod**2 - (crank * math.sin(angle)) ** 2)
@@ -39,14 +39,14 @@ def test_a_piston_follows_its_crank_all_the_way_round(crank: float, rod: float) 
         np.testing.assert_allclose((big_end @ [0, 0, rod, 1])[:3], (0, 0, height), atol=1e-13)
 
 
-def test_a_piston_stands_still_at_its_dead_centres() -> None:
+def test_piston_speed_is_zero_at_the_dead_centres() -> None:
     model = model_of(kv.articulations.PistonAndRod(**WHERE))
     for angle in (0.0, math.pi, -math.pi):
         np.testing.assert_allclose(model.jacobian("m/piston")({"m": angle}), 0, atol=1e-16)
     assert model.limits("m") == (-math.inf, math.inf)
 
 
-def test_a_lid_opens_by_a_function_of_the_pedal() -> None:
+def test_pedal_bin_lid_angle_is_the_arcsine_formula() -> None:
     can = kv.articulations.PedalBin(**WHERE)
     for p in np.linspace(0, 0.25, 11):
         lift = can.arm * math.sin(p)
@@ -70,7 +70,7 @@ def test_a_lid_opens_by_a_function_of_the_pedal() -> None:
 
 
 @pytest.mark.parametrize("stages", [1, 3])
-def test_a_scissor_lift_rises_straight(stages: int) -> None:
+def test_scissor_lift_platform_rises_vertically(stages: int) -> None:
     lift = kv.articulations.ScissorLift(**WHERE, stages=stages, arm=0.8, angle=kv.Limits(0.0, math.pi / 2))
     for angle in np.linspace(0, math.pi / 2, 7):
         rise, reach = 0.8 * math.sin(angle), 0.8 * math.cos(angle)
@@ -90,7 +90,7 @@ def test_a_scissor_lift_rises_straight(stages: int) -> None:
     assert len(model_of(lift).frames) == 3 + 2 * stages
 
 
-def test_a_lamp_keeps_its_head_up() -> None:
+def test_desk_lamp_head_keeps_its_orientation() -> None:
     lamp = kv.articulations.DeskLamp(**WHERE)
     for a in np.linspace(-0.8, 0.8, 5):
         for b in np.linspace(-0.9, 0.9, 5):
@@ -113,7 +113,7 @@ def test_a_lamp_keeps_its_head_up() -> None:
 
 
 @pytest.mark.parametrize(("pitch", "start"), [(0.004, 0.2), (-0.004, 0.0)])
-def test_a_nut_slides_while_its_screw_turns(pitch: float, start: float) -> None:
+def test_nut_slides_while_the_screw_rotates(pitch: float, start: float) -> None:
     vice = kv.articulations.ScrewAndNut(**WHERE, pitch=pitch)
     model = model_of(vice)
     assert model.limits("m") == (0, pytest.approx(math.tau * 50))
@@ -124,7 +124,7 @@ def test_a_nut_slides_while_its_screw_turns(pitch: float, start: float) -> None:
     assert origin(vice, "nut", m=math.tau * 50)[2] == pytest.approx(0.2 - start)
 
 
-def test_the_nut_on_its_screw_is_a_screw_joint() -> None:
+def test_nut_relative_to_screw_is_a_screw_joint() -> None:
     """Seen from the screw, the nut turns the other way and goes along by the pitch: that is the thread."""
     vice = model_of(kv.articulations.ScrewAndNut(**WHERE, pitch=0.01))
     thread = model_of(kv.articulations.Screw(name="t", parent="world", child="t", axis=(0, 0, 1), pitch=0.01))
@@ -134,7 +134,7 @@ def test_the_nut_on_its_screw_is_a_screw_joint() -> None:
         np.testing.assert_allclose(found, thread.fk("t")({"t": -angle}), atol=1e-14)
 
 
-def test_a_ratchet_turns_one_way_until_its_pawl_is_lifted() -> None:
+def test_ratchet_turns_one_way_until_its_pawl_is_lifted() -> None:
     model = model_of(kv.articulations.Ratchet(**WHERE))
     wheel, pawl = kv.position("m/wheel"), kv.position("m/pawl")
     assert dict(model.articulations["m"].dynamics) == {"teeth": 24, "pitch": math.tau / 24}
@@ -163,7 +163,7 @@ def test_a_ratchet_turns_one_way_until_its_pawl_is_lifted() -> None:
     assert (up @ [-0.035, 0, 0, 1])[2] > (down @ [-0.035, 0, 0, 1])[2] + 0.01
 
 
-def test_a_tap_lifts_and_turns_and_knows_its_flow() -> None:
+def test_faucet_poses_and_flow() -> None:
     tap = kv.articulations.Faucet(**WHERE)
     for lift, turn in ((0.0, -0.8), (0.2, 0.3), (0.5, 0.8)):
         where = kv.State({"m/lift": lift, "m/turn": turn})
@@ -207,5 +207,5 @@ BROKEN: list[tuple[type[Mechanism], dict[str, Any], str]] = [
 
 
 @pytest.mark.parametrize(("kind", "given", "words"), BROKEN)
-def test_what_cannot_be_is_refused(kind: type[Mechanism], given: dict[str, Any], words: str) -> None:
+def test_invalid_mechanism_is_refused(kind: type[Mechanism], given: dict[str, Any], words: str) -> None:
     assert words in refused(kind, given)

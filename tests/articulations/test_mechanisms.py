@@ -27,7 +27,7 @@ each_kind = pytest.mark.parametrize("kind", KINDS, ids=lambda k: k.__name__)
 
 
 @each_kind
-def test_a_name_and_a_parent_are_enough(kind: type[Mechanism]) -> None:
+def test_mechanism_needs_only_name_and_parent(kind: type[Mechanism]) -> None:
     model = model_of(kind(name="garage/thing", parent="world"))
     assert getattr(kv.articulations, kind.__name__) is kind
     assert kind.__name__ in kv.articulations.__all__
@@ -41,7 +41,7 @@ def test_a_name_and_a_parent_are_enough(kind: type[Mechanism]) -> None:
 
 
 @each
-def test_it_stands_where_its_origin_is(mechanism: Mechanism) -> None:
+def test_mechanism_base_is_at_its_origin(mechanism: Mechanism) -> None:
     model = model_of(mechanism)
     assert np.array_equal(model.fk("m/base")(), ORIGIN)
     assert [n for n, f in model.frames.items() if f.parent == "world"] == ["m/base"]
@@ -52,7 +52,7 @@ def test_it_stands_where_its_origin_is(mechanism: Mechanism) -> None:
 
 
 @each
-def test_jacobians_are_differences_over_the_whole_range(mechanism: Mechanism) -> None:
+def test_mechanism_jacobians_equal_finite_differences_over_the_whole_range(mechanism: Mechanism) -> None:
     model = model_of(mechanism)
     for at in across(mechanism):
         if mechanism is EVERY["published garage door"] and at[kv.position("m/door")] > 2.0:
@@ -64,7 +64,7 @@ def test_jacobians_are_differences_over_the_whole_range(mechanism: Mechanism) ->
 
 @each
 @pytest.mark.parametrize("seed", range(2))
-def test_it_moves_as_gradients_say(mechanism: Mechanism, seed: int) -> None:
+def test_mechanism_tangent_equals_motion_along_rates(mechanism: Mechanism, seed: int) -> None:
     model = model_of(mechanism)
     rng = np.random.default_rng(seed)
     inside = {}
@@ -75,7 +75,7 @@ def test_it_moves_as_gradients_say(mechanism: Mechanism, seed: int) -> None:
 
 
 @each
-def test_limits_are_honoured(mechanism: Mechanism) -> None:
+def test_mechanism_limits_are_constraints(mechanism: Mechanism) -> None:
     model = model_of(mechanism)
     still = dict.fromkeys(model.speeds, 0.0)
     home = {**model.default_state(), **still}
@@ -97,7 +97,7 @@ def test_limits_are_honoured(mechanism: Mechanism) -> None:
 
 @each
 @pytest.mark.parametrize("direction", [1.0, -1.0])
-def test_rows_keep_all_limits(mechanism: Mechanism, direction: float) -> None:
+def test_velocity_rows_keep_all_limits_of_mechanisms(mechanism: Mechanism, direction: float) -> None:
     model = model_of(mechanism)
     wish = {str(s): direction for s in model.speeds}
     start = model.default_state()
@@ -109,7 +109,7 @@ def test_rows_keep_all_limits(mechanism: Mechanism, direction: float) -> None:
 
 
 @each
-def test_it_is_a_value_and_a_document(mechanism: Mechanism, tmp_path: Path) -> None:
+def test_mechanism_is_hashable_and_survives_a_document(mechanism: Mechanism, tmp_path: Path) -> None:
     model = model_of(mechanism)
     assert_is_a_value(mechanism, model, tmp_path)
     read = kv.load(tmp_path / "model.kv.json", prefix="new")
@@ -125,7 +125,7 @@ def test_it_is_a_value_and_a_document(mechanism: Mechanism, tmp_path: Path) -> N
 
 
 @each
-def test_it_can_be_looked_at_and_touched(mechanism: Mechanism) -> None:
+def test_mechanism_has_visual_and_collision_shapes(mechanism: Mechanism) -> None:
     model = model_of(mechanism)
     assert mechanism.child in model.bodies
     assert "m/base" in model.bodies
@@ -143,7 +143,7 @@ def test_it_can_be_looked_at_and_touched(mechanism: Mechanism) -> None:
 
 
 @each_kind
-def test_names_that_are_taken_are_refused(kind: type[Mechanism]) -> None:
+def test_mechanism_refuses_taken_names(kind: type[Mechanism]) -> None:
     words = refused(kind, {"name": "old"})
     assert words.startswith("DuplicateNameError: There is an articulation 'old' already, so the ")
     model = model_of(kv.Fixed(name="f", parent="world", child="m/base"))
@@ -156,7 +156,7 @@ def test_names_that_are_taken_are_refused(kind: type[Mechanism]) -> None:
 
 
 @each_kind
-def test_every_number_is_checked(kind: type[Mechanism]) -> None:
+def test_every_numeric_field_is_checked(kind: type[Mechanism]) -> None:
     """No length, speed or threshold may be NaN, zero or a word; the error names the mechanism and the number."""
     made = kind(**WHERE)
     lengths = 0
@@ -183,7 +183,7 @@ def test_every_number_is_checked(kind: type[Mechanism]) -> None:
 
 
 @each_kind
-def test_every_range_is_checked(kind: type[Mechanism]) -> None:
+def test_every_limits_field_is_checked(kind: type[Mechanism]) -> None:
     made: Any = kind(**WHERE)
     for field, value in vars(made).items():
         if not isinstance(value, kv.Limits):

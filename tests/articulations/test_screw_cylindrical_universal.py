@@ -38,7 +38,7 @@ EVERY: list[Any] = [
 
 @pytest.mark.parametrize("axis", AXES)
 @pytest.mark.parametrize("pitch", [0.02, -0.5])
-def test_a_screw_moves_by_its_pitch_in_a_revolution(axis: Any, pitch: float) -> None:
+def test_screw_moves_by_its_pitch_in_a_revolution(axis: Any, pitch: float) -> None:
     pose = model_of(kv.articulations.Screw(**WHERE, axis=axis, pitch=pitch)).fk("c")
     for q in (0.0, 0.7, -2.0, 9.0, math.tau):
         expected = ORIGIN @ slid(axis, pitch * q / math.tau) @ turned(axis, q)
@@ -48,7 +48,7 @@ def test_a_screw_moves_by_its_pitch_in_a_revolution(axis: Any, pitch: float) -> 
 
 
 @pytest.mark.parametrize("axis", AXES)
-def test_a_cylindrical_joint_slides_and_turns(axis: Any) -> None:
+def test_cylindrical_joint_slides_and_rotates(axis: Any) -> None:
     pose = model_of(kv.articulations.Cylindrical(**WHERE, axis=axis)).fk("c")
     for s, angle in ((0, 0), (0.3, -2), (-1, 7)):
         expected = ORIGIN @ slid(axis, s) @ turned(axis, angle)
@@ -56,7 +56,7 @@ def test_a_cylindrical_joint_slides_and_turns(axis: Any) -> None:
 
 
 @pytest.mark.parametrize(("first", "second"), PERPENDICULAR)
-def test_a_universal_joint_turns_about_one_axis_and_then_the_other(first: Any, second: Any) -> None:
+def test_universal_joint_rotates_about_first_then_second_axis(first: Any, second: Any) -> None:
     pose = model_of(kv.articulations.Universal(**WHERE, first=first, second=second)).fk("c")
     for a, b in ((0, 0), (0.3, -2), (-1, 7)):
         expected = ORIGIN @ turned(first, a) @ turned(second, b)
@@ -65,22 +65,22 @@ def test_a_universal_joint_turns_about_one_axis_and_then_the_other(first: Any, s
 
 @pytest.mark.parametrize("operation", EVERY, ids=lambda o: type(o).__name__)
 @pytest.mark.parametrize("seed", range(4))
-def test_jacobians_are_differences(operation: kv.Operation, seed: int) -> None:
+def test_joint_jacobians_equal_finite_differences(operation: kv.Operation, seed: int) -> None:
     assert_jacobian(model_of(operation), "c", seed, reach=3.0)
 
 
 @pytest.mark.parametrize("operation", EVERY, ids=lambda o: type(o).__name__)
-def test_they_move_as_gradients_say(operation: kv.Operation) -> None:
+def test_joint_tangents_equal_motion_along_rates(operation: kv.Operation) -> None:
     model = model_of(operation)
     assert_motion_law(model, [model.fk("c"), model.jacobian("c")], seed=3)
 
 
 @pytest.mark.parametrize("operation", EVERY, ids=lambda o: type(o).__name__)
-def test_they_are_values_and_documents(operation: Any, tmp_path: Path) -> None:
+def test_joints_are_hashable_and_survive_a_document(operation: Any, tmp_path: Path) -> None:
     assert_is_a_value(operation, model_of(operation), tmp_path)
 
 
-def test_each_coordinate_has_its_limits() -> None:
+def test_each_coordinate_of_a_joint_has_its_limits() -> None:
     cylinder = model_of(
         kv.articulations.Cylindrical(
             **WHERE, slide=kv.Limits(0, 0.2, 0.5), turn=kv.Limits(upper=1, velocity=2)
@@ -104,7 +104,7 @@ def test_each_coordinate_has_its_limits() -> None:
     assert [v.name for v in screw.violations({"j": 10, "j:velocity": -0.6})] == ["j/position", "j/velocity"]
 
 
-def test_rows_keep_the_limits() -> None:
+def test_velocity_rows_keep_joint_limits() -> None:
     model = model_of(
         kv.articulations.Cylindrical(**WHERE, slide=kv.Limits(0, 0.2, 0.5), turn=kv.Limits(-1, 1, 2))
     )
@@ -145,7 +145,7 @@ BROKEN: list[tuple[type[Any], dict[str, Any], str]] = [
 
 
 @pytest.mark.parametrize(("kind", "given", "words"), BROKEN)
-def test_bad_input_names_the_articulation_and_the_number(
+def test_invalid_joint_error_names_articulation_and_number(
     kind: type[Any], given: dict[str, Any], words: str
 ) -> None:
     model = model_of(kv.Fixed(name="old", parent="world", child="old"))

@@ -52,7 +52,7 @@ def driven(operation: kv.Operation) -> kv.Model:
 
 
 @pytest.mark.parametrize("axis", AXES)
-def test_each_follows_its_driver(axis: Any) -> None:
+def test_transmission_position_is_a_function_of_its_driver(axis: Any) -> None:
     gear = driven(kv.articulations.Gearbox(**WHERE, axis=axis, driver="motor", ratio=-2.5, offset=0.3)).fk(
         "c"
     )
@@ -76,18 +76,18 @@ def test_each_follows_its_driver(axis: Any) -> None:
 
 @pytest.mark.parametrize("operation", EVERY, ids=lambda o: type(o).__name__)
 @pytest.mark.parametrize("seed", range(4))
-def test_jacobians_are_differences(operation: kv.Operation, seed: int) -> None:
+def test_transmission_jacobians_equal_finite_differences(operation: kv.Operation, seed: int) -> None:
     assert_jacobian(driven(operation), "c", seed, reach=3.0)
 
 
 @pytest.mark.parametrize("operation", EVERY, ids=lambda o: type(o).__name__)
-def test_they_move_as_gradients_say(operation: kv.Operation) -> None:
+def test_transmission_tangents_equal_motion_along_rates(operation: kv.Operation) -> None:
     model = driven(operation)
     assert_motion_law(model, [model.fk("c"), model.jacobian("c")], seed=5)
 
 
 @pytest.mark.parametrize("operation", EVERY, ids=lambda o: type(o).__name__)
-def test_they_are_values_and_documents(operation: Any, tmp_path: Path) -> None:
+def test_transmissions_are_hashable_and_survive_a_document(operation: Any, tmp_path: Path) -> None:
     model = driven(operation)
     assert_is_a_value(operation, model, tmp_path)
     record = model.articulations["j"]
@@ -97,7 +97,7 @@ def test_they_are_values_and_documents(operation: Any, tmp_path: Path) -> None:
     assert {s.path for s in read.articulations["new/j"].position.symbols} <= {"new/motor", "new/other"}
 
 
-def test_the_follower_of_a_cam_has_no_jumps_in_its_acceleration() -> None:
+def test_cam_follower_acceleration_is_continuous() -> None:
     height = (
         driven(kv.articulations.Cam(**WHERE, driver="motor", angles=ANGLES, values=LIFTS))
         .articulations["j"]
@@ -115,7 +115,7 @@ def test_the_follower_of_a_cam_has_no_jumps_in_its_acceleration() -> None:
 # -- limits --------------------------------------------------------------------------------------------
 
 
-def test_limits_are_about_what_the_driver_makes_of_it() -> None:
+def test_transmission_limits_constrain_the_function_of_the_driver() -> None:
     model = driven(
         kv.articulations.Gearbox(**WHERE, driver="motor", ratio=-2, offset=1, lower=-1, upper=3, velocity=4)
     )
@@ -127,7 +127,7 @@ def test_limits_are_about_what_the_driver_makes_of_it() -> None:
     assert set(model.constraints_for(model.fk("shaft"))) == {"j/position", "j/velocity"}
 
 
-def test_rows_keep_the_limits_of_what_is_driven() -> None:
+def test_velocity_rows_keep_transmission_limits() -> None:
     gear = kv.articulations.Gearbox(**WHERE, driver="motor", ratio=-2, upper=3, lower=-3, velocity=4)
     cam = kv.articulations.Cam(
         name="k",
@@ -162,7 +162,7 @@ def train() -> kv.Model:
     )
 
 
-def test_couplings_drive_couplings() -> None:
+def test_transmissions_drive_transmissions() -> None:
     model = train()
     assert model.degrees_of_freedom == (d,)
     assert model.fk("rack")({d: 0.7})[0, 3] == pytest.approx(0.05 * 3 * 0.7)
@@ -171,7 +171,7 @@ def test_couplings_drive_couplings() -> None:
     assert (speed, float(ratio)) == (SPEED, pytest.approx(0.15))
 
 
-def test_exchanging_the_driver_runs_the_train_again_and_nothing_else() -> None:
+def test_replacing_the_driver_reruns_the_gear_train_only() -> None:
     model = train()
     heard: list[kv.model.Diff] = []
     with model.listen(heard.append):
@@ -191,7 +191,7 @@ def test_exchanging_the_driver_runs_the_train_again_and_nothing_else() -> None:
         assert model.fk("rack")({crank: 0.7})[0, 3] == pytest.approx(0.05 * 6 * 0.49)
 
 
-def test_a_train_without_its_driver_is_refused() -> None:
+def test_removing_the_driver_of_a_train_is_refused() -> None:
     model = train()
     before = model.snapshot()
     with pytest.raises(kv.errors.EditError) as info, model.edit() as edit:
@@ -200,7 +200,7 @@ def test_a_train_without_its_driver_is_refused() -> None:
     assert model.snapshot() == before
 
 
-def test_anything_with_one_number_drives() -> None:
+def test_any_articulation_with_one_coordinate_is_a_driver() -> None:
     """A slider, a mimic joint, a screw, one of two coordinates, a wheel of a base."""
     where = {"parent": "world"}
     operations = [
@@ -257,7 +257,7 @@ BROKEN: list[tuple[type[Any], dict[str, Any], str]] = [
 
 
 @pytest.mark.parametrize(("kind", "given", "words"), BROKEN)
-def test_bad_input_names_the_articulation_and_the_number(
+def test_invalid_transmission_error_names_articulation_and_number(
     kind: type[Any], given: dict[str, Any], words: str
 ) -> None:
     model = model_of(
@@ -271,7 +271,7 @@ def test_bad_input_names_the_articulation_and_the_number(
     assert model.snapshot() == before
 
 
-def test_profiles_given_as_arrays_are_values_too() -> None:
+def test_cam_profiles_given_as_arrays_are_hashable() -> None:
     one = kv.articulations.Cam(**WHERE, driver="motor", angles=np.array(ANGLES), values=list(LIFTS))
     assert one == kv.articulations.Cam(**WHERE, driver="motor", angles=ANGLES, values=LIFTS)
     assert hash(one) == hash(kv.articulations.Cam(**WHERE, driver="motor", angles=ANGLES, values=LIFTS))

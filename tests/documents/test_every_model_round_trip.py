@@ -84,7 +84,7 @@ def survives(model: kv.Model) -> None:
 
 
 @pytest.mark.parametrize("name", [*kv.shipped_models(), *gallery.names()])
-def test_what_ships(name: str) -> None:
+def test_shipped_models_and_scenes_survive_a_round_trip(name: str) -> None:
     try:
         model = kv.load(name)
     except kv.errors.UnknownNameError:
@@ -93,7 +93,7 @@ def test_what_ships(name: str) -> None:
 
 
 @pytest.mark.parametrize("folder", FOLDERS)
-def test_files_of_others(folder: str) -> None:
+def test_files_of_other_projects_survive_a_round_trip(folder: str) -> None:
     if not (SHARED / folder).is_dir():
         pytest.skip(f"no {SHARED / folder}")
     loaded = 0

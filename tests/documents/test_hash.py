@@ -38,7 +38,7 @@ def shuffled(value: Any, random: Any, named: bool = False) -> Any:
     return {key: shuffled(value[key], random, key in NAMED and not named) for key in keys}
 
 
-def test_it_is_sha256_of_the_text_without_it() -> None:
+def test_hash_is_sha256_of_the_text_without_it() -> None:
     """As anybody computes it who has the file and the documentation."""
     tree = json.loads(TEXT)
     claim = tree.pop("sha256")
@@ -52,7 +52,7 @@ def test_it_is_sha256_of_the_text_without_it() -> None:
     random=st.randoms(use_true_random=False), indent=st.sampled_from([None, 0, 2]), ascii_only=st.booleans()
 )
 @settings(max_examples=attempts(20), deadline=None)
-def test_the_layout_does_not_matter(random: Any, indent: int | None, ascii_only: bool) -> None:
+def test_hash_ignores_the_layout_of_json(random: Any, indent: int | None, ascii_only: bool) -> None:
     text = json.dumps(shuffled(json.loads(TEXT), random), indent=indent, ensure_ascii=ascii_only)
     assert read_operations(text) == read_operations(TEXT)
 
@@ -70,7 +70,7 @@ LEAVES = leaves_of(json.loads(TEXT))
 
 @given(st.data())
 @settings(max_examples=attempts(50), deadline=None)
-def test_whatever_is_changed_is_noticed(data: st.DataObject) -> None:
+def test_hash_detects_any_change_of_a_value(data: st.DataObject) -> None:
     tree = json.loads(TEXT)
     *path, last = data.draw(st.sampled_from([p for p in LEAVES if p[0] in ("nodes", "operations")]))
     place = tree
@@ -87,14 +87,14 @@ def test_whatever_is_changed_is_noticed(data: st.DataObject) -> None:
         read_operations(json.dumps(tree))
 
 
-def test_where_it_is_changed_as_text() -> None:
+def test_hash_detects_a_change_of_the_text() -> None:
     """The place of a digit, in what is laid out as it was written."""
     place = TEXT.index("0.30000000000000004")
     with pytest.raises(kv.errors.FormatError, match="delete the member 'sha256'"):
         read_operations(TEXT[:place] + "0.30000000000000014" + TEXT[place + 19 :])
 
 
-def test_a_change_that_is_meant() -> None:
+def test_document_without_hash_is_accepted() -> None:
     """Without the hash a document is what it says."""
     tree = json.loads(to_json(kv.load("shelf_door")))
     del tree["sha256"]
@@ -102,19 +102,19 @@ def test_a_change_that_is_meant() -> None:
 
 
 @pytest.mark.parametrize("wrong", [None, 7, "", "0" * 63, "0" * 65, "G" * 64, HASH.upper(), [HASH]])
-def test_what_is_no_hash(wrong: Any) -> None:
+def test_malformed_hash_is_refused(wrong: Any) -> None:
     with pytest.raises(kv.errors.FormatError, match="64 digits from 0 to f"):
         read_operations(json.dumps({**json.loads(TEXT), "sha256": wrong}))
 
 
-def test_it_stays_when_a_model_is_saved_and_loaded(tmp_path: Path) -> None:
+def test_hash_is_preserved_by_save_and_load(tmp_path: Path) -> None:
     MODEL.save(tmp_path / "m.kv.json")
     read = kv.load(tmp_path / "m.kv.json")
     assert kv.formats.document_hash(read) == kv.formats.document_hash(read.snapshot()) == HASH
     assert (tmp_path / "m.kv.json").read_text().endswith(f'"sha256":"{HASH}"}}\n')
 
 
-def test_in_another_process() -> None:
+def test_hash_is_equal_in_another_process() -> None:
     script = (
         "import sys; sys.path.insert(0, sys.argv[1]); import kineverse as kv;"
         "from document_models import rich_model; print(kv.formats.document_hash(rich_model()))"
@@ -125,7 +125,7 @@ def test_in_another_process() -> None:
     assert other.stdout == f"{HASH}\n"
 
 
-def test_it_is_about_what_models_are_made_of() -> None:
+def test_hash_depends_on_operations_and_names() -> None:
     """Whole and real numbers of equal value make equal shapes; another tag makes another document."""
     made = []
     for size, tag in (((1, 2, 3), "t"), ((1.0, 2.0, 3.0), "t"), ((1, 2, 3), "u")):

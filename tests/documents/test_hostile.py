@@ -181,14 +181,14 @@ REFUSED = {
 
 
 @pytest.mark.parametrize("name", REFUSED)
-def test_what_costs_too_much_is_refused(name: str) -> None:
+def test_document_beyond_the_budget_is_refused(name: str) -> None:
     text, reason = REFUSED[name]
     assert len(text) < 1_000_000
     with pytest.raises(kv.errors.FormatError, match=reason):
         read_operations(text)
 
 
-def test_ten_million_nodes_take_no_memory() -> None:
+def test_refusing_ten_million_nodes_takes_no_memory() -> None:
     text = b'{"format":"kineverse","version":1,"nodes":[["constant",1.0]' + b',["constant",1.0]' * 10_000_000
     before = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
     with pytest.raises(kv.errors.FormatError, match="more than 10,000,000 lists"):
@@ -199,7 +199,7 @@ def test_ten_million_nodes_take_no_memory() -> None:
 @pytest.mark.parametrize(
     "text", ["[" * 100_000, '{"a":' * 100_000, '{"format":"kineverse","x":' + "[" * 100_000]
 )
-def test_a_hundred_thousand_levels(text: str) -> None:
+def test_nesting_of_a_hundred_thousand_levels_is_refused(text: str) -> None:
     with pytest.raises(kv.errors.FormatError, match="nested too deeply"):
         read_operations(text)
 
@@ -243,7 +243,7 @@ USED = {
 
 
 @pytest.mark.parametrize("name", USED)
-def test_what_is_read_can_be_used(name: str, tmp_path: Any) -> None:
+def test_accepted_document_can_be_evaluated(name: str, tmp_path: Any) -> None:
     """Poses, both gradients, evaluation, relevance, validity, saving, and an edit: nothing hangs or crashes."""
     path = tmp_path / "hostile.kv.json"
     path.write_text(USED[name])
@@ -287,7 +287,7 @@ def growing(question: Any, count: int) -> str:
 
 
 @pytest.mark.parametrize("look", [0, 1, 2])
-def test_an_edit_upstream_of_a_trace_that_explodes(look: int, tmp_path: Any) -> None:
+def test_edit_upstream_of_an_exploding_trace_is_refused(look: int, tmp_path: Any) -> None:
     path = tmp_path / "hostile.kv.json"
     path.write_text(growing(lambda e, at: ["substitute", look, e, 3, at], 60))
     model = kv.load(path)
@@ -300,7 +300,7 @@ def test_an_edit_upstream_of_a_trace_that_explodes(look: int, tmp_path: Any) -> 
     assert model.snapshot() == before
 
 
-def test_frames_in_a_circle(tmp_path: Any) -> None:
+def test_cycle_of_frames_is_refused(tmp_path: Any) -> None:
     path = tmp_path / "circle.kv.json"
     circles = (
         [operation("f", {"frames": {"f": {"parent": "f", "factors": [POSE]}}})],
@@ -323,7 +323,7 @@ def test_frames_in_a_circle(tmp_path: Any) -> None:
             kv.load(path)
 
 
-def test_a_very_long_arm(tmp_path: Any) -> None:
+def test_very_long_kinematic_chain_is_read(tmp_path: Any) -> None:
     """Frames on frames are many, and no way down."""
     count = 3000
     operations = [
@@ -373,7 +373,7 @@ def test_random_tables_are_read_or_refused() -> None:
                 nodes.pop()
 
 
-def test_what_nobody_could_read_again_is_not_written(tmp_path: Any) -> None:
+def test_unreadable_model_is_not_written(tmp_path: Any) -> None:
     """The writer keeps the limits of the reader; parameters that go too deep are left out."""
     deep: Any = 1
     for _ in range(150):

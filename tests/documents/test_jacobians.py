@@ -49,7 +49,7 @@ def assert_same_bits(model: kv.Model, other: kv.Model) -> None:
 
 
 @pytest.mark.parametrize("axis", AXES, ids=str)
-def test_joints_by_any_amount(axis: tuple[float, float, float]) -> None:
+def test_jacobian_of_joints_by_any_amount_survives_a_document(axis: tuple[float, float, float]) -> None:
     model = kv.Model()
     parent = "world"
     with model.edit() as edit:
@@ -61,7 +61,7 @@ def test_joints_by_any_amount(axis: tuple[float, float, float]) -> None:
     assert_same_bits(model, read_again(model))
 
 
-def test_transforms_that_are_motions_and_that_are_none() -> None:
+def test_one_axis_transforms_are_recognised_in_documents() -> None:
     model = kv.Model()
     parent = "world"
     with model.edit() as edit:
@@ -76,7 +76,7 @@ def test_transforms_that_are_motions_and_that_are_none() -> None:
     assert is_motion == [True, False, True, True, False, False, True, False, False, True]
 
 
-def test_a_motion_is_the_matrix_that_it_was() -> None:
+def test_one_axis_transform_from_a_document_has_the_same_matrix() -> None:
     for transform in TRANSFORMS:
         (factor,) = kv.model.Frame.from_transform("world", transform).factors
         assert factor == transform

@@ -31,7 +31,7 @@ def refusal(data: bytes) -> str:
     return str(caught.value)
 
 
-def test_it_is_the_same_model_and_the_same_tree() -> None:
+def test_msgpack_holds_the_same_model_and_the_same_tree() -> None:
     read = kv.formats.from_bytes(DATA)
     assert read.snapshot() == MODEL.snapshot()
     assert to_json(read) == to_json(MODEL)
@@ -40,7 +40,7 @@ def test_it_is_the_same_model_and_the_same_tree() -> None:
     assert kv.formats.to_bytes(read) == kv.formats.to_bytes(MODEL.snapshot()) == DATA == pack(TREE)
 
 
-def test_files(tmp_path: Path) -> None:
+def test_msgpack_files_are_saved_and_loaded(tmp_path: Path) -> None:
     path = tmp_path / "model.kv.msgpack"
     MODEL.save(path)
     assert path.read_bytes() == DATA
@@ -56,7 +56,7 @@ def test_files(tmp_path: Path) -> None:
     assert room.snapshot() == left.snapshot()
 
 
-def test_integers_of_any_length(tmp_path: Path) -> None:
+def test_integers_of_any_length_survive_msgpack(tmp_path: Path) -> None:
     model = kv.Model()
     data = (2**63 - 1, -(2**63) + 1, 2**63, -(2**64), 10**3000, True, 1, 1.0)
     with model.edit() as edit:
@@ -66,14 +66,14 @@ def test_integers_of_any_length(tmp_path: Path) -> None:
     assert list(map(type, read)) == list(map(type, data))
 
 
-def test_cut_off_anywhere() -> None:
+def test_truncated_msgpack_is_refused() -> None:
     for length in range(len(SMALL)):
         assert "the document" in refusal(SMALL[:length]), length
 
 
 @settings(max_examples=attempts(300), suppress_health_check=list(HealthCheck), deadline=None)
 @given(place=st.integers(0, len(SMALL) - 1), byte=st.integers(0, 255))
-def test_any_byte_changed_is_noticed(place: int, byte: int) -> None:
+def test_any_changed_byte_is_detected(place: int, byte: int) -> None:
     changed = SMALL[:place] + bytes([byte]) + SMALL[place + 1 :]
     if changed != SMALL:
         refusal(changed)
@@ -81,7 +81,7 @@ def test_any_byte_changed_is_noticed(place: int, byte: int) -> None:
 
 @settings(max_examples=attempts(300))
 @given(st.binary(max_size=60))
-def test_any_bytes(data: bytes) -> None:
+def test_arbitrary_bytes_are_read_or_refused(data: bytes) -> None:
     refusal(data)
 
 
@@ -108,7 +108,7 @@ def test_any_bytes(data: bytes) -> None:
         ("text", "bytes, not a str"),
     ],
 )
-def test_what_is_none(data: Any, reason: str) -> None:
+def test_invalid_msgpack_is_refused(data: Any, reason: str) -> None:
     assert reason in refusal(data)
 
 
@@ -140,12 +140,12 @@ def without_hash(**changes: Any) -> bytes:
         ),
     ],
 )
-def test_what_only_msgpack_can_say(data: bytes) -> None:
+def test_values_that_json_lacks_are_refused(data: bytes) -> None:
     """It has bytes, NaN and keys of any type; a document has not."""
     assert len(refusal(data)) < 300
 
 
-def test_who_has_no_msgspec_is_told(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+def test_missing_msgspec_is_a_clear_error(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
     path = tmp_path / "m.kv.msgpack"
     path.write_bytes(DATA)
     monkeypatch.setitem(sys.modules, "msgspec.msgpack", None)

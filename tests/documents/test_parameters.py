@@ -73,7 +73,7 @@ def made_anew() -> dict[str, int]:
     return count
 
 
-def test_every_kind_is_made_anew() -> None:
+def test_every_kind_of_operation_is_rebuilt_from_its_parameters() -> None:
     count = made_anew()
     assert not set(KINDS) - set(count), "a kind that ships is in no scene: add it to hand_made()"
     assert {"SetRate", "CloseLoop", "Ratchet", "Attach", SetBody.__name__} <= set(count)
@@ -87,7 +87,7 @@ def test_limits_follow_a_prefix_only_where_they_are_expressions() -> None:
     assert rod.parameters["name"] == "rod"
 
 
-def test_a_record_of_somebody_elses_class_stays_one() -> None:
+def test_record_of_an_unknown_class_stays_opaque() -> None:
     from dataclasses import dataclass
 
     @dataclass(frozen=True)
@@ -116,7 +116,7 @@ def test_a_record_of_somebody_elses_class_stays_one() -> None:
     assert to_json(again) == text
 
 
-def test_a_joint_from_a_document_is_exchanged_for_one_made_anew() -> None:
+def test_joint_from_a_document_is_replaced_by_a_rebuilt_one() -> None:
     model = kv.load("articulations/scissor_lift")
     tag = next(t for t in model.history.tags if "lift" in t and t != "frame scissor_lift/base")
     read = kv.Model()

@@ -41,7 +41,7 @@ def operation(kind="data", name="x", value="1", **others):
     return WRITES % ("{" + ", ".join(f'"{k}": {v}' for k, v in parts.items()) + "}")
 
 
-def test_cut_off_anywhere():
+def test_truncated_document_is_refused():
     text = to_json(kv.load("shelf_door"))
     end = len(text.rstrip())
     for length in range(end):
@@ -101,7 +101,7 @@ def test_cut_off_anywhere():
         (operation(value="[" * 900 + "]" * 900), None),
     ],
 )  # fmt: skip
-def test_one_error_with_the_place(text, reason):
+def test_invalid_document_error_names_the_place(text, reason):
     result = outcome(text)
     if reason is None:
         return
@@ -111,7 +111,7 @@ def test_one_error_with_the_place(text, reason):
     assert len(result) < 600
 
 
-def test_a_long_way_down():
+def test_deeply_nested_document_is_refused():
     """Nesting beyond what is followed is refused, and a long chain of plain sums is not nesting."""
     deep = ['["symbol", "a", 0, "dof"]', *(f'["not", {i}]' for i in range(5000))]
     assert "inside one another" in outcome(NODE % ",".join(deep))
@@ -121,7 +121,7 @@ def test_a_long_way_down():
 
 @settings(max_examples=attempts(150), suppress_health_check=list(HealthCheck))
 @given(data=st.data())
-def test_anything_changed_is_read_or_refused(data):
+def test_document_with_a_changed_value_is_read_or_refused(data):
     """Replace, drop or double any part of a real document: a model or one error of our own comes out."""
     given = json.loads(TEXT)
     del given["sha256"]
@@ -150,12 +150,12 @@ def test_anything_changed_is_read_or_refused(data):
 
 @settings(max_examples=attempts(100))
 @given(place=st.integers(0, len(WITHOUT_HASH) - 1), what=st.characters())
-def test_any_character_changed_is_read_or_refused(place, what):
+def test_document_with_a_changed_character_is_read_or_refused(place, what):
     outcome(TEXT[:place] + what + TEXT[place + 1 :])
     outcome(WITHOUT_HASH[:place] + what + WITHOUT_HASH[place + 1 :])
 
 
-def test_files_that_are_none(tmp_path):
+def test_files_that_are_no_documents_are_refused(tmp_path):
     path = tmp_path / "m.kv.json"
     with pytest.raises(kv.errors.UnknownNameError, match=r"m\.kv\.json"):
         kv.load(path)
@@ -168,7 +168,7 @@ def test_files_that_are_none(tmp_path):
         kv.load(path)
 
 
-def test_nothing_is_included_from_a_document_that_fails(tmp_path):
+def test_failed_include_leaves_the_model_unchanged(tmp_path):
     path = tmp_path / "m.kv.json"
     kv.load("shelf_door").save(path)
     content = json.loads(path.read_text())
@@ -189,7 +189,7 @@ class Odd:
     """Nothing that a document knows."""
 
 
-def test_what_cannot_be_saved_is_named_and_the_file_stays(tmp_path):
+def test_failed_save_names_the_part_and_leaves_the_file_unchanged(tmp_path):
     path = tmp_path / "m.kv.json"
     path.write_text("precious")
     model = kv.load("shelf_door")
@@ -201,7 +201,7 @@ def test_what_cannot_be_saved_is_named_and_the_file_stays(tmp_path):
     assert os.listdir(tmp_path) == ["m.kv.json"]
 
 
-def test_the_ending_and_the_folder(tmp_path):
+def test_save_checks_ending_and_folder(tmp_path):
     model = kv.load("shelf_door")
     with pytest.raises(kv.errors.FormatError, match=r"m\.kv\.json"):
         model.save(tmp_path / "m.json")
@@ -210,7 +210,7 @@ def test_the_ending_and_the_folder(tmp_path):
     assert os.listdir(tmp_path) == []
 
 
-def test_a_file_keeps_its_permissions_and_a_link_its_target(tmp_path):
+def test_saved_file_keeps_permissions_and_link_target(tmp_path):
     target, link = tmp_path / "real.kv.json", tmp_path / "link.kv.json"
     model = kv.load("shelf_door")
     model.save(target)

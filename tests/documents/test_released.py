@@ -45,7 +45,7 @@ def flat(values: Any) -> list[float]:
 
 
 @pytest.mark.parametrize("version", VERSIONS)
-def test_it_is_what_it_was(version: int) -> None:
+def test_released_document_has_the_values_it_had(version: int) -> None:
     expected = json.loads((FOLDER / f"version_{version}.values.json").read_text("utf-8"))
     found = json.loads(json.dumps(values_of(kv.load(FOLDER / f"version_{version}.kv.json"))))
     assert found["tags"] == expected["tags"]
@@ -60,7 +60,7 @@ def test_it_is_what_it_was(version: int) -> None:
 
 
 @pytest.mark.parametrize("version", VERSIONS)
-def test_its_operations_are_known(version: int) -> None:
+def test_released_operations_are_rebuilt_and_rerun(version: int) -> None:
     """The one of a class that nobody has follows a change upstream, and the file says what made the others."""
     model = kv.load(FOLDER / f"version_{version}.kv.json")
     assert model.data["heavy"] == 3.0
@@ -70,7 +70,7 @@ def test_its_operations_are_known(version: int) -> None:
     assert model.history.operation("the arm").parameters["axis"] == (1.0, 2.0, 3.0)
 
 
-def test_no_version_is_missing() -> None:
+def test_every_released_version_has_a_document() -> None:
     assert sorted(p.name for p in FOLDER.iterdir()) == sorted(
         f"version_{v}.{end}" for v in VERSIONS for end in ("kv.json", "values.json")
     )

@@ -41,7 +41,7 @@ def everything(model):
     ]
 
 
-def test_it_is_the_same_model(model, tmp_path):
+def test_round_trip_preserves_the_model(model, tmp_path):
     read = saved(model, tmp_path)
     assert read.snapshot() == model.snapshot()
     assert read.history.tags == model.history.tags
@@ -52,7 +52,7 @@ def test_it_is_the_same_model(model, tmp_path):
     assert read.default_state() == model.default_state()
 
 
-def test_every_bit_of_every_value_and_gradient(model, tmp_path):
+def test_round_trip_preserves_every_bit_of_values_and_gradients(model, tmp_path):
     ours, theirs = everything(model), everything(saved(model, tmp_path))
     inputs = sorted({s for e in ours for s in e.symbols}, key=lambda s: s.sort_key)
     assert sorted({s for e in theirs for s in e.symbols}, key=lambda s: s.sort_key) == inputs
@@ -64,13 +64,13 @@ def test_every_bit_of_every_value_and_gradient(model, tmp_path):
             assert np.asarray(mine).tobytes() == np.asarray(other).tobytes()
 
 
-def test_the_text_is_canonical(model, tmp_path):
+def test_document_text_is_canonical(model, tmp_path):
     read = saved(model, tmp_path)
     assert to_json(read) == to_json(model) == to_json(model.snapshot())
     assert (tmp_path / "model.kv.json").read_text(encoding="utf-8") == to_json(model)
 
 
-def test_the_same_text_in_another_process():
+def test_document_text_is_equal_in_another_process():
     script = (
         "import sys; sys.path.insert(0, sys.argv[1]); from document_models import rich_model;"
         "from kineverse.formats.document import to_json; sys.stdout.buffer.write(to_json(rich_model()).encode())"
@@ -81,7 +81,7 @@ def test_the_same_text_in_another_process():
     assert other.stdout.decode() == to_json(rich_model())
 
 
-def test_without_the_classes_that_made_it(tmp_path):
+def test_document_is_read_without_the_classes_that_made_it(tmp_path):
     """A process that imports nothing of ours but the package loads a user's operations."""
     rich_model().save(tmp_path / "rich.kv.json")
     script = (
@@ -93,7 +93,7 @@ def test_without_the_classes_that_made_it(tmp_path):
     assert other.stdout == "42 Doubled\n"
 
 
-def test_under_a_prefix(tmp_path):
+def test_document_is_read_under_a_prefix(tmp_path):
     model = rich_model()
     read = saved(model, tmp_path, "there")
     assert set(read.frames) == {f if f == "world" else f"there/{f}" for f in model.frames}
@@ -112,7 +112,7 @@ def test_under_a_prefix(tmp_path):
         twice.include(path, prefix="left")
 
 
-def test_what_was_read_still_binds(tmp_path):
+def test_reads_of_loaded_operations_still_bind(tmp_path):
     """Taking away what a frozen operation was made from is refused and names it; the rest can be edited."""
     read = saved(rich_model(), tmp_path)
     before = read.snapshot()
@@ -129,7 +129,7 @@ def test_what_was_read_still_binds(tmp_path):
     assert "number" not in read.data
 
 
-def test_a_frozen_operation_is_replaced_by_a_live_one(tmp_path):
+def test_frozen_operation_is_replaced_by_a_live_one(tmp_path):
     read = saved(rich_model(), tmp_path)
     with read.edit() as edit:
         edit.insert(Doubled("number", "more"), before="mine")
@@ -137,7 +137,7 @@ def test_a_frozen_operation_is_replaced_by_a_live_one(tmp_path):
     assert read.data["twice"] == 84
 
 
-def test_a_snapshot_is_saved_as_it_was(tmp_path):
+def test_snapshot_is_saved_as_it_was(tmp_path):
     model = kv.load("shelf_door")
     snapshot = model.snapshot()
     with model.edit() as edit:
@@ -146,7 +146,7 @@ def test_a_snapshot_is_saved_as_it_was(tmp_path):
     assert kv.load(tmp_path / "s.kv.json").snapshot() == snapshot
 
 
-def test_the_empty_model(tmp_path):
+def test_empty_model_survives_a_round_trip(tmp_path):
     read = saved(kv.Model(), tmp_path)
     assert read.snapshot() == kv.Model().snapshot()
     assert json.loads(to_json(read)) == {

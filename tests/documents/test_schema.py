@@ -39,12 +39,12 @@ MODELS = {
 }
 
 
-def test_it_is_a_schema() -> None:
+def test_schema_is_valid_json_schema() -> None:
     Draft202012Validator.check_schema(SCHEMA)
 
 
 @pytest.mark.parametrize("name", MODELS)
-def test_what_is_written_follows_it(name: str) -> None:
+def test_written_documents_follow_the_schema(name: str) -> None:
     error = next(VALID.iter_errors(json.loads(to_json(MODELS[name]()))), None)
     assert error is None, f"{error.json_path}: {error.message[:300]}"
 
@@ -60,7 +60,7 @@ def branches(what: str) -> list[str]:
     return firsts
 
 
-def test_it_knows_what_the_reader_knows() -> None:
+def test_schema_lists_the_names_of_the_reader() -> None:
     """Both ways: nothing is only here, nothing only there."""
     assert set(branches("node")) == set(NODE_TYPES)
     for kind in NODE_TYPES:
@@ -149,7 +149,7 @@ WRITES = OPERATION.replace('"writes": {}%s', '"writes": %s')
         WRITES % '{"articulations": {"a": {"kind": "k"}}}',
     ],
 )
-def test_both_refuse(text: str) -> None:
+def test_schema_and_reader_refuse_alike(text: str) -> None:
     assert not VALID.is_valid(json.loads(text))
     with pytest.raises(kv.errors.FormatError):
         read_operations(text)
@@ -167,7 +167,7 @@ def test_a_parameter_is_no_schema_of_its_own() -> None:
         read_operations(text)
 
 
-def test_it_lies_in_the_package() -> None:
+def test_schema_is_in_the_package() -> None:
     """Where others find it, without anything but the standard library."""
     script = (
         "from importlib.resources import files; import json;"
@@ -177,7 +177,7 @@ def test_it_lies_in_the_package() -> None:
     assert said == f"{SCHEMA['$id']}\n"
 
 
-def test_it_does_not_grow_by_itself() -> None:
+def test_every_definition_of_the_schema_is_used() -> None:
     """Every definition is used."""
     text = json.dumps(SCHEMA)
     unused: list[Any] = [name for name in DEFINITIONS if f'"#/$defs/{name}"' not in text]

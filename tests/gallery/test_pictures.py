@@ -21,7 +21,7 @@ def shown_in(*pages: Path) -> list[str]:
     return sorted(re.findall(r"!\[[^\]]+\]\(pictures/(\w+)\.png\)", text))
 
 
-def test_every_scene_has_its_picture_in_the_docs():
+def test_every_scene_has_a_picture_in_the_docs():
     assert shown_in(DOCS / "articulations.md", DOCS / "mechanisms.md") == sorted(gallery.names())
 
 

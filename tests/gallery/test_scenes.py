@@ -47,7 +47,7 @@ def paths(model):
 
 
 @every
-def test_it_has_bodies_and_breaks_no_constraint_at_first(name):
+def test_scene_has_bodies_and_violates_no_constraint_at_the_default_state(name):
     model = opened(name)
     assert model.bodies
     assert all(body.visuals for body in model.bodies.values())
@@ -56,7 +56,7 @@ def test_it_has_bodies_and_breaks_no_constraint_at_first(name):
 
 
 @every
-def test_it_moves_over_the_whole_range_of_every_slider(name):
+def test_scene_moves_over_the_whole_range_of_every_slider(name):
     model = opened(name)
     poses, moved = shown(model), dict.fromkeys(map(str, model.degrees_of_freedom), 0.0)
     for freedom, path, values in paths(model):
@@ -74,7 +74,7 @@ def test_it_moves_over_the_whole_range_of_every_slider(name):
 
 
 @every
-def test_loops_stay_closed_while_it_moves(name):
+def test_scene_loops_stay_closed_during_motion(name):
     model = opened(name)
     loops = [record for record in model.articulations.values() if record.kind == "closedloop"]
     for record in loops:
@@ -88,7 +88,7 @@ def test_loops_stay_closed_while_it_moves(name):
 
 
 @every
-def test_the_commands_take_its_name(name, capsys):
+def test_commands_take_the_name_of_a_scene(name, capsys):
     model = opened(name)
     assert main(["info", f"articulations/{name}", "--json"]) == 0
     told = json.loads(capsys.readouterr().out)
@@ -100,7 +100,7 @@ def test_the_commands_take_its_name(name, capsys):
 
 
 @every
-def test_all_its_names_are_below_a_prefix_and_it_can_be_included_twice(name):
+def test_scene_names_are_below_a_prefix_and_it_can_be_included_twice(name):
     model = kv.Model()
     model.include(f"articulations/{name}", prefix="left")
     model.include(f"articulations/{name}", prefix="right")
@@ -120,7 +120,7 @@ def test_all_its_names_are_below_a_prefix_and_it_can_be_included_twice(name):
 
 
 @every
-def test_a_document_of_it_needs_no_code(name, tmp_path):
+def test_scene_document_needs_no_code(name, tmp_path):
     model = opened(name)
     model.save(tmp_path / "scene.kv.json")
     again = kv.load(tmp_path / "scene.kv.json")
@@ -131,14 +131,14 @@ def test_a_document_of_it_needs_no_code(name, tmp_path):
         np.testing.assert_array_equal(again.fk(frame)(state), model.fk(frame)(state))
 
 
-def test_what_was_loaded_is_remembered():
+def test_loaded_scene_is_cached():
     first, second = kv.load("articulations/jansen_leg"), kv.load("articulations/jansen_leg")
     assert first is not second
     assert first.snapshot() == second.snapshot()
     assert first.frames["jansen_leg/crank"] is second.frames["jansen_leg/crank"]
 
 
-def test_every_kind_of_joint_is_there():
+def test_every_articulation_has_a_scene():
     from kineverse import articulations
 
     abstract = {
@@ -157,7 +157,7 @@ def test_every_kind_of_joint_is_there():
     assert kinds - found == set()
 
 
-def test_a_wrong_name_is_told_the_right_ones():
+def test_unknown_scene_error_suggests_names():
     for name, meant in {
         "articulations/skrew": "articulations/screw",
         "articulations/foldng_door": "articulations/folding_door",
@@ -182,7 +182,7 @@ def test_a_wrong_name_is_told_the_right_ones():
         list(gallery.operations("nothing"))
 
 
-def test_a_file_of_ones_own_is_not_hidden(tmp_path, monkeypatch):
+def test_file_in_a_folder_articulations_is_not_hidden_by_the_gallery(tmp_path, monkeypatch):
     folder = tmp_path / "articulations"
     folder.mkdir()
     (folder / "arm.urdf").write_text('<robot name="arm"><link name="base"/></robot>')
@@ -191,7 +191,7 @@ def test_a_file_of_ones_own_is_not_hidden(tmp_path, monkeypatch):
 
 
 @pytest.mark.parametrize("command", ["info", "view"])
-def test_the_list(command, capsys):
+def test_list_of_scenes(command, capsys):
     assert main([command, "articulations"]) == 0
     lines = capsys.readouterr().out.splitlines()
     for name in NAMES:
@@ -201,7 +201,7 @@ def test_the_list(command, capsys):
     assert len(json.loads(capsys.readouterr().out)["models"]) == len(NAMES)
 
 
-def test_it_is_imported_when_it_is_asked_for():
+def test_gallery_is_imported_lazily():
     import subprocess
     import sys
 

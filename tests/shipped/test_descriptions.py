@@ -147,38 +147,38 @@ def scene(name: str) -> Scene:
     return Scene(name)
 
 
-def test_nothing_else_ships() -> None:
+def test_shipped_models_are_the_known_ones() -> None:
     assert {path.stem for path in SHIPPED.glob("*.urdf")} == set(ALL)
 
 
-def test_files_are_what_their_source_writes() -> None:
+def test_shipped_files_equal_the_output_of_their_source() -> None:
     tools = SHIPPED.parents[2] / "tools" / "models"
     done = subprocess.run([sys.executable, tools, "--check"], capture_output=True, text=True, check=False)
     assert done.returncode == 0, done.stderr
 
 
 @pytest.mark.parametrize("name", ALL)
-def test_degrees_of_freedom(name: str) -> None:
+def test_shipped_degrees_of_freedom(name: str) -> None:
     assert set(scene(name).dof) == DOF[name]
     mimics = {joint.name: joint.mimic for joint in scene(name).joints.values() if joint.mimic}
     assert mimics == MIMIC.get(name, {})
 
 
 @pytest.mark.parametrize("name", ALL)
-def test_frames(name: str) -> None:
+def test_shipped_frames(name: str) -> None:
     assert scene(name).links[0] == ROOT[name]
     assert FRAMES[name] <= set(scene(name).links)
 
 
 @pytest.mark.parametrize("name", ALL)
-def test_root_is_a_frame_only(name: str) -> None:
+def test_root_link_is_a_frame_only(name: str) -> None:
     root = scene(name).xml.find(f"link[@name='{ROOT[name]}']")
     assert root is not None
     assert len(root) == 0
 
 
 @pytest.mark.parametrize("name", ALL)
-def test_limits_are_sane(name: str) -> None:
+def test_shipped_limits_are_plausible(name: str) -> None:
     for joint in scene(name).joints.values():
         assert joint.velocity > 0, joint
         assert sorted(np.abs(joint.axis)) == [0, 0, 1], joint
@@ -189,7 +189,7 @@ def test_limits_are_sane(name: str) -> None:
 
 
 @pytest.mark.parametrize("name", sorted(MIMIC))
-def test_what_mimics_stays_in_its_own_limits(name: str) -> None:
+def test_mimic_joints_stay_within_their_own_limits(name: str) -> None:
     for joint in scene(name).joints.values():
         if joint.mimic:
             master, factor, offset = joint.mimic
@@ -238,7 +238,7 @@ def test_start_poses_are_within_limits(name: str) -> None:
 
 
 @pytest.mark.parametrize("name", ALL)
-def test_physical_links_are_seen_and_collide_and_weigh(name: str) -> None:
+def test_physical_links_have_visuals_collisions_and_mass(name: str) -> None:
     for link in scene(name).xml.iterfind("link"):
         parts = {tag: len(link.findall(tag)) for tag in ("visual", "collision", "inertial")}
         assert not len(link) or all(parts.values()), (link.get("name"), parts)
@@ -256,7 +256,7 @@ def test_materials_are_named_once_and_all_used(name: str) -> None:
 
 
 @pytest.mark.parametrize("name", ALL)
-def test_inertias_are_those_of_solids(name: str) -> None:
+def test_inertias_equal_those_of_solids(name: str) -> None:
     for link in scene(name).xml.iterfind("link/inertial"):
         moments = np.linalg.eigvalsh(_inertia(link))
         assert float(link.find("mass").get("value")) > 0
@@ -293,13 +293,13 @@ def test_inertias_agree_with_coal(name: str) -> None:
 
 @pytest.mark.parametrize("name", ["kitchen", *ROBOTS])
 @pytest.mark.parametrize("kind", ["shapes", "visuals"])
-def test_stands_on_the_floor(name: str, kind: str) -> None:
+def test_models_stand_on_the_floor(name: str, kind: str) -> None:
     lowest, _ = scene(name).bounds(kind, {})
     assert lowest[:, 2].min() == pytest.approx(0, abs=1e-9)
 
 
 @pytest.mark.parametrize("name", FURNITURE)
-def test_parts_of_furniture_do_not_meet_when_closed(name: str) -> None:
+def test_furniture_parts_do_not_collide_when_closed(name: str) -> None:
     s = scene(name)
     assert not list(s.penetrations({}, lambda a, b: s.link_of(a) != s.link_of(b), HAIR))
 
@@ -307,7 +307,7 @@ def test_parts_of_furniture_do_not_meet_when_closed(name: str) -> None:
 @pytest.mark.parametrize(
     ("name", "dof"), [(name, dof) for name in FURNITURE for dof in sorted(DOF[name])], ids=lambda part: part
 )
-def test_parts_of_furniture_do_not_meet_on_the_way(name: str, dof: str) -> None:
+def test_furniture_parts_do_not_collide_during_motion(name: str, dof: str) -> None:
     s = scene(name)
     body = s.model.getJointId(dof)
 
@@ -322,7 +322,7 @@ def test_parts_of_furniture_do_not_meet_on_the_way(name: str, dof: str) -> None:
 
 @pytest.mark.parametrize("name", ROBOTS)
 @pytest.mark.parametrize("pose", ["zero", "start"])
-def test_robots_do_not_touch_themselves(name: str, pose: str) -> None:
+def test_robots_have_no_self_collision(name: str, pose: str) -> None:
     """Parts on both sides of one joint overlap on purpose, as an elbow does; no others."""
     s = scene(name)
     positions = POSES[name] if pose == "start" else {}
@@ -351,14 +351,14 @@ def test_grippers_close_without_overlap_and_open_by_their_joint() -> None:
 
 
 @pytest.mark.parametrize("name", ALL)
-def test_mujoco_compiles_them(name: str) -> None:
+def test_mujoco_compiles_shipped_models(name: str) -> None:
     mujoco = pytest.importorskip("mujoco")
     model = mujoco.MjModel.from_xml_path(str(SHIPPED / f"{name}.urdf"))
     assert model.njnt - model.neq == len(DOF[name])
 
 
 @pytest.mark.parametrize("name", ALL)
-def test_yourdfpy_finds_them_valid(name: str) -> None:
+def test_yourdfpy_accepts_shipped_models(name: str) -> None:
     yourdfpy = pytest.importorskip("yourdfpy")
     robot = yourdfpy.URDF.load(str(SHIPPED / f"{name}.urdf"))
     assert robot.validate()
@@ -366,7 +366,7 @@ def test_yourdfpy_finds_them_valid(name: str) -> None:
 
 
 @pytest.mark.parametrize("name", ALL)
-def test_files_are_small(name: str) -> None:
+def test_shipped_files_are_small(name: str) -> None:
     assert Path(SHIPPED / f"{name}.urdf").stat().st_size < 120_000
 
 

@@ -15,6 +15,8 @@ from kineverse import shipped
 from kineverse.errors import FormatError, UnknownNameError, suggest
 from kineverse.model import registry
 
+from .root_folder import split_path_variable
+
 MODEL_PATH = "KINEVERSE_MODEL_PATH"
 _DEPTH = 6
 _LISTED = 6
@@ -131,8 +133,8 @@ def _no_scene(name: str) -> str:
 
 def model_folders() -> Iterator[tuple[str, Path]]:
     """Yield the folders in which models are searched by name, each with its origin."""
-    for entry in os.environ.get(MODEL_PATH, "").split(os.pathsep):
-        if entry and Path(entry).is_dir():
+    for entry in split_path_variable(MODEL_PATH):
+        if Path(entry).is_dir():
             yield MODEL_PATH, Path(entry)
     site = Path(sysconfig.get_paths()["purelib"])
     for package in ("cmeel.prefix/share/example-robot-data/robots", "example_robot_data/robots"):
@@ -208,7 +210,7 @@ def _stem(file: str) -> str:
 
 
 def _missing_places() -> str:
-    missing = [e for e in os.environ.get(MODEL_PATH, "").split(os.pathsep) if e and not Path(e).is_dir()]
+    missing = [entry for entry in split_path_variable(MODEL_PATH) if not Path(entry).is_dir()]
     return f" {MODEL_PATH} names folders that do not exist: {', '.join(missing)}." if missing else ""
 
 

@@ -25,6 +25,7 @@ from kineverse.formats.root_folder import (
     is_below,
     is_common,
     outside_root_error,
+    split_path_variable,
 )
 from kineverse.formats.xml_reader import quote
 from kineverse.model.body import Body, Mesh, Shape
@@ -109,9 +110,8 @@ def locate_resource(
 def model_paths() -> Iterator[tuple[str, Path]]:
     """Yield the folders of models in environment variables, each with its variable."""
     for variable in _MODELS:
-        for place in os.environ.get(variable, "").split(os.pathsep):
-            if place:
-                yield variable, Path(place).absolute()
+        for place in split_path_variable(variable):
+            yield variable, Path(place).absolute()
 
 
 @dataclass
@@ -214,9 +214,8 @@ def declared_folders() -> Iterator[str]:
     """Yield the real paths of the folders of packages and models in environment variables."""
     for variables, inside in ((_WORKSPACES, ""), (_PREFIXES, "share"), (_MODELS, "")):
         for variable in variables:
-            for place in os.environ.get(variable, "").split(os.pathsep):
-                if place:
-                    yield os.path.realpath(os.path.join(place, inside))
+            for place in split_path_variable(variable):
+                yield os.path.realpath(os.path.join(place, inside))
 
 
 def _inside(uri: str, text: str) -> list[str]:
@@ -304,10 +303,9 @@ def counts_as_package(package: Path, folder: Path, root: str) -> bool:
 
 
 def _paths_in(variable: str, log: _SearchLog) -> Iterator[Path]:
-    for place in os.environ.get(variable, "").split(os.pathsep):
-        if place:
-            log.places.append(f"{place} (${variable})")
-            yield Path(place).absolute()
+    for place in split_path_variable(variable):
+        log.places.append(f"{place} (${variable})")
+        yield Path(place).absolute()
 
 
 def _at_or_in(place: Path, name: str) -> Iterator[Path]:

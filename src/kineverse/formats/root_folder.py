@@ -69,9 +69,13 @@ def find_text_root(folder: Folder, root: Folder | None = None) -> str:
 
 def declared_roots() -> Iterator[str]:
     """Yield the real paths of the folders of ``KINEVERSE_ROOT``."""
-    for place in os.environ.get(ROOT, "").split(os.pathsep):
-        if place:
-            yield os.path.realpath(os.path.expanduser(place))
+    for place in split_path_variable(ROOT):
+        yield os.path.realpath(os.path.expanduser(place))
+
+
+def split_path_variable(variable: str) -> Iterator[str]:
+    """Return the paths in an environment variable."""
+    return filter(None, os.environ.get(variable, "").split(os.pathsep))
 
 
 def is_below(path: str, folder: str) -> bool:

@@ -11,9 +11,9 @@ content (:mod:`.encoding`), and is optional. Reading a document runs no code and
 """
 
 from .opaque_operation import OpaqueOperation
-from .reader import from_bytes, read_operations, read_packed_operations, to_bytes
+from .reader import from_bytes, read_operations, read_packed_operations
 from .schema import schema
-from .writer import document_hash, to_json, write_document
+from .writer import document_hash, to_bytes, to_json, write_document
 
 __all__ = [
     "OpaqueOperation",

@@ -16,7 +16,6 @@ from kineverse.formats.resource_paths import restrict_meshes
 from kineverse.formats.root_folder import NOWHERE, find_text_root
 from kineverse.model.frame import WORLD
 from kineverse.model.model import Model
-from kineverse.model.model_view import ModelView
 from kineverse.model.operation import BODIES, FRAMES, KINDS, RATES, Cell, find_expressions
 from kineverse.model.read_recorder import ABSENT, Read
 from kineverse.model.registry import FileContent
@@ -25,7 +24,7 @@ from kineverse.model.traces.placeholder import find_read_nodes
 from kineverse.symbols import symbol_name
 
 from .budget import COST_OF_NAME, MAX_NODES, check_counts, spend_rate_coupling
-from .encoding import HASH, check_hash, pack_document, unpack_document
+from .encoding import HASH, check_hash, unpack_document
 from .node_graph import NodeGraph
 from .node_types import read_node
 from .opaque_operation import OpaqueOperation
@@ -33,7 +32,7 @@ from .parameters import decode_parameter
 from .schema import InvalidDocumentError, check_entity_name, check_keys, check_list, check_text
 from .traces import TraceConsistency, check_read_nodes, decode_queries, merge_reads
 from .values import Rename, decode_value
-from .writer import FORMAT, VERSION, to_json
+from .writer import FORMAT, VERSION
 
 LONGEST_REASON = 1000
 
@@ -322,28 +321,10 @@ def _kind(value: Any) -> str:
     return str(value)
 
 
-def to_bytes(model: ModelView) -> bytes:
-    """Return a model as a document in msgpack, as in ``.kv.msgpack`` files; equal for equal models.
-
-    Parameters
-    ----------
-    model
-        Model or snapshot.
-
-    Raises
-    ------
-    FormatError
-        For content that a document cannot carry.
-    MissingDependencyError
-        If msgspec is not installed, which the extra ``exchange`` brings.
-    """
-    return pack_document(to_json(model))
-
-
 def from_bytes(
     data: bytes, prefix: str | None = None, *, root: str | os.PathLike[str] | None = None
 ) -> Model:
-    """Return the model in the result of :func:`to_bytes`. Runs no code and imports no name.
+    """Return the model in the result of :func:`.writer.to_bytes`. Runs no code and imports no name.
 
     Parameters
     ----------

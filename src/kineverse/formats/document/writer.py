@@ -70,6 +70,24 @@ def to_json(model: ModelView) -> str:
         raise FormatError("The model contains data or gradients that are nested too deeply.") from None
 
 
+def to_bytes(model: ModelView) -> bytes:
+    """Return a model as a document in msgpack, as in ``.kv.msgpack`` files; equal for equal models.
+
+    Parameters
+    ----------
+    model
+        Model or snapshot.
+
+    Raises
+    ------
+    FormatError
+        For content that a document cannot carry.
+    MissingDependencyError
+        If msgspec is not installed, which the extra ``exchange`` brings.
+    """
+    return pack_document(to_json(model))
+
+
 def _write_text(snapshot: Snapshot) -> str:
     parts = [_Parts(entry, cells) for entry, cells in _with_cells_before(snapshot.entries)]
     table = NodeTable(e for part in parts for e in part.expressions)
