@@ -196,9 +196,7 @@ def test_missing_textures_are_left_out_and_shapes_kept(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("ending", ["urdf", "xml"])
-def test_save_outside_of_the_root_warns_of_the_root_to_give(
-    ending: str, package: Path, tmp_path: Path
-) -> None:
+def test_save_in_another_folder_warns_of_the_root_to_give(ending: str, package: Path, tmp_path: Path) -> None:
     if ending == "xml":
         pytest.importorskip("mujoco")
     there = tmp_path / "some" / "where"

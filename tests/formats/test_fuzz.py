@@ -21,44 +21,44 @@ TOOLS = Path(__file__).parents[2] / "tools"
 sys.path.insert(0, str(TOOLS))
 
 from fuzz import programs  # noqa: E402  - it is no part of the package
-from fuzz.edits import ATTEMPTS, edits  # noqa: E402
+from fuzz.check_options import CheckOptions, choose_options  # noqa: E402
+from fuzz.edits import ATTEMPTS, apply_random_edits  # noqa: E402
+from fuzz.findings import FindingStore  # noqa: E402
 from fuzz.grammars import document  # noqa: E402
 from fuzz.inputs import inputs  # noqa: E402
-from fuzz.law import Tally, check  # noqa: E402
+from fuzz.invariants import OutcomeCounts, check  # noqa: E402
 from fuzz.minimise import minimise  # noqa: E402
-from fuzz.records import Records  # noqa: E402
 from fuzz.targets import TARGETS, Target  # noqa: E402
-from fuzz.ways import Way, way_of  # noqa: E402
-from fuzz.worker import place  # noqa: E402
+from fuzz.worker import make_input_folder  # noqa: E402
 
 COUNTS = {"urdf": 150, "sdf": 60, "mjcf": 40, "document": 150}
 
 
 @pytest.fixture
 def folder(tmp_path) -> Path:
-    return place(tmp_path)
+    return make_input_folder(tmp_path)
 
 
 @pytest.mark.parametrize("name", TARGETS)
 def test_fuzzing_finds_no_violation(name, folder):
-    target, tally = TARGETS[name], Tally()
+    target, counts = TARGETS[name], OutcomeCounts()
     count = COUNTS.get(name, 60)
     for data in islice(inputs(target, target.own_seeds(), Random(7)), count):
-        way = way_of(data)
-        assert check(target, data, folder, tally, way) is None, (way, data)
+        options = choose_options(data)
+        assert check(target, data, folder, counts, options) is None, (options, data)
     # Neither all good nor all bad, or the grammars would test nothing.
-    assert tally.models > count / 20
-    assert tally.errors > count / 20
+    assert counts.models > count / 20
+    assert counts.errors > count / 20
 
 
 @pytest.mark.parametrize("name", TARGETS)
 def test_all_seeds_load(name, folder):
-    target, tally = TARGETS[name], Tally()
+    target, counts = TARGETS[name], OutcomeCounts()
     seeds = target.own_seeds()
     assert seeds
     for data in seeds:
-        assert check(target, data, folder, tally) is None
-    assert tally == Tally(models=len(seeds))
+        assert check(target, data, folder, counts) is None
+    assert counts == OutcomeCounts(models=len(seeds))
 
 
 @pytest.mark.parametrize("name", TARGETS)
@@ -163,8 +163,8 @@ def test_names_without_the_prefix_are_detected(folder):
     target = TARGETS["urdf"]
     ignores = replace(target, operations=lambda data, folder, prefix: target.operations(data, folder, None))
     data = b'<robot name="r"><link name="a"/></robot>'
-    assert check(target, data, folder, way=Way(prefix="p")) is None
-    finding = check(ignores, data, folder, way=Way(prefix="p"))
+    assert check(target, data, folder, options=CheckOptions(prefix="p")) is None
+    finding = check(ignores, data, folder, options=CheckOptions(prefix="p"))
     assert finding is not None
     assert finding.signature == "broken: a name without the prefix"
 
@@ -194,13 +194,13 @@ def test_edits_are_applied_and_undone():
             nonlocal taken
             taken += to_json(model) != before
 
-        edits(model, seed, changed)
+        apply_random_edits(model, seed, changed)
         assert to_json(model) == before
     assert 3 < taken < 12 * ATTEMPTS
 
 
 def test_the_smallest_input_is_kept(tmp_path, folder):
-    records = Records(tmp_path / "findings")
+    records = FindingStore(tmp_path / "findings")
     finding = check(broken(other_error), b"", folder)
     assert records.add(finding, b"long")
     assert not records.add(finding, b"short")

@@ -15,22 +15,22 @@ pytest.importorskip("mujoco")
 sys.path.insert(0, str(Path(__file__).parents[2] / "tools"))
 
 from fuzz.inputs import inputs
-from fuzz.peers import quiet, reader_of, refusal
+from fuzz.peers import find_peer, quiet, unexcused_error
 from fuzz.targets import TARGETS
-from fuzz.worker import place
+from fuzz.worker import make_input_folder
 
 
 @pytest.mark.parametrize(("name", "tried", "read"), [("urdf", 400, 100), ("mjcf", 60, 1)])
 def test_files_that_other_parsers_read_are_refused_for_six_reasons_only(tmp_path, name, tried, read):
-    target, folder = TARGETS[name], place(tmp_path)
+    target, folder = TARGETS[name], make_input_folder(tmp_path)
     with quiet():
         given = [
             data
             for data in islice(inputs(target, target.own_seeds(), Random(7)), tried)
-            if reader_of(name, data)
+            if find_peer(name, data)
         ]
     assert len(given) >= read
-    refused = [(text, data) for data in given if (text := refusal(target, data, folder))]
+    refused = [(text, data) for data in given if (text := unexcused_error(target, data, folder))]
     assert refused == []
 
 
@@ -45,13 +45,13 @@ def test_files_that_other_parsers_read_are_refused_for_six_reasons_only(tmp_path
 )
 def test_parsers_that_read_each_file_are_recorded(text, by):
     with quiet():
-        assert reader_of("urdf", text.encode()) == by
+        assert find_peer("urdf", text.encode()) == by
 
 
 def test_refusal_without_a_known_reason_is_detected(tmp_path):
     target = TARGETS["urdf"]
-    assert "has the name of the link" in refusal(
+    assert "has the name of the link" in unexcused_error(
         target, b'<robot name="r"><link name="l"/><link name="l"/></robot>', tmp_path
     )
     for excused in (b"<robot name='r'/>", b"<robot", b"<!DOCTYPE robot><robot/>"):
-        assert refusal(target, excused, tmp_path) == ""
+        assert unexcused_error(target, excused, tmp_path) == ""

@@ -1,7 +1,7 @@
 """Search for inputs that break a reader: ``make fuzz ARGS="--target sdf --minutes 60"``.
 
-The search runs in processes of its own, which may die of what they read and are started again. What it finds
-lies in build/fuzz/TARGET/findings, minimised; what reached new code, in build/fuzz/TARGET/corpus.
+The search runs in separate processes, which an input may kill and which are then restarted. Minimised
+findings are in build/fuzz/TARGET/findings, and inputs that reached new code in build/fuzz/TARGET/corpus.
 """
 
 from __future__ import annotations
@@ -16,20 +16,20 @@ import tempfile
 import time
 from pathlib import Path
 
-from .law import Finding, check
+from .check_options import CheckOptions, all_options
+from .findings import FindingStore
+from .invariants import Finding, check
 from .minimise import minimise
-from .records import Records
 from .targets import TARGETS, Target
-from .ways import Way, all_ways
-from .worker import HANG, place
+from .worker import HANG, make_input_folder
 
 ROUND = 300
-"""[s] after which a process is exchanged for a fresh one: what it remembers is memory."""
+"""Time [s] after which a process is replaced by a new one, since its caches grow."""
 _COVERAGE = re.compile(r"cov: (\d+) ft: (\d+) corp: (\d+)")
 
 
 def main() -> int:
-    """Search; return how many things were found."""
+    """Run the search and return the number of findings."""
     parser = argparse.ArgumentParser(prog="make fuzz", description=__doc__)
     parser.add_argument("--target", choices=TARGETS, action="append", help="a format; may be repeated (all)")
     parser.add_argument("--minutes", type=float, default=10.0, help="how long, for all targets together (10)")
@@ -41,7 +41,7 @@ def main() -> int:
     given = parser.parse_args()
     targets = given.target or list(TARGETS)
     if given.check is not None:
-        return _look(TARGETS[targets[0]], given.check)
+        return _check_file(TARGETS[targets[0]], given.check)
     searches = [_Search(TARGETS[name], given.folder / name) for name in targets]
     end, seed = time.monotonic() + 60 * given.minutes, given.seed
     try:
@@ -57,16 +57,16 @@ def main() -> int:
 
 
 class _Search:
-    """The search for one target, over many processes."""
+    """Search for one target, over many processes."""
 
     def __init__(self, target: Target, folder: Path) -> None:
         self._target, self._folder = target, folder
-        self._records = Records(folder / "findings")
+        self._records = FindingStore(folder / "findings")
         self._models = self._errors = self._deaths = 0
         self._seconds = 0.0
 
     def round(self, seconds: int, seed: int) -> None:
-        """Let a process search for some seconds, and take up what it left."""
+        """Run a process for some seconds, and collect its results."""
         folder, log = self._folder, self._folder / "log.txt"
         status = folder / "status.json"
         status.unlink(missing_ok=True)
@@ -84,10 +84,10 @@ class _Search:
         self._seconds += time.monotonic() - start
         died = list(folder.glob("died-*"))
         for path in died:
-            self._died(path)
+            self._confirm_death(path)
         if status.exists():
-            tally = json.loads(status.read_text())
-            self._models, self._errors = self._models + tally["models"], self._errors + tally["errors"]
+            counts = json.loads(status.read_text())
+            self._models, self._errors = self._models + counts["models"], self._errors + counts["errors"]
         elif process.returncode:
             raise SystemExit(f"the search ended at once:\n{log.read_text(errors='replace')[-3000:]}")
         if process.returncode and not died:
@@ -97,7 +97,7 @@ class _Search:
         _say(f"{self._line()}; branches {reached[-1][0]}, inputs kept {reached[-1][2]}")
 
     def summary(self) -> list[str]:
-        """Minimise what was found, and return a line for each."""
+        """Minimise all findings, and return a line for each."""
         _say(self._line())
         lines = []
         for signature, path in self._records.all():
@@ -105,13 +105,13 @@ class _Search:
                 lines.append(f"{signature}: {path}")
                 continue
             with tempfile.TemporaryDirectory() as folder:
-                small = _minimised(self._target, path.read_bytes(), signature, place(Path(folder)))
+                small = _minimise(self._target, path.read_bytes(), signature, make_input_folder(Path(folder)))
             path.write_bytes(small)
             lines.append(f"{signature}: {path} ({len(small)} bytes)")
         return lines
 
-    def _died(self, path: Path) -> None:
-        """Look whether an input kills a process of its own, too, or its successor was to blame."""
+    def _confirm_death(self, path: Path) -> None:
+        """Record an input that killed a process if it also kills a new process alone."""
         data, how = path.read_bytes(), path.name.split("-")[1]
         path.unlink()
         again = self._folder / "again"
@@ -127,9 +127,11 @@ class _Search:
             self._records.add(Finding(f"dies: {how}", f"the process ends with {code}"), data)
 
     def _worker(self, *arguments: str) -> list[str]:
+        """Return the command line of a search process."""
         return [sys.executable, "-m", "fuzz.worker", "--target", self._target.name, *arguments]
 
     def _line(self) -> str:
+        """Return the state of the search as a line."""
         runs = self._models + self._errors
         return (
             f"{self._target.name}: {runs} inputs in {self._seconds / 60:.1f} min, "
@@ -137,25 +139,27 @@ class _Search:
         )
 
 
-def _look(target: Target, path: Path) -> int:
+def _check_file(target: Target, path: Path) -> int:
+    """Check one input with all options, and print its minimised form if an invariant is violated."""
     data = path.read_bytes()
     with tempfile.TemporaryDirectory() as name:
-        folder = place(Path(name))
-        found = (check(target, data, folder, way=way) for way in all_ways())
+        folder = make_input_folder(Path(name))
+        found = (check(target, data, folder, options=options) for options in all_options())
         finding = next(filter(None, found), None)
         if finding is None:
             _say("nothing is wrong")
             return 0
-        small = _minimised(target, data, finding.signature, folder)
+        small = _minimise(target, data, finding.signature, folder)
     sys.stdout.write(f"{finding.signature}\n{finding.detail}\n\n{small.decode(errors='backslashreplace')}\n")
     return 1
 
 
-def _minimised(target: Target, data: bytes, signature: str, folder: Path) -> bytes:
-    for way in all_ways():
+def _minimise(target: Target, data: bytes, signature: str, folder: Path) -> bytes:
+    """Minimise an input with the first options that give its signature."""
+    for options in all_options():
 
-        def fails(candidate: bytes, way: Way = way) -> bool:
-            finding = check(target, candidate, folder, way=way)
+        def fails(candidate: bytes, options: CheckOptions = options) -> bool:
+            finding = check(target, candidate, folder, options=options)
             return finding is not None and finding.signature == signature
 
         if fails(data):
@@ -164,6 +168,7 @@ def _minimised(target: Target, data: bytes, signature: str, folder: Path) -> byt
 
 
 def _say(text: str) -> None:
+    """Print a line with the time."""
     sys.stdout.write(f"{time.strftime('%H:%M:%S')} {text}\n")
     sys.stdout.flush()
 

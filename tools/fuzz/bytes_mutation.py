@@ -1,4 +1,4 @@
-"""Mutations that know nothing of the format."""
+"""Mutations of bytes, for any format."""
 
 from __future__ import annotations
 
@@ -18,20 +18,20 @@ MAX_LENGTH = 60_000
 
 
 def mutate(data: bytes, other: bytes, random: Random) -> bytes:
-    """Return data with some bytes exchanged, put in, taken out, or replaced by those of another input."""
+    """Exchange, insert or remove some bytes, or replace them by those of another input."""
     for _ in range(random.choice((1, 1, 2, 4))):
         at, end = sorted(random.randint(0, len(data)) for _ in range(2))
         end = min(end, at + random.choice((1, 2, 8, 64, 1000)))
-        what = random.randrange(6)
-        if what == 0:
+        kind = random.randrange(6)
+        if kind == 0:
             data = data[:at] + data[end:]
-        elif what == 1:
+        elif kind == 1:
             data = data[:at] + random.choice(_CHUNKS) + data[at:]
-        elif what == 2:
+        elif kind == 2:
             data = data[:at] + random.choice(_CHUNKS) + data[end:]
-        elif what == 3:
+        elif kind == 3:
             data = data[:at] + bytes([random.randrange(256)]) + data[at + 1 :]
-        elif what == 4:
+        elif kind == 4:
             data = data[:end] + data[at:end] * random.choice((1, 2, 20)) + data[end:]
         else:
             start = random.randint(0, len(other))

@@ -1,4 +1,4 @@
-"""What somebody does with a model that was loaded: exchange what others were made from, and take it back."""
+"""Random edits of a loaded model: operations are replaced or removed, and the edit is undone."""
 
 from __future__ import annotations
 
@@ -17,27 +17,27 @@ _NUMBERS = (1.0, -0.5, 1e-9, 1e200, 0)
 
 
 @dataclass(frozen=True)
-class Rewritten(kv.Operation):
-    """Writes what it is told to write."""
+class SetWrites(kv.Operation):
+    """Operation with given writes."""
 
     content: tuple[tuple[Cell, Any], ...]
 
     def apply(self, model: ReadRecorder) -> kv.model.Writes:
-        """Write it."""
+        """Write the content."""
         return kv.model.Writes.from_cells(dict(self.content))
 
 
-def edits(model: kv.Model, seed: int, whole: Callable[[], object]) -> None:
-    """Try some edits of a model, each of which it takes or refuses, and take them back.
+def apply_random_edits(model: kv.Model, seed: int, check: Callable[[], object]) -> None:
+    """Apply some random edits to a model, and undo those that it accepts.
 
     Parameters
     ----------
     model
-        The model, as which it is left.
+        The model, which is unchanged afterwards.
     seed
-        Of the choice.
-    whole
-        Called after each edit that was taken; raises if anything is wrong with the model.
+        Seed of the random choices.
+    check
+        Called after each accepted edit; raises if an invariant of the model is violated.
     """
     random = Random(seed)
     for _ in range(ATTEMPTS):
@@ -51,20 +51,22 @@ def edits(model: kv.Model, seed: int, whole: Callable[[], object]) -> None:
                 if random.random() < 0.2:
                     edit.remove(tag)
                 else:
-                    edit.replace(tag, Rewritten(_changed(dict(model.history.entry(tag).writes), random)))
+                    edit.replace(
+                        tag, SetWrites(_change_writes(dict(model.history.entry(tag).writes), random))
+                    )
         except kv.KineverseError:
             continue
-        whole()
+        check()
         removed = tag not in model.history.tags
         with model.edit() as edit:
             if removed:
-                _put_back(edit, old, tag, tags)
+                _reinsert(edit, old, tag, tags)
             else:
                 edit.replace(tag, old)
 
 
-def _put_back(edit: kv.model.Edit, old: kv.Operation, tag: str, tags: list[str]) -> None:
-    """Insert an operation where it was among the tags."""
+def _reinsert(edit: kv.model.Edit, old: kv.Operation, tag: str, tags: list[str]) -> None:
+    """Insert a removed operation at its former place."""
     place = tags.index(tag)
     if place:
         edit.insert(old, tag, after=tags[place - 1])
@@ -74,16 +76,17 @@ def _put_back(edit: kv.model.Edit, old: kv.Operation, tag: str, tags: list[str])
         edit.apply(old, tag)
 
 
-def _changed(writes: dict[Cell, Any], random: Random) -> tuple[tuple[Cell, Any], ...]:
-    """Return what an operation wrote, most of it with something else in it."""
+def _change_writes(writes: dict[Cell, Any], random: Random) -> tuple[tuple[Cell, Any], ...]:
+    """Return the writes of an operation, most of them with changed values."""
     return tuple(
-        ((kind, name), _other(kind, value, random) if random.random() < 0.8 else value)
+        ((kind, name), _change_value(kind, value, random) if random.random() < 0.8 else value)
         for (kind, name), value in writes.items()
         if random.random() < 0.95
     )
 
 
-def _other(kind: str, value: Any, random: Random) -> Any:
+def _change_value(kind: str, value: Any, random: Random) -> Any:
+    """Return a value of one kind with a changed expression, pose or shape."""
     number = random.choice(_NUMBERS)
     symbol = random.choice((kv.position("a"), kv.velocity("b"), kv.position("new")))
     more = random.choice((number, number, symbol, symbol * number))

@@ -1,4 +1,4 @@
-"""Inputs one after the other, the same ones for the same seed."""
+"""Sequences of inputs, the same for the same seed."""
 
 from __future__ import annotations
 
@@ -9,15 +9,15 @@ from .targets import Target
 
 
 def inputs(target: Target, seeds: Sequence[bytes], random: Random) -> Iterator[bytes]:
-    """Yield inputs by grammar and mutations of those and of seeds, without end."""
+    """Yield inputs by grammar, seeds, and mutations of both, without end."""
     while True:
         base = random.choice(seeds) if seeds and random.random() < 0.5 else target.generate(random)
         yield base
-        yield another(target, base, seeds, random)
+        yield mutate_input(target, base, seeds, random)
 
 
-def another(target: Target, data: bytes, others: Sequence[bytes], random: Random) -> bytes:
-    """Return an input made of one that is known, or one by grammar, which is right more often."""
+def mutate_input(target: Target, data: bytes, others: Sequence[bytes], random: Random) -> bytes:
+    """Mutate an input, or return one by grammar, which is valid more often."""
     if random.random() < 0.3:
         return target.generate(random)
     other = random.choice(others) if others and random.random() < 0.5 else target.generate(random)

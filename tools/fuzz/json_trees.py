@@ -1,4 +1,4 @@
-"""Mutations and reductions of JSON and of what says the same in other bytes, value by value."""
+"""Mutations and reductions of JSON and msgpack, value by value."""
 
 from __future__ import annotations
 
@@ -24,26 +24,26 @@ _SIMPLEST: tuple[Any, ...] = (0, "a", [])
 
 @dataclass(frozen=True)
 class Notation:
-    """How bytes are read as values, None where they are none, and values written as bytes."""
+    """Notation of values: a reader that returns None for invalid bytes, and a writer."""
 
     read: Callable[[bytes], Any]
     write: Callable[[Any], bytes]
 
 
 def mutator(vocabulary: tuple[str, ...], notation: Notation) -> Callable[[bytes, bytes, Random], bytes]:
-    """Return the mutation of a format that consists of values."""
+    """Return the mutation function of a format in a notation."""
 
     def mutate(data: bytes, other: bytes, random: Random) -> bytes:
         tree = notation.read(data)
         if not isinstance(tree, (dict, list)) or random.random() < 0.1:
             return bytes_mutation.mutate(data, other, random)
         if isinstance(tree, dict) and random.random() < 0.95:
-            tree.pop("sha256", None)  # or it would be all that is looked at
+            tree.pop("sha256", None)  # a wrong hash would hide all other mutations
         donor = notation.read(other) if random.random() < 0.3 else tree
         try:
             for _ in range(random.choice((1, 1, 1, 2, 3, 6))):
                 _mutate(tree, donor, vocabulary, random)
-        except RecursionError:  # what is deep already cannot be copied
+        except RecursionError:  # deep values cannot be copied
             pass
         return notation.write(tree)
 
@@ -55,24 +55,24 @@ def _mutate(tree: Any, donor: Any, vocabulary: tuple[str, ...], random: Random) 
     if not places or len(places) > MAX_VALUES:
         return
     owner, key = random.choice(places)
-    value, what = owner[key], random.randrange(9)
-    if what == 0:
+    value, kind = owner[key], random.randrange(9)
+    if kind == 0:
         del owner[key]
-    elif what == 1 and isinstance(owner, list):
+    elif kind == 1 and isinstance(owner, list):
         owner[key:key] = [copy.deepcopy(value)] * random.choice((1, 1, 2, 30))
-    elif what == 2:
+    elif kind == 2:
         other, place = random.choice(places)
         owner[key], other[place] = copy.deepcopy(other[place]), copy.deepcopy(value)
-    elif what == 3:
+    elif kind == 3:
         found = list(_places(donor))
         if found:
             other, place = random.choice(found)
             owner[key] = copy.deepcopy(other[place])
-    elif what == 4:
+    elif kind == 4:
         for _ in range(random.choice((1, 2, 500))):
             value = [value] if random.random() < 0.8 else {"expression": value}
         owner[key] = value
-    elif what == 5 and isinstance(owner, dict):
+    elif kind == 5 and isinstance(owner, dict):
         owner[random.choice((*vocabulary, *values.NAMES))] = owner.pop(key)
     elif isinstance(value, str):
         owner[key] = random.choice((*vocabulary, *vocabulary, *values.NAMES, *_VALUES))
@@ -128,7 +128,7 @@ MSGPACK = Notation(_unpacked, _packed)
 
 
 def reducer(notation: Notation) -> Callable[[bytes], Iterator[bytes]]:
-    """Return what yields inputs with a value less, or with a simpler one in its place."""
+    """Return a function that yields inputs with one value removed or simplified."""
 
     def reductions(data: bytes) -> Iterator[bytes]:
         tree = notation.read(data)

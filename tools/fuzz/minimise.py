@@ -1,4 +1,4 @@
-"""Smaller inputs that fail in the same way."""
+"""Minimisation of failing inputs."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from .targets import Target
 
 
 def minimise(data: bytes, target: Target, fails: Callable[[bytes], bool], seconds: float = 60.0) -> bytes:
-    """Return an input of which nothing can be left out, or as far as one comes in some seconds."""
+    """Return a failing input from which nothing can be removed, or the smallest one found in time."""
     end = time.monotonic() + seconds
     smaller = True
     while smaller and time.monotonic() < end:
@@ -28,7 +28,7 @@ def minimise(data: bytes, target: Target, fails: Callable[[bytes], bool], second
 
 
 def _chunks(data: bytes) -> Iterator[bytes]:
-    """Yield inputs with a run of bytes less, long ones first (delta debugging)."""
+    """Yield inputs without a run of bytes, long runs first (delta debugging)."""
     size = len(data) // 2
     while size >= (1 if len(data) <= 2000 else 16):
         for at in range(0, len(data), size):

@@ -1,7 +1,7 @@
-"""Files that others read and Kineverse refuses: ``PYTHONPATH=tools python -m fuzz.peers --minutes 5``.
+"""Files that other parsers read and Kineverse refuses: ``PYTHONPATH=tools python -m fuzz.peers --minutes 5``.
 
-A refusal is excused by one of six reasons, see ``EXCUSES``. A peer reads a file if it gives a model whose
-poses are finite, and not beyond 1e50, of all that the file says: joints that it drops may have any.
+A refusal is excused by one of six reasons, see ``EXCUSES``. A peer reads a file if it returns a model with
+finite poses of at most 1e50; joints that it drops may have any numbers.
 """
 
 from __future__ import annotations
@@ -28,7 +28,7 @@ from kineverse.formats.xml_values import LARGEST
 
 from .inputs import inputs
 from .targets import TARGETS, Target
-from .worker import place
+from .worker import make_input_folder
 
 EXCUSES = {
     "entities": re.compile("document types and entities|undefined entity"),
@@ -38,19 +38,19 @@ EXCUSES = {
     "XML": re.compile("not well-formed XML|cannot be decoded"),
     "no link": re.compile("has no <link>"),
 }
-"""Why a file may be refused though others read it, by what the error says."""
+"""Patterns of error messages with which a file may be refused although other parsers read it."""
 
 _MESH = re.compile(rb"<mesh\b[^<>]*/>")
-"""MuJoCo opens the files of meshes; without them it would refuse."""
+"""Meshes of a URDF, whose files MuJoCo would open."""
 
 _TOO_LARGE = re.compile("has a number beyond|has '[-+]?(inf|nan)")
-"""Numbers that nobody can compute with; others may drop the joint that has them."""
+"""Errors for numbers that are too large; other parsers may drop the joint that has them."""
 
 _PARTICULARS = re.compile(r'line [0-9]+|"[^"]*"|[-+.0-9e]{3,}')
 
 
-def reader_of(target: str, data: bytes) -> str:
-    """Return who of the others reads a file; empty if nobody does."""
+def find_peer(target: str, data: bytes) -> str:
+    """Return the name of a peer that reads a file; empty if there is none."""
     if target == "urdf" and _read_by_pinocchio(data):
         return "pinocchio"
     if target in ("urdf", "mjcf") and _read_by_mujoco(data):
@@ -58,12 +58,12 @@ def reader_of(target: str, data: bytes) -> str:
     return ""
 
 
-def refusal(target: Target, data: bytes, folder: Path) -> str:
-    """Return what an error says that is not excused; empty if the file is read."""
+def unexcused_error(target: Target, data: bytes, folder: Path) -> str:
+    """Return the message of an error that is not excused; empty if the file is read."""
     try:
         model = kv.Model()
         with model.edit() as edit:
-            # As kv.load does: what cannot be followed is kept as a constraint.
+            # As in kv.load, unsolvable loops stay constraints.
             closures = LoopClosures(edit, edit.model, "input", "equality", "solve")
             for tag, operation in target.operations(data, folder, None):
                 list(closures.apply(tag, operation))
@@ -76,34 +76,37 @@ def refusal(target: Target, data: bytes, folder: Path) -> str:
 
 
 def _read_by_pinocchio(data: bytes) -> bool:
+    """Return True if pinocchio reads a file."""
     try:
         model = pinocchio.buildModelFromXML(data.decode())
-        at = model.createData()
-        pinocchio.forwardKinematics(model, at, pinocchio.neutral(model))
+        state = model.createData()
+        pinocchio.forwardKinematics(model, state, pinocchio.neutral(model))
     except (ValueError, RuntimeError, IndexError):
         return False
-    placed = [*model.jointPlacements, *at.oMi, *(frame.placement for frame in model.frames)]
-    return all(_is_sound(pose.homogeneous) for pose in placed)
+    poses = [*model.jointPlacements, *state.oMi, *(frame.placement for frame in model.frames)]
+    return all(_is_bounded(pose.homogeneous) for pose in poses)
 
 
 def _read_by_mujoco(data: bytes) -> bool:
+    """Return True if MuJoCo reads a file."""
     try:
         model = mujoco.MjModel.from_xml_string(_MESH.sub(b'<sphere radius="1"/>', data).decode())
-        at = mujoco.MjData(model)
-        mujoco.mj_kinematics(model, at)
+        state = mujoco.MjData(model)
+        mujoco.mj_kinematics(model, state)
     except (ValueError, RuntimeError, mujoco.FatalError):
         return False
     names = ("body_pos", "body_quat", "jnt_pos", "jnt_axis", "qpos0", "site_pos", "site_quat")
-    return all(map(_is_sound, (at.xpos, at.xmat, *(getattr(model, name) for name in names))))
+    return all(map(_is_bounded, (state.xpos, state.xmat, *(getattr(model, name) for name in names))))
 
 
-def _is_sound(values: Any) -> bool:
+def _is_bounded(values: Any) -> bool:
+    """Return True if all values are finite and not too large."""
     return bool((np.abs(values) <= LARGEST).all())
 
 
 @contextmanager
 def quiet() -> Iterator[None]:
-    """Send what the others print nowhere."""
+    """Suppress the output of the peers."""
     sys.stdout.flush()
     kept = os.dup(2)
     nowhere = os.open(os.devnull, os.O_WRONLY)
@@ -117,18 +120,18 @@ def quiet() -> Iterator[None]:
 
 
 def compare(target: Target, random: Random, folder: Path, end: float) -> tuple[int, int, dict[str, bytes]]:
-    """Return how many inputs were tried, how many of them others read, and refusals with an input."""
+    """Return the number of inputs, the number that a peer reads, and an input for each kind of refusal."""
     tried, read, found = 0, 0, {}
     for data in inputs(target, target.seeds(), random):
         if time.monotonic() > end:
             break
         tried += 1
         with quiet():
-            by = reader_of(target.name, data)
+            by = find_peer(target.name, data)
         if not by:
             continue
         read += 1
-        text = refusal(target, data, folder)
+        text = unexcused_error(target, data, folder)
         if text:
             kind = f"{by}: {_PARTICULARS.sub('…', text)[:110]}"
             found[kind] = min(found.get(kind, data), data, key=len)
@@ -136,7 +139,7 @@ def compare(target: Target, random: Random, folder: Path, end: float) -> tuple[i
 
 
 def main() -> int:
-    """Compare, print, and return how many kinds of refusals were found."""
+    """Compare the readers, print the results, and return the number of kinds of refusals."""
     parser = argparse.ArgumentParser(prog="python -m fuzz.peers", description=__doc__)
     parser.add_argument("--target", choices=("urdf", "mjcf"), action="append", help="a format (both)")
     parser.add_argument("--minutes", type=float, default=5.0, help="how long, for all together (5)")
@@ -148,7 +151,7 @@ def main() -> int:
     for name in names:
         with tempfile.TemporaryDirectory() as top:
             end = time.monotonic() + 60 * given.minutes / len(names)
-            tried, read, found = compare(TARGETS[name], Random(given.seed), place(Path(top)), end)
+            tried, read, found = compare(TARGETS[name], Random(given.seed), make_input_folder(Path(top)), end)
         print(f"{name}: {tried} inputs, {read} read by others, {len(found)} kinds of refusals")
         for kind, data in found.items():
             print(f"  {kind}\n    {data[:600]!r}")

@@ -1,4 +1,4 @@
-"""Operations that ask a model this and that, and documents of what they did."""
+"""Random operations that read from a model, and documents of their traces."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ _NAMES = (*FRAMES, "n", "e", "t", "c", "p0/c", "p0/d")
 
 @dataclass(frozen=True)
 class Setting:
-    """A parameter that is a record, with others inside."""
+    """Parameter of an operation that is a record with nested values."""
 
     number: float
     pose: kv.model.Pose
@@ -35,21 +35,21 @@ class Setting:
 
 @dataclass(frozen=True)
 class Rate(kv.Operation):
-    """Says how a coordinate moves, or of what it is made."""
+    """Operation that writes the rate or the expression of a coordinate."""
 
     coordinate: kv.Symbol
     rate: Any
 
     def apply(self, model: ReadRecorder) -> kv.model.Writes:
-        """Write that."""
+        """Write the rate."""
         return kv.model.Writes(rates={self.coordinate: self.rate})
 
 
 @dataclass(frozen=True)
 class Program(kv.Operation):
-    """Asks, computes with the answers, and writes what came out.
+    """Operation that reads from a model, computes with the results, and writes them.
 
-    ``steps`` are names of :data:`STEPS`, each with two numbers that choose among names and earlier results.
+    ``steps`` are names of :data:`STEPS`, each with two numbers that choose names and earlier results.
     """
 
     name: str
@@ -70,7 +70,7 @@ class Program(kv.Operation):
 
 
 class _Work:
-    """What a program has found so far."""
+    """Results of a program so far."""
 
     def __init__(self, model: ReadRecorder) -> None:
         self.model = model
@@ -171,7 +171,7 @@ STEPS: dict[str, Step] = {
 
 
 def base(random: Random) -> list[kv.Operation]:
-    """Return operations for others to read from; the same names with other values for another seed."""
+    """Return operations for programs to read from; another seed gives other values of the same names."""
     a, b, x = SYMBOLS
     number = round(random.uniform(-1, 1), 3)
     pose = kv.model.Pose.from_matrix(kv.translation(number, 0, 1) @ kv.rotation_x(number))
@@ -204,7 +204,7 @@ def base(random: Random) -> list[kv.Operation]:
 
 
 def program(random: Random, name: str) -> Program:
-    """Return a program of some steps."""
+    """Return a random program."""
     steps = [(random.choice(list(STEPS)), random.randrange(12), random.randrange(12)) for _ in range(6)]
     pose = kv.model.Pose.from_matrix(kv.translation(1, 2, 3))
     inside = random.choice(((1, "a"), ({"k": (1.0, None)},), (pose, SYMBOLS[1]), (float("inf"), 1 << 80)))
@@ -212,20 +212,20 @@ def program(random: Random, name: str) -> Program:
 
 
 def model(random: Random) -> kv.Model:
-    """Return a model of what could be applied of operations and programs."""
+    """Return a model of all base operations and programs that can be applied."""
     result = kv.Model()
     programs: list[kv.Operation] = [program(random, f"p{i}") for i in range(random.choice((1, 2, 3)))]
     for operation in [*base(random), *programs]:
         try:
             with result.edit() as edit:
                 edit.apply(operation)
-        except kv.KineverseError:  # it asked for what is not there
+        except kv.KineverseError:  # it reads a name that does not exist
             continue
     return result
 
 
 def document(random: Random) -> bytes:
-    """Return such a model as a document, without the hash that forbids to change it."""
+    """Return a random model as a document, without its hash, so that it can be changed."""
     tree = json.loads(to_json(model(random)))
     del tree["sha256"]
     return json.dumps(tree).encode()

@@ -1,4 +1,4 @@
-"""The formats whose readers are fuzzed."""
+"""Formats whose readers are fuzzed."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from random import Random
 
-import mujoco  # noqa: F401  - it looks about when it is imported, so before anybody watches
+import mujoco  # noqa: F401  - its import opens files, so it comes before the files are watched
 
 import kineverse as kv
 from kineverse import gallery
@@ -28,33 +28,33 @@ from .grammars import document, mjcf, sdf, urdf
 SEEDS = Path(__file__).parent / "seeds"
 DATA = Path(__file__).resolve().parents[3] / "shared" / "data"
 MAX_SEED = 20_000
-"""Larger files [byte] make slow seeds, and have nothing in them that smaller ones have not."""
+"""Size [byte] of the largest seeds; larger files are slow and contain nothing new."""
 
 Operations = Iterable[tuple[str | None, kv.Operation]]
 
 
 @dataclass(frozen=True)
 class Target:
-    """A format: its reader, and where inputs for that come from.
+    """Format with its reader and the sources of its inputs.
 
     Attributes
     ----------
     suffix
-        What the names of its files end with.
+        Suffix of its files.
     operations
-        The reader: what a text in a folder describes, below a prefix.
+        Reader that returns the operations of a text in a folder, below a prefix.
     generate
-        Returns an input by grammar, right or wrong.
+        Returns an input by grammar, valid or invalid.
     mutate
-        Returns another input, made of one and of parts of a second one.
+        Mutates an input with parts of a second one.
     reduce
-        Yields smaller inputs with the structure of the format, for minimising.
+        Yields smaller inputs with the structure of the format, for minimisation.
     finite
-        Whether poses have to be finite; where expressions are free, they may be what they like.
+        True if poses have to be finite; not in formats with arbitrary expressions.
     examples
-        Returns further inputs to begin a search with.
+        Returns further seeds.
     mark
-        What tells its files from others of that suffix.
+        Text that all of its files contain, and other files of that suffix do not.
     """
 
     name: str
@@ -68,7 +68,7 @@ class Target:
     mark: bytes = b""
 
     def seeds(self) -> list[bytes]:
-        """Return the inputs to begin with: written for it, small files of the data beside, and examples."""
+        """Return the seeds: own inputs, small files of the shared data, and examples."""
         own = sorted(SEEDS.glob(f"*{self.suffix}"))
         found = sorted(DATA.rglob(f"*{self.suffix}")) if DATA.is_dir() else []
         small = [path for path in found if path.is_file() and path.stat().st_size <= MAX_SEED]
@@ -76,7 +76,7 @@ class Target:
         return [data for data in read if self.mark in data] + self.examples()
 
     def own_seeds(self) -> list[bytes]:
-        """Return the inputs that were written for it."""
+        """Return the inputs that were written for the format."""
         return [path.read_bytes() for path in sorted(SEEDS.glob(f"*{self.suffix}"))]
 
 
@@ -108,12 +108,12 @@ def _in_msgpack(data: bytes) -> bytes:
 
 
 def _examples() -> list[bytes]:
-    """Return documents of what programs did, and of scenes."""
+    """Return documents of programs and of scenes."""
     return [programs.document(Random(seed)) for seed in range(40)] + _scenes()
 
 
 def _scenes() -> list[bytes]:
-    """Return the scenes of the gallery as documents, without the hash that forbids to change them."""
+    """Return the scenes of the gallery as documents, without their hashes, so that they can be changed."""
     found = []
     for name in gallery.names():
         model = kv.Model()

@@ -1,4 +1,4 @@
-"""Numbers and names that readers may not expect."""
+"""Unusual numbers and names."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ EXTREME = (
     ),
     *("9" * 30, "9" * 300, "0." + "3" * 60),
 )
-"""Finite numbers, of which some have no meaning."""
+"""Finite numbers, some of which are too large or too small."""
 
 MALFORMED = (
     *words(
@@ -44,7 +44,7 @@ NAMES = (
 
 
 def number(random: Random) -> str:
-    """Return the text of a number, mostly of a good one."""
+    """Return the text of a number, mostly of an ordinary one."""
     chance = random.random()
     if chance < 0.92:
         return random.choice((f"{random.uniform(-2, 2):.3g}", str(random.randint(-3, 3))))
@@ -52,12 +52,12 @@ def number(random: Random) -> str:
 
 
 def numbers(random: Random, count: int) -> str:
-    """Return the texts of so many numbers, now and then of a few more or less."""
+    """Return the text of several numbers, rarely of a few more or less."""
     if random.random() < 0.01:
         count = random.choice((0, 1, count - 1, count + 1, 40))
     return " ".join(number(random) for _ in range(count))
 
 
 def name(random: Random, usual: tuple[str, ...] = ("a", "b", "c", "d")) -> str:
-    """Return a name, mostly one of the usual."""
+    """Return a name, mostly a usual one."""
     return random.choice(usual if random.random() < 0.95 else NAMES)

@@ -1,7 +1,7 @@
-"""A process that feeds a reader until it is stopped, or dies of an input: the search guided by coverage.
+"""Coverage-guided search in one process, until it is stopped or an input kills it.
 
 ``python -m fuzz.worker --target urdf --folder build/fuzz/urdf --seconds 300`` searches.
-With ``--replay FILE`` it looks at one input and says what is wrong with it; it returns 1 if anything is.
+With ``--replay FILE`` it checks one input and prints the violated invariant; it returns 1 if there is one.
 """
 
 from __future__ import annotations
@@ -18,12 +18,13 @@ from random import Random
 MAX_LENGTH = 60_000
 MAX_SPACE = 6 << 30
 MAX_RESIDENT = 2048
-"""[MiB]; an input may take half of that, see :mod:`.law`."""
+"""Memory limit [MiB]; an input may take half of it, see :mod:`.invariants`."""
 HANG = 20
-"""[s] of wall clock, after which an input counts as a hang; :mod:`.law` complains of 5 s of work."""
+"""Wall-clock time [s] after which an input counts as a hang; :mod:`.invariants` allows 5 s of CPU time."""
 
 
 def main() -> int:
+    """Search, or check one input."""
     parser = argparse.ArgumentParser(prog="python -m fuzz.worker", description=__doc__)
     parser.add_argument("--target", required=True)
     parser.add_argument("--folder", type=Path, default=None)
@@ -40,45 +41,47 @@ def main() -> int:
 
 
 def _replay(name: str, path: Path) -> int:
-    from .law import check
+    """Check one input."""
+    from .check_options import choose_options
+    from .invariants import check
     from .targets import TARGETS
-    from .ways import way_of
 
     data = path.read_bytes()
     with tempfile.TemporaryDirectory() as folder:
-        finding = check(TARGETS[name], data, place(Path(folder)), way=way_of(data))
+        finding = check(TARGETS[name], data, make_input_folder(Path(folder)), options=choose_options(data))
     if finding is not None:
         sys.stdout.write(f"{finding.signature}\n\n{finding.detail}\n")
     return finding is not None
 
 
 def _search(name: str, folder: Path, seconds: int, seed: int) -> None:
+    """Run libFuzzer on a target."""
     import atheris
 
     with atheris.instrument_imports(include=["kineverse.formats"]):
         from .targets import TARGETS
-    from .inputs import another
-    from .law import Tally, check
-    from .records import Records
-    from .ways import way_of
+    from .check_options import choose_options
+    from .findings import FindingStore
+    from .inputs import mutate_input
+    from .invariants import OutcomeCounts, check
 
-    target, records, tally = TARGETS[name], Records(folder / "findings"), Tally()
-    beside = place(Path(tempfile.mkdtemp(prefix="fuzz-")))
+    target, records, counts = TARGETS[name], FindingStore(folder / "findings"), OutcomeCounts()
+    beside = make_input_folder(Path(tempfile.mkdtemp(prefix="fuzz-")))
     others = target.seeds()
     status = folder / "status.json"
 
     def one(data: bytes) -> None:
-        finding = check(target, data, beside, tally, way_of(data))
+        finding = check(target, data, beside, counts, choose_options(data))
         if finding is not None and records.add(finding, data):
             sys.stderr.write(f"FOUND {finding.signature}\n")
-        if (tally.models + tally.errors) % 100 == 0:
-            status.write_text(json.dumps({"models": tally.models, "errors": tally.errors}))
+        if (counts.models + counts.errors) % 100 == 0:
+            status.write_text(json.dumps({"models": counts.models, "errors": counts.errors}))
 
     def mutate(data: bytes, max_size: int, chance: int) -> bytes:
         random = Random(chance)
         if random.random() < 0.1:
             return bytes(atheris.Mutate(data, max_size))
-        return another(target, data, others, random)[:max_size]
+        return mutate_input(target, data, others, random)[:max_size]
 
     corpus = folder / "corpus"
     corpus.mkdir(parents=True, exist_ok=True)
@@ -102,8 +105,8 @@ def _search(name: str, folder: Path, seconds: int, seed: int) -> None:
     atheris.Fuzz()
 
 
-def place(folder: Path) -> Path:
-    """Return a folder with models in it that others may include."""
+def make_input_folder(folder: Path) -> Path:
+    """Return a folder for inputs, with models that they may include."""
     folder = folder.resolve() / "inputs"
     part = folder / "part"
     part.mkdir(parents=True)

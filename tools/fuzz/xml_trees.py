@@ -16,7 +16,7 @@ MAX_ELEMENTS = 1500
 
 @dataclass(frozen=True)
 class Vocabulary:
-    """What elements and attributes of a format are called, and words that mean something in it."""
+    """Names of elements and attributes of a format, and words with a meaning in it."""
 
     tags: tuple[str, ...]
     attributes: tuple[str, ...]
@@ -24,7 +24,7 @@ class Vocabulary:
 
 
 def mutator(vocabulary: Vocabulary) -> Callable[[bytes, bytes, Random], bytes]:
-    """Return the mutation of a format that is XML."""
+    """Return the mutation function of an XML format."""
 
     def mutate(data: bytes, other: bytes, random: Random) -> bytes:
         root = _parsed(data)
@@ -34,7 +34,7 @@ def mutator(vocabulary: Vocabulary) -> Callable[[bytes, bytes, Random], bytes]:
         try:
             for _ in range(random.choice((1, 1, 1, 2, 3, 6))):
                 _mutate(root, donor if donor is not None else root, vocabulary, random)
-        except RecursionError:  # what is deep already cannot be copied
+        except RecursionError:  # deep elements cannot be copied
             pass
         return _text(root)
 
@@ -46,34 +46,34 @@ def _mutate(root: Element, donor: Element, vocabulary: Vocabulary, random: Rando
     if not pairs or len(pairs) > MAX_ELEMENTS:
         return
     parent, element = random.choice(pairs)
-    what = random.randrange(12)
-    if what == 0:
+    kind = random.randrange(12)
+    if kind == 0:
         parent.remove(element)
-    elif what == 1:
+    elif kind == 1:
         for _ in range(random.choice((1, 1, 2, 30))):
             parent.append(copy.deepcopy(element))
-    elif what == 2:
+    elif kind == 2:
         _, element_2 = random.choice(pairs)
         one, two = copy.deepcopy(element), copy.deepcopy(element_2)
         _become(element, two)
         _become(element_2, one)
-    elif what == 3:
+    elif kind == 3:
         new = copy.deepcopy(random.choice(list(donor.iter())))
         parent.insert(random.randint(0, len(parent)), new)
-    elif what == 4:
+    elif kind == 4:
         _become(element, copy.deepcopy(random.choice(list(donor.iter()))))
-    elif what == 5:
+    elif kind == 5:
         for _ in range(random.choice((1, 1, 3, 220))):
             inner = copy.copy(element)
             _become(element, Element(random.choice((element.tag, "model", "a"))))
             element.append(inner)
-    elif what == 6:
+    elif kind == 6:
         element.tag = random.choice(vocabulary.tags)
-    elif what == 7:
+    elif kind == 7:
         ElementTree.SubElement(element, random.choice(vocabulary.tags)).text = _value(
             "", root, vocabulary, random
         )
-    elif what == 8:
+    elif kind == 8:
         key = random.choice(vocabulary.attributes)
         element.set(key, _value("", root, vocabulary, random))
     else:
@@ -94,17 +94,17 @@ def _mutate_value(element: Element, root: Element, vocabulary: Vocabulary, rando
 
 
 def _value(old: str, root: Element, vocabulary: Vocabulary, random: Random) -> str:
-    what = random.randrange(6)
+    kind = random.randrange(6)
     words = old.split()
-    if what <= 1 and words:
+    if kind <= 1 and words:
         words[random.randrange(len(words))] = random.choice(random.choice((values.EXTREME, values.NUMBERS)))
         return " ".join(words)
-    if what == 2:
+    if kind == 2:
         return values.numbers(random, random.choice((1, 3, 4, 6, 7)))
-    if what == 3:
+    if kind == 3:
         found = [v for e in root.iter() for v in (*e.attrib.values(), (e.text or "").strip())]
         return random.choice(found)
-    if what == 4:
+    if kind == 4:
         return random.choice(values.NAMES)
     return random.choice(vocabulary.words)
 
@@ -117,7 +117,7 @@ def _become(element: Element, other: Element) -> None:
 
 
 def _parsed(data: bytes) -> Element | None:
-    if b"<!" in data:  # comments are no loss, and document types are refused
+    if b"<!" in data:  # comments and document types are left to mutations of bytes
         return None
     try:
         return ElementTree.fromstring(data)
@@ -133,7 +133,7 @@ def _text(root: Element) -> bytes:
 
 
 def reductions(data: bytes) -> Iterator[bytes]:
-    """Yield inputs with an element, an attribute or a text less."""
+    """Yield inputs with one element, attribute or text removed or simplified."""
     root = _parsed(data)
     if root is None:
         return

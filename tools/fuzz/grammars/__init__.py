@@ -1,1 +1,1 @@
-"""Inputs by grammar, right and wrong: a module for each format."""
+"""Valid and invalid inputs by grammar, a module for each format."""

@@ -41,7 +41,7 @@ _IDENTITY = [1, 0, 0, 0, 0, 1, 0, 0, 0, 0, 1, 0]
 
 
 def generate(random: Random) -> bytes:
-    """Return a document, most of whose nodes and references are right."""
+    """Return a document with mostly valid nodes and references."""
     if random.random() < 0.15:
         return programs.document(random)
     table = Table(random)
@@ -62,7 +62,7 @@ def generate(random: Random) -> bytes:
 
 
 class Table:
-    """A table of nodes that knows their shapes."""
+    """Table of nodes with their shapes."""
 
     def __init__(self, random: Random) -> None:
         self.random = random
@@ -78,19 +78,19 @@ class Table:
         self.one = len(self.nodes) - 3
 
     def add(self, node: list[Any], shape: tuple[int, ...]) -> int:
-        """Put a node at the end and return its place."""
+        """Append a node and return its index."""
         self.nodes.append(node)
         self.shapes.append(shape)
         return len(self.nodes) - 1
 
     def hide(self, first: int) -> None:
-        """Let nodes from a place on not be chosen any more."""
+        """Exclude the nodes from an index on from further choices."""
         self.shapes[first:] = [(-1,)] * (len(self.shapes) - first)
         self.symbols = [found for found in self.symbols if found[0] < first]
         self.carried = [place for place in self.carried if place < first]
 
     def ref(self, shape: tuple[int, ...] | None = ()) -> Any:
-        """Return the place of a node of a shape, now and then a wrong one."""
+        """Return the index of a node of a shape, rarely a wrong one."""
         if self.random.random() < 0.004:
             return self.random.choice(
                 (-1, len(self.nodes), len(self.nodes) + 5, 1 << 70, None, "0", 0.0, True, [0])
@@ -101,13 +101,13 @@ class Table:
         return self.random.choice(fitting[-12:] if self.random.random() < 0.7 else fitting)
 
     def matrix(self, shape: tuple[int, ...]) -> int:
-        """Put an array at the end and return its place."""
+        """Append an array and return its index."""
         count = math.prod(shape)
         refs = [self.ref() if self.random.random() < 0.6 else None for _ in range(count)]
         return self.add(["matrix", list(shape), refs], shape)
 
     def symbol(self, order: int | None = None, path: str | None = None) -> int:
-        """Return the place of a symbol, of an order and a path if they are given."""
+        """Return the index of a symbol, of an order and a path if they are given."""
         places = [s for s, p, o in self.symbols if order in (None, o) and path in (None, p)]
         return self.random.choice(places)
 
@@ -227,7 +227,7 @@ class Table:
 
 
 class _Writer:
-    """Operations over a table."""
+    """Writer of operations over a table."""
 
     def __init__(self, table: Table, random: Random) -> None:
         self.table, self.random = table, random

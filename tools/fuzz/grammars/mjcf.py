@@ -45,7 +45,7 @@ _TETRAHEDRON = "0 0 0  1 0 0  0 1 0  0 0 1"
 
 
 def generate(random: Random) -> bytes:
-    """Return a tree of bodies, and what ties them together."""
+    """Return a tree of bodies with equalities, tendons and actuators."""
     world = _world(random)
     known = _Known(random, world)
     parts = [_compiler(random), _defaults(random), _assets(random), world]
@@ -58,7 +58,7 @@ def generate(random: Random) -> bytes:
 
 
 class _Known:
-    """The names of what has one."""
+    """Names of the elements so far, by kind."""
 
     def __init__(self, random: Random, text: str) -> None:
         self._random = random
@@ -66,7 +66,7 @@ class _Known:
         self._names["joint"] = re.findall(r'<joint name="(\w+)" type="(?:hinge|slide)"', text)
 
     def names(self, tag: str, count: int) -> list[str]:
-        """Return so many of them, or as many as there are; now and then one that is none."""
+        """Return several names of a kind, or as many as there are; rarely an unknown one."""
         found = self._names[tag]
         names = self._random.sample(found, min(count, len(found))) or ["a"]
         if self._random.random() < 0.05:
@@ -74,12 +74,12 @@ class _Known:
         return names
 
     def name(self, tag: str) -> str:
-        """Return one of them."""
+        """Return a name of a kind."""
         return self.names(tag, 1)[0]
 
 
 def number(random: Random) -> str:
-    """Return the text of a number, a good one nearly always: there are many in a file."""
+    """Return the text of a number, nearly always an ordinary one, since a file has many."""
     return numbers(random, 1)
 
 
@@ -242,10 +242,10 @@ def _site(random: Random, site: str) -> str:
 
 def _placed(random: Random) -> dict[str, str]:
     given = {"pos": numbers(random, 3)} if random.random() < 0.5 else {}
-    ways = {"quat": 4, "axisangle": 4, "euler": 3, "xyaxes": 6, "zaxis": 3}
+    notations = {"quat": 4, "axisangle": 4, "euler": 3, "xyaxes": 6, "zaxis": 3}
     if random.random() < 0.3:
-        way = random.choice(list(ways))
-        given[way] = numbers(random, ways[way])
+        notation = random.choice(list(notations))
+        given[notation] = numbers(random, notations[notation])
     return given
 
 

@@ -1,4 +1,4 @@
-"""Traces by grammar: questions of every kind, and writes made of their answers."""
+"""Traces by grammar: reads of every kind, and writes of their results."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ _CELL = {
 
 
 class Tracer:
-    """Writes traces of operations; what it adds to the table is not for others to use."""
+    """Writer of traces of operations, whose nodes are not used by other operations."""
 
     def __init__(self, table: Table, random: Random, names: dict[str, list[str]]) -> None:
         self._table, self._random, self._names = table, random, names
@@ -35,7 +35,7 @@ class Tracer:
         Parameters
         ----------
         write
-            Returns writes of what the table has at its end.
+            Function that returns writes of the last nodes of the table.
         """
         first = len(self._table.nodes)
         questions: list[Any] = []
@@ -51,7 +51,7 @@ class Tracer:
         return {"questions": questions, "writes": writes}, cells
 
     def _answer(self, place: int, part: int, shape: tuple[int, ...]) -> None:
-        """Put a part of an answer into the table, with something that is made of it."""
+        """Add a part of an answer to the table, with an expression of it."""
         random, table = self._random, self._table
         steps = random.choice((0, 0, 0, 1, 2, 16))
         path = [[table.symbol(random.choice((1, 1, 2))), random.random() < 0.5] for _ in range(steps)]

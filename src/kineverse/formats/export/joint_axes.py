@@ -16,7 +16,7 @@ import numpy as np
 import numpy.typing as npt
 
 from kineverse.expressions.expression import Expression
-from kineverse.formats.description import IDENTITY_COEFFICIENTS, Coefficients
+from kineverse.formats.description import IDENTITY_COEFFICIENTS, Coefficients, Matrix
 from kineverse.intervals.graph import Term, TermGraph
 from kineverse.lie import rotation_along_z, round_exact, transform, translation
 from kineverse.model.body import Pose, Vector3
@@ -24,7 +24,6 @@ from kineverse.spatial import OneAxisTransform
 
 from .trig_polynomial import NOISE, TooManyTermsError, TrigPolynomial, TrigPolynomialConverter
 
-Matrix: TypeAlias = npt.NDArray[np.float64]
 ZERO_VECTOR: Vector3 = (0.0, 0.0, 0.0)
 
 

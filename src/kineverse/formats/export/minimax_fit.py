@@ -14,9 +14,8 @@ from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
-import numpy.typing as npt
 
-from kineverse.formats.description import Coefficients
+from kineverse.formats.description import Coefficients, Matrix
 from kineverse.intervals.arithmetic import (
     ZERO_INTERVAL,
     RealInterval,
@@ -28,7 +27,6 @@ from kineverse.intervals.arithmetic import (
 )
 from kineverse.intervals.taylor import TaylorSeries, taylor_polynomial, taylor_subtract, taylor_variable
 
-Matrix = npt.NDArray[np.float64]
 SeriesCurve = Callable[[RealInterval], TaylorSeries]
 """Function that returns the Taylor series of a curve over an interval."""
 

@@ -2,16 +2,12 @@
 
 from __future__ import annotations
 
-from typing import TypeAlias
-
 import numpy as np
-import numpy.typing as npt
 
 from kineverse.formats import poses
+from kineverse.formats.description import Matrix
 from kineverse.lie import snap, to_quaternion, to_rpy
 from kineverse.model.body import Vector3
-
-Matrix: TypeAlias = npt.NDArray[np.float64]
 
 ROTATION_TOLERANCE = 1e-13
 """Largest deviation of an entry of a written rotation matrix."""

@@ -1,9 +1,9 @@
 """MJCF documents compiled by MuJoCo.
 
-Of the two things that MuJoCo makes of a file, its ``MjSpec`` still has everything as it was written:
-defaults, frames, six ways to say an orientation, degrees. Its ``MjModel`` has everything resolved, in one
-convention, and is what its kinematics run on. So the description is taken from the ``MjModel``, and the
-``MjSpec`` is asked for the rest: lines, actuators, keys, whether a body states its inertia.
+MuJoCo's ``MjSpec`` of a file keeps its notation: defaults, frames, six notations of an orientation, degrees.
+Its ``MjModel`` has all of it resolved to one convention, with which MuJoCo computes kinematics. So the
+description is taken from the ``MjModel``, and only lines, actuators, keys and explicit inertia from the
+``MjSpec``.
 """
 
 from __future__ import annotations

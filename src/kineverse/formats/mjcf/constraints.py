@@ -2,10 +2,11 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from typing import Literal
 
 import numpy as np
+import numpy.typing as npt
 
 from kineverse.formats.names import NameFaultHandler, UniqueNames
 from kineverse.formats.poses import IDENTITY, compose_poses, invert_pose
@@ -101,36 +102,27 @@ class MjcfConstraints:
     def _joint_coupling(self, number: int) -> MjcfCoupling:
         """Return a joint equality."""
         m = self._model
+        return self._coupling(number, self._bodies.joint_names, m.qpos0[m.jnt_qposadr])
+
+    def _tendon_coupling(self, number: int) -> Iterator[MjcfCoupling]:
+        """Yield a tendon equality, unless one of its tendons is left out."""
+        coupling = self._coupling(number, self._tendon_names, self._model.tendon_length0)
+        if coupling.follower in self._known and (coupling.leader is None or coupling.leader in self._known):
+            yield coupling
+        else:
+            self._remark(self._nodes.get(number), "is left out, as its tendon is.")
+
+    def _coupling(self, number: int, names: Sequence[str], rest: npt.NDArray[np.float64]) -> MjcfCoupling:
+        """Return an equality between two joints or two tendons, with their names and rest values."""
+        m = self._model
         follower, leader = int(m.eq_obj1id[number]), int(m.eq_obj2id[number])
-        rest = [float(m.qpos0[m.jnt_qposadr[joint]]) if joint >= 0 else 0.0 for joint in (follower, leader)]
-        names = self._bodies.joint_names
         return MjcfCoupling(
             self._names[number],
             names[follower],
             names[leader] if leader >= 0 else None,
             self._quartic(number),
-            rest[0],
-            rest[1],
-            self._where(self._nodes.get(number)),
-        )
-
-    def _tendon_coupling(self, number: int) -> Iterator[MjcfCoupling]:
-        """Yield a tendon equality, unless one of its tendons is left out."""
-        m = self._model
-        follower, leader = int(m.eq_obj1id[number]), int(m.eq_obj2id[number])
-        names = self._tendon_names
-        ends = [names[tendon] for tendon in (follower, leader) if tendon >= 0]
-        if any(name not in self._known for name in ends):
-            self._remark(self._nodes.get(number), "is left out, as its tendon is.")
-            return
-        rest = [float(m.tendon_length0[tendon]) if tendon >= 0 else 0.0 for tendon in (follower, leader)]
-        yield MjcfCoupling(
-            self._names[number],
-            ends[0],
-            ends[1] if leader >= 0 else None,
-            self._quartic(number),
-            rest[0],
-            rest[1],
+            float(rest[follower]),
+            float(rest[leader]) if leader >= 0 else 0.0,
             self._where(self._nodes.get(number)),
         )
 

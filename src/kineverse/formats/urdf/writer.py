@@ -15,7 +15,6 @@ from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
-import numpy.typing as npt
 
 from kineverse._gc import no_collection
 from kineverse.articulations.multi_axis import rotation_from_z
@@ -26,6 +25,7 @@ from kineverse.formats.description import (
     BallJointDescription,
     JointDescription,
     LinkDescription,
+    Matrix,
     RobotDescription,
     WrittenFile,
 )
@@ -160,8 +160,6 @@ def _add_inertia(link: Tag, inertia: Inertia) -> None:
     element.add("mass", value=inertia.mass)
     element.add("inertia", **dict(zip(_TENSOR, inertia.tensor, strict=True)))
 
-
-Matrix = npt.NDArray[np.float64]
 
 URDF_CAPABILITIES = FormatCapabilities("URDF")
 LARGEST_FLOAT = sys.float_info.max

@@ -1,22 +1,22 @@
-"""What was found, in a folder: for each signature the smallest input, and what happened."""
+"""Findings in a folder: for each signature the smallest input, and its description."""
 
 from __future__ import annotations
 
 import hashlib
 from pathlib import Path
 
-from .law import Finding
+from .invariants import Finding
 
 
-class Records:
-    """The findings of a target."""
+class FindingStore:
+    """Folder with the findings of a target."""
 
     def __init__(self, folder: Path) -> None:
         self.folder = folder
         folder.mkdir(parents=True, exist_ok=True)
 
     def add(self, finding: Finding, data: bytes) -> bool:
-        """Keep an input if there is no smaller one for the same reason; return whether the reason is new."""
+        """Store an input unless there is a smaller one of its signature; return True for a new signature."""
         key = hashlib.blake2b(finding.signature.encode(), digest_size=6).hexdigest()
         path = self.folder / f"{key}.input"
         new = not path.exists()
@@ -28,7 +28,7 @@ class Records:
         return new
 
     def all(self) -> list[tuple[str, Path]]:
-        """Return signatures and inputs."""
+        """Return all signatures with the paths of their inputs."""
         paths = sorted(self.folder.glob("*.input"))
         return [
             (path.with_suffix(".txt").read_text(encoding="utf-8").partition("\n")[0], path) for path in paths

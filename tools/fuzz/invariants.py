@@ -1,8 +1,8 @@
-"""What holds for every input of a reader, whatever it is.
+"""Invariants of the readers, which hold for every input.
 
-It gives a model that can be used and survives being saved, or one error of our own with a message of bounded
-length. There is no other exception and no warning, it takes no more than some seconds and a gigabyte, and no
-file is opened but those beside the input.
+A reader returns a usable model that is unchanged by saving and loading, or raises one error of Kineverse with
+a message of bounded length. It raises no other exception and no warning, takes at most some seconds and a
+gigabyte, and opens only files in the folder of the input.
 """
 
 from __future__ import annotations
@@ -25,8 +25,8 @@ import numpy as np
 import kineverse as kv
 from kineverse.formats.document import read_operations, to_json
 
-from .edits import edits
-from .ways import Way
+from .check_options import CheckOptions
+from .edits import apply_random_edits
 
 if TYPE_CHECKING:
     from .targets import Target
@@ -35,28 +35,35 @@ MAX_SECONDS = 5.0
 MAX_KILOBYTES = 1 << 20
 MAX_MESSAGE = 2000
 ROUNDING = 1e-6
-MOST_FRAMES = 40
-"""So many poses are evaluated, which is enough to see how they fail."""
+MAX_FRAMES = 40
+"""Number of frames whose poses are evaluated."""
 
 _FILE = re.compile(r"[\w.]+\.(urdf|sdf|xml|json|msgpack|config)[,:]")
-"""What errors of readers begin with."""
+"""Beginning of the error messages of readers."""
 
 _HERE = str(Path(__file__).parent)
 _LIBRARY = str(Path(kv.__file__).parent)
 _OPENING = ("open", "os.listdir", "os.scandir", "os.mkdir", "os.remove", "os.rename")
-_REACHING = ("socket.", "subprocess.", "os.system", "os.exec", "os.posix_spawn", "os.fork", "ctypes.dlopen")
+_EXTERNAL_CALLS = (
+    "socket.",
+    "subprocess.",
+    "os.system",
+    "os.exec",
+    "os.posix_spawn",
+    "os.fork",
+    "ctypes.dlopen",
+)
 
 
-class BrokenError(Exception):
-    """The law does not hold, in a way that raised nothing."""
+class InvariantError(Exception):
+    """A violated invariant that raised no exception by itself."""
 
 
 @dataclass(frozen=True)
 class Finding:
-    """An input for which the law does not hold.
+    """Violation of an invariant by an input.
 
-    ``signature`` is the same for inputs that fail for the same reason, as far as one can tell; ``detail`` is
-    for people.
+    ``signature`` is the same for inputs that fail for the same reason; ``detail`` is a description.
     """
 
     signature: str
@@ -64,30 +71,34 @@ class Finding:
 
 
 @dataclass
-class Tally:
-    """How many inputs gave a model, and how many an error."""
+class OutcomeCounts:
+    """Number of inputs that gave a model, and of those that gave an error."""
 
     models: int = 0
     errors: int = 0
 
 
 def check(
-    target: Target, data: bytes, folder: Path, tally: Tally | None = None, way: Way | None = None
+    target: Target,
+    data: bytes,
+    folder: Path,
+    counts: OutcomeCounts | None = None,
+    options: CheckOptions | None = None,
 ) -> Finding | None:
-    """Return what is wrong with how a target takes an input, looked at in one way; None if nothing is."""
-    way = way or Way()
-    tally = tally or Tally()
+    """Check an input with some options; return the violated invariant, None if all of them hold."""
+    options = options or CheckOptions()
+    counts = counts or OutcomeCounts()
     before, start = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss, time.process_time()
     finding = None
     with _watching(folder) as reached, warnings.catch_warnings():
         warnings.simplefilter("error")
         try:
-            _use(target, _model(target, data, folder, way), way)
-            tally.models += 1
+            _use(target, _model(target, data, folder, options), options)
+            counts.models += 1
         except kv.KineverseError as error:
-            tally.errors += 1
-            finding = _of_message(error)
-        except BrokenError as broken:
+            counts.errors += 1
+            finding = _check_message(error)
+        except InvariantError as broken:
             finding = Finding(f"broken: {str(broken).partition(':')[0]}", str(broken))
         except Exception as error:
             detail = "".join(traceback.format_exception(error)[-12:])
@@ -103,17 +114,17 @@ def check(
     return finding
 
 
-def _model(target: Target, data: bytes, folder: Path, way: Way) -> kv.Model:
-    """Return the model that an input describes."""
+def _model(target: Target, data: bytes, folder: Path, options: CheckOptions) -> kv.Model:
+    """Return the model of an input."""
     try:
-        operations = list(target.operations(data, folder, way.prefix))
+        operations = list(target.operations(data, folder, options.prefix))
     except kv.KineverseError as error:
         if not isinstance(error, kv.errors.FormatError):
-            raise BrokenError(f"an error of another kind, at {_place(error)}: {error!r}") from error
+            raise InvariantError(f"an error of another kind, at {_place(error)}: {error!r}") from error
         if str(error) and not _FILE.match(str(error)):
-            raise BrokenError(f"an error without place, at {_place(error)}: {error}") from error
+            raise InvariantError(f"an error without place, at {_place(error)}: {error}") from error
         raise
-    if not way.loops:
+    if not options.loops:
         operations = [(tag, o) for tag, o in operations if not isinstance(o, kv.CloseLoop)]
     model = kv.Model()
     try:
@@ -121,32 +132,32 @@ def _model(target: Target, data: bytes, folder: Path, way: Way) -> kv.Model:
             for tag, operation in operations:
                 edit.apply(operation, tag)
     except kv.KineverseError as error:
-        # The reader of a description has seen all of it; of a loop it cannot know whether it closes.
+        # A reader refuses everything that cannot be applied, except for loops that cannot be closed.
         if target.finite and not isinstance(operation, kv.CloseLoop):
-            raise BrokenError(f"what was read cannot be applied, at {_place(error)}: {error!r}") from error
+            raise InvariantError(f"what was read cannot be applied, at {_place(error)}: {error!r}") from error
         raise
     return model
 
 
-def _use(target: Target, model: kv.Model, way: Way) -> None:
-    """Do with a model what anybody would do first."""
+def _use(target: Target, model: kv.Model, options: CheckOptions) -> None:
+    """Save, evaluate and edit a model."""
     text, loaded = _saved(model)
     names = [*model.frames, *model.constraints, *model.data, *(s.path for s in model.symbols)]
-    if way.prefix and not all(name.startswith(f"{way.prefix}/") for name in names):
-        raise BrokenError(f"a name without the prefix: {names[:50]}")
+    if options.prefix and not all(name.startswith(f"{options.prefix}/") for name in names):
+        raise InvariantError(f"a name without the prefix: {names[:50]}")
     _evaluate(target, model)
-    if way.seed is None:
+    if options.seed is None:
         return
     try:
-        edits(loaded, way.seed, lambda: _saved(loaded))
+        apply_random_edits(loaded, options.seed, lambda: _saved(loaded))
     except kv.KineverseError as error:
-        raise BrokenError(f"an edit cannot be taken back, at {_place(error)}: {error}") from error
+        raise InvariantError(f"an edit cannot be taken back, at {_place(error)}: {error}") from error
     if to_json(loaded) != text:
-        raise BrokenError("an edit that was refused or taken back left something behind")
+        raise InvariantError("an edit that was refused or taken back left something behind")
 
 
 def _saved(model: kv.Model) -> tuple[str, kv.Model]:
-    """Return the document of a model, and what is loaded from it, whose document is the same."""
+    """Return the document of a model, and the model loaded from it, whose document is the same."""
     try:
         text = to_json(model)
         again = kv.Model()
@@ -154,18 +165,18 @@ def _saved(model: kv.Model) -> tuple[str, kv.Model]:
             for tag, operation in read_operations(text, "saved"):
                 edit.apply(operation, tag)
         if to_json(again) != text:
-            raise BrokenError("saved and loaded, the model is another one")
+            raise InvariantError("saved and loaded, the model is another one")
     except kv.KineverseError as error:
-        raise BrokenError(f"it cannot be saved and loaded, at {_place(error)}: {error}") from error
+        raise InvariantError(f"it cannot be saved and loaded, at {_place(error)}: {error}") from error
     return text, again
 
 
 def _evaluate(target: Target, model: kv.Model) -> None:
-    """Ask for positions, poses, and what is violated."""
+    """Evaluate the positions, poses and violated constraints of a model."""
     state = model.default_state()
     if target.finite and not all(np.isfinite(value) for value in state.values()):
-        raise BrokenError(f"a position is not finite: {state}")
-    names = list(model.frames)[:MOST_FRAMES]
+        raise InvariantError(f"a position is not finite: {state}")
+    names = list(model.frames)[:MAX_FRAMES]
     if not names:
         return
     model.violations(state)
@@ -176,12 +187,13 @@ def _evaluate(target: Target, model: kv.Model) -> None:
         for name, value in zip(names, values, strict=True):
             rotation = value[:3, :3]
             if not np.isfinite(value).all():
-                raise BrokenError(f"a pose is not finite: that of {name[:80]!r} is\n{value}")
+                raise InvariantError(f"a pose is not finite: that of {name[:80]!r} is\n{value}")
             if np.abs(rotation @ rotation.T - np.eye(3)).max() > ROUNDING:
-                raise BrokenError(f"a pose is not rigid: that of {name[:80]!r} is\n{value}")
+                raise InvariantError(f"a pose is not rigid: that of {name[:80]!r} is\n{value}")
 
 
-def _of_message(error: kv.KineverseError) -> Finding | None:
+def _check_message(error: kv.KineverseError) -> Finding | None:
+    """Return a finding for a message that is too long, empty or no text."""
     message = str(error)
     where = f"{type(error).__name__} at {_place(error)}"
     if len(message) >= MAX_MESSAGE:
@@ -196,7 +208,7 @@ def _of_message(error: kv.KineverseError) -> Finding | None:
 
 
 def _place(error: BaseException) -> str:
-    """Return the innermost function of the library that an error came through."""
+    """Return the innermost function of the library in the traceback of an error."""
     frames = traceback.extract_tb(error.__traceback__)
     if isinstance(error, RecursionError):
         frames = traceback.StackSummary.from_list(frames[:40])
@@ -206,20 +218,21 @@ def _place(error: BaseException) -> str:
     return f"{ours[-1].filename[len(_LIBRARY) + 1 :]}:{ours[-1].name}"
 
 
-# An audit hook cannot be taken away again, so there is one, which looks where this points.
+# An audit hook cannot be removed, so there is one, which records for the current watch.
 _watch: tuple[str, list[str]] | None = None
 _hooked = False
 
 
 def _hook(event: str, arguments: tuple[Any, ...]) -> None:
+    """Record file accesses outside of the watched folder, and external calls."""
     if _watch is None:
         return
     folder, reached = _watch
-    if event.startswith(_REACHING):
+    if event.startswith(_EXTERNAL_CALLS):
         reached.append(f"{event} {arguments!r}"[:300])
     elif event in _OPENING and isinstance(arguments[0], (str, bytes)):
         path = os.path.abspath(os.fsdecode(arguments[0]))
-        # Modules are imported when they are needed first, and a traceback shows lines of them.
+        # Modules are imported when they are first needed, and tracebacks read their lines.
         if path in map(os.path.abspath, sys.path):
             return
         if not path.startswith((folder, sys.prefix, sys.base_prefix, _LIBRARY, _HERE)):
@@ -228,7 +241,7 @@ def _hook(event: str, arguments: tuple[Any, ...]) -> None:
 
 @contextmanager
 def _watching(folder: Path) -> Iterator[list[str]]:
-    """Note what is opened meanwhile outside of a folder."""
+    """Record the files that are opened outside of a folder, and external calls."""
     global _watch, _hooked
     if not _hooked:
         sys.addaudithook(_hook)
