@@ -94,7 +94,7 @@ def by_c(solids: list[Solid], poses: Floats) -> tuple[float, Floats]:
     """Return the distance and the normal by C; NaN for what is left to coal."""
     table = ObjectTable(2, np.arange(2, dtype=np.int32), 1 - np.eye(2, dtype=np.uint8))
     for k, solid in enumerate(solids):
-        table.give_solid(k, solid.centre, solid.half, solid.radius, solid.core)
+        table.set_solid(k, solid.centre, solid.half, solid.radius, solid.core)
     broadphase.place_objects(table, poses)
     distances, witnesses = collision_library.measure(table, np.array([[0, 1]], dtype=np.int32), np.inf)
     return float(distances[0]), witnesses[0, 6:]

@@ -7,6 +7,7 @@ All of them derive from :class:`KineverseError`, and also from the corresponding
 from __future__ import annotations
 
 import difflib
+import re
 from collections.abc import Iterable, Mapping
 
 
@@ -82,6 +83,23 @@ def duplicate_value_error(symbol: object) -> DuplicateNameError:
         f"There are two values for '{symbol}', by symbol and by name. "
         f"Instead of {{**state, '{symbol}': ...}} write state.updated({{'{symbol}': ...}})."
     )
+
+
+def summarize_error(error: Exception, advice: bool = True) -> str:
+    """Return the first line of an error's message, without the places in which a file was looked for.
+
+    Parameters
+    ----------
+    error
+        Any exception; without a message, the name of its type is returned.
+    advice
+        Whether to keep the sentence that says which variable to set.
+    """
+    text = str(error).strip()
+    if not advice:
+        text = re.split(r" (?:Looked|Set) ", text, maxsplit=1)[0]
+    first = (text.splitlines() or [type(error).__name__])[0]
+    return re.sub(r" (?:Looked (?:in|for)|It is at):$", "", first).strip()
 
 
 _LONGEST = 100

@@ -37,7 +37,7 @@ class Cloud:
             low, high = points.min(axis=0), points.max(axis=0)
             centre = (low + high) / 2
             radius = np.linalg.norm(points - centre, axis=1).max()
-            self.table.give_solid(k, centre, (high - low) / 2, radius)
+            self.table.set_solid(k, centre, (high - low) / 2, radius)
         self.table.choose_axis()
 
     def random_poses(self, count: int) -> np.ndarray:
@@ -81,7 +81,7 @@ def test_no_pair_is_missed_and_bounds_are_bounds(seed, count, reach, step):
                 assert (i, j) in said
             if (i, j) in said:
                 assert said[i, j] <= distance + 1e-9
-                table.remember(i, j, distance)
+                table.record_distance(i, j, distance)
 
 
 @pytest.mark.compiler
@@ -108,7 +108,7 @@ def test_numpy_and_c_agree(library, seed, count, reach):
         np.testing.assert_allclose(lows, same_lows, atol=1e-12)
         for i, j in pairs[::2].tolist():
             for table in (one.table, other.table):
-                table.remember(i, j, one.distance(i, j))
+                table.record_distance(i, j, one.distance(i, j))
 
 
 def _sorted(pairs, lows):
@@ -131,12 +131,12 @@ def test_carried_bounds_spare_the_measuring():
     """Two discs a metre wide, half a metre apart: boxes and spheres overlap, what was measured does not."""
     table = ObjectTable(2, np.arange(2, dtype=np.int32), 1 - np.eye(2, dtype=np.uint8))
     for k in range(2):
-        table.give_solid(k, np.zeros(3), np.array([1.0, 1.0, 1.0]), 1.8)
+        table.set_solid(k, np.zeros(3), np.array([1.0, 1.0, 1.0]), 1.8)
     poses = table.poses.copy()
     poses[1, 0, 3] = 0.5
     broadphase.place_objects(table, poses)
     assert len(broadphase.find_near_pairs(table, 0.1)[0]) == 1
-    table.remember(0, 1, 0.5)
+    table.record_distance(0, 1, 0.5)
     assert len(broadphase.find_near_pairs(table, 0.1)[0]) == 0
     poses[1, 0, 3] += 0.3
     broadphase.place_objects(table, poses)
@@ -176,7 +176,7 @@ def test_what_stands_is_found_where_it_was_put_last(library):
     for _ in range(3):
         standing = np.arange(2, 12)
         table.poses[standing] = cloud.random_poses(10)
-        table.put(standing)
+        table.update_boxes(standing)
         found, expected = (_sorted(*way(table, 0.3))[0] for way in (library.near, broadphase.find_near_pairs))
         np.testing.assert_array_equal(found, expected)
 

@@ -24,7 +24,7 @@ from kineverse.geometry.decomposition import (
     decompose_all,
     find_hulls,
     hull_cache,
-    listing,
+    list_entries,
     worker,
 )
 from kineverse.geometry.decomposition.accuracy import Polytope, is_closed, measure_accuracy
@@ -94,7 +94,7 @@ def test_every_hull_is_convex(name):
     for hull in made(name)[1].hulls:
         oracle = spatial.ConvexHull(hull)
         assert len(oracle.vertices) == len(hull)
-        assert oracle.volume == pytest.approx(Polytope.of(hull).volume, rel=1e-6)
+        assert oracle.volume == pytest.approx(Polytope.from_points(hull).volume, rel=1e-6)
 
 
 @pytest.mark.parametrize("name", SHAPES)
@@ -157,7 +157,7 @@ def _surface(mesh):
 
 def test_measures_of_an_ell_and_its_hull():
     mesh = _surface(ell())
-    measured = measure_accuracy(mesh, [Polytope.of(mesh.vertices)])
+    measured = measure_accuracy(mesh, [Polytope.from_points(mesh.vertices)])
     # The middle of the slanted face of the hull is 75 mm from the sides of both legs.
     assert 0.073 < measured.excess <= 0.075 + 1e-5
     assert measured.uncovered == 0.0
@@ -167,7 +167,7 @@ def test_measures_of_an_ell_and_its_hull():
 
 def test_measures_of_an_ell_and_one_leg():
     leg = cube((0.2, 0.05, 0.05), (0.1, 0.025, 0.025)).vertices
-    measured = measure_accuracy(_surface(ell()), [Polytope.of(np.array(leg))])
+    measured = measure_accuracy(_surface(ell()), [Polytope.from_points(np.array(leg))])
     assert measured.uncovered == pytest.approx(0.15, abs=1e-5)
     assert measured.excess == 0.0
     assert measured.volume == pytest.approx(0.2 * 0.05 * 0.05)
@@ -175,7 +175,9 @@ def test_measures_of_an_ell_and_one_leg():
 
 @pytest.mark.parametrize("overlap", [0.0, 0.3, 1.0])
 def test_the_volume_of_a_union_counts_what_overlaps_once(overlap):
-    cubes = [Polytope.of(np.array(cube((1, 1, 1), (k * (1 - overlap), 0, 0)).vertices)) for k in range(2)]
+    cubes = [
+        Polytope.from_points(np.array(cube((1, 1, 1), (k * (1 - overlap), 0, 0)).vertices)) for k in range(2)
+    ]
     measured = measure_accuracy(_surface(cube((1, 1, 1))), cubes)
     assert measured.volume == pytest.approx(2 - overlap, rel=1e-2)
 
@@ -190,7 +192,7 @@ def test_a_surface_is_closed_if_every_edge_is_passed_both_ways():
 
 
 def test_hulls_are_joined_where_that_adds_least():
-    row = [Polytope.of(np.array(cube((1, 1, 1), (x, 0, 0)).vertices)) for x in (0, 1, 2, 10)]
+    row = [Polytope.from_points(np.array(cube((1, 1, 1), (x, 0, 0)).vertices)) for x in (0, 1, 2, 10)]
     joined = reduce_hulls(row, 2)
     assert sorted(round(one.volume, 9) for one in joined) == [1.0, 3.0]
     assert len(reduce_hulls(row, 1)) == 1
@@ -200,9 +202,9 @@ def test_hulls_are_joined_where_that_adds_least():
 def test_hulls_inside_of_others_and_splinters_are_left_out():
     large, small = (np.array(cube((e, e, e)).vertices) for e in (1.0, 0.5))
     line = np.outer(np.arange(4.0), [1, 0, 0])
-    (one,) = clean_hulls([small, line, large], Polytope.of(2 * large))
+    (one,) = clean_hulls([small, line, large], Polytope.from_points(2 * large))
     assert one.volume == pytest.approx(1.0)
-    (one,) = clean_hulls([small, line, 1.1 * large], Polytope.of(large))
+    (one,) = clean_hulls([small, line, 1.1 * large], Polytope.from_points(large))
     np.testing.assert_allclose(np.abs(one.points), 0.5, atol=1e-6)
 
 
@@ -211,9 +213,9 @@ def test_a_part_inside_out_is_a_hole_and_stays_with_what_is_around_it(file):
     hole.invert()
     hollow = clean_mesh(file(trimesh.util.concatenate([cube(), hole]), "hollow.stl"))
     assert hollow.parts.max() == 0
-    assert measure_accuracy(hollow.faces, [Polytope.of(hollow.faces.vertices)]).mesh_volume == pytest.approx(
-        0.1**3 - 0.05**3
-    )
+    assert measure_accuracy(
+        hollow.faces, [Polytope.from_points(hollow.faces.vertices)]
+    ).mesh_volume == pytest.approx(0.1**3 - 0.05**3)
     assert clean_mesh(file(overlapping(), "two.stl")).parts.max() == 1
     inverted = overlapping()
     inverted.invert()
@@ -288,12 +290,15 @@ def test_the_cache_is_bounded_listed_and_cleared(file, plain, monkeypatch):
     small, large = file(cube(), "small.stl"), file(cube((1, 1, 1)), "large.stl")
     decompose(small)
     decompose(large)
-    assert [os.path.basename(kept.decomposition.name) for kept in listing()] == ["large.stl", "small.stl"]
-    monkeypatch.setattr(hull_cache, "MAXIMUM_BYTES", max(kept.bytes for kept in listing()) + 100)
+    assert [os.path.basename(kept.decomposition.name) for kept in list_entries()] == [
+        "large.stl",
+        "small.stl",
+    ]
+    monkeypatch.setattr(hull_cache, "MAXIMUM_BYTES", max(kept.bytes for kept in list_entries()) + 100)
     decompose(file(finger(), "finger.stl"))
-    assert [os.path.basename(kept.decomposition.name) for kept in listing()] == ["finger.stl"]
+    assert [os.path.basename(kept.decomposition.name) for kept in list_entries()] == ["finger.stl"]
     assert clear() == 1
-    assert listing() == []
+    assert list_entries() == []
 
 
 # CoACD goes wrong.

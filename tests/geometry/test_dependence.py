@@ -14,8 +14,8 @@ from kineverse.model.body import Box
 def test_opening_the_fridge_moves_its_door_and_its_handle_and_nothing_else():
     scene = Scene(kv.load("kitchen"))
     wanted = ("kitchen/fridge_door", "kitchen/fridge_door_handle")
-    assert scene.moved_by("kitchen/fridge_door") == wanted
-    assert scene.moved_by(kv.velocity("kitchen/fridge_door")) == wanted
+    assert scene.bodies_moved_by("kitchen/fridge_door") == wanted
+    assert scene.bodies_moved_by(kv.velocity("kitchen/fridge_door")) == wanted
     pairs = scene.pairs_affected_by("kitchen/fridge_door")
     assert all(set(pair) & set(wanted) for pair in pairs)
     assert ("kitchen/fridge_door", "kitchen/fridge_door_handle") not in pairs
@@ -34,8 +34,8 @@ def test_wheels_move_the_whole_robot(base):
         edit.add_frame("wall", "world", kv.translation(2, 0, 0), body(Box((0.1, 3, 3))))
     scene = Scene(model)
     for speed in model.speeds:
-        assert scene.moved_by(speed) == (("arm",) if speed.path == "arm" else ("chassis", "arm"))
-    assert scene.moved_by(["arm"]) == ("arm",)
+        assert scene.bodies_moved_by(speed) == (("arm",) if speed.path == "arm" else ("chassis", "arm"))
+    assert scene.bodies_moved_by(["arm"]) == ("arm",)
     assert set(scene.pairs_affected_by(next(s for s in model.speeds if s.path != "arm"))) == {
         ("chassis", "wall"),
         ("arm", "wall"),
@@ -46,10 +46,10 @@ def test_the_crank_of_a_loop_moves_what_follows_it():
     model = kv.load("articulations/four_bar")
     scene = Scene(model)
     (crank,) = model.degrees_of_freedom
-    moved = set(scene.moved_by(crank))
+    moved = set(scene.bodies_moved_by(crank))
     assert len(moved) >= 3
     for follower in model.rates.dependent:
-        assert set(scene.moved_by(follower)) <= moved
+        assert set(scene.bodies_moved_by(follower)) <= moved
 
 
 def test_only_distances_that_are_listed_change():
@@ -83,6 +83,6 @@ def _pair(known, names):
 def test_a_symbol_that_nobody_knows_is_an_error():
     scene = Scene(kv.load("kitchen"))
     with pytest.raises(kv.errors.UnknownNameError, match="kitchen/fridge_door"):
-        scene.moved_by("kitchen/fridge_dor")
+        scene.bodies_moved_by("kitchen/fridge_dor")
     with pytest.raises(kv.errors.UnknownNameError, match="nobody"):
         scene.pairs_affected_by(kv.position("nobody"))

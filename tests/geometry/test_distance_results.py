@@ -18,18 +18,18 @@ def scene():
 
 
 def test_it_is_a_sequence_of_pairs(scene):
-    found = scene.within(0.5)
+    found = scene.pairs_within(0.5)
     assert isinstance(found, DistanceResults)
     assert len(found) == len(list(found)) > 5
     assert all(isinstance(pair, DistanceResult) for pair in found[1:4])
     assert found[-1].distance == found.distances[-1]
     with pytest.raises(IndexError):
         found[len(found)]
-    assert not scene.within(0.0)[:0]
+    assert not scene.pairs_within(0.0)[:0]
 
 
 def test_its_arrays_and_its_entries_say_the_same(scene):
-    found = scene.within(0.5)
+    found = scene.pairs_within(0.5)
     order = {name: k for k, name in enumerate(scene.bodies)}
     for k, pair in enumerate(found):
         assert order[pair.a] < order[pair.b]
@@ -42,17 +42,17 @@ def test_its_arrays_and_its_entries_say_the_same(scene):
 
 
 def test_it_stays_when_the_scene_moves_on(scene):
-    found = scene.within(0.5)
+    found = scene.pairs_within(0.5)
     before = found.distances.copy(), found.normals.copy(), [str(pair) for pair in found]
     scene.update(random_state(scene.model, np.random.default_rng(1)))
-    scene.within(0.5)
+    scene.pairs_within(0.5)
     np.testing.assert_array_equal(found.distances, before[0])
     np.testing.assert_array_equal(found.normals, before[1])
     assert [str(pair) for pair in found] == before[2]
 
 
 def test_its_text_lists_the_nearest(scene):
-    found = scene.within(0.5)
+    found = scene.pairs_within(0.5)
     text = repr(found).splitlines()
     assert text[0] == f"<{len(found)} pairs"
     assert text[1].strip() == str(found[0])

@@ -63,14 +63,14 @@ def test_shapes_that_cannot_be_used_are_named_and_the_rest_can_be_asked(tmp_path
     ]
     scene = Scene(model, leave_out=problems)
     scene.update(model.default_state())
-    assert scene.within(0.1)
+    assert scene.pairs_within(0.1)
     assert "bad/all" not in scene.bodies
     # The ball, at (0, 0, 1) of the base, is there, in each of them.
     for name in ("lost", "empty", "flat"):
         found = scene.distance(f"bad/{name}", "box0")
         only = Scene(model, leave_out=[f"bad/{name}", *problems])
         assert f"bad/{name}" not in only.bodies
-        assert found.piece_a == 0
+        assert found.shape_a == 0
     assert find_unusable_shapes(arm_among_boxes()) == {}
 
 
@@ -96,15 +96,15 @@ def test_every_pair_is_looked_at_or_there_is_a_reason():
     ignored = ExcludedPairs(model, scene.bodies)
     pairs = list(itertools.combinations(scene.bodies, 2))
     for a, b in pairs:
-        assert (ignored.why(a, b) == "") == scene.checks_pair(a, b)
-        assert ignored.why(a, b) == ignored.why(b, a)
+        assert (ignored.reason(a, b) == "") == scene.checks_pair(a, b)
+        assert ignored.reason(a, b) == ignored.reason(b, a)
     looked_at = sum(scene.checks_pair(a, b) for a, b in pairs)
     assert ignored.counts == (looked_at, len(pairs) - looked_at)
-    assert ignored.why("hand", "hand/camera") == RIGID
-    assert ignored.why("link3", "hand/camera") == JOINED
-    assert ignored.why("hand", "box3") == "excepted: it reaches between them"
-    assert ignored.why("link2", "box1") == "excepted by a rule"
-    assert ignored.why("link0", "link1") == ""
+    assert ignored.reason("hand", "hand/camera") == RIGID
+    assert ignored.reason("link3", "hand/camera") == JOINED
+    assert ignored.reason("hand", "box3") == "excepted: it reaches between them"
+    assert ignored.reason("link2", "box1") == "excepted by a rule"
+    assert ignored.reason("link0", "link1") == ""
 
 
 @given(st.integers(0, 2**32 - 1), st.integers(4, 60))
@@ -130,7 +130,7 @@ def test_of_many_missing_meshes_a_few_are_listed_each_in_one_short_line(tmp_path
     scene = Scene(model)
     scene.update(model.default_state())
     with pytest.raises(kv.KineverseError) as caught:
-        scene.within(0.1)
+        scene.pairs_within(0.1)
     first, *lines = str(caught.value).splitlines()
     assert first.startswith("20 shapes cannot be used. Mend the model, or leave such bodies out")
     assert len(lines) == 13

@@ -122,7 +122,7 @@ def check(model, *names):
     scene = Scene(model)
     scene.update({"x": 0.0})
     for ask in (
-        lambda: scene.within(1.0),
+        lambda: scene.pairs_within(1.0),
         lambda: scene.distance("good", "bad"),
         lambda: scene.ray((0, 0, 9), (1, 0, 0)),
     ):
@@ -135,10 +135,10 @@ def check(model, *names):
     assert scene.distance("good", "fine").distance == pytest.approx(1.0)
     without = Scene(model, leave_out=["bad"])
     without.update({"x": 1.0})
-    assert [r.distance for r in without.within(2.0)] == [pytest.approx(1.0)]
+    assert [r.distance for r in without.pairs_within(2.0)] == [pytest.approx(1.0)]
     with model.edit() as edit:
         edit.remove("frame bad")
-    assert [r.distance for r in scene.within(2.0)] == [pytest.approx(1.0)]
+    assert [r.distance for r in scene.pairs_within(2.0)] == [pytest.approx(1.0)]
 
 
 @pytest.mark.parametrize("name", BAD_MESHES)
@@ -192,7 +192,7 @@ def test_several_bad_ones_are_listed(tmp_path):
     scene = Scene(model)
     scene.update({"x": 0.0})
     with pytest.raises(kv.errors.FormatError, match=r"2 shapes(.|\n)*'bad'(.|\n)*'worse'.*gone"):
-        scene.within(1.0)
+        scene.pairs_within(1.0)
 
 
 def test_a_pose_that_is_not_finite_moves_nothing():
@@ -216,7 +216,7 @@ def test_wrong_names_and_values_are_errors():
     model = with_a_bad_one(Sphere(0.5))
     scene = Scene(model)
     with pytest.raises(kv.errors.UnknownNameError, match=r"'x'|x: call"):
-        scene.within(1.0)
+        scene.pairs_within(1.0)
     with pytest.raises(kv.errors.UnknownNameError, match="'x'"):
         scene.update({})
     with pytest.raises(kv.errors.UnknownNameError, match="no symbol"):
@@ -230,7 +230,7 @@ def test_wrong_names_and_values_are_errors():
         scene.distance("good", "good")
     for radius in (-1.0, np.nan):
         with pytest.raises(kv.errors.InvalidValueError, match="radius"):
-            scene.within(radius)
+            scene.pairs_within(radius)
     with pytest.raises(kv.errors.UnknownNameError, match="rule"):
         Scene(model, rules=[kv.geometry.Rule("good", "goood")])
     with pytest.raises(kv.errors.InvalidValueError, match="rule"):

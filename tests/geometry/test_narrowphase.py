@@ -139,7 +139,7 @@ def test_needles_and_plates_in_touch_touch(other):
 
 
 def test_where_coal_fails_altogether_there_is_still_a_way_out(shapes, monkeypatch):
-    monkeypatch.setattr(Narrowphase, "_normal_is_right", lambda narrow: False)
+    monkeypatch.setattr(Narrowphase, "_is_unit_normal", lambda narrow: False)
     rng = np.random.default_rng(13)
     for one, other in PAIRS:
         a, b = shapes[one][0], shapes[other][1]

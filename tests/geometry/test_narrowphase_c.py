@@ -37,7 +37,7 @@ def placed(shapes, poses):
     table = ObjectTable(2, np.arange(2, dtype=np.int32), 1 - np.eye(2, dtype=np.uint8))
     for k, shape in enumerate(shapes):
         solid = shape.solid
-        table.give_solid(k, solid.centre, solid.half, solid.radius, solid.core)
+        table.set_solid(k, solid.centre, solid.half, solid.radius, solid.core)
     broadphase.place_objects(table, np.stack(poses))
     return table
 
@@ -178,20 +178,22 @@ def test_what_did_not_move_is_not_measured_again():
     scene, fresh = Scene(model), Scene(model)
     for s in (scene, fresh):
         s.update(state)
-    found = scene.within(0.3)
-    memory = scene._world.table.memory
+    found = scene.pairs_within(0.3)
+    memory = scene.collision_world.table.memory
     assert (memory["pair"] > 0).sum() >= len(found) > 5
     memory["numbers"][:, 2] += 1.0
-    np.testing.assert_allclose(scene.within(2.0).distances[: len(found)], found.distances + 1.0, atol=1.0)
+    np.testing.assert_allclose(
+        scene.pairs_within(2.0).distances[: len(found)], found.distances + 1.0, atol=1.0
+    )
     memory[:] = 0
-    for again in (scene.within(0.3), fresh.within(0.3)):
+    for again in (scene.pairs_within(0.3), fresh.pairs_within(0.3)):
         np.testing.assert_array_equal(again.distances, found.distances)
         np.testing.assert_array_equal(again.normals, found.normals)
     moved = state.updated({symbol: value + 0.01 for symbol, value in state.items()})
     for s in (scene, Scene(model)):
         s.update(moved)
         s.update(state)
-        np.testing.assert_array_equal(s.within(0.3).distances, found.distances)
+        np.testing.assert_array_equal(s.pairs_within(0.3).distances, found.distances)
 
 
 @settings(max_examples=attempts(12))
@@ -204,10 +206,10 @@ def test_a_scene_finds_the_same_with_c_and_without_and_by_brute_force(seed, radi
         state = state.updated({s: v + float(rng.normal(scale=0.01)) for s, v in state.items()})
         quick.update(state)
         slow.update(state)
-        found = quick.within(radius)
+        found = quick.pairs_within(radius)
         with pytest.MonkeyPatch.context() as patch:
             patch.setattr(collision_library, "_code", None)
-            other = slow.within(radius)
+            other = slow.pairs_within(radius)
         expected = {frozenset(k): d for k, d in brute_force(quick, state).items() if d <= radius}
         for answer in (found, other):
             distances = by_names(answer)
@@ -266,7 +268,7 @@ def test_many_corners_are_found_whatever_the_processor_takes_at_a_time(narrower,
     for library in (collision_library, narrower):
         table = ObjectTable(2, np.arange(2, dtype=np.int32), 1 - np.eye(2, dtype=np.uint8))
         for k, solid in enumerate(solids):
-            table.give_solid(k, solid.centre, solid.half, solid.radius, solid.core)
+            table.set_solid(k, solid.centre, solid.half, solid.radius, solid.core)
         broadphase.place_objects(table, poses)
         found.append(library.measure(table, pair, np.inf))
     (distance, witness), (same, same_witness) = found

@@ -43,7 +43,7 @@ def test_what_is_near_is_what_brute_force_finds(model, either_sweep):
         scene.update(state)
         expected = brute_force(scene, state)
         radius = (0.0, 0.1, 0.4)[step % 3]
-        near = scene.within(radius)
+        near = scene.pairs_within(radius)
         want = {frozenset(names): d for names, d in expected.items() if d <= radius}
         assert by_names(near).keys() == want.keys()
         for names, distance in by_names(near).items():
@@ -59,7 +59,7 @@ def test_after_a_jump_of_any_size_answers_are_as_before(model, either_sweep, jum
     for rail in (0.0, jump, *(np.arange(8) * 3e-5).tolist()):
         there = state.updated({"rail": rail})
         scene.update(there)
-        near = by_names(scene.within(0.3))
+        near = by_names(scene.pairs_within(0.3))
     expected = brute_force(scene, there)
     want = {frozenset(names): pytest.approx(d, abs=1e-6) for names, d in expected.items() if d <= 0.3}
     assert near == want
@@ -70,11 +70,11 @@ def test_what_is_beyond_all_measure_is_refused_with_its_name(model, either_sweep
     scene = Scene(model)
     state = model.default_state()
     scene.update(state)
-    near = by_names(scene.within(0.3))
+    near = by_names(scene.pairs_within(0.3))
     for rail in (1e13, 1e200):
         with pytest.raises(kv.errors.InvalidValueError, match=r"'base', .*1e\+12 m away; nothing was moved"):
             scene.update(state.updated({"rail": rail}))
-    assert by_names(scene.within(0.3)) == near
+    assert by_names(scene.pairs_within(0.3)) == near
     far = kv.Model()
     with far.edit() as edit:
         edit.add_frame("post", "world", kv.translation(1e50, 0, 0), body(Sphere(0.1)))
@@ -87,12 +87,12 @@ def test_most_pairs_are_settled_without_measuring(model):
     scene = Scene(model)
     state = model.default_state()
     scene.update(state)
-    scene.within(0.3)
-    before = scene._world.narrow.calls
+    scene.pairs_within(0.3)
+    before = scene.collision_world.narrowphase.calls
     for k in range(20):
         scene.update(state.updated({"j0": 0.002 * k}))
-        scene.within(0.3)
-    measured = (scene._world.narrow.calls - before) / 20
+        scene.pairs_within(0.3)
+    measured = (scene.collision_world.narrowphase.calls - before) / 20
     assert measured < 0.3 * len(brute_force(scene, state))
 
 
@@ -101,12 +101,12 @@ def test_one_against_all_and_lists_of_pairs(model):
     state = random_state(model, np.random.default_rng(4))
     scene.update(state)
     expected = brute_force(scene, state)
-    around = scene.around("hand")
+    around = scene.distances_to("hand")
     assert all(r.a == "hand" for r in around)
     assert {r.b: pytest.approx(r.distance, abs=1e-6) for r in around} == {
         (set(names) - {"hand"}).pop(): d for names, d in expected.items() if "hand" in names
     }
-    assert [r.b for r in scene.around("hand", around[1].distance)] == [r.b for r in around[:2]]
+    assert [r.b for r in scene.distances_to("hand", around[1].distance)] == [r.b for r in around[:2]]
     pairs = [("hand", "box0"), ("box0", "hand"), ("box1", "box2")]
     one, other, boxes = scene.distances(pairs)
     assert (one.a, one.b, other.a, other.b) == ("hand", "box0", "box0", "hand")
@@ -122,12 +122,12 @@ def test_answers_do_not_depend_on_what_was_asked_before(model):
     used = Scene(model)
     for state in states[:-1]:
         used.update(state)
-        used.within(0.5)
+        used.pairs_within(0.5)
         used.first_contact()
     fresh = Scene(model)
     for scene in (used, fresh):
         scene.update(states[-1])
-    one, other = used.within(0.4), fresh.within(0.4)
+    one, other = used.pairs_within(0.4), fresh.pairs_within(0.4)
     assert [(r.a, r.b, r.distance) for r in one] == [(r.a, r.b, r.distance) for r in other]
     for a, b in zip(one, other, strict=True):
         np.testing.assert_array_equal(a.normal, b.normal)
@@ -139,10 +139,10 @@ def test_parts_of_a_scene_against_each_other(model):
     scene = Scene(model)
     state = random_state(model, np.random.default_rng(8))
     scene.update(state)
-    everything = by_names(scene.within(0.5))
+    everything = by_names(scene.pairs_within(0.5))
     own = {f"link{k}" for k in range(5)} | {"base", "hand"}
-    assert by_names(scene.inside("base", 0.5)) == {n: d for n, d in everything.items() if n <= own}
-    assert by_names(scene.between("base", "ball", 0.5)) == {
+    assert by_names(scene.self_pairs("base", 0.5)) == {n: d for n, d in everything.items() if n <= own}
+    assert by_names(scene.pairs_between("base", "ball", 0.5)) == {
         n: d for n, d in everything.items() if n & own and "ball/body" in n
     }
 
@@ -155,7 +155,7 @@ def test_two_scenes_in_two_threads_answer_as_alone(model):
         found = []
         for state in states:
             scene.update(state)
-            found.append([(r.a, r.b, r.distance, *r.point_a, *r.normal) for r in scene.within(0.2)])
+            found.append([(r.a, r.b, r.distance, *r.point_a, *r.normal) for r in scene.pairs_within(0.2)])
         return found
 
     alone = [answers(Scene(model), s) for s in states]
@@ -177,7 +177,7 @@ def test_a_vector_is_a_state(model):
     state = random_state(model, np.random.default_rng(2))
     by_name.update(dict(state))
     by_vector.update(np.array([state[s] for s in by_vector.inputs]))
-    assert by_names(by_name.within(0.3)) == by_names(by_vector.within(0.3))
+    assert by_names(by_name.pairs_within(0.3)) == by_names(by_vector.pairs_within(0.3))
     np.testing.assert_allclose(by_name.pose("hand"), model.fk("hand")(state), atol=1e-12)
 
 
@@ -209,18 +209,18 @@ def test_an_edit_changes_what_it_touches(counted):
     scene = Scene(model)
     state = random_state(model, np.random.default_rng(3))
     scene.update(state)
-    scene.within(0.3)
+    scene.pairs_within(0.3)
 
     def after(change):
         counted.update(dict.fromkeys(counted, 0))
         with model.edit() as edit:
             change(edit)
-        near = scene.within(0.3)
+        near = scene.pairs_within(0.3)
         fresh = Scene(model)
         work = dict(counted)
         fresh.update({**state, **{s: model.default_state()[s] for s in model.symbols if s not in state}})
-        assert by_names(near) == by_names(fresh.within(0.3))
-        made = len(fresh._world.pieces)
+        assert by_names(near) == by_names(fresh.pairs_within(0.3))
+        made = len(fresh.collision_world.objects)
         return {**work, "pieces": work["pieces"] - made, "compiled": work["compiled"] - 1}
 
     def constrain(edit):
@@ -259,7 +259,7 @@ def test_what_is_picked_up_goes_with_the_hand():
     np.testing.assert_allclose(scene.pose("box0"), model.fk("box0")(state), atol=1e-12)
     other = state.updated({"j0": 0.9})
     scene.update(other)
-    assert by_names(scene.within(0.3)) == {
+    assert by_names(scene.pairs_within(0.3)) == {
         frozenset(n): pytest.approx(d, abs=1e-6) for n, d in brute_force(scene, other).items() if d <= 0.3
     }
 
@@ -281,7 +281,7 @@ def test_after_an_edit_a_new_symbol_needs_a_value():
     with model.edit() as edit:
         edit.add_frame("flap", "world", kv.rotation_z(kv.position("flap")), body(Box((1, 0.1, 0.1))))
     with pytest.raises(kv.errors.UnknownNameError, match=r"flap.*update"):
-        scene.within(0.1)
+        scene.pairs_within(0.1)
     scene.update(model.default_state())
     assert scene.distance("flap", "box0").distance > 0
 
@@ -294,7 +294,7 @@ def test_after_an_edit_the_last_state_may_be_impossible():
         root = np.sqrt(kv.position("rail") - 1)
         edit.add_frame("flap", "world", kv.translation(0, 0, root), body(Box((1, 0.1, 0.1))))
     with pytest.raises(kv.KineverseError, match=r"flap.*update"):
-        scene.within(0.1)
+        scene.pairs_within(0.1)
     scene.update({**model.default_state(), kv.position("rail"): 2.0})
     assert scene.distance("flap", "box0").distance > 0
 
@@ -303,18 +303,18 @@ def test_an_edit_that_a_scene_cannot_follow_is_said_until_it_is_mended():
     model = arm_among_boxes(boxes=1)
     scene = Scene(model)
     scene.update(model.default_state())
-    near = by_names(scene.within(0.3))
+    near = by_names(scene.pairs_within(0.3))
     with model.edit() as edit:
         for k, width in enumerate((1.0, 2.0)):  # two parameters of one name
             post = kv.translation(kv.parameter("width", width), 0, 0)
             edit.add_frame(f"post{k}", "world", post, body(Box((0.1, 0.1, 0.1))))
     for _ in range(2):
         with pytest.raises(kv.errors.DuplicateNameError, match="width"):
-            scene.within(0.3)
+            scene.pairs_within(0.3)
     with model.edit() as edit:
         edit.remove("frame post0")
         edit.remove("frame post1")
-    assert by_names(scene.within(0.3)) == near
+    assert by_names(scene.pairs_within(0.3)) == near
 
 
 # -- rules -------------------------------------------------------------------------------------------------
@@ -401,7 +401,7 @@ def test_rules_mean_what_their_patterns_match(model):
     named.append(Rule("box0", "link0", check=True))
     one = Scene(model, rules=named)
     other = Scene(model, rules=[Rule("link?", "box*"), Rule("link0", "box0", check=True)])
-    np.testing.assert_array_equal(one._world.table.allowed, other._world.table.allowed)
+    np.testing.assert_array_equal(one.collision_world.table.allowed, other.collision_world.table.allowed)
     assert one.checks_pair("link0", "box0")
     assert not one.checks_pair("box1", "link0")
 
@@ -416,8 +416,8 @@ def test_pairs_that_never_touched_are_a_rule(model):
     for state in states:
         for s in (scene, quiet):
             s.update(state)
-        assert by_names(scene.within(0.0)) == by_names(quiet.within(0.0))
-        assert len(quiet.within(0.5)) <= len(scene.within(0.5))
+        assert by_names(scene.pairs_within(0.0)) == by_names(quiet.pairs_within(0.0))
+        assert len(quiet.pairs_within(0.5)) <= len(scene.pairs_within(0.5))
     with pytest.raises(kv.errors.InvalidValueError, match="none is given"):
         scene.find_never_colliding([])
 
@@ -451,12 +451,12 @@ def test_what_is_chosen_follows_the_model():
         for one, other in itertools.product(("world", scene.bodies[0], top), repeat=2):
             want = {
                 frozenset((near.a, near.b))
-                for near in scene.within(0.5)
+                for near in scene.pairs_within(0.5)
                 if {near.a in below(one), near.b in below(other)} == {True}
                 or {near.b in below(one), near.a in below(other)} == {True}
             }
             for _ in range(2):
-                assert by_names(scene.between(one, other, 0.5)).keys() == want
+                assert by_names(scene.pairs_between(one, other, 0.5)).keys() == want
         with arm.edit() as edit:
             edit.add_frame(
                 f"another_{number}", scene.bodies[0], np.eye(4), Body(collisions=(Shape(Sphere(0.3)),))

@@ -21,7 +21,7 @@ def test_a_shipped_robot_beside_the_shipped_kitchen():
     for step in range(3):
         state = state.updated({s: state[s] + float(rng.normal()) * 0.05 for s in robot})
         scene.update(state)
-        near = by_names(scene.between("pr2/base_footprint", "kitchen/kitchen", 0.3))
+        near = by_names(scene.pairs_between("pr2/base_footprint", "kitchen/kitchen", 0.3))
         assert all(len({name.split("/")[0] for name in names}) == 2 for names in near)
         if step == 2:
             expected = {frozenset(n): d for n, d in brute_force(scene, state).items() if d <= 0.3}
@@ -43,7 +43,7 @@ def test_the_pr2_beside_the_iai_kitchen(monkeypatch):
     state = model.default_state()
     scene.update(state)
     assert len(scene.bodies) > 150
-    moved = scene.moved_by("pr2/torso_lift_joint")
+    moved = scene.bodies_moved_by("pr2/torso_lift_joint")
     assert "pr2/head_pan_link" in moved
     assert not any(name.startswith("kitchen/") for name in moved)
     near = scene.pairs_near_moving("pr2/torso_lift_joint", 0.1)
@@ -51,4 +51,4 @@ def test_the_pr2_beside_the_iai_kitchen(monkeypatch):
     scene.update(state.updated({"pr2/torso_lift_joint": 0.2}))
     fresh = Scene(model)
     fresh.update(state.updated({"pr2/torso_lift_joint": 0.2}))
-    assert by_names(scene.within(0.05)) == by_names(fresh.within(0.05))
+    assert by_names(scene.pairs_within(0.05)) == by_names(fresh.pairs_within(0.05))

@@ -238,7 +238,7 @@ def _outcome_to_json(task: MeshTask, outcome: DecompositionOutcome) -> dict[str,
 
 
 def _manage_cache(arguments: argparse.Namespace) -> int:
-    from kineverse.geometry.decomposition import clear, folder, listing
+    from kineverse.geometry.decomposition import clear, folder, list_entries
 
     if arguments.names or (arguments.list and arguments.clear):
         raise InvalidValueError("--list and --clear are about the whole cache, and one at a time.")
@@ -247,7 +247,7 @@ def _manage_cache(arguments: argparse.Namespace) -> int:
         told = json.dumps({"removed": count}) if arguments.json else f"{count} removed from {folder()}"
         print(told)
         return 0
-    kept = listing()
+    kept = list_entries()
     if arguments.json:
         entries = [
             {**_decomposition_to_json(k.decomposition), "made": k.decomposition.made, "bytes": k.bytes}

@@ -60,7 +60,7 @@ def find_penetrations(model: ModelView) -> Iterator[ModelProblem]:
 def _touching_pairs(model: ModelView) -> Sequence[DistanceResult]:
     scene = Scene(model, leave_out=find_unusable_shapes(model))
     scene.update(model.default_state())
-    return scene.within(0.0)
+    return scene.pairs_within(0.0)
 
 
 @dataclass(frozen=True, slots=True)

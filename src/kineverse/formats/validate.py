@@ -8,7 +8,7 @@ from math import isfinite, isnan
 
 import numpy as np
 
-from kineverse.errors import KineverseError
+from kineverse.errors import KineverseError, summarize_error
 from kineverse.expressions.printing import format_number
 from kineverse.formats.resource_paths import locate_mesh
 from kineverse.loops.record import find_loops
@@ -163,11 +163,6 @@ def find_inertia_errors(inertia: Inertia) -> Iterator[str]:
         yield f"{shown} without any mass"
 
 
-def _first_line(error: Exception) -> str:
-    first = (str(error).splitlines() or [type(error).__name__])[0]
-    return first.removesuffix(" Looked in:").removesuffix(" Looked for:").removesuffix(" It is at:")
-
-
 def _find_missing_meshes(model: ModelView) -> Iterator[ModelProblem]:
     missing: dict[Mesh, str] = {}
     found: set[Mesh] = set()
@@ -180,6 +175,6 @@ def _find_missing_meshes(model: ModelView) -> Iterator[ModelProblem]:
                     found.add(mesh)
                 except (KineverseError, OSError) as error:
                     # The folders searched are the same for all meshes.
-                    missing[mesh] = _first_line(error)
+                    missing[mesh] = summarize_error(error)
             if mesh in missing:
                 yield ModelProblem("mesh", name, missing[mesh])

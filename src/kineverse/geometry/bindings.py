@@ -63,7 +63,7 @@ class CollisionLibrary(SourceLibrary):
             found = self._code.near(native.address, reach, *native.results)
             if found <= len(native.lows):
                 return native.pairs[:found], native.lows[:found]
-            native.room(2 * found)
+            native.reserve(2 * found)
 
     def measure(self, table: ObjectTable, pairs: Indices, limit: float) -> tuple[Floats, Floats]:
         """Measure pairs of pieces, (K, 2) with the smaller number first, as far as C can.
@@ -131,7 +131,7 @@ class CollisionLibrary(SourceLibrary):
             while (found := self._code.search(native.address, reach, radius, *native.everything)) > len(
                 native.lows
             ):
-                native.room(2 * found)
+                native.reserve(2 * found)
         finally:
             native.struct.allowed = looked_at
         kept = native.kept.value
@@ -154,17 +154,17 @@ class _TableBinding:
         self.struct.count, self.struct.moving = table.count, table.moving
         self.struct.bodies = len(table.allowed)
         self.address = ctypes.addressof(self.struct)
-        self.room(256)
+        self.reserve(256)
 
-    def stand(self, table: ObjectTable) -> None:
+    def rebuild_tree(self, table: ObjectTable) -> None:
         """Take notice of where the pieces are that stand."""
         standing = np.arange(table.moving, table.count, dtype=np.int32)
         self.boxes, self.leaves = build_static_tree(table.low, table.high, standing)
         self.struct.boxes, self.struct.leaves = self.boxes.ctypes.data, self.leaves.ctypes.data
         self.struct.leaf_count = len(self.leaves)
-        table.standing_changed = False
+        table.static_changed = False
 
-    def room(self, count: int) -> None:
+    def reserve(self, count: int) -> None:
         """Make room for so many pairs."""
         self.pairs = np.empty((count, 2), dtype=np.int32)
         self.lows = np.empty(count)
@@ -179,12 +179,12 @@ class _TableBinding:
 
 
 def _bind_table(table: ObjectTable) -> _TableBinding:
-    native: _TableBinding | None = table.native
+    native: _TableBinding | None = table.binding
     if native is None:
-        native = table.native = _TableBinding(table)
+        native = table.binding = _TableBinding(table)
     native.struct.axis = table.axis
-    if table.standing_changed:
-        native.stand(table)
+    if table.static_changed:
+        native.rebuild_tree(table)
     return native
 
 

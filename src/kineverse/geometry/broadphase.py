@@ -30,7 +30,7 @@ MEMORY_SLOTS = 2**13
 
 _MEMORY = np.dtype([("pair", np.int64), ("numbers", np.float64, 12)])
 
-_TAKEN_OVER = (
+_INHERITED = (
     "active", "centre", "half", "radius", "poses", "travel",
     "corners", "corner_count", "edges", "radii", "round", "tip",
 )  # fmt: skip
@@ -68,7 +68,7 @@ class ObjectTable:
         (M,) the moving pieces sorted along ``axis`` when that was last done, and then the others.
     sorted_boxes
         Room for C: the corners of the boxes of the moving pieces in that order, and a row of gaps.
-    standing_changed
+    static_changed
         Whether any of the others was put somewhere since somebody took notice.
     bounds
         (M, M) for i < j, the distance when it was measured, plus the travel of both at that time; 0 if it
@@ -98,8 +98,8 @@ class ObjectTable:
     sorted_boxes: Floats = field(init=False)
     bounds: Floats | None = field(init=False)
     axis: int = 0
-    native: Any = None
-    standing_changed: bool = True
+    binding: Any = None
+    static_changed: bool = True
 
     def __post_init__(self) -> None:
         count = len(self.body)
@@ -120,7 +120,7 @@ class ObjectTable:
         """How many pieces there are."""
         return len(self.body)
 
-    def give_solid(
+    def set_solid(
         self, piece: int, centre: Floats, half: Floats, radius: float, core: Core | None = None
     ) -> None:
         """Enter what encloses a piece, and what it is."""
@@ -130,20 +130,20 @@ class ObjectTable:
             self.edges[piece], self.radii[piece], self.round[piece] = core.half, core.radii, core.radius
             self.tip[piece] = core.tip
         self.active[piece] = 1
-        self.put(np.array([piece]))
+        self.update_boxes(np.array([piece]))
 
-    def put(self, pieces: npt.NDArray[np.integer[Any]]) -> None:
+    def update_boxes(self, pieces: npt.NDArray[np.integer[Any]]) -> None:
         """Compute where pieces are from their poses."""
-        self.standing_changed |= bool((pieces >= self.moving).any())
+        self.static_changed |= bool((pieces >= self.moving).any())
         rotation, position = self.poses[pieces, :, :3], self.poses[pieces, :, 3]
         place = np.einsum("kij,kj->ki", rotation, self.centre[pieces]) + position
         extent = np.einsum("kij,kj->ki", np.abs(rotation), self.half[pieces])
         self.place[pieces], self.low[pieces], self.high[pieces] = place, place - extent, place + extent
 
-    def take_over(self, old: ObjectTable, kept: npt.NDArray[np.integer[Any]]) -> None:
+    def inherit(self, old: ObjectTable, kept: npt.NDArray[np.integer[Any]]) -> None:
         """Enter what another table knew of pieces: (K, 2) their numbers here and there."""
         here, there = kept[:, 0], kept[:, 1]
-        for name in _TAKEN_OVER:
+        for name in _INHERITED:
             getattr(self, name)[here] = getattr(old, name)[there]
         self.axis = old.axis
         if self.bounds is None or old.bounds is None:
@@ -157,7 +157,7 @@ class ObjectTable:
         # Kept for the smaller number first; numbers may have changed places.
         self.bounds[np.minimum(ones, others), np.maximum(ones, others)] = old.bounds[measured][both]
 
-    def forget_travel(self) -> None:
+    def reset_travel(self) -> None:
         """Begin to count again, with nothing known of any pair."""
         self.travel[:] = 0.0
         self.memory[:] = 0
@@ -170,7 +170,7 @@ class ObjectTable:
         if there.any():
             self.axis = int(np.argmax(self.place[there].std(axis=0)))
 
-    def remember(self, i: int, j: int, distance: float) -> None:
+    def record_distance(self, i: int, j: int, distance: float) -> None:
         """Keep a measured distance of two pieces, i < j."""
         if self.bounds is not None:
             self.bounds[i, j] = distance + self.travel[i] + self.travel[j]
@@ -265,7 +265,7 @@ def place_objects(table: ObjectTable, fresh: Floats) -> int:
     moving = np.arange(table.moving)
     before, old = table.place[moving], table.poses[moving, :, :3]
     table.poses[moving] = fresh
-    table.put(moving)
+    table.update_boxes(moving)
     # The spectral norm of the difference of two rotations is its Frobenius norm by the root of 2.
     turned = np.sqrt(((fresh[:, :, :3] - old) ** 2).sum(axis=(1, 2)) / 2)
     shifted = np.sqrt(((table.place[moving] - before) ** 2).sum(axis=1))

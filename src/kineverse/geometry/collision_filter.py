@@ -137,14 +137,14 @@ def adjacent_pairs(model: ModelView, bodies: Sequence[str]) -> Flags:
     table: Flags = (number[:, None] == number[None, :]).astype(np.uint8)
     place = {name: k for k, name in enumerate(bodies)}
 
-    def those_at(frame: str) -> npt.NDArray[np.bool_]:
+    def bodies_at(frame: str) -> npt.NDArray[np.bool_]:
         group = _rigid_group(frame, frames)
         if group == WORLD:
-            return np.asarray(np.arange(len(bodies)) == _carrier(frame, frames, place))
+            return np.asarray(np.arange(len(bodies)) == _supporting_body(frame, frames, place))
         return np.asarray(number == numbers.get(group, -1))
 
     for one, other in _joined_frames(model, frames, numbers):
-        members, joined = those_at(one), those_at(other)
+        members, joined = bodies_at(one), bodies_at(other)
         table[np.outer(members, joined) | np.outer(joined, members)] = 1
     return table
 
@@ -167,7 +167,7 @@ def _rigid_group(name: str, frames: Mapping[str, Frame]) -> str:
     return name
 
 
-def _carrier(name: str, frames: Mapping[str, Frame], place: Mapping[str, int]) -> int:
+def _supporting_body(name: str, frames: Mapping[str, Frame], place: Mapping[str, int]) -> int:
     """Return the number of the nearest body at or above a frame that does not move; -1 if there is none."""
     while name not in place and name != WORLD:
         name = frames[name].parent

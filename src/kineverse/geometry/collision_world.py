@@ -29,32 +29,34 @@ from .narrowphase import ACCURACY, Narrowphase
 from .objects import CollisionObject, CollisionObjects, Exclusion, load_solids
 from .shapes import Solid
 
-_MOST_KNOWN = 200_000
+_MAX_MEASUREMENTS = 200_000
 
 
 class CollisionWorld:
-    """The pieces of a model and where they are; for one thread.
+    """Collision objects of a model and their poses; for one thread.
 
     Parameters
     ----------
     model
-        What is mirrored, at whatever version it is.
+        The model, whose present version is used.
     rules
-        Beside those that the model keeps; they come after them.
+        Rules of the collision filter, applied after those that the model keeps.
     triangles, decomposed, leave_out
-        Patterns of bodies whose meshes stay triangles, of those whose meshes are the hulls that they were
-        decomposed into, and of bodies that do not take part, or bodies with the number of a shape.
+        Patterns of bodies whose meshes stay triangles; of bodies whose meshes are replaced by the hulls of
+        their decomposition; and exclusions.
 
     Attributes
     ----------
-    pieces
-        In the order of the table: those that move first, each group in the order of the bodies.
+    inputs
+        Symbols that poses depend on.
+    objects
+        Collision objects in the order of the table: moving ones first, each group in the order of the bodies.
     bodies
-        The names of the bodies that have pieces, in the order of the model.
+        Names of the bodies that have objects, in the order of the model.
     members
-        The numbers of the pieces of each body, in the order of :attr:`bodies`.
-    table, narrow
-        See there.
+        Indices of the objects of each body, in the order of :attr:`bodies`.
+    table, narrowphase
+        Tables of the broad phase, and the narrow phase by coal.
     """
 
     def __init__(
@@ -75,70 +77,70 @@ class CollisionWorld:
         self._source = CollisionObjects(*patterns)
         self._version: int | None = None
         self._values: dict[Symbol, float] = {}
-        self._unplaced = ""
+        self._missing_state = ""
         self._evaluator: Any = None
         self.inputs: tuple[Symbol, ...] = ()
-        self.pieces: list[CollisionObject] = []
+        self.objects: list[CollisionObject] = []
         self.bodies: tuple[str, ...] = ()
         self.members: list[list[int]] = []
         self._solids: list[Solid | None] = []
         self._all_loaded = False
         self.table = ObjectTable(0, np.zeros(0, dtype=np.int32), np.zeros((0, 0), dtype=np.uint8))
         collision_library.prepare()
-        self.follow()
+        self.synchronize()
 
     # -- the model -----------------------------------------------------------------------------------------
 
-    def follow(self) -> None:
-        """Catch up with the model's version: what is the same keeps its solids, travel and bounds."""
+    def synchronize(self) -> None:
+        """Update to the model's present version; unchanged objects keep their solids, travel and bounds."""
         if self._version == self.model.version:
             return
         version = self.model.version
         rules = (*read_rules(self.model), *self._own_rules)
-        if self._source.follow(self.model):
+        if self._source.synchronize(self.model):
             try:
                 self._rebuild(rules)
             except BaseException:
-                self._source.forget()  # so that the next question finds a difference again
+                self._source.clear()  # so that the next query finds a difference again
                 raise
         else:
-            # Other frames may have come in between, and with them other neighbours.
+            # Frames may have been inserted, which changes the adjacent pairs.
             self.table.allowed[:] = allowed_pairs(self.model, self.bodies, rules)
         self._version = version
 
     def _rebuild(self, rules: Sequence[Rule]) -> None:
         by_body = self._source.by_body
-        before, old = {id(piece): k for k, piece in enumerate(self.pieces)}, self.table
+        before, old = {id(item): k for k, item in enumerate(self.objects)}, self.table
         old_solids = self._solids
-        everything = [piece for pieces in by_body.values() for piece in pieces]
-        moving = [piece for piece in everything if piece.moves]
-        same = moving == self.pieces[: old.moving]
-        self.pieces = [*moving, *(piece for piece in everything if not piece.moves)]
+        everything = [item for items in by_body.values() for item in items]
+        moving = [item for item in everything if item.moves]
+        same = moving == self.objects[: old.moving]
+        self.objects = [*moving, *(item for item in everything if not item.moves)]
         self.bodies = tuple(by_body)
         number = {name: k for k, name in enumerate(self.bodies)}
-        body = np.array([number[piece.body] for piece in self.pieces], dtype=np.int32)
+        body = np.array([number[item.body] for item in self.objects], dtype=np.int32)
         self.members = [[] for _ in self.bodies]
         for k, owner in enumerate(body.tolist()):
             self.members[owner].append(k)
         self.table = table = ObjectTable(len(moving), body, allowed_pairs(self.model, self.bodies, rules))
-        kept = [(k, before[id(piece)]) for k, piece in enumerate(self.pieces) if id(piece) in before]
-        self._solids = [None] * len(self.pieces)
+        kept = [(k, before[id(item)]) for k, item in enumerate(self.objects) if id(item) in before]
+        self._solids = [None] * len(self.objects)
         for new, previous in kept:
             self._solids[new] = old_solids[previous]
-        table.take_over(old, np.array(kept, dtype=int).reshape(-1, 2))
+        table.inherit(old, np.array(kept, dtype=int).reshape(-1, 2))
         known = {new for new, _ in kept}
-        for k in range(len(moving), len(self.pieces)):
+        for k in range(len(moving), len(self.objects)):
             if k not in known:
-                table.poses[k] = _static_pose(self.pieces[k])
-        table.put(np.arange(table.count))
+                table.poses[k] = _static_pose(self.objects[k])
+        table.update_boxes(np.arange(table.count))
         self._all_loaded = all(solid is not None for solid in self._solids)
-        self.narrow = Narrowphase(self._solids, table.poses)
+        self.narrowphase = Narrowphase(self._solids, table.poses)
         self._travel = table.travel.data
         self._bounds: Any = None if table.bounds is None else table.bounds.data
-        self._known: dict[tuple[int, int], tuple[float, float, float, Floats]] = {}
+        self._measurements: dict[tuple[int, int], tuple[float, float, float, Floats]] = {}
         if not same:
-            self._compile([piece.pose for piece in moving])
-        self._place_again()
+            self._compile([item.pose for item in moving])
+        self._restore_poses()
 
     def _compile(self, poses: list[Any]) -> None:
         function = compile_expressions(np.stack(poses)) if poses else None
@@ -148,20 +150,20 @@ class CollisionWorld:
     # -- the state -----------------------------------------------------------------------------------------
 
     def update(self, state: StateLike | Sequence[float] | Floats) -> None:
-        """Place everything, see :meth:`Scene.update`."""
-        self.follow()
+        """Compute all poses at a state, see :meth:`Scene.update`."""
+        self.synchronize()
         if isinstance(state, Mapping):
-            state = self._relevant(state)
+            state = self._select_inputs(state)
         if self._evaluator is not None:
             self._evaluator(state)
             self._place()
             self._values = dict(zip(self.inputs, self._evaluator.input.tolist(), strict=True))
         elif not isinstance(state, Mapping) and len(state):
             raise InvalidValueError(f"Nothing moves in this scene, and {len(state)} values are given.")
-        self._unplaced = ""
+        self._missing_state = ""
 
-    def _relevant(self, state: StateLike) -> StateLike:
-        """Return the part of a mapping that poses depend on; the rest has to be known to the model."""
+    def _select_inputs(self, state: StateLike) -> StateLike:
+        """Return the part of a mapping that poses depend on, after checking all other names."""
         if isinstance(state, State):
             return state
         inputs = {key for symbol in self.inputs for key in (symbol, str(symbol))}
@@ -176,8 +178,8 @@ class CollisionWorld:
         outcome = collision_library.place(self.table, self._evaluator.outputs[0])
         if outcome >= 0:
             names = dict.fromkeys(
-                piece.body
-                for piece, pose in zip(self.pieces, self._evaluator.outputs[0], strict=False)
+                item.body
+                for item, pose in zip(self.objects, self._evaluator.outputs[0], strict=False)
                 if not (np.abs(pose) <= FURTHEST).all()
             )
             raise InvalidValueError(
@@ -185,162 +187,163 @@ class CollisionWorld:
                 f"{FURTHEST:g} m away; nothing was moved."
             )
         if outcome == TRAVEL_EXCEEDED:
-            self.table.forget_travel()
-            self._known.clear()
-        self.narrow.moved(self.table.moving)
+            self.table.reset_travel()
+            self._measurements.clear()
+        self.narrowphase.invalidate_poses(self.table.moving)
 
-    def _place_again(self) -> None:
-        """Place everything at the last state after an edit, as far as that says where things are."""
+    def _restore_poses(self) -> None:
+        """Recompute all poses at the last state after an edit, if that state still determines them."""
         values = {s: self._values.get(s, s.value) for s in self.inputs}
         missing = [str(s) for s, value in values.items() if value is None]
         more = f" and {len(missing) - 12} more" if len(missing) > 12 else ""
-        self._unplaced = f"There is no value for {', '.join(missing[:12])}{more}" if missing else ""
+        self._missing_state = f"There is no value for {', '.join(missing[:12])}{more}" if missing else ""
         if self._evaluator is None or missing:
             return
         try:
             self._evaluator(np.array([values[s] for s in self.inputs], dtype=float))
             self._place()
-        except KineverseError as error:  # a loop that does not close, a root of what is negative
-            self._unplaced = f"The last state has no poses after the edit ({error})"
+        except KineverseError as error:  # a loop that does not close, a root of a negative number
+            self._missing_state = f"The last state has no poses after the edit ({error})"
 
     # -- questions -----------------------------------------------------------------------------------------
 
-    def ready(self, pieces: Iterable[int] | None = None) -> None:
-        """Catch up with the model, and make the solids of pieces, or of all.
+    def prepare(self, objects: Iterable[int] | None = None) -> None:
+        """Update to the model's version, and make the solids of some objects, or of all.
 
         Raises
         ------
         UnknownNameError
-            If there is no state that says where everything is.
+            If no state determines the poses.
         KineverseError
             If a solid cannot be made.
         """
-        self.follow()
-        if self._unplaced:
-            raise UnknownNameError(f"{self._unplaced}: call scene.update(state) first.")
+        self.synchronize()
+        if self._missing_state:
+            raise UnknownNameError(f"{self._missing_state}: call scene.update(state) first.")
         if self._all_loaded:
             return
         wanted = [
-            k for k in (range(len(self.pieces)) if pieces is None else pieces) if self._solids[k] is None
+            k for k in (range(len(self.objects)) if objects is None else objects) if self._solids[k] is None
         ]
-        # From the first measured distance on it is C that measures, or else never: answers do not change.
+        # The choice between C and coal is made before the first distance, so that answers never change.
         collision_library.prepare(wait=True)
         first = self.table.active.any()
-        for k, solid in zip(wanted, load_solids(self.pieces[k] for k in wanted), strict=True):
+        for k, solid in zip(wanted, load_solids(self.objects[k] for k in wanted), strict=True):
             self._solids[k] = solid
-            self.table.give_solid(k, solid.centre, solid.half, solid.radius, solid.core)
-        if wanted and (pieces is None or not first):
+            self.table.set_solid(k, solid.centre, solid.half, solid.radius, solid.core)
+        if wanted and (objects is None or not first):
             self.table.choose_axis()
-        self._all_loaded = pieces is None
+        self._all_loaded = objects is None
 
     def measure(self, pairs: Indices, lows: Floats, limit: float) -> tuple[Floats, Floats]:
-        """Measure pairs of pieces, of each pair of bodies at least the nearest.
+        """Measure pairs of objects; of each pair of bodies, at least the nearest one.
 
         Parameters
         ----------
         pairs, lows
-            (K, 2), the smaller number first, and (K,) lower bounds of their distances [m].
+            (K, 2) pairs, the smaller index first, and (K,) lower bounds of their distances [m].
         limit
-            How far is of interest [m].
+            Largest distance of interest [m].
 
         Returns
         -------
         distances, witnesses
-            (K,) [m], more than the limit for what is further apart, infinite for what is not the nearest;
-            (K, 9) the nearest points of both and the normal, where the distance is within the limit.
+            (K,) distances [m]: above the limit for pairs beyond it, infinite for pairs that are not the
+            nearest of their bodies. (K, 9) both nearest points and the normal, where the distance is within
+            the limit.
         """
         distances, witnesses = collision_library.measure(self.table, pairs, limit)
         if np.isnan(distances).any():
-            self.measure_rest(pairs, lows, limit, distances, witnesses)
+            self.measure_remaining(pairs, lows, limit, distances, witnesses)
         return distances, witnesses
 
-    def measure_rest(
+    def measure_remaining(
         self, pairs: Indices, lows: Floats, limit: float, distances: Floats, witnesses: Floats
     ) -> None:
-        """Have coal measure the pairs whose distance is NaN, see :meth:`measure`."""
+        """Measure by coal the pairs whose distance is NaN, see :meth:`measure`."""
         owners = self.table.body[pairs]
         keys = owners.min(axis=1).astype(np.int64) * len(self.bodies) + owners.max(axis=1)
         unsolved = np.flatnonzero(np.isnan(distances))
-        # Most bodies have one piece, and then there is nobody to be nearer.
+        # Most bodies have one object; then no other pair of the same bodies can be nearer.
         nearest = _NearestByBodies(keys, distances) if len(np.unique(keys)) < len(keys) else None
         for k in unsolved[np.argsort(lows[unsolved], kind="stable")].tolist():
-            if nearest is not None and nearest.is_nearer(k, lows[k]):
+            if nearest is not None and nearest.has_nearer(k, lows[k]):
                 distances[k] = math.inf
                 continue
             i, j = pairs[k].tolist()
-            distances[k], witness = self._measured(i, j, limit)
+            distances[k], witness = self._measure_by_coal(i, j, limit)
             if witness is not None:
                 witnesses[k] = witness
             if nearest is not None:
-                nearest.note(k, distances[k])
+                nearest.update(k, distances[k])
 
-    def _measured(self, i: int, j: int, limit: float) -> tuple[float, Floats | None]:
-        """Return distance and witness of two pieces, i < j, from memory if neither has moved since.
+    def _measure_by_coal(self, i: int, j: int, limit: float) -> tuple[float, Floats | None]:
+        """Return distance and witness of two objects, i < j, from memory if neither has moved since.
 
-        Beyond a limit the distance is infinite, and there is no witness.
+        Beyond the limit the distance is infinite, and there is no witness.
         """
         one, other = self._travel[i], self._travel[j]
-        known = self._known.get((i, j))
+        known = self._measurements.get((i, j))
         if known is not None and known[0] == one and known[1] == other:
             return (known[2], known[3]) if known[2] <= limit else (math.inf, None)
-        distance = self.narrow.distance(i, j)
+        distance = self.narrowphase.distance(i, j)
         if self._bounds is not None:
-            self._bounds[i, j] = distance + one + other  # as Table.remember, in a fifth of the time
+            self._bounds[i, j] = distance + one + other  # ObjectTable.record_distance, faster
         if distance > limit:
             return math.inf, None
-        witness = np.concatenate(self.narrow.witness())
-        if len(self._known) >= _MOST_KNOWN:
-            self._known.clear()
-        self._known[i, j] = one, other, distance, witness
+        witness = np.concatenate(self.narrowphase.witness())
+        if len(self._measurements) >= _MAX_MEASUREMENTS:
+            self._measurements.clear()
+        self._measurements[i, j] = one, other, distance, witness
         return distance, witness
 
-    def number(self, body: str) -> int:
-        """Return the number of a body.
+    def body_index(self, body: str) -> int:
+        """Return the index of a body.
 
         Raises
         ------
         UnknownNameError
-            If it has no pieces, with similar names.
+            If it has no collision objects; the message lists similar names.
         """
-        self.follow()
+        self.synchronize()
         try:
             return self.bodies.index(body)
         except ValueError:
             what = "has no shapes here" if body in self.model.frames else "is no frame of the model"
             raise UnknownNameError(f"'{body}' {what}. {suggest(str(body), self.bodies, 'body')}") from None
 
-    def solid(self, piece: int) -> Solid:
-        """Return the solid of a piece that is there."""
-        solid = self._solids[piece]
+    def solid(self, index: int) -> Solid:
+        """Return the solid of an object that :meth:`prepare` has made."""
+        solid = self._solids[index]
         assert solid is not None
         return solid
 
 
 class _NearestByBodies:
-    """How near the nearest pieces are that are known, by the key of their bodies."""
+    """Smallest known distance of each pair of bodies, by the key of the pair."""
 
     def __init__(self, keys: npt.NDArray[np.int64], distances: Floats) -> None:
         self._keys = keys.tolist()
         self._least: dict[int, float] = {}
         for k in np.flatnonzero(~np.isnan(distances)).tolist():
-            self.note(k, distances[k])
+            self.update(k, distances[k])
 
-    def note(self, k: int, distance: float) -> None:
-        """Take notice of a distance."""
+    def update(self, k: int, distance: float) -> None:
+        """Enter a measured distance."""
         key = self._keys[k]
         self._least[key] = min(self._least.get(key, math.inf), distance)
 
-    def is_nearer(self, k: int, low: float) -> bool:
-        """Whether others are nearer; within the accuracy a pair that comes later may still be the nearest."""
+    def has_nearer(self, k: int, low: float) -> bool:
+        """Return True if another pair of the same bodies is nearer than a lower bound, beyond the accuracy."""
         return low > self._least.get(self._keys[k], math.inf) + ACCURACY
 
 
-def _static_pose(piece: CollisionObject) -> Floats:
-    """Return the (3, 4) pose of a piece that never moves."""
-    pose: Floats = piece.pose({})
+def _static_pose(item: CollisionObject) -> Floats:
+    """Return the (3, 4) pose of an object that never moves."""
+    pose: Floats = item.pose({})
     if not (np.abs(pose) <= FURTHEST).all():
         raise InvalidValueError(
-            f"Body '{piece.body}' stands further than {FURTHEST:g} m away. Mend the model, or leave it out: "
+            f"Body '{item.body}' stands further than {FURTHEST:g} m away. Mend the model, or leave it out: "
             "Scene(model, leave_out=[...])."
         )
     return pose

@@ -13,10 +13,11 @@ from kineverse.symbols import Symbol
 
 
 class FrameDependence:
-    """What of a model moves when some symbols change.
+    """Frames of a model that move when some symbols change.
 
-    Coordinates are compared, whatever their order, as for constraints: a speed moves what its position moves,
-    and whatever coordinate's rate it is in; an independent coordinate of a loop moves those that follow it.
+    Symbols are compared as coordinates, whatever their order, as for constraints. A speed moves the frames
+    that its position moves, and those of every coordinate whose rate contains the speed. An independent
+    coordinate of a closed loop moves the frames of its dependent coordinates.
 
     Parameters
     ----------
@@ -34,28 +35,27 @@ class FrameDependence:
     def __init__(self, model: ModelView, symbols: Iterable[Symbol | str]) -> None:
         self._frames: Mapping[str, Frame] = dict(model.frames)
         self._paths = _driven_coordinates(model, {_symbol_path(model, symbol) for symbol in symbols})
-        # The frames on the way from the world that move in their parent, by the frame.
-        self._ways: dict[str, tuple[str, ...]] = {WORLD: ()}
+        self._moving_ancestors: dict[str, tuple[str, ...]] = {WORLD: ()}
 
     def moves(self, frame: str) -> bool:
-        """Whether a frame moves in the world."""
-        return bool(self.way(frame))
+        """Return True if a frame moves in the world."""
+        return bool(self.moving_ancestors(frame))
 
     def moves_between(self, one: str, other: str) -> bool:
-        """Whether two frames move with respect to each other."""
-        return self.way(one) != self.way(other)
+        """Return True if two frames move with respect to each other."""
+        return self.moving_ancestors(one) != self.moving_ancestors(other)
 
-    def way(self, name: str) -> tuple[str, ...]:
-        """Return the frames from the world to a frame that move in their parent."""
+    def moving_ancestors(self, name: str) -> tuple[str, ...]:
+        """Return those frames on the path from the world to a frame that move in their parent."""
         above = []
-        while name not in self._ways:
+        while name not in self._moving_ancestors:
             above.append(name)
             name = self._frames[name].parent
-        way = self._ways[name]
+        moving = self._moving_ancestors[name]
         for frame in reversed(above):
-            way = (*way, frame) if self._moves_in_parent(frame) else way
-            self._ways[frame] = way
-        return way
+            moving = (*moving, frame) if self._moves_in_parent(frame) else moving
+            self._moving_ancestors[frame] = moving
+        return moving
 
     def _moves_in_parent(self, name: str) -> bool:
         for factor in self._frames[name].factors:
@@ -79,13 +79,13 @@ def _symbol_path(model: ModelView, symbol: Symbol | str) -> str:
 
 
 def _driven_coordinates(model: ModelView, paths: set[str]) -> set[str]:
-    """Return the paths of all coordinates that move with those given, which are among them."""
+    """Return the paths of all coordinates that move with the given ones, including these."""
     rates = model.rates
     found = set(paths)
     for coordinate, row in rates.items():
         if any(speed.path in paths for speed in row):
             found.add(coordinate.path)
-    # A row may drive what another coordinate follows.
+    # A coordinate in such a row may in turn determine dependent coordinates.
     for coordinate, expression in rates.dependent.items():
         if any(s.path in found for s in expression.symbols):
             found.add(coordinate.path)

@@ -17,71 +17,71 @@ from .narrowphase import ACCURACY
 from .results import DistanceResult, DistanceResults
 
 
-def find_distance(mirror: CollisionWorld, a: str, b: str) -> DistanceResult:
-    """Return how near two bodies are, whatever the rules say."""
-    one, other = mirror.number(a), mirror.number(b)
+def find_distance(world: CollisionWorld, a: str, b: str) -> DistanceResult:
+    """Return the distance of two bodies, regardless of the rules."""
+    one, other = world.body_index(a), world.body_index(b)
     if one == other:
         raise InvalidValueError(f"'{a}' is asked for its distance to itself.")
-    members, others = mirror.members[one], mirror.members[other]
-    mirror.ready((*members, *others))
+    members, others = world.members[one], world.members[other]
+    world.prepare((*members, *others))
     pairs = _pair_product(members, others)
     radius, lows = math.inf, np.full(len(pairs), -math.inf)
     if len(pairs) > 1:
-        # The two that may be nearest say how near the others would have to be.
-        lows = mirror.table.lower_bounds(pairs[:, 0], pairs[:, 1])
-        radius = _least_distance(mirror, pairs[[np.argmin(lows)]]) + ACCURACY
+        # The distance of the most promising pair bounds the answer from above.
+        lows = world.table.lower_bounds(pairs[:, 0], pairs[:, 1])
+        radius = _least_distance(world, pairs[[np.argmin(lows)]]) + ACCURACY
         near = lows <= radius
         pairs, lows = pairs[near], lows[near]
-    (found,) = _nearest_pairs(mirror, pairs, lows, radius)
-    return found if found.a == a else found.swapped()
+    (found,) = _nearest_pairs(world, pairs, lows, radius)
+    return found if found.a == a else found.swap()
 
 
-def find_pairs_within(mirror: CollisionWorld, radius: float, wanted: Flags | None = None) -> DistanceResults:
+def find_pairs_within(world: CollisionWorld, radius: float, wanted: Flags | None = None) -> DistanceResults:
     """Return the pairs of bodies within a radius [m], nearest first.
 
-    Those that are looked at; or of these only some, (B, B) flags.
+    All checked pairs are searched, or only those flagged in ``wanted``, (B, B).
     """
-    _check_radius(radius)
-    mirror.ready()
-    table = mirror.table
+    check_radius(radius)
+    world.prepare()
+    table = world.table
     reach = radius + ACCURACY
     pairs, lows, distances, witnesses, nearest = collision_library.search(table, reach, radius, wanted)
     if nearest is not None:
-        return DistanceResults(mirror, *nearest)
-    mirror.measure_rest(pairs, lows, radius, distances, witnesses)
+        return DistanceResults(world, *nearest)
+    world.measure_remaining(pairs, lows, radius, distances, witnesses)
     order = collision_library.rank(table, pairs, distances, radius)
-    return _make_results(mirror, pairs, distances, witnesses, order)
+    return _make_results(world, pairs, distances, witnesses, order)
 
 
-def find_first_contact(mirror: CollisionWorld, margin: float) -> DistanceResult | None:
-    """Return the first pair found within a margin [m], in the order of the pieces; None if there is none."""
-    _check_radius(margin)
-    mirror.ready()
-    pairs, _ = collision_library.near(mirror.table, margin + ACCURACY)
+def find_first_contact(world: CollisionWorld, margin: float) -> DistanceResult | None:
+    """Return the first pair within a margin [m], in the order of the objects; None if there is none."""
+    check_radius(margin)
+    world.prepare()
+    pairs, _ = collision_library.near(world.table, margin + ACCURACY)
     pairs = pairs[np.lexsort((pairs[:, 1], pairs[:, 0]))]
-    distances, witnesses = collision_library.measure(mirror.table, pairs, margin)
+    distances, witnesses = collision_library.measure(world.table, pairs, margin)
     for k in np.flatnonzero(~(distances > margin)).tolist():
         only = slice(k, k + 1)
         if math.isnan(distances[k]):
-            mirror.measure_rest(pairs[only], np.zeros(1), margin, distances[only], witnesses[only])
+            world.measure_remaining(pairs[only], np.zeros(1), margin, distances[only], witnesses[only])
         if distances[k] <= margin:
             return _make_results(
-                mirror, pairs[only], distances[only], witnesses[only], np.zeros(1, dtype=np.int64)
+                world, pairs[only], distances[only], witnesses[only], np.zeros(1, dtype=np.int64)
             )[0]
     return None
 
 
-def find_distances_to(mirror: CollisionWorld, body: str, radius: float) -> list[DistanceResult]:
-    """Return how near the others are to one body, nearest first."""
-    _check_radius(radius)
-    one = mirror.number(body)
-    mirror.ready()
-    table = mirror.table
-    pairs = _pair_product(mirror.members[one], np.flatnonzero(table.allowed[one][table.body] == 1).tolist())
+def find_distances_to(world: CollisionWorld, body: str, radius: float) -> list[DistanceResult]:
+    """Return the distances of one body to the others within a radius [m], nearest first."""
+    check_radius(radius)
+    one = world.body_index(body)
+    world.prepare()
+    table = world.table
+    pairs = _pair_product(world.members[one], np.flatnonzero(table.allowed[one][table.body] == 1).tolist())
     lows = table.lower_bounds(pairs[:, 0], pairs[:, 1])
     near = lows <= radius + ACCURACY
-    nearest = _nearest_pairs(mirror, pairs[near], lows[near], radius)
-    return [found if found.a == body else found.swapped() for found in nearest]
+    nearest = _nearest_pairs(world, pairs[near], lows[near], radius)
+    return [found if found.a == body else found.swap() for found in nearest]
 
 
 def _pair_product(members: list[int], others: list[int]) -> Indices:
@@ -90,25 +90,24 @@ def _pair_product(members: list[int], others: list[int]) -> Indices:
     return np.stack([np.minimum(left, right), np.maximum(left, right)], axis=1).astype(np.int32)
 
 
-def _least_distance(mirror: CollisionWorld, pairs: Indices) -> float:
-    return float(mirror.measure(pairs, np.zeros(len(pairs)), math.inf)[0].min())
+def _least_distance(world: CollisionWorld, pairs: Indices) -> float:
+    return float(world.measure(pairs, np.zeros(len(pairs)), math.inf)[0].min())
 
 
-def _nearest_pairs(mirror: CollisionWorld, pairs: Indices, lows: Floats, radius: float) -> DistanceResults:
-    """Measure pairs of pieces, and return the nearest ones of each pair of bodies within a radius [m]."""
-    distances, witnesses = mirror.measure(pairs, lows, radius)
-    order = collision_library.rank(mirror.table, pairs, distances, radius)
-    return _make_results(mirror, pairs, distances, witnesses, order)
+def _nearest_pairs(world: CollisionWorld, pairs: Indices, lows: Floats, radius: float) -> DistanceResults:
+    """Measure pairs of objects, and return the nearest of each pair of bodies within a radius [m]."""
+    distances, witnesses = world.measure(pairs, lows, radius)
+    order = collision_library.rank(world.table, pairs, distances, radius)
+    return _make_results(world, pairs, distances, witnesses, order)
 
 
 def _make_results(
-    mirror: CollisionWorld, pairs: Indices, distances: Floats, witnesses: Floats, order: npt.NDArray[np.int64]
+    world: CollisionWorld, pairs: Indices, distances: Floats, witnesses: Floats, order: npt.NDArray[np.int64]
 ) -> DistanceResults:
-    return DistanceResults(
-        mirror, *collision_library.gather(mirror.table, pairs, distances, witnesses, order)
-    )
+    return DistanceResults(world, *collision_library.gather(world.table, pairs, distances, witnesses, order))
 
 
-def _check_radius(radius: float) -> None:
+def check_radius(radius: float) -> None:
+    """Raise InvalidValueError for a radius that is negative or NaN."""
     if not radius >= 0.0:
         raise InvalidValueError(f"A radius is a distance from 0 on [m], not {radius!r}.")

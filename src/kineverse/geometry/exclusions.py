@@ -6,13 +6,13 @@ from collections import Counter
 from collections.abc import Mapping, Sequence
 from importlib.util import find_spec
 
-from kineverse.errors import FormatError, InvalidValueError, MissingDependencyError
+from kineverse.errors import FormatError, InvalidValueError, MissingDependencyError, summarize_error
 from kineverse.model.body import Geometry, Mesh
 from kineverse.model.model_view import ModelView
 
 from .broadphase import Flags
 from .collision_filter import Rule, adjacent_pairs, allowed_pairs, read_rules
-from .objects import collision_shapes, matches_pattern, summarize_error
+from .objects import collision_shapes, matches_pattern
 from .shapes import solid_from_geometry
 
 RIGID = "rigidly connected"
@@ -20,14 +20,14 @@ JOINED = "joined by an articulation"
 
 
 def is_installed() -> bool:
-    """Return whether the extra ``geometry`` is there; nothing is imported to find out."""
+    """Return True if the extra ``geometry`` is installed, without importing it."""
     return find_spec("coal") is not None
 
 
 def find_unusable_shapes(model: ModelView) -> dict[tuple[str, int], str]:
-    """Return the shapes that distances cannot be computed to, with the reason in one line.
+    """Return the shapes whose distances cannot be computed, with the reason in one line.
 
-    They are known by their body and number. A scene without them answers for all the others:
+    The keys are body and index of the shape. A scene without these shapes answers for all others:
     ``Scene(model, leave_out=find_unusable_shapes(model))``.
 
     Raises
@@ -47,7 +47,7 @@ def find_unusable_shapes(model: ModelView) -> dict[tuple[str, int], str]:
 
 
 def label_unusable_shapes(model: ModelView, problems: Mapping[tuple[str, int], str]) -> dict[str, str]:
-    """Return what to call shapes that are left out, with the reason; without a number if no other is left."""
+    """Return labels of excluded shapes, with the reasons; the body's name if all of its shapes are excluded."""
     count = Counter(name for name, _ in problems)
     found: dict[str, str] = {}
     for (name, number), why in problems.items():
@@ -62,20 +62,20 @@ def _find_problem(geometry: Geometry) -> str:
     except MissingDependencyError:
         raise
     except (FormatError, InvalidValueError, OSError) as error:
-        reason = summarize_error(error)
+        reason = summarize_error(error, advice=False)
         return f"mesh {geometry.uri}: {reason}" if isinstance(geometry, Mesh) else reason
     return ""
 
 
 class ExcludedPairs:
-    """The pairs of a model's bodies that its scenes do not look at.
+    """Pairs of a model's bodies that its collision filter excludes, with the reasons.
 
     Parameters
     ----------
     model
-        The model; what is said is about its version now.
+        The model, in its present version.
     bodies
-        The bodies that take part.
+        The bodies of the scene.
     """
 
     def __init__(self, model: ModelView, bodies: Sequence[str]) -> None:
@@ -87,22 +87,22 @@ class ExcludedPairs:
 
     @property
     def counts(self) -> tuple[int, int]:
-        """How many pairs are looked at, and how many are not."""
+        """Numbers of checked pairs and of excluded pairs."""
         looked_at, bodies = int(self._allowed.sum()) // 2, len(self._number)
         return looked_at, bodies * (bodies - 1) // 2 - looked_at
 
-    def why(self, a: str, b: str) -> str:
-        """Return why a pair of bodies is not looked at; empty if it is."""
-        if self._of(self._allowed, a, b):
+    def reason(self, a: str, b: str) -> str:
+        """Return the reason for which a pair of bodies is excluded; empty if it is checked."""
+        if self._is_set(self._allowed, a, b):
             return ""
-        if not self._of(self._adjacent, a, b):
-            return self._rule(a, b)
+        if not self._is_set(self._adjacent, a, b):
+            return self._rule_reason(a, b)
         return JOINED if self._model.fk(a, b).symbols else RIGID
 
-    def _of(self, table: Flags, a: str, b: str) -> bool:
+    def _is_set(self, table: Flags, a: str, b: str) -> bool:
         return bool(table[self._number[a], self._number[b]])
 
-    def _rule(self, a: str, b: str) -> str:
+    def _rule_reason(self, a: str, b: str) -> str:
         for rule in reversed(self._rules):
             if _rule_applies(rule, a, b) or _rule_applies(rule, b, a):
                 return f"excepted: {rule.why}" if rule.why else "excepted by a rule"

@@ -20,7 +20,7 @@ _MET, _STUCK = 1e-11, 1e-7
 than 1 m this part."""
 
 
-def separation(a: PlacedSolid, b: PlacedSolid) -> tuple[float, Floats, Floats] | None:
+def gjk_distance(a: PlacedSolid, b: PlacedSolid) -> tuple[float, Floats, Floats] | None:
     """Return the distance of two solids [m], the nearest point (3,) of the first, and the normal from it.
 
     None if they touch, or if that is not certain.
@@ -53,10 +53,10 @@ def separation(a: PlacedSolid, b: PlacedSolid) -> tuple[float, Floats, Floats] |
     return high, weights @ np.array(origins), way / high
 
 
-def separation_of_faces(
+def gjk_distance_to_faces(
     a: PlacedSolid, faces: Faces, rotation: Floats, position: Floats
 ) -> tuple[float, Floats, Floats] | None:
-    """Return what :func:`separation` does, for a convex solid and triangles at a pose; None in touch."""
+    """Return what :func:`gjk_distance` does, for a convex solid and triangles at a pose; None in touch."""
     solid, rotation_a, at_a = a
     corners = (faces.vertices @ rotation.T + position)[faces.faces]
     # In the frame of the solid it lies in its box, so that a triangle is no nearer than its own box there.
@@ -69,8 +69,10 @@ def separation_of_faces(
             break
         middle = corners[k].mean(axis=0)
         radius = float(np.linalg.norm(corners[k] - middle, axis=1).max())
-        triangle = Solid(None, faces, np.zeros(3), np.zeros(3), radius, core=Core.hull(corners[k] - middle))
-        found = separation(a, (triangle, np.eye(3), middle))
+        triangle = Solid(
+            None, faces, np.zeros(3), np.zeros(3), radius, core=Core.from_corners(corners[k] - middle)
+        )
+        found = gjk_distance(a, (triangle, np.eye(3), middle))
         if found is None:
             return None
         if best is None or found[0] < best[0]:

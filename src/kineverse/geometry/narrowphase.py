@@ -18,7 +18,7 @@ import numpy as np
 
 from kineverse.model.body import Sphere
 
-from .gjk import separation, separation_of_faces
+from .gjk import gjk_distance, gjk_distance_to_faces
 from .mesh_files import Faces, Floats
 from .shapes import Solid, import_coal, scale_solid, solid_from_geometry
 from .support import PlacedSolid, directional_gaps, find_widest_gap, smoothed_support
@@ -59,7 +59,7 @@ class Narrowphase:
     solids
         By the number of the piece; None for those that are not made yet.
     poses
-        (M, 3, 4) where they are in the world, which others rewrite and announce by :meth:`moved`.
+        (M, 3, 4) where they are in the world, which others rewrite and announce by :meth:`invalidate_poses`.
     """
 
     def __init__(self, solids: Sequence[Solid | None], poses: Floats) -> None:
@@ -71,15 +71,15 @@ class Narrowphase:
         self._functors: dict[tuple[int, int], Any] = {}
         self._kept: list[tuple[Solid, Solid]] = []
         # Pairs of triangle meshes, for which coal leaves the normal as it was in memory.
-        self._surfaces: set[tuple[int, int]] = set()
-        self._small: dict[tuple[int, int], tuple[float, Floats, Narrowphase]] = {}
-        self._request, *self._rougher = (_request(coal, factor) for factor in (1.0, 10.0, 100.0))
-        self._roughest = _request(coal, 1e5)
+        self._triangle_pairs: set[tuple[int, int]] = set()
+        self._enlarged: dict[tuple[int, int], tuple[float, Floats, Narrowphase]] = {}
+        self._request, *self._coarser = (_request(coal, factor) for factor in (1.0, 10.0, 100.0))
+        self._coarsest = _request(coal, 1e5)
         self._result = coal.DistanceResult()
-        self._mended: Witness | None = None
+        self._witness: Witness | None = None
         self.calls = 0
 
-    def moved(self, count: int) -> None:
+    def invalidate_poses(self, count: int) -> None:
         """Note that the poses of so many pieces, the first ones, have changed."""
         self._placed[:count] = bytes(count)
 
@@ -92,45 +92,49 @@ class Narrowphase:
                 self._transforms[k].setTransform(*self._parts[k])
                 placed[k] = 1
         functor = self._functors.get((i, j)) or self._functor(i, j)
-        if self._small and (i, j) in self._small:
-            return self._enlarged(i, j)
+        if self._enlarged and (i, j) in self._enlarged:
+            return self._measure_enlarged(i, j)
         at_a, at_b, result = self._transforms[i], self._transforms[j], self._result
         result.clear()
-        self._mended = None
+        self._witness = None
         distance: float = functor(at_a, at_b, self._request, result)
         if _TOUCH < distance < 1e300:
-            if (i, j) in self._surfaces:
-                self._mended = self._between_points(distance)
+            if (i, j) in self._triangle_pairs:
+                self._witness = self._witness_from_points(distance)
                 return distance
             a, b = self._pair(i, j)
             if not (a.is_convex and b.is_convex):
-                return self._from_triangles(i, j, distance, functor)
-            return distance if self._shows(i, j, distance) else self._solved(i, j)
+                return self._check_triangles(i, j, distance, functor)
+            return distance if self._normal_confirms(i, j, distance) else self._solve(i, j)
         a, b = self._pair(i, j)
         if not (a.is_convex and b.is_convex):
-            return self._touching_triangles(i, j, functor)
-        for request in (*self._rougher, None):
-            if -1e300 < distance < -_TOUCH and self._normal_is_right() and self._shows(i, j, distance):
+            return self._measure_touching_triangles(i, j, functor)
+        for request in (*self._coarser, None):
+            if (
+                -1e300 < distance < -_TOUCH
+                and self._is_unit_normal()
+                and self._normal_confirms(i, j, distance)
+            ):
                 return distance
             if request is None or abs(distance) <= _TOUCH:
                 break
             result.clear()
             distance = functor(at_a, at_b, request, result)
-            if distance > _TOUCH and self._shows(i, j, distance):
+            if distance > _TOUCH and self._normal_confirms(i, j, distance):
                 return distance
-        return self._mend(i, j, functor)
+        return self._measure_shifted(i, j, functor)
 
     def witness(self) -> Witness:
         """Return the closest points and the unit normal from the first to the second, of the last distance.
 
         All are in the world, (3,), and ``distance == normal @ (point_b - point_a)``.
         """
-        if self._mended is not None:
-            return self._mended
+        if self._witness is not None:
+            return self._witness
         result = self._result
         return result.getNearestPoint1(), result.getNearestPoint2(), np.array(result.normal)
 
-    def _between_points(self, distance: float) -> Witness:
+    def _witness_from_points(self, distance: float) -> Witness:
         point_a, point_b = self._result.getNearestPoint1(), self._result.getNearestPoint2()
         return point_a, point_b, (point_b - point_a) / distance
 
@@ -148,33 +152,33 @@ class Narrowphase:
         functor = self._functors[i, j] = self._coal.ComputeDistance(one, other)
         self._kept.append((a, b))  # coal does not keep what it computes with
         if not (a.is_convex or b.is_convex):
-            self._surfaces.add((i, j))
+            self._triangle_pairs.add((i, j))
         factor = _enlargement(a, b)
         if factor > 1.0:
             poses = np.tile(np.eye(4)[:3], (2, 1, 1))
-            self._small[i, j] = (
+            self._enlarged[i, j] = (
                 factor,
                 poses,
                 Narrowphase([scale_solid(a, factor), scale_solid(b, factor)], poses),
             )
         return functor
 
-    def _enlarged(self, i: int, j: int) -> float:
+    def _measure_enlarged(self, i: int, j: int) -> float:
         """Measure two convex solids of which one is small as if both were larger."""
-        factor, poses, narrow = self._small[i, j]
+        factor, poses, narrow = self._enlarged[i, j]
         (poses[0, :, :3], start), (poses[1, :, :3], end) = self._parts[i], self._parts[j]
         poses[1, :, 3] = factor * (end - start)
-        narrow.moved(2)
+        narrow.invalidate_poses(2)
         distance = narrow.distance(0, 1) / factor
         point_a, point_b, normal = narrow.witness()
-        self._mended = start + point_a / factor, start + point_b / factor, normal
+        self._witness = start + point_a / factor, start + point_b / factor, normal
         return distance
 
-    def _normal_is_right(self) -> bool:
+    def _is_unit_normal(self) -> bool:
         x, y, z = self._result.normal.tolist()
         return bool(abs(x * x + y * y + z * z - 1.0) < 1e-6)
 
-    def _shows(self, i: int, j: int, distance: float) -> bool:
+    def _normal_confirms(self, i: int, j: int, distance: float) -> bool:
         """Whether the normal shows the distance of two convex solids.
 
         Apart, that is the gap of the planes that hold them; in each other, so far they have to be moved.
@@ -183,16 +187,16 @@ class Narrowphase:
         shown = float(directional_gaps(*self._placed_solids(i, j), self.witness()[2][None])[0])
         return abs(distance - shown) <= _SHOWN * max(1.0, distance, a.radius, b.radius)
 
-    def _solved(self, i: int, j: int) -> float:
+    def _solve(self, i: int, j: int) -> float:
         """Measure two convex solids without coal."""
-        found = separation(*self._placed_solids(i, j))
+        found = gjk_distance(*self._placed_solids(i, j))
         if found is None:
-            return self._searched(i, j)
+            return self._search(i, j)
         distance, point, normal = found
-        self._mended = point, point + distance * normal, normal
+        self._witness = point, point + distance * normal, normal
         return distance
 
-    def _from_triangles(self, i: int, j: int, distance: float, functor: Any) -> float:
+    def _check_triangles(self, i: int, j: int, distance: float, functor: Any) -> float:
         """Check the distance of a convex solid from triangles, between which there is no plane.
 
         coal goes wrong where its iterations cannot end, so they are given another end; where that gives
@@ -200,42 +204,42 @@ class Narrowphase:
         """
         witness = self.witness()
         a, b = self._pair(i, j)
-        again = self._asked_again(i, j, functor)
-        self._mended = witness
+        again = self._remeasure(i, j, functor)
+        self._witness = witness
         if abs(again - distance) <= _SHOWN * max(1.0, distance, a.radius, b.radius):
             return distance
-        solved = self._solved_triangles(i, j)
-        return self._with_triangles(i, j) if solved is None else solved
+        solved = self._solve_triangles(i, j)
+        return self._measure_contacts(i, j) if solved is None else solved
 
-    def _touching_triangles(self, i: int, j: int, functor: Any) -> float:
+    def _measure_touching_triangles(self, i: int, j: int, functor: Any) -> float:
         """Measure in touch where triangles take part, if that is so."""
         a, b = self._pair(i, j)
-        if (a.is_convex or b.is_convex) and self._asked_again(i, j, functor) > _TOUCH:
-            solved = self._solved_triangles(i, j)
+        if (a.is_convex or b.is_convex) and self._remeasure(i, j, functor) > _TOUCH:
+            solved = self._solve_triangles(i, j)
             if solved is not None:
                 return solved
-        return self._with_triangles(i, j)
+        return self._measure_contacts(i, j)
 
-    def _asked_again(self, i: int, j: int, functor: Any) -> float:
+    def _remeasure(self, i: int, j: int, functor: Any) -> float:
         self._result.clear()
-        distance: float = functor(self._transforms[i], self._transforms[j], self._roughest, self._result)
+        distance: float = functor(self._transforms[i], self._transforms[j], self._coarsest, self._result)
         return distance
 
-    def _solved_triangles(self, i: int, j: int) -> float | None:
+    def _solve_triangles(self, i: int, j: int) -> float | None:
         """Measure a convex solid and triangles without coal; None if they touch."""
         turned = not self._pair(i, j)[0].is_convex
         solid, mesh = (j, i) if turned else (i, j)
         surface = self._pair(mesh, mesh)[0].surface
         assert isinstance(surface, Faces)
-        found = separation_of_faces(self._placed_solids(solid, solid)[0], surface, *self._parts[mesh])
+        found = gjk_distance_to_faces(self._placed_solids(solid, solid)[0], surface, *self._parts[mesh])
         if found is None:
             return None
         distance, point, normal = found
         other = point + distance * normal
-        self._mended = (other, point, -normal) if turned else (point, other, normal)
+        self._witness = (other, point, -normal) if turned else (point, other, normal)
         return distance
 
-    def _mend(self, i: int, j: int, functor: Any) -> float:
+    def _measure_shifted(self, i: int, j: int, functor: Any) -> float:
         """Measure two convex solids in touch, or that coal failed on, when they are a little apart.
 
         By how much and in which direction they were moved is taken off again. For flat faces that is exact,
@@ -243,33 +247,33 @@ class Narrowphase:
         """
         at_a, result = self._transforms[i], self._result
         rotation, position = self._parts[j]
-        for shift in self._ways_apart(i, j):
+        for shift in self._shifts(i, j):
             shifted = self._coal.Transform3s(rotation, position + shift)
-            for request in (self._request, *self._rougher):
+            for request in (self._request, *self._coarser):
                 result.clear()
-                self._mended = None
+                self._witness = None
                 distance: float = functor(at_a, shifted, request, result)
-                if abs(distance) < 1e300 and self._normal_is_right():
+                if abs(distance) < 1e300 and self._is_unit_normal():
                     point_a, point_b, normal = self.witness()
                     distance -= float(normal @ shift)
-                    self._mended = point_a, point_b - shift, normal
-                    if self._shows(i, j, distance):
+                    self._witness = point_a, point_b - shift, normal
+                    if self._normal_confirms(i, j, distance):
                         return distance
-        return self._searched(i, j)
+        return self._search(i, j)
 
-    def _searched(self, i: int, j: int) -> float:
+    def _search(self, i: int, j: int) -> float:
         """Measure two convex solids by a search: a way out for certain, and nearly the shortest."""
         a, b = self._placed_solids(i, j)
         start, end = self._centres(i, j)
         distance, normal = find_widest_gap(a, b, _unit(end - start)[None])
-        self._mended = smoothed_support(a, normal), smoothed_support(b, -normal), normal
+        self._witness = smoothed_support(a, normal), smoothed_support(b, -normal), normal
         return distance
 
     def _placed_solids(self, i: int, j: int) -> tuple[PlacedSolid, PlacedSolid]:
         a, b = self._pair(i, j)
         return (a, *self._parts[i]), (b, *self._parts[j])
 
-    def _ways_apart(self, i: int, j: int) -> list[Floats]:
+    def _shifts(self, i: int, j: int) -> list[Floats]:
         far = min(_APART, _APART_OF_RADIUS * min(solid.radius for solid in self._pair(i, j)))
         start, end = self._centres(i, j)
         # Convex things in touch come apart along the line between any two points of their insides.
@@ -280,7 +284,7 @@ class Narrowphase:
         (rotation_a, at_a), (rotation_b, at_b) = self._parts[i], self._parts[j]
         return rotation_a @ a.centre + at_a, rotation_b @ b.centre + at_b
 
-    def _with_triangles(self, i: int, j: int) -> float:
+    def _measure_contacts(self, i: int, j: int) -> float:
         """Measure in touch where triangles take part: how deep in the triangle that is entered the most."""
         (a, b), at_a, at_b = self._pair(i, j), self._transforms[i], self._transforms[j]
         coal = self._coal
@@ -294,17 +298,17 @@ class Narrowphase:
             if depth < -contact.penetration_depth < 1e300 and abs(np.linalg.norm(contact.normal) - 1) < 1e-6:
                 deepest, depth = contact, -contact.penetration_depth
         if deepest is None:
-            if (a.is_convex or b.is_convex) and (solved := self._solved_triangles(i, j)) is not None:
+            if (a.is_convex or b.is_convex) and (solved := self._solve_triangles(i, j)) is not None:
                 return solved
             point = np.array(self._result.getNearestPoint1())
             if not np.isfinite(point).all():
                 point = np.array(at_a.getTranslation())
             normal = _unit(np.array(at_b.getTranslation()) - np.array(at_a.getTranslation()))
-            self._mended = point, point, normal
+            self._witness = point, point, normal
             return 0.0
         normal = np.array(deepest.normal)
         point = np.array(deepest.pos)
-        self._mended = point + normal * depth / 2, point - normal * depth / 2, normal
+        self._witness = point + normal * depth / 2, point - normal * depth / 2, normal
         return -depth
 
 

@@ -37,29 +37,31 @@ def intersect_ray(solid: Solid, origin: Floats, direction: Floats) -> RayEntry |
     """
     surface = solid.surface
     if isinstance(surface, Faces):
-        return _triangles(surface, origin, direction)
+        return _intersect_triangles(surface, origin, direction)
     if isinstance(surface, Hull):
-        return _polytope(surface.normals, surface.offsets, origin, direction)
-    return _primitive(surface, origin, direction)
+        return _intersect_polytope(surface.normals, surface.offsets, origin, direction)
+    return _intersect_primitive(surface, origin, direction)
 
 
-def _primitive(shape: Primitive, origin: Floats, direction: Floats) -> RayEntry | None:
+def _intersect_primitive(shape: Primitive, origin: Floats, direction: Floats) -> RayEntry | None:
     if isinstance(shape, Box):
         half = np.array(shape.size, dtype=float) / 2
-        return _polytope(_AXES, np.concatenate([half, half]), origin, direction)
+        return _intersect_polytope(_AXES, np.concatenate([half, half]), origin, direction)
     if isinstance(shape, Sphere):
-        return _ball(np.full(3, shape.radius), origin, direction)
+        return _intersect_ellipsoid(np.full(3, shape.radius), origin, direction)
     if isinstance(shape, Ellipsoid):
-        return _ball(np.array(shape.radii, dtype=float), origin, direction)
+        return _intersect_ellipsoid(np.array(shape.radii, dtype=float), origin, direction)
     if isinstance(shape, Capsule):
-        return _capsule(shape, origin, direction)
-    return _round(shape, origin, direction)
+        return _intersect_capsule(shape, origin, direction)
+    return _intersect_cylinder_or_cone(shape, origin, direction)
 
 
 _AXES = np.concatenate([np.eye(3), -np.eye(3)])
 
 
-def _polytope(normals: Floats, offsets: Floats, origin: Floats, direction: Floats) -> RayEntry | None:
+def _intersect_polytope(
+    normals: Floats, offsets: Floats, origin: Floats, direction: Floats
+) -> RayEntry | None:
     speed, gap = normals @ direction, offsets - normals @ origin
     if ((np.abs(speed) < _PARALLEL) & (gap < 0.0)).any():
         return None
@@ -77,15 +79,15 @@ def _entry_between(enters: float, leaves: float, normal: Floats, direction: Floa
     return (enters, normal) if enters >= 0.0 else (0.0, -direction)
 
 
-def _ball(radii: Floats, origin: Floats, direction: Floats) -> RayEntry | None:
-    span = _roots(origin / radii, direction / radii, 1.0)
+def _intersect_ellipsoid(radii: Floats, origin: Floats, direction: Floats) -> RayEntry | None:
+    span = _ball_interval(origin / radii, direction / radii, 1.0)
     if span is None:
         return None
     point = (origin + span[0] * direction) / radii**2
     return _entry_between(*span, point / np.linalg.norm(point), direction)
 
 
-def _roots(origin: Floats, direction: Floats, radius: float) -> tuple[float, float] | None:
+def _ball_interval(origin: Floats, direction: Floats, radius: float) -> tuple[float, float] | None:
     """Return the times between which a line is inside a ball; None for never."""
     a, b = float(direction @ direction), float(origin @ direction)
     # The distance of the line from the centre, which has more digits than the difference of squares.
@@ -97,21 +99,23 @@ def _roots(origin: Floats, direction: Floats, radius: float) -> tuple[float, flo
     return -b / a - root, -b / a + root
 
 
-def _capsule(shape: Capsule, origin: Floats, direction: Floats) -> RayEntry | None:
+def _intersect_capsule(shape: Capsule, origin: Floats, direction: Floats) -> RayEntry | None:
     half = np.array([0.0, 0.0, shape.length / 2])
-    found = [_round(Cylinder(shape.radius, shape.length), origin, direction)]
-    found += [_ball(np.full(3, shape.radius), origin + end, direction) for end in (half, -half)]
+    found = [_intersect_cylinder_or_cone(Cylinder(shape.radius, shape.length), origin, direction)]
+    found += [
+        _intersect_ellipsoid(np.full(3, shape.radius), origin + end, direction) for end in (half, -half)
+    ]
     hits = [hit for hit in found if hit is not None]
     # From inside any of the three it is inside the capsule.
     return min(hits, key=lambda hit: hit[0]) if hits else None
 
 
-def _round(shape: Cylinder | Cone, origin: Floats, direction: Floats) -> RayEntry | None:
+def _intersect_cylinder_or_cone(shape: Cylinder | Cone, origin: Floats, direction: Floats) -> RayEntry | None:
     """Cut between two discs by the wall x² + y² = r(z)², r linear in z; z runs between ±length/2."""
     radius, half = shape.radius, shape.length / 2
     slope = radius / shape.length if isinstance(shape, Cone) else 0.0
     start = radius / 2 if isinstance(shape, Cone) else radius
-    caps = _polytope_span(half, origin[2], direction[2])
+    caps = _slab_interval(half, origin[2], direction[2])
     if caps is None:
         return None
     # r(z) = start - slope z; the inside is where q(t) = x² + y² - r² <= 0 and r >= 0, which the caps ensure.
@@ -134,7 +138,7 @@ def _round(shape: Cylinder | Cone, origin: Floats, direction: Floats) -> RayEntr
     return best
 
 
-def _polytope_span(half: float, z: float, speed: float) -> tuple[float, float] | None:
+def _slab_interval(half: float, z: float, speed: float) -> tuple[float, float] | None:
     if abs(speed) < _PARALLEL:
         return (-math.inf, math.inf) if abs(z) <= half else None
     one, other = (-half - z) / speed, (half - z) / speed
@@ -157,7 +161,7 @@ def _intervals_below_zero(a: float, b: float, c: float) -> list[tuple[float, flo
     return [(roots[0], roots[1])] if a > 0.0 else [(-math.inf, roots[0]), (roots[1], math.inf)]
 
 
-def _triangles(mesh: Faces, origin: Floats, direction: Floats) -> RayEntry | None:
+def _intersect_triangles(mesh: Faces, origin: Floats, direction: Floats) -> RayEntry | None:
     """Return the nearest crossing, of either side (Möller and Trumbore 1997)."""
     corners = mesh.vertices[mesh.faces]
     one, other = corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]
@@ -181,7 +185,7 @@ def _triangles(mesh: Faces, origin: Floats, direction: Floats) -> RayEntry | Non
 
 
 def cast_ray(
-    mirror: CollisionWorld, origin: npt.ArrayLike, direction: npt.ArrayLike, length: float
+    world: CollisionWorld, origin: npt.ArrayLike, direction: npt.ArrayLike, length: float
 ) -> RayHit | None:
     """Return what a ray meets first within a length [m], None if nothing."""
     start, way = _check_point(origin, "origin"), _check_vector(direction, "direction")
@@ -192,8 +196,8 @@ def cast_ray(
         raise InvalidValueError(f"The length of a ray is positive [m], not {length!r}.")
     way = way / size  # first, so that squares neither overflow nor vanish
     way /= np.linalg.norm(way)
-    mirror.ready()
-    table = mirror.table
+    world.prepare()
+    table = world.table
     # How far along the ray each sphere begins, if the ray goes through it.
     to_centre = table.place - start
     along = to_centre @ way
@@ -206,24 +210,24 @@ def cast_ray(
         if along[k] - table.radius[k] > limit:
             break
         rotation, position = table.poses[k, :, :3], table.poses[k, :, 3]
-        entry = intersect_ray(mirror.solid(k), rotation.T @ (start - position), rotation.T @ way)
+        entry = intersect_ray(world.solid(k), rotation.T @ (start - position), rotation.T @ way)
         if entry is not None and entry[0] <= limit and (best is None or (entry[0], k) < best[:2]):
             best = entry[0], k, rotation @ entry[1]
             limit = entry[0]
     if best is None:
         return None
     distance, k, normal = best
-    piece = mirror.pieces[k]
+    piece = world.objects[k]
     return RayHit(piece.body, piece.number, distance, start + distance * way, normal)
 
 
-def find_nearest_point(mirror: CollisionWorld, point: npt.ArrayLike, radius: float) -> NearestPoint | None:
+def find_nearest_point(world: CollisionWorld, point: npt.ArrayLike, radius: float) -> NearestPoint | None:
     """Return what is nearest to a point within a radius [m], deepest if it is inside; None if nothing is."""
     place = _check_point(point, "point")
     if not radius >= 0.0:
         raise InvalidValueError(f"A radius is a distance from 0 on [m], not {radius!r}.")
-    mirror.ready()
-    table = mirror.table
+    world.prepare()
+    table = world.table
     to_point = place - table.place
     lows = np.linalg.norm(to_point, axis=1) - table.radius
     inside = np.einsum("kji,kj->ki", table.poses[:, :, :3], to_point)
@@ -233,9 +237,9 @@ def find_nearest_point(mirror: CollisionWorld, point: npt.ArrayLike, radius: flo
     for k in np.argsort(lows, kind="stable").tolist():
         if lows[k] > (radius if best is None else best.distance) + ACCURACY:
             break
-        distance, nearest, normal = distance_to_point(mirror.solid(k), table.poses[k], place)
+        distance, nearest, normal = distance_to_point(world.solid(k), table.poses[k], place)
         if distance <= radius and (best is None or distance < best.distance):
-            piece = mirror.pieces[k]
+            piece = world.objects[k]
             best = NearestPoint(piece.body, piece.number, distance, nearest, normal)
     return best
 

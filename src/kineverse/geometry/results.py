@@ -13,20 +13,21 @@ from .mesh_files import Floats
 
 @dataclass(frozen=True, slots=True, eq=False)
 class DistanceResult:
-    """How near two bodies are.
+    """Signed distance of two bodies, with its witness points and normal.
 
     Attributes
     ----------
     a, b
         The bodies.
     distance
-        Between the nearest two of their pieces [m]; in penetration minus the shortest way out.
+        Smallest distance between their shapes [m]; in penetration, minus the length of the shortest
+        translation that separates them.
     point_a, point_b
-        (3,) the points of a and b that are nearest to each other, or deepest in each other [m].
+        (3,) the nearest points of a and b, or the deepest ones in penetration [m].
     normal
-        (3,) unit vector from a to b, with ``distance == normal @ (point_b - point_a)``, through penetration.
-    piece_a, piece_b
-        Which of the shapes of each body they are on.
+        (3,) unit vector from a to b, with ``distance == normal @ (point_b - point_a)``, also in penetration.
+    shape_a, shape_b
+        Index of the nearest shape of each body.
     """
 
     a: str
@@ -35,19 +36,19 @@ class DistanceResult:
     point_a: Floats
     point_b: Floats
     normal: Floats
-    piece_a: int
-    piece_b: int
+    shape_a: int
+    shape_b: int
 
     @property
     def touches(self) -> bool:
-        """Whether they touch or penetrate."""
+        """True if the bodies touch or penetrate each other."""
         return self.distance <= 0.0
 
     def __str__(self) -> str:
         return f"{self.a} and {self.b}: {self.distance:.4g} m"
 
-    def swapped(self) -> DistanceResult:
-        """Return the same, seen from b."""
+    def swap(self) -> DistanceResult:
+        """Return the same result with a and b exchanged."""
         return DistanceResult(
             self.b,
             self.a,
@@ -55,27 +56,27 @@ class DistanceResult:
             self.point_b,
             self.point_a,
             -self.normal,
-            self.piece_b,
-            self.piece_a,
+            self.shape_b,
+            self.shape_a,
         )
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class RayHit:
-    """Where a ray meets a body first.
+    """First hit of a ray.
 
     Attributes
     ----------
-    body, piece
-        What is hit, and which of its shapes.
+    body, shape
+        The body that is hit, and the index of its shape.
     distance
-        From the origin of the ray [m]; 0 if that is inside a shape.
+        Distance from the origin of the ray [m]; 0 if the origin is inside of a shape.
     point, normal
-        (3,) where [m], and the outward unit normal there; against the ray from inside.
+        (3,) the point of the hit [m], and the outward unit normal there; against the ray if it starts inside.
     """
 
     body: str
-    piece: int
+    shape: int
     distance: float
     point: Floats
     normal: Floats
@@ -83,54 +84,54 @@ class RayHit:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class NearestPoint:
-    """What is nearest to a point.
+    """Nearest body to a query point.
 
     Attributes
     ----------
-    body, piece
-        What is nearest, and which of its shapes.
+    body, shape
+        The nearest body, and the index of its shape.
     distance
-        [m]; negative inside, by how far it is to the surface.
+        Signed distance from the surface [m]; negative inside.
     point, normal
-        (3,) the nearest point of the surface [m], and the unit normal there that points out of the body.
+        (3,) the nearest point of the surface [m], and the outward unit normal there.
     """
 
     body: str
-    piece: int
+    shape: int
     distance: float
     point: Floats
     normal: Floats
 
     @property
     def inside(self) -> bool:
-        """Whether the point is inside."""
+        """True if the point is inside of the body."""
         return self.distance < 0.0
 
 
 class DistanceResults(Sequence[DistanceResult]):
-    """Pairs of bodies, nearest first, each of which is made when it is looked at.
+    """Sequence of distance results, nearest first, whose entries are made on access.
 
     Parameters
     ----------
-    mirror
-        Where the pieces are from.
-    pieces, bodies, distances, witnesses
-        (K, 2) pieces, (K, 2) their bodies, that first which is before the other in the model, (K,) their
-        distances [m], (K, 9) the nearest points of both and the normals.
+    world
+        The collision world of the query.
+    objects, bodies, distances, witnesses
+        (K, 2) indices of collision objects, (K, 2) of their bodies, in the order of the model, (K,) distances
+        [m], and (K, 9) both nearest points and the normal.
 
     Attributes
     ----------
     distances
-        (K,) [m].
+        (K,) signed distances [m].
     points_a, points_b, normals
         (K, 3) each, as in :class:`DistanceResult`.
     """
 
     def __init__(
-        self, mirror: CollisionWorld, pieces: Indices, bodies: Indices, distances: Floats, witnesses: Floats
+        self, world: CollisionWorld, objects: Indices, bodies: Indices, distances: Floats, witnesses: Floats
     ) -> None:
-        self._bodies, self._pieces = mirror.bodies, mirror.pieces
-        self._numbers, self._owners = pieces, bodies
+        self._bodies, self._objects = world.bodies, world.objects
+        self._object_indices, self._body_indices = objects, bodies
         self.distances = distances
         self.points_a, self.points_b, self.normals = witnesses[:, :3], witnesses[:, 3:6], witnesses[:, 6:]
 
@@ -144,7 +145,7 @@ class DistanceResults(Sequence[DistanceResult]):
     def __getitem__(self, index: int | slice) -> DistanceResult | list[DistanceResult]:
         if isinstance(index, slice):
             return [self[k] for k in range(*index.indices(len(self)))]
-        (a, b), (i, j) = self._owners[index].tolist(), self._numbers[index].tolist()
+        (a, b), (i, j) = self._body_indices[index].tolist(), self._object_indices[index].tolist()
         return DistanceResult(
             self._bodies[a],
             self._bodies[b],
@@ -152,8 +153,8 @@ class DistanceResults(Sequence[DistanceResult]):
             self.points_a[index],
             self.points_b[index],
             self.normals[index],
-            self._pieces[i].number,
-            self._pieces[j].number,
+            self._objects[i].number,
+            self._objects[j].number,
         )
 
     def __repr__(self) -> str:

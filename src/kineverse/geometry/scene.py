@@ -31,34 +31,35 @@ _MAX_SELECTIONS = 32
 
 
 class Scene:
-    """The bodies of a model and where they are, for one thread; as many side by side as wanted.
+    """Collision scene: the bodies of a model at one state, with distance, ray and point queries.
 
-    It follows the model: after an edit the next question is about the new version. Bodies stand where the
-    last :meth:`update` put them. Files are read when the first question needs them. A body without collision
-    shapes is there as what is seen of it, a mesh as its convex hull.
+    A scene follows its model: after an edit, the next query is about the new version. Bodies have the poses
+    of the last :meth:`update`. Mesh files are read when the first query needs them. A body without collision
+    shapes is represented by its visual shapes, and a mesh by its convex hull. A scene is for one thread;
+    several scenes of one model are independent of each other.
 
     Parameters
     ----------
     model
         A model or a snapshot of one.
     rules
-        Which pairs of bodies are looked at, beside those that the model keeps under ``geometry/rules``; see
+        Rules of the collision filter, applied after those that the model keeps under ``geometry/rules``; see
         :class:`Rule`.
     triangles
-        Bodies, or patterns, whose meshes stay as they are: surfaces without an inside.
+        Bodies, or patterns, whose meshes stay triangle meshes: surfaces without an inside.
     decomposed
-        Bodies, or patterns, whose meshes are the convex hulls that ``kineverse decompose`` made of them, as
-        far as they are in the cache; the log names the others, which are their one hull. Their files are read
-        at once.
+        Bodies, or patterns, whose meshes are replaced by the convex hulls that ``kineverse decompose`` made
+        of them and cached. The log names meshes that are not in the cache; each of these is its one convex
+        hull. These files are read at once.
     leave_out
-        Bodies, or patterns, that do not take part; or ``(body, number)``, the shape of a body that does not.
+        Excluded bodies, or patterns; or ``(body, number)``, one excluded shape of a body.
 
     Raises
     ------
     MissingDependencyError
         If coal is not installed.
     UnknownNameError
-        If a rule, or another argument, is about a frame that does not exist.
+        If a rule, or another argument, names a frame that does not exist.
     """
 
     def __init__(
@@ -73,94 +74,102 @@ class Scene:
         self.model = model
         self._world = CollisionWorld(model, rules, triangles, decomposed, leave_out)
         self._parameters: dict[tuple[str, str], DistanceParameters] = {}
-        self._chosen: dict[tuple[Any, ...], Flags] = {}
+        self._selections: dict[tuple[Any, ...], Flags] = {}
         self._version: int | None = None
 
     @property
+    def collision_world(self) -> CollisionWorld:
+        """The collision objects in tables, for callers that compute with them."""
+        return self._world
+
+    @property
     def bodies(self) -> tuple[str, ...]:
-        """The bodies that take part, in the order of the model."""
-        self._world.follow()
+        """The bodies of the scene, in the order of the model."""
+        self._world.synchronize()
         return self._world.bodies
 
     @property
     def inputs(self) -> tuple[Symbol, ...]:
-        """The symbols that poses depend on: the order of a vector given to :meth:`update`."""
-        self._world.follow()
+        """The symbols that poses depend on, in the order of a vector given to :meth:`update`."""
+        self._world.synchronize()
         return self._world.inputs
 
     def update(self, state: StateLike | Sequence[float] | Floats) -> None:
-        """Put everything where it is at a state.
+        """Compute the poses of all bodies at a state.
 
         Parameters
         ----------
         state
-            A state or a mapping from symbols or names to values, of which speeds are not needed; or the
+            A state, or a mapping from symbols or names to values, in which speeds may be missing; or the
             values of :attr:`inputs` as a vector, which is faster [m], [rad].
 
         Raises
         ------
         UnknownNameError
-            If a value is missing or one is for a symbol that the model does not know.
+            If a value is missing, or the model has no symbol of that name.
         ShapeError
             If a vector has another length.
         InvalidValueError
-            If a value is NaN or a pose is not finite or 1e12 m away, naming the bodies; then everything stays
-            where it was.
+            If a value is NaN, or a pose is not finite or 1e12 m away; the message names the bodies. Then all
+            poses stay as they were.
         """
         self._world.update(state)
 
     def pose(self, body: str) -> npt.NDArray[np.float64]:
-        """Return where a body was put, world_T_body, (4, 4) [m]."""
-        mirror = self._world
-        mirror.ready(())
-        piece = mirror.members[mirror.number(body)][0]
-        world_T_piece = np.vstack([mirror.table.poses[piece], [0.0, 0.0, 0.0, 1.0]])
-        return np.asarray(world_T_piece @ inverse(mirror.pieces[piece].shape.origin.matrix))
+        """Return the pose of a body at the last update, world_T_body, (4, 4) [m]."""
+        world = self._world
+        world.prepare(())
+        first = world.members[world.body_index(body)][0]
+        world_T_object = np.vstack([world.table.poses[first], [0.0, 0.0, 0.0, 1.0]])
+        return np.asarray(world_T_object @ inverse(world.objects[first].shape.origin.matrix))
 
     # -- distances -----------------------------------------------------------------------------------------
 
     def distance(self, a: str, b: str) -> DistanceResult:
-        """Return how near two bodies are, whatever the rules say.
+        """Return the signed distance of two bodies, with the nearest points, regardless of the rules.
 
         Raises
         ------
         UnknownNameError
-            If one of them has no shapes, or there was no :meth:`update` yet.
+            If one of them has no shapes, or :meth:`update` was not called yet.
         KineverseError
-            If one of its shapes cannot be used, naming body and file.
+            If one of its shapes cannot be used; the message names body and file.
         """
         return distance_queries.find_distance(self._world, a, b)
 
     def distances(self, pairs: Iterable[tuple[str, str]]) -> list[DistanceResult]:
-        """Return how near the two bodies of each pair are, in the order of the pairs."""
+        """Return the distance of each pair of bodies, in the order of the pairs."""
         return [distance_queries.find_distance(self._world, a, b) for a, b in pairs]
 
-    def around(self, body: str, radius: float = math.inf) -> list[DistanceResult]:
-        """Return how near others are to a body, ``a`` in the results, nearest first, within a radius [m]."""
+    def distances_to(self, body: str, radius: float = math.inf) -> list[DistanceResult]:
+        """Return the distances of a body to all bodies within a radius [m], nearest first.
+
+        The body is ``a`` in the results.
+        """
         return distance_queries.find_distances_to(self._world, body, radius)
 
-    def within(self, radius: float) -> DistanceResults:
+    def pairs_within(self, radius: float) -> DistanceResults:
         """Return all pairs of bodies within a radius of each other [m], nearest first.
 
-        Bounds are carried from one state to the next, so that the cost follows what is near.
+        Bounds are carried from one state to the next, so the cost grows with the number of near pairs.
         """
         return distance_queries.find_pairs_within(self._world, radius)
 
-    def between(self, one: str, other: str, radius: float) -> DistanceResults:
-        """Return the pairs within a radius [m] of which one body is at or below each of two frames."""
+    def pairs_between(self, one: str, other: str, radius: float) -> DistanceResults:
+        """Return the pairs within a radius [m] between the subtrees of two frames, nearest first."""
         return distance_queries.find_pairs_within(
-            self._world, radius, self._wanted(("between", one, other), self._both_below)
+            self._world, radius, self._select_pairs(("between", one, other), self._between_subtrees)
         )
 
-    def inside(self, frame: str, radius: float) -> DistanceResults:
-        """Return the pairs within a radius [m] that are both at or below a frame: self-collision."""
-        return self.between(frame, frame, radius)
+    def self_pairs(self, frame: str, radius: float) -> DistanceResults:
+        """Return the pairs within a radius [m] inside the subtree of a frame: self-collision."""
+        return self.pairs_between(frame, frame, radius)
 
     def expression(self, a: str, b: str) -> PairDistance:
-        """Return the signed distance of two bodies as an expression, exact to first order at the state now.
+        """Return the signed distance of two bodies as an expression, exact to first order at the present state.
 
-        At other states give it :meth:`expression_values` of there. The symbols are the same every time, and
-        those that the model has, if it keeps a distance of these two.
+        At other states, evaluate it with the :meth:`expression_values` of that state. Every call for the same
+        pair uses the same symbols; if the model already contains a distance of the pair, those of the model.
         """
         closest, *poses = self._with_poses(a, b)
         if (a, b) not in self._parameters:
@@ -168,7 +177,7 @@ class Scene:
         return distance_expression(self.model, a, b, self._parameters[a, b])
 
     def expression_values(self, pairs: PairDistance | Iterable[PairDistance]) -> dict[Symbol, float]:
-        """Return the values that the parameters of distances have now, for ``state | kv.State(values)``."""
+        """Return the present values of the parameters of distances, for ``state | kv.State(values)``."""
         values: dict[Symbol, float] = {}
         for pair in [pairs] if isinstance(pairs, PairDistance) else pairs:
             values.update(pair.values(*self._with_poses(pair.a, pair.b)))
@@ -178,23 +187,24 @@ class Scene:
         return self.distance(a, b), self.pose(a), self.pose(b)
 
     def first_contact(self, margin: float = 0.0) -> DistanceResult | None:
-        """Return the first pair found within a margin [m], always the same at a state; None if none is."""
+        """Return a pair within a margin [m], or None; always the same pair at the same state."""
         return distance_queries.find_first_contact(self._world, margin)
 
     @property
     def in_collision(self) -> bool:
-        """Whether any pair touches."""
+        """True if any checked pair touches or penetrates."""
         return self.first_contact() is not None
 
     def checks_pair(self, a: str, b: str) -> bool:
-        """Return whether a pair is looked at, by adjacency and rules."""
-        one, other = self._world.number(a), self._world.number(b)
+        """Return True if the collision filter lets a pair be checked."""
+        one, other = self._world.body_index(a), self._world.body_index(b)
         return bool(self._world.table.allowed[one, other])
 
     def find_never_colliding(self, states: Iterable[StateLike], margin: float = 0.0) -> tuple[Rule, ...]:
-        """Return rules that except the pairs which are within a margin [m] at none of some states.
+        """Return rules that except all pairs that are never within a margin [m] at the given states.
 
-        That is an observation and no proof: choose states over the whole range. The scene stays at the last.
+        This is an observation, not a proof: choose states over the whole range. The scene stays at the last
+        state.
 
         Raises
         ------
@@ -204,10 +214,10 @@ class Scene:
         met: set[frozenset[str]] = set()
         every = list(states)
         if not every:
-            raise InvalidValueError("What never touches is seen at states, and none is given.")
+            raise InvalidValueError("Pairs that never touch are found by sampling states, and none is given.")
         for state in every:
             self.update(state)
-            met.update(frozenset((found.a, found.b)) for found in self.within(margin))
+            met.update(frozenset((found.a, found.b)) for found in self.pairs_within(margin))
         bodies, table = self.bodies, self._world.table.allowed
         pairs = [(a, b) for k, a in enumerate(bodies) for m, b in enumerate(bodies[:k]) if table[k, m]]
         why = f"never within {margin:g} m at {len(every)} states"
@@ -216,30 +226,31 @@ class Scene:
     # -- rays and points -----------------------------------------------------------------------------------
 
     def ray(self, origin: npt.ArrayLike, direction: npt.ArrayLike, length: float = math.inf) -> RayHit | None:
-        """Return what a ray meets first, None if nothing.
+        """Return the first hit of a ray, or None.
 
         Parameters
         ----------
         origin, direction
             (3,) in the world [m]; the direction has any length but 0.
         length
-            How far to look [m].
+            Length of the ray [m].
         """
         return rays.cast_ray(self._world, origin, direction, length)
 
     def point(self, point: npt.ArrayLike, radius: float = math.inf) -> NearestPoint | None:
-        """Return what is nearest to a point (3,) in the world within a radius [m], None if nothing is.
+        """Return the body nearest to a point (3,) in the world within a radius [m], or None.
 
-        Of what the point is inside of, that is where it is deepest. Triangles have no inside.
+        If the point is inside of bodies, it is the body in which the point is deepest. Triangles have no
+        inside.
         """
         return rays.find_nearest_point(self._world, point, radius)
 
     # -- symbols -------------------------------------------------------------------------------------------
 
-    def moved_by(self, symbols: Symbol | str | Iterable[Symbol | str]) -> tuple[str, ...]:
-        """Return the bodies that move in the world with some symbols, in the order of the model.
+    def bodies_moved_by(self, symbols: Symbol | str | Iterable[Symbol | str]) -> tuple[str, ...]:
+        """Return the bodies whose pose in the world depends on some symbols, in the order of the model.
 
-        A wheel's speed moves the whole robot, the crank of a loop all that follows it.
+        A wheel's speed moves the whole robot; the crank of a closed loop moves all dependent links.
 
         Raises
         ------
@@ -252,7 +263,7 @@ class Scene:
     def pairs_affected_by(
         self, symbols: Symbol | str | Iterable[Symbol | str]
     ) -> tuple[tuple[str, str], ...]:
-        """Return the pairs that are looked at whose distance depends on some symbols."""
+        """Return the checked pairs whose distance depends on some symbols."""
         motion = FrameDependence(self.model, _as_list(symbols))
         bodies, table = self.bodies, self._world.table.allowed
         ones, others = np.nonzero(np.triu(table))
@@ -264,31 +275,33 @@ class Scene:
     ) -> DistanceResults:
         """Return the pairs within a radius [m] whose distance depends on some symbols, nearest first."""
         return distance_queries.find_pairs_within(
-            self._world, radius, self._wanted(("moved by", *_as_list(symbols)), self._moving_apart)
+            self._world,
+            radius,
+            self._select_pairs(("moved by", *_as_list(symbols)), self._relatively_moving),
         )
 
-    def _wanted(self, key: tuple[Any, ...], choose: Callable[..., npt.NDArray[np.bool_]]) -> Flags:
-        """Return the pairs that are looked at and chosen, (B, B); kept for this version of the model."""
-        self._world.follow()
-        if self._version != self.model.version or len(self._chosen) > _MAX_SELECTIONS:
-            self._chosen.clear()
+    def _select_pairs(self, key: tuple[Any, ...], choose: Callable[..., npt.NDArray[np.bool_]]) -> Flags:
+        """Return flags (B, B) of the checked pairs that are chosen, cached for this version of the model."""
+        self._world.synchronize()
+        if self._version != self.model.version or len(self._selections) > _MAX_SELECTIONS:
+            self._selections.clear()
             self._version = self.model.version
-        if key not in self._chosen:
-            self._chosen[key] = np.ascontiguousarray(self._world.table.allowed * choose(*key[1:]))
-        return self._chosen[key]
+        if key not in self._selections:
+            self._selections[key] = np.ascontiguousarray(self._world.table.allowed * choose(*key[1:]))
+        return self._selections[key]
 
-    def _both_below(self, one: str, other: str) -> npt.NDArray[np.bool_]:
-        there = np.logical_and.outer(self._below(one), self._below(other))
-        return np.asarray(there | there.T)
+    def _between_subtrees(self, one: str, other: str) -> npt.NDArray[np.bool_]:
+        between = np.logical_and.outer(self._in_subtree(one), self._in_subtree(other))
+        return np.asarray(between | between.T)
 
-    def _moving_apart(self, *symbols: Symbol | str) -> npt.NDArray[np.bool_]:
+    def _relatively_moving(self, *symbols: Symbol | str) -> npt.NDArray[np.bool_]:
         motion = FrameDependence(self.model, symbols)
-        ways = [motion.way(body) for body in self.bodies]
-        numbers = {way: k for k, way in enumerate(dict.fromkeys(ways))}
-        number = np.array([numbers[way] for way in ways], dtype=int)
+        ancestors_of = [motion.moving_ancestors(body) for body in self.bodies]
+        numbers = {moving: k for k, moving in enumerate(dict.fromkeys(ancestors_of))}
+        number = np.array([numbers[moving] for moving in ancestors_of], dtype=int)
         return np.asarray(np.not_equal.outer(number, number))
 
-    def _below(self, frame: str) -> npt.NDArray[np.bool_]:
+    def _in_subtree(self, frame: str) -> npt.NDArray[np.bool_]:
         frames = self.model.frames
         if frame != WORLD and frame not in frames:
             raise UnknownNameError(f"There is no frame '{frame}'. {suggest(frame, frames, 'frame')}")
@@ -298,7 +311,7 @@ class Scene:
         )
 
     def __repr__(self) -> str:
-        return f"<Scene: {len(self._world.pieces)} pieces of {len(self._world.bodies)} bodies>"
+        return f"<Scene: {len(self._world.objects)} collision objects of {len(self._world.bodies)} bodies>"
 
 
 def _as_list(symbols: Symbol | str | Iterable[Symbol | str]) -> list[Symbol | str]:

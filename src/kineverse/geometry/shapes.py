@@ -118,7 +118,7 @@ class Core:
     tip: float = 0.0
 
     @staticmethod
-    def hull(points: Floats) -> Core:
+    def from_corners(points: Floats) -> Core:
         """Return the hull of (n, 3) corners."""
         missing = -len(points) % 8
         corners = np.ascontiguousarray(np.vstack([points, *missing * [points[:1]]]).T)
@@ -249,7 +249,9 @@ def _hull_solid(points: Floats) -> Solid:
     corners = np.array(convex.points())
     low, high = corners.min(axis=0), corners.max(axis=0)
     surface = Hull(np.array(convex.normals()), -np.array(convex.offsets()).reshape(-1))
-    return _solid_around(convex, surface, (low + high) / 2, (high - low) / 2, corners, Core.hull(corners))
+    return _solid_around(
+        convex, surface, (low + high) / 2, (high - low) / 2, corners, Core.from_corners(corners)
+    )
 
 
 def _triangle_solid(vertices: Floats, faces: Integers) -> Solid:

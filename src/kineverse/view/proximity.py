@@ -130,7 +130,7 @@ class ProximityQuery:
         """
         # A state, for the values may be of more symbols than the scene has.
         self._scene.update(State(values))
-        found = _filter_by_name(self._scene.within(radius), containing)
+        found = _filter_by_name(self._scene.pairs_within(radius), containing)
         looked_at, unchecked_pairs = self._ignored.counts
         return ProximityResult(
             radius,
@@ -148,8 +148,8 @@ class ProximityQuery:
         if self._all is None:
             self._all = self._scene_with([Rule("*", "*", check=True)])
         self._all.update(State(values))
-        found = _filter_by_name(self._all.within(radius), containing)
-        reasons = ((pair, self._ignored.why(pair.a, pair.b)) for pair in found)
+        found = _filter_by_name(self._all.pairs_within(radius), containing)
+        reasons = ((pair, self._ignored.reason(pair.a, pair.b)) for pair in found)
         return [(pair, why) for pair, why in reasons if why not in ("", RIGID)][:MOST_PAIRS]
 
 

@@ -42,7 +42,7 @@ class KineverseSearch:
 
     def find(self) -> object:
         """Find what is near."""
-        self.found = self.scene.within(self._radius)
+        self.found = self.scene.pairs_within(self._radius)
         return self.found
 
     def distances(self) -> PairDistances:
@@ -59,14 +59,14 @@ class CoalSearch:
     def __init__(self, scene: Scene, radius: float = RADIUS) -> None:
         coal = import_coal()
         self._radius = radius
-        self._scene, mirror = scene, scene._world
+        self._scene, world = scene, scene.collision_world
         scene.update(np.zeros(len(scene.inputs)))
-        mirror.ready()
-        self._table = table = mirror.table
+        world.prepare()
+        self._table = table = world.table
         self._looked_at = np.triu(table.allowed[table.body[: table.moving, None], table.body] == 1)
         self._reach = (table.radius[: table.moving, None] + table.radius + radius) ** 2
-        self._solids = [mirror.solid(k) for k in range(table.count)]
-        self._names = [piece.body for piece in mirror.pieces]
+        self._solids = [world.solid(k) for k in range(table.count)]
+        self._names = [piece.body for piece in world.objects]
         self._transforms = [coal.Transform3s(pose[:, :3], pose[:, 3]) for pose in table.poses]
         self._make, self._functors = coal.ComputeDistance, dict[tuple[int, int], Any]()
         self._request, self._result = coal.DistanceRequest(), coal.DistanceResult()

@@ -31,10 +31,10 @@ class RobotSurroundings:
     """
 
     def __init__(self, scene: Scene, values: Array, robot: str) -> None:
-        self._scene, self._world = scene, scene._world
+        self._scene, self._world = scene, scene.collision_world
         scene.update(values)
-        self._world.ready()
-        self.names = [piece.body for piece in self._world.pieces]
+        self._world.prepare()
+        self.names = [piece.body for piece in self._world.objects]
         self.robot = [k for k, name in enumerate(self.names) if name.startswith(robot)]
         self.others = [k for k, name in enumerate(self.names) if not name.startswith(robot)]
 

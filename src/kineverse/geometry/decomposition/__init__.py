@@ -7,7 +7,7 @@ there.
 
 from .accuracy import Accuracy
 from .convex_decomposition import DecompositionOutcome, decompose, decompose_all, find_hulls
-from .hull_cache import CacheEntry, clear, folder, listing
+from .hull_cache import CacheEntry, clear, folder, list_entries
 from .result import Decomposition, DecompositionSettings
 from .worker import DecompositionError, ResourceLimits
 
@@ -24,5 +24,5 @@ __all__ = [
     "decompose_all",
     "find_hulls",
     "folder",
-    "listing",
+    "list_entries",
 ]

@@ -61,7 +61,7 @@ class Polytope:
     offsets: Floats
 
     @staticmethod
-    def of(points: Floats) -> Polytope:
+    def from_points(points: Floats) -> Polytope:
         """Return the hull of (n, 3) points [m]; flat ones are given a thickness.
 
         Raises
@@ -86,7 +86,7 @@ class Polytope:
         triangles[inwards] = triangles[inwards, ::-1]
         return Polytope(convex, corners, triangles, normals, offsets)
 
-    def outside(self, points: Floats) -> Floats:
+    def face_distances(self, points: Floats) -> Floats:
         """Return how far (N, 3) points are beyond the face that they are furthest beyond, (N,) [m].
 
         Negative inside. Outside, the distance is no less.
@@ -113,7 +113,7 @@ def measure_accuracy(mesh: Faces, hulls: list[Polytope]) -> Accuracy:
     return Accuracy(
         mesh_volume=abs(enclosed_volume(mesh.vertices, mesh.faces)) if is_closed(mesh.faces) else None,
         volume=_union_volume(hulls, random),
-        hull_volume=Polytope.of(mesh.vertices).volume,
+        hull_volume=Polytope.from_points(mesh.vertices).volume,
         excess=_excess(mesh, hulls, random),
         uncovered=_uncovered(mesh, hulls, random),
     )
@@ -136,15 +136,15 @@ def _union_volume(hulls: list[Polytope], random: np.random.Generator) -> float:
     """Return ``Σ V_i · mean of 1/m(x) over x in convex_hull i``, where m(x) counts the hulls that hold x."""
     total = 0.0
     for k, polytope in enumerate(hulls):
-        inside = _inside(polytope, random)
+        inside = _sample_volume(polytope, random)
         held = np.ones(len(inside))
         for other in (*hulls[:k], *hulls[k + 1 :]):
-            held += other.outside(inside) < 0.0
+            held += other.face_distances(inside) < 0.0
         total += polytope.volume * float((1.0 / held).mean())
     return total
 
 
-def _inside(polytope: Polytope, random: np.random.Generator) -> Floats:
+def _sample_volume(polytope: Polytope, random: np.random.Generator) -> Floats:
     """Return points spread evenly in a hull: in tetrahedra over its triangles."""
     centre = polytope.points.mean(axis=0)
     corners = polytope.points[polytope.triangles] - centre
@@ -154,7 +154,7 @@ def _inside(polytope: Polytope, random: np.random.Generator) -> Floats:
     return np.asarray(centre + np.einsum("nk,nkd->nd", weights, corners[chosen]))
 
 
-def _on_surface(vertices: Floats, faces: Integers, count: int, random: np.random.Generator) -> Floats:
+def _sample_surface(vertices: Floats, faces: Integers, count: int, random: np.random.Generator) -> Floats:
     """Return points spread evenly on triangles."""
     a, b, c = (vertices[faces[:, k]] for k in range(3))
     areas = np.linalg.norm(np.cross(b - a, c - a), axis=1)
@@ -167,8 +167,8 @@ def _uncovered(mesh: Faces, hulls: list[Polytope], random: np.random.Generator) 
     corners = mesh.vertices
     if len(corners) > _MOST_CORNERS:
         corners = random.choice(corners, _MOST_CORNERS, replace=False)
-    points = np.concatenate([corners, _on_surface(mesh.vertices, mesh.faces, SAMPLES, random)])
-    beyond = np.min([polytope.outside(points) for polytope in hulls], axis=0)
+    points = np.concatenate([corners, _sample_surface(mesh.vertices, mesh.faces, SAMPLES, random)])
+    beyond = np.min([polytope.face_distances(points) for polytope in hulls], axis=0)
     points = points[beyond > _NOTHING * np.ptp(mesh.vertices, axis=0).max()]
     if not len(points):
         return 0.0
@@ -182,9 +182,11 @@ def _excess(mesh: Faces, hulls: list[Polytope], random: np.random.Generator) -> 
     each = max(SAMPLES // len(hulls), 100)
     points = []
     for k, polytope in enumerate(hulls):
-        on = np.concatenate([polytope.points, _on_surface(polytope.points, polytope.triangles, each, random)])
+        on = np.concatenate(
+            [polytope.points, _sample_surface(polytope.points, polytope.triangles, each, random)]
+        )
         # A point inside of another hull is not on the surface of the union.
-        depths = [other.outside(on) for other in (*hulls[:k], *hulls[k + 1 :])]
+        depths = [other.face_distances(on) for other in (*hulls[:k], *hulls[k + 1 :])]
         points.append(on[np.min(depths, axis=0) > -_NOTHING * size] if depths else on)
     outermost = np.concatenate(points)
     if not len(outermost):
@@ -196,13 +198,13 @@ def _excess(mesh: Faces, hulls: list[Polytope], random: np.random.Generator) -> 
     step = max(_PAIRS // len(mesh.faces), 1)
     for start in range(0, len(order), step):
         some = order[start : start + step]
-        out = np.flatnonzero(np.abs(_winding(mesh, outermost[some])) < 0.5)
+        out = np.flatnonzero(np.abs(_winding_numbers(mesh, outermost[some])) < 0.5)
         if len(out):
             return float(distances[some[out[0]]])
     return 0.0
 
 
-def _winding(mesh: Faces, points: Floats) -> Floats:
+def _winding_numbers(mesh: Faces, points: Floats) -> Floats:
     """Return how often a mesh winds around (N, 3) points: 1 inside, 0 outside, between them if it is open.
 
     The sum of the solid angles of its triangles over 4π (Jacobson, Kavan and Sorkine-Hornung, 2013).

@@ -33,21 +33,21 @@ def clean_hulls(hulls: list[Floats], whole: Polytope) -> list[Polytope]:
     found = []
     for points in hulls:
         try:
-            found.append(Polytope.of(_project_inside(points, whole)))
+            found.append(Polytope.from_points(_project_inside(points, whole)))
         except InvalidValueError:  # A splinter: a cut has come upon a point or an edge.
             continue
     found.sort(key=lambda polytope: -polytope.volume)
     kept: list[Polytope] = []
     for polytope in found:
         room = _INSIDE * np.ptp(polytope.points, axis=0).max()
-        if not any((larger.outside(polytope.points) <= room).all() for larger in kept):
+        if not any((larger.face_distances(polytope.points) <= room).all() for larger in kept):
             kept.append(polytope)
     return kept
 
 
 def _project_inside(points: Floats, whole: Polytope) -> Floats:
     points = points.copy()
-    beyond = whole.outside(points) > 0.0
+    beyond = whole.face_distances(points) > 0.0
     points[beyond] = nearest_surface_points(whole.engine, points[beyond])[1]
     return points
 
@@ -73,7 +73,7 @@ def reduce_hulls(hulls: list[Polytope], count: int) -> list[Polytope]:
 
 def _join_hulls(one: Polytope, other: Polytope) -> tuple[float, Polytope]:
     """Return the volume that joining two hulls adds [m³], and what they become."""
-    both = Polytope.of(np.concatenate([one.points, other.points]))
+    both = Polytope.from_points(np.concatenate([one.points, other.points]))
     return both.volume - one.volume - other.volume, both
 
 
@@ -209,7 +209,7 @@ def _decompose_surface(
 ) -> Decomposition:
     start = time.perf_counter()
     error = settings.allowed(surface.size)
-    found = clean_hulls(run_coacd(surface, error, limits, stop), Polytope.of(surface.faces.vertices))
+    found = clean_hulls(run_coacd(surface, error, limits, stop), Polytope.from_points(surface.faces.vertices))
     hulls = reduce_hulls(found, settings.max_hulls)
     if not hulls:
         raise DecompositionError("CoACD found no hull.")

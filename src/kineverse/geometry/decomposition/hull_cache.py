@@ -78,7 +78,7 @@ def add_entry(mesh: str, settings: str, decomposition: Decomposition) -> None:
     _make_room(folder)
 
 
-def listing() -> list[CacheEntry]:
+def list_entries() -> list[CacheEntry]:
     """Return what is in the cache, by name of the file it was made from."""
     folder = _folder()
     found = [(_read(folder, name, used=False), size) for _, size, name in _files(folder)]
