@@ -97,7 +97,7 @@ def test_numpy_and_c_agree(library, seed, count, reach):
             == library.place(other.table, np.ascontiguousarray(fresh))
             == -1
         )
-        for name in ("poses", "travel", "place", "low", "high"):
+        for name in ("poses", "travel", "position", "low", "high"):
             np.testing.assert_allclose(getattr(one.table, name), getattr(other.table, name), atol=1e-12)
         lists = [
             _sorted(*way(cloud.table, reach))

@@ -1,6 +1,6 @@
 """Bindings of the compiled broad and narrow phase, with the numpy path until they are built.
 
-Until then, and without a compiler, numpy and coal do it.
+Until the library is built, and without a compiler, numpy and coal compute the same results.
 """
 
 from __future__ import annotations
@@ -22,16 +22,16 @@ from .support_c import SUPPORT
 
 _ARRAYS = (
     "body", "allowed", "active", "centre", "half", "radius",
-    "poses", "travel", "place", "low", "high", "bounds", "order", "sorted_boxes",
+    "poses", "travel", "position", "low", "high", "bounds", "order", "sorted_boxes",
     "corners", "corner_count", "edges", "radii", "round", "tip", "memory",
 )  # fmt: skip
 
 
 RankedPairs: TypeAlias = tuple[Indices, Indices, Floats, Floats]
-"""Pieces (K, 2), their bodies (K, 2), distances (K,) and witnesses (K, 9), in an order."""
+"""Objects (K, 2), their bodies (K, 2), distances (K,) and witnesses (K, 9), nearest first."""
 
 SearchResult: TypeAlias = tuple[Indices, Floats, Floats, Floats, RankedPairs | None]
-"""Pairs, lower bounds, distances, witnesses, until the next question; and the nearest ones, to be kept."""
+"""Pairs, lower bounds, distances and witnesses, valid until the next query; and copies of ranked pairs."""
 
 
 class _Struct(ctypes.Structure):
@@ -43,36 +43,36 @@ class _Struct(ctypes.Structure):
 
 
 class CollisionLibrary(SourceLibrary):
-    """The compiled sweep, once there is one; for all scenes of the process."""
+    """Compiled broad and narrow phase, once it is built; shared by all scenes of the process."""
 
     def __init__(self) -> None:
         super().__init__(SWEEP + SUPPORT + SIMPLEX + PENETRATION + NARROW + SEARCH, _declare_signatures)
 
     def place(self, table: ObjectTable, fresh: Floats) -> int:
-        """Do what :func:`.broadphase.place_objects` does; ``fresh`` is contiguous."""
+        """Place objects as :func:`.broadphase.place_objects` does; ``fresh`` is contiguous."""
         if self._code is None:
             return broadphase.place_objects(table, fresh)
         return int(self._code.place(_bind_table(table).address, fresh.ctypes.data))
 
     def near(self, table: ObjectTable, reach: float) -> tuple[Indices, Floats]:
-        """Do what :func:`.broadphase.find_near_pairs` does, for all pairs that are looked at."""
+        """Find near pairs as :func:`.broadphase.find_near_pairs` does, among all checked pairs."""
         if self._code is None:
             return broadphase.find_near_pairs(table, reach)
-        native = _bind_table(table)
+        binding = _bind_table(table)
         while True:
-            found = self._code.near(native.address, reach, *native.results)
-            if found <= len(native.lows):
-                return native.pairs[:found], native.lows[:found]
-            native.reserve(2 * found)
+            found = self._code.near(binding.address, reach, *binding.results)
+            if found <= len(binding.lows):
+                return binding.pairs[:found], binding.lows[:found]
+            binding.reserve(2 * found)
 
     def measure(self, table: ObjectTable, pairs: Indices, limit: float) -> tuple[Floats, Floats]:
-        """Measure pairs of pieces, (K, 2) with the smaller number first, as far as C can.
+        """Measure pairs of objects, (K, 2) with the smaller index first, as far as C can.
 
         Returns
         -------
         distances, witnesses
-            (K,) [m], infinite or not beyond the limit, NaN for those that are left to coal; and (K, 9) the
-            nearest points of both and the normal, where the distance is finite.
+            (K,) distances [m], possibly infinite beyond the limit, and NaN for pairs that are left to coal;
+            (K, 9) both nearest points and the normal, where the distance is finite.
         """
         count = len(pairs)
         if self._code is None or not count:
@@ -85,7 +85,7 @@ class CollisionLibrary(SourceLibrary):
     def rank(
         self, table: ObjectTable, pairs: Indices, distances: Floats, radius: float
     ) -> npt.NDArray[np.int64]:
-        """Do what :func:`.broadphase.rank_pairs` does; all arrays are contiguous."""
+        """Rank pairs as :func:`.broadphase.rank_pairs` does; all arrays are contiguous."""
         if self._code is not None:
             order = np.empty(len(pairs), dtype=np.int64)
             where = pairs.ctypes.data, len(pairs), distances.ctypes.data, radius, order.ctypes.data
@@ -102,49 +102,49 @@ class CollisionLibrary(SourceLibrary):
         witnesses: Floats,
         order: npt.NDArray[np.int64],
     ) -> RankedPairs:
-        """Do what :func:`.broadphase.gather_pairs` does; all arrays are contiguous."""
+        """Gather pairs as :func:`.broadphase.gather_pairs` does; all arrays are contiguous."""
         if self._code is None:
             return broadphase.gather_pairs(table, pairs, distances, witnesses, order)
         count = len(order)
-        pieces, bodies = np.empty((2, count, 2), dtype=np.int32)
+        objects, bodies = np.empty((2, count, 2), dtype=np.int32)
         near, points = np.empty(count), np.empty((count, 9))
         given = (array.ctypes.data for array in (pairs, distances, witnesses, order))
-        made = (array.ctypes.data for array in (pieces, bodies, near, points))
+        made = (array.ctypes.data for array in (objects, bodies, near, points))
         self._code.gather(_bind_table(table).address, *given, count, *made)
-        return pieces, bodies, near, points
+        return objects, bodies, near, points
 
     def search(
         self, table: ObjectTable, reach: float, radius: float, wanted: Flags | None = None
     ) -> SearchResult:
-        """Do :meth:`near` and :meth:`measure`; if that leaves nothing to coal, :meth:`rank`, :meth:`gather`.
+        """Apply :meth:`near`, :meth:`measure` and, if none is left to coal, :meth:`rank` and :meth:`gather`.
 
-        For the pairs of bodies that are wanted, (B, B); for all that are looked at if None.
+        The search covers the pairs of bodies flagged in ``wanted``, (B, B), or all checked pairs if None.
         """
         if self._code is None:
             pairs, lows = broadphase.find_near_pairs(table, reach, wanted)
             return pairs, lows, *self.measure(table, pairs, radius), None
-        native = _bind_table(table)
-        looked_at = native.struct.allowed
+        binding = _bind_table(table)
+        checked = binding.struct.allowed
         if wanted is not None:
-            native.struct.allowed = wanted.ctypes.data
+            binding.struct.allowed = wanted.ctypes.data
         try:
-            while (found := self._code.search(native.address, reach, radius, *native.everything)) > len(
-                native.lows
+            while (found := self._code.search(binding.address, reach, radius, *binding.everything)) > len(
+                binding.lows
             ):
-                native.reserve(2 * found)
+                binding.reserve(2 * found)
         finally:
-            native.struct.allowed = looked_at
-        kept = native.kept.value
-        pairs, lows, distances, witnesses = native.pairs, native.lows, native.distances, native.witnesses
+            binding.struct.allowed = checked
+        kept = binding.kept.value
+        pairs, lows, distances, witnesses = binding.pairs, binding.lows, binding.distances, binding.witnesses
         if kept < 0:
             return pairs[:found], lows[:found], distances[:found], witnesses[:found], None
-        pieces, bodies, near, points = native.nearest
-        nearest = pieces[:kept].copy(), bodies[:kept].copy(), near[:kept].copy(), points[:kept].copy()
+        objects, bodies, near, points = binding.nearest
+        nearest = objects[:kept].copy(), bodies[:kept].copy(), near[:kept].copy(), points[:kept].copy()
         return pairs[:found], lows[:found], distances[:found], witnesses[:found], nearest
 
 
 class _TableBinding:
-    """A table as C sees it, and where the pairs go."""
+    """Table as C reads it, with buffers for results."""
 
     def __init__(self, table: ObjectTable) -> None:
         self.struct = _Struct()
@@ -157,35 +157,35 @@ class _TableBinding:
         self.reserve(256)
 
     def rebuild_tree(self, table: ObjectTable) -> None:
-        """Take notice of where the pieces are that stand."""
-        standing = np.arange(table.moving, table.count, dtype=np.int32)
-        self.boxes, self.leaves = build_static_tree(table.low, table.high, standing)
+        """Rebuild the tree of the static objects."""
+        static = np.arange(table.moving, table.count, dtype=np.int32)
+        self.boxes, self.leaves = build_static_tree(table.low, table.high, static)
         self.struct.boxes, self.struct.leaves = self.boxes.ctypes.data, self.leaves.ctypes.data
         self.struct.leaf_count = len(self.leaves)
         table.static_changed = False
 
     def reserve(self, count: int) -> None:
-        """Make room for so many pairs."""
+        """Allocate buffers for a number of pairs."""
         self.pairs = np.empty((count, 2), dtype=np.int32)
         self.lows = np.empty(count)
         self.distances, self.witnesses = np.empty(count), np.empty((count, 9))
         self.order, self.kept = np.empty(count, dtype=np.int64), ctypes.c_int64()
         self.results = self.pairs.ctypes.data, self.lows.ctypes.data, count
-        pieces, bodies = np.empty((2, count, 2), dtype=np.int32)
-        self.nearest = pieces, bodies, np.empty(count), np.empty((count, 9))
+        objects, bodies = np.empty((2, count, 2), dtype=np.int32)
+        self.nearest = objects, bodies, np.empty(count), np.empty((count, 9))
         measured = (array.ctypes.data for array in (self.distances, self.witnesses, self.order))
         gathered = (array.ctypes.data for array in self.nearest)
         self.everything = count, *self.results[:2], *measured, ctypes.addressof(self.kept), *gathered
 
 
 def _bind_table(table: ObjectTable) -> _TableBinding:
-    native: _TableBinding | None = table.binding
-    if native is None:
-        native = table.binding = _TableBinding(table)
-    native.struct.axis = table.axis
+    binding: _TableBinding | None = table.binding
+    if binding is None:
+        binding = table.binding = _TableBinding(table)
+    binding.struct.axis = table.axis
     if table.static_changed:
-        native.rebuild_tree(table)
-    return native
+        binding.rebuild_tree(table)
+    return binding
 
 
 def _declare_signatures(code: Any) -> None:

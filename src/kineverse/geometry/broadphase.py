@@ -1,11 +1,12 @@
 """Broad phase: sweep and prune with a static AABB tree, and lower bounds carried from state to state.
 
-A point of a piece at c from its centre moves by ``|Δcentre + ΔR c| <= |Δcentre| + r ‖ΔR‖``, with r the radius
-of its sphere. The sum of this over all updates is its *travel* s. Two pieces that were at a distance d when
-they had travelled s_i and s_j are therefore at least ``d + s_i + s_j`` less their present travel apart. What
-has gone too far for that to be exact in floating point begins again at 0.
+In one update, a point of an object at c from its centre moves by ``|Δcentre + ΔR c| <= |Δcentre| + r ‖ΔR‖``,
+with r the radius of the bounding sphere. The sum of this bound over all updates is the *travel* s of the
+object. Let two objects have had the distance d when their travel was s_i and s_j. Then ``d + s_i + s_j``
+minus their present travel is a lower bound of their distance. Travel that is too large for exact bounds in
+floating point is reset to 0.
 
-This is the whole of it in numpy; :mod:`.sweep_native` has the same in C, several times as fast.
+This module is the numpy path; :mod:`.bindings` offers the same in C, several times as fast.
 """
 
 from __future__ import annotations
@@ -23,10 +24,10 @@ Indices: TypeAlias = npt.NDArray[np.int32]
 Flags: TypeAlias = npt.NDArray[np.uint8]
 
 MAX_BOUNDED_OBJECTS = 6000
-"""Bounds are carried for so many pieces at most; memory is touched only for pairs that were measured."""
+"""Largest number of objects for which bounds are carried; only measured pairs touch their memory."""
 
 MEMORY_SLOTS = 2**13
-"""So many pairs are not measured again where nothing has moved; a power of two."""
+"""Number of measured pairs that are remembered until an object moves; a power of two."""
 
 _MEMORY = np.dtype([("pair", np.int64), ("numbers", np.float64, 12)])
 
@@ -38,41 +39,45 @@ _INHERITED = (
 
 @dataclass(eq=False)
 class ObjectTable:
-    """M pieces of B bodies, those that move first.
+    """Table of M collision objects of B bodies, moving objects first.
 
     Attributes
     ----------
     moving
-        How many move; the others stand where they were first put.
+        Number of moving objects; the others are static.
     body
-        (M,) the number of the body of each.
+        (M,) index of the body of each object.
     allowed
-        (B, B) 1 for pairs of bodies that are looked at, symmetric; 0 on the diagonal.
+        (B, B) 1 for pairs of bodies that are checked, symmetric; 0 on the diagonal.
     active
-        (M,) 1 for pieces that have a solid.
+        (M,) 1 for objects that have a solid.
     centre, half, radius
-        (M, 3), (M, 3), (M,) the box and the sphere around each in its own frame [m].
+        (M, 3), (M, 3), (M,) bounding box and bounding sphere in the frame of the object [m].
     poses
-        (M, 3, 4) in the world.
+        (M, 3, 4) poses in the world.
     travel
-        (M,) by how much any point of a piece can have moved since the beginning, at most [m].
-    place, low, high
-        (M, 3) each: the centre in the world, and the corners of the box around the piece there [m].
+        (M,) upper bounds of the motion of any point of an object since the last reset [m].
+    position, low, high
+        (M, 3) each: the centre in the world, and the corners of the axis-aligned bounding box [m].
     corners, corner_count, edges, radii, round, tip
-        (M,) the address of a piece's corners, how many these are, -1 for a piece without a core; the (M, 3)
-        box, (M, 3) ellipsoid, (M,) ball and (M,) tip of its core [m]. See :class:`.shapes.Core`, which has to
-        outlive this.
+        Cores of the solids, see :class:`.shapes.Core`, which has to outlive the table: (M,) address and (M,)
+        number of the corners, -1 without a core; (M, 3) half edges of the box, (M, 3) radii of the ellipsoid,
+        (M,) radius of the ball and (M,) tip of the cone [m].
     memory
-        What C measured last, of each pair that has not given way to another one.
+        Last results of C, in slots that later pairs overwrite.
     order
-        (M,) the moving pieces sorted along ``axis`` when that was last done, and then the others.
+        (M,) moving objects as last sorted along ``axis``, then the static ones.
     sorted_boxes
-        Room for C: the corners of the boxes of the moving pieces in that order, and a row of gaps.
+        Work space of C: corners of the moving objects' boxes in that order, and a row of gaps.
+    axis
+        Axis of the sweep: 0, 1 or 2.
+    binding
+        The table as C reads it, once it exists.
     static_changed
-        Whether any of the others was put somewhere since somebody took notice.
+        True if a static object was placed since the static tree was built.
     bounds
-        (M, M) for i < j, the distance when it was measured, plus the travel of both at that time; 0 if it
-        never was. Less their travel now it is a lower bound of the distance. None for too many pieces.
+        (M, M) for i < j, the last measured distance plus the travel of both at that time; 0 before. Minus the
+        present travel it is a lower bound of the distance. None for too many objects.
     """
 
     moving: int
@@ -84,7 +89,7 @@ class ObjectTable:
     radius: Floats = field(init=False)
     poses: Floats = field(init=False)
     travel: Floats = field(init=False)
-    place: Floats = field(init=False)
+    position: Floats = field(init=False)
     low: Floats = field(init=False)
     high: Floats = field(init=False)
     corners: npt.NDArray[np.uintp] = field(init=False)
@@ -107,7 +112,7 @@ class ObjectTable:
         self.centre, self.half = np.zeros((count, 3)), np.zeros((count, 3))
         self.radius, self.travel = np.zeros(count), np.zeros(count)
         self.poses = np.tile(np.eye(4)[:3], (count, 1, 1))
-        self.place, self.low, self.high = (np.zeros((count, 3)) for _ in range(3))
+        self.position, self.low, self.high = (np.zeros((count, 3)) for _ in range(3))
         self.corners, self.corner_count = np.zeros(count, dtype=np.uintp), np.full(count, -1, dtype=np.int64)
         self.edges, self.radii, self.round = np.zeros((count, 3)), np.zeros((count, 3)), np.zeros(count)
         self.tip, self.memory = np.zeros(count), np.zeros(MEMORY_SLOTS, dtype=_MEMORY)
@@ -117,31 +122,35 @@ class ObjectTable:
 
     @property
     def count(self) -> int:
-        """How many pieces there are."""
+        """Number of objects."""
         return len(self.body)
 
     def set_solid(
-        self, piece: int, centre: Floats, half: Floats, radius: float, core: Core | None = None
+        self, index: int, centre: Floats, half: Floats, radius: float, core: Core | None = None
     ) -> None:
-        """Enter what encloses a piece, and what it is."""
-        self.centre[piece], self.half[piece], self.radius[piece] = centre, half, radius
+        """Enter the bounding volumes and the core of an object's solid."""
+        self.centre[index], self.half[index], self.radius[index] = centre, half, radius
         if core is not None:
-            self.corners[piece], self.corner_count[piece] = core.corners.ctypes.data, core.corners.shape[1]
-            self.edges[piece], self.radii[piece], self.round[piece] = core.half, core.radii, core.radius
-            self.tip[piece] = core.tip
-        self.active[piece] = 1
-        self.update_boxes(np.array([piece]))
+            self.corners[index], self.corner_count[index] = core.corners.ctypes.data, core.corners.shape[1]
+            self.edges[index], self.radii[index], self.round[index] = core.half, core.radii, core.radius
+            self.tip[index] = core.tip
+        self.active[index] = 1
+        self.update_boxes(np.array([index]))
 
-    def update_boxes(self, pieces: npt.NDArray[np.integer[Any]]) -> None:
-        """Compute where pieces are from their poses."""
-        self.static_changed |= bool((pieces >= self.moving).any())
-        rotation, position = self.poses[pieces, :, :3], self.poses[pieces, :, 3]
-        place = np.einsum("kij,kj->ki", rotation, self.centre[pieces]) + position
-        extent = np.einsum("kij,kj->ki", np.abs(rotation), self.half[pieces])
-        self.place[pieces], self.low[pieces], self.high[pieces] = place, place - extent, place + extent
+    def update_boxes(self, objects: npt.NDArray[np.integer[Any]]) -> None:
+        """Recompute the centres and boxes of objects from their poses."""
+        self.static_changed |= bool((objects >= self.moving).any())
+        rotation, translation = self.poses[objects, :, :3], self.poses[objects, :, 3]
+        centre = np.einsum("kij,kj->ki", rotation, self.centre[objects]) + translation
+        extent = np.einsum("kij,kj->ki", np.abs(rotation), self.half[objects])
+        self.position[objects], self.low[objects], self.high[objects] = (
+            centre,
+            centre - extent,
+            centre + extent,
+        )
 
     def inherit(self, old: ObjectTable, kept: npt.NDArray[np.integer[Any]]) -> None:
-        """Enter what another table knew of pieces: (K, 2) their numbers here and there."""
+        """Copy rows of another table; ``kept`` holds (K, 2) indices in this table and in the other."""
         here, there = kept[:, 0], kept[:, 1]
         for name in _INHERITED:
             getattr(self, name)[here] = getattr(old, name)[there]
@@ -151,33 +160,33 @@ class ObjectTable:
         number = np.full(old.count, -1)
         number[there] = here
         measured = np.nonzero(old.bounds)
-        ones, others = (number[pieces] for pieces in measured)
+        ones, others = (number[objects] for objects in measured)
         both = (ones >= 0) & (others >= 0)
         ones, others = ones[both], others[both]
-        # Kept for the smaller number first; numbers may have changed places.
+        # Entries stand at (smaller, larger) index; the order of two objects may have changed.
         self.bounds[np.minimum(ones, others), np.maximum(ones, others)] = old.bounds[measured][both]
 
     def reset_travel(self) -> None:
-        """Begin to count again, with nothing known of any pair."""
+        """Reset travel, bounds and remembered results."""
         self.travel[:] = 0.0
         self.memory[:] = 0
         if self.bounds is not None:
             self.bounds[self.bounds != 0.0] = 0.0
 
     def choose_axis(self) -> None:
-        """Sort along the axis on which the pieces are spread the most, from now on."""
+        """Choose the axis with the largest spread of centres for the sweep."""
         there = self.active.astype(bool)
         if there.any():
-            self.axis = int(np.argmax(self.place[there].std(axis=0)))
+            self.axis = int(np.argmax(self.position[there].std(axis=0)))
 
     def record_distance(self, i: int, j: int, distance: float) -> None:
-        """Keep a measured distance of two pieces, i < j."""
+        """Record a measured distance of two objects, i < j."""
         if self.bounds is not None:
             self.bounds[i, j] = distance + self.travel[i] + self.travel[j]
 
     def lower_bounds(self, ones: Indices, others: Indices) -> Floats:
         """Return lower bounds of the distances of pairs (K,), (K,), with ones < others, [m]."""
-        between = self.place[others] - self.place[ones]
+        between = self.position[others] - self.position[ones]
         bound: Floats = np.linalg.norm(between, axis=1) - self.radius[ones] - self.radius[others]
         np.maximum(bound, self._box_to_sphere(ones, others, between), out=bound)
         np.maximum(bound, self._box_to_sphere(others, ones, -between), out=bound)
@@ -189,40 +198,40 @@ class ObjectTable:
         return bound
 
     def _box_to_sphere(self, boxes: Indices, spheres: Indices, between: Floats) -> Floats:
-        """Return the distances of the spheres of some pieces from the boxes of others."""
+        """Return the distances of bounding spheres from bounding boxes."""
         inside = np.einsum("kji,kj->ki", self.poses[boxes, :, :3], between)
         outside = np.maximum(np.abs(inside) - self.half[boxes], 0.0)
         distances: Floats = np.sqrt((outside**2).sum(axis=1)) - self.radius[spheres]
-        # From inside the box there is nothing to be said.
+        # A centre inside of the box gives no bound.
         distances[~outside.any(axis=1)] = -np.inf
         return distances
 
 
 LEAF_SIZE = 4
-"""So many pieces are in a leaf."""
+"""Number of objects in a leaf of the static tree."""
 
 
-def build_static_tree(low: Floats, high: Floats, pieces: Indices) -> tuple[Floats, Indices]:
-    """Return a full binary tree over pieces, halved along the longest edge again and again.
+def build_static_tree(low: Floats, high: Floats, objects: Indices) -> tuple[Floats, Indices]:
+    """Build an AABB tree: a full binary tree of boxes, split at the median of the longest edge.
 
     Parameters
     ----------
     low, high
-        (M, 3) the corners of the boxes around all pieces [m].
-    pieces
-        (K,) which of them are in the tree.
+        (M, 3) corners of the boxes of all objects [m].
+    objects
+        (K,) indices of the objects in the tree.
 
     Returns
     -------
     boxes, leaves
-        (2 L - 1, 6) the corners of the box around all below a node k, whose children are 2 k + 1 and 2 k + 2;
-        and (L, 4) the pieces of the leaves, which are the last L nodes; -1 for none.
+        (2 L - 1, 6) corners of the box of each node; the children of node k are 2 k + 1 and 2 k + 2. (L, 4)
+        objects of the leaves, which are the last L nodes; -1 for none.
     """
     count = 1
-    while LEAF_SIZE * count < len(pieces):
+    while LEAF_SIZE * count < len(objects):
         count *= 2
     leaves = np.full((count, LEAF_SIZE), -1, dtype=np.int32)
-    parts = [(pieces, 0, count)]
+    parts = [(objects, 0, count)]
     while parts:
         some, first, width = parts.pop()
         if width == 1:
@@ -234,7 +243,7 @@ def build_static_tree(low: Floats, high: Floats, pieces: Indices) -> tuple[Float
         half = (len(some) + 1) // 2
         parts += [(order[:half], first, width // 2), (order[half:], first + width // 2, width // 2)]
     boxes = np.empty((2 * count - 1, 6))
-    # A row more, which -1 finds: the box around nothing. There may be no piece at all.
+    # Index -1 finds one more row, the empty box; there may be no object at all.
     nothing = np.full((1, 3), np.inf)
     boxes[count - 1 :, :3] = np.concatenate([low, nothing])[leaves].min(axis=1)
     boxes[count - 1 :, 3:] = np.concatenate([high, -nothing])[leaves].max(axis=1)
@@ -245,44 +254,46 @@ def build_static_tree(low: Floats, high: Floats, pieces: Indices) -> tuple[Float
 
 
 FURTHEST = 1e12
-"""Nothing is put further than this from the origin, where numbers are 0.1 mm apart [m]."""
+"""Largest distance of an object from the origin [m]; floating-point numbers are 0.1 mm apart there."""
 
 LONGEST_TRAVEL = 1e4
-"""Up to this, bounds are right to some 1e-12 m [m]."""
+"""Travel up to which bounds are exact to about 1e-12 m [m]."""
 
 PLACED, TRAVEL_EXCEEDED = -1, -2
 
 
 def place_objects(table: ObjectTable, fresh: Floats) -> int:
-    """Put the moving pieces at new poses (moving, 3, 4) and add to their travel.
+    """Move the moving objects to new poses (moving, 3, 4) and add to their travel.
 
-    Returns the first piece whose pose is not finite or too far away, and then nothing has happened; otherwise
-    :data:`PLACED`, or :data:`TRAVEL_EXCEEDED` if a piece's travel is above :data:`LONGEST_TRAVEL`.
+    Returns ------- The index of the first object whose pose is not finite or too far away; then nothing has
+    changed. Otherwise :data:`PLACED`, or :data:`TRAVEL_EXCEEDED` if the travel of an object is above
+    :data:`LONGEST_TRAVEL`.
     """
     bad = ~(np.abs(fresh) <= FURTHEST).all(axis=(1, 2))
     if bad.any():
         return int(np.argmax(bad))
     moving = np.arange(table.moving)
-    before, old = table.place[moving], table.poses[moving, :, :3]
+    before, old = table.position[moving], table.poses[moving, :, :3]
     table.poses[moving] = fresh
     table.update_boxes(moving)
-    # The spectral norm of the difference of two rotations is its Frobenius norm by the root of 2.
+    # The spectral norm of the difference of two rotations is its Frobenius norm over √2.
     turned = np.sqrt(((fresh[:, :, :3] - old) ** 2).sum(axis=(1, 2)) / 2)
-    shifted = np.sqrt(((table.place[moving] - before) ** 2).sum(axis=1))
+    shifted = np.sqrt(((table.position[moving] - before) ** 2).sum(axis=1))
     table.travel[moving] += shifted + table.radius[moving] * turned
     return TRAVEL_EXCEEDED if (table.travel[moving] > LONGEST_TRAVEL).any() else PLACED
 
 
 def find_near_pairs(table: ObjectTable, reach: float, allowed: Flags | None = None) -> tuple[Indices, Floats]:
-    """Return the pairs that may be within ``reach`` [m] of each other.
+    """Return all pairs of objects that may be within ``reach`` [m] of each other.
 
-    Only active pieces of pairs of bodies that are looked at, or ``allowed``, (B, B), of which one moves; no
-    pair is missing whose distance, when it was or would be measured, is at most ``reach``.
+    Pairs consist of active objects, at least one of which moves, of checked bodies, or of the bodies flagged
+    in ``allowed``, (B, B). No pair whose measured distance is at most ``reach`` is missing.
 
     Returns
     -------
     pairs, lows
-        (K, 2) pieces, the smaller number first, in no particular order; (K,) lower bounds of distances [m].
+        (K, 2) indices of objects, the smaller one first, in no particular order; (K,) lower bounds of their
+        distances [m].
     """
     low, high = table.low[:, table.axis], table.high[:, table.axis]
     order = np.argsort(low, kind="stable").astype(np.int32)
@@ -293,8 +304,8 @@ def find_near_pairs(table: ObjectTable, reach: float, allowed: Flags | None = No
     step = np.arange(len(first)) - np.repeat(np.cumsum(counts) - counts, counts) + 1
     ones, others = order[first], order[first + step]
     ones, others = np.minimum(ones, others), np.maximum(ones, others)
-    looked_at = table.allowed if allowed is None else allowed
-    keep = (looked_at[table.body[ones], table.body[others]] == 1) & (ones < table.moving)
+    checked = table.allowed if allowed is None else allowed
+    keep = (checked[table.body[ones], table.body[others]] == 1) & (ones < table.moving)
     ones, others = ones[keep], others[keep]
     gaps = np.maximum(table.low[ones] - table.high[others], table.low[others] - table.high[ones])
     keep = (np.maximum(gaps, 0.0) ** 2).sum(axis=1) <= reach * reach
@@ -305,14 +316,14 @@ def find_near_pairs(table: ObjectTable, reach: float, allowed: Flags | None = No
 
 
 def rank_pairs(table: ObjectTable, pairs: Indices, distances: Floats, radius: float) -> npt.NDArray[np.int64]:
-    """Return which pairs are the nearest ones of their bodies and within a radius [m], nearest first.
+    """Return the pairs that are the nearest of their bodies, by index, within a radius [m], nearest first.
 
-    Of equal distances that of the pieces, and then of the bodies, comes first that was there first.
+    Ties are broken by the indices of the bodies and then of the objects.
 
     Parameters
     ----------
     pairs, distances
-        (K, 2) pieces and (K,) how far apart they are [m].
+        (K, 2) objects and (K,) their distances [m].
     """
     owners = table.body[pairs]
     low, high = owners.min(axis=1, initial=len(table.allowed)), owners.max(axis=1, initial=0)
@@ -326,9 +337,9 @@ def rank_pairs(table: ObjectTable, pairs: Indices, distances: Floats, radius: fl
 def gather_pairs(
     table: ObjectTable, pairs: Indices, distances: Floats, witnesses: Floats, order: npt.NDArray[np.int64]
 ) -> tuple[Indices, Indices, Floats, Floats]:
-    """Return pieces (K, 2), their bodies (K, 2), distances and witnesses in an order.
+    """Return objects (K, 2), their bodies (K, 2), distances and witnesses in an order.
 
-    The first body of each pair is before the other in the model.
+    The first body of each pair precedes the second in the model.
     """
     pairs, distances, witnesses = pairs[order], distances[order], witnesses[order]
     owners = table.body[pairs]

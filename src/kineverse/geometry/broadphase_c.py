@@ -8,7 +8,7 @@ SWEEP = r"""
 #include <stdlib.h>
 #include <string.h>
 
-/* A pair that was measured: the travel of both at that time, and what came out. */
+/* Measured pair: the travel of both at that time, and the result. */
 typedef struct {
   int64_t pair; /* 0 for none */
   double travel_i, travel_j, distance, witness[9];
@@ -34,31 +34,31 @@ typedef struct {
 #define MEMORY_BITS @BITS@
 #define EXPORT __attribute__((visibility("default")))
 
-/* Where a pair is remembered, unless another one has taken its place. */
+/* Slot of a pair, which another pair may have overwritten. */
 static inline Memory *memory_of(const Table *t, int64_t i, int64_t j) {
   return t->memory + ((uint64_t)(t->count * i + j + 1) * 0x9E3779B97F4A7C15u >> (64 - MEMORY_BITS));
 }
 
-/* Whether a pair is remembered, and neither has moved since. */
+/* True if the pair is remembered and neither object has moved since. */
 static inline int is_known(const Memory *m, const Table *t, int64_t i, int64_t j) {
   return m->pair == t->count * i + j + 1 && m->travel_i == t->travel[i] && m->travel_j == t->travel[j];
 }
 
 static inline double square(double x) { return x * x; }
 
-/* fmax is a call, for the sake of NaN, and there is none here. */
+/* Faster than fmax, which handles NaN; there is none here. */
 static inline double larger(double x, double y) { return x > y ? x : y; }
 
-/* Both in [m], and what is returned, as in sweep.py. */
+/* Constants of broadphase.py; lengths in [m]. */
 #define FURTHEST 1e12
 #define LONGEST_TRAVEL 1e4
 #define PLACED -1
-#define GONE_TOO_FAR -2
+#define TRAVEL_EXCEEDED -2
 
 EXPORT int64_t place(Table *t, const double *fresh) {
   int64_t outcome = PLACED;
   for (int64_t k = 0; k < 12 * t->moving; k++)
-    if (!(fabs(fresh[k]) <= FURTHEST)) return k / 12; /* NaN is not either */
+    if (!(fabs(fresh[k]) <= FURTHEST)) return k / 12; /* also for NaN */
   for (int64_t k = 0; k < t->moving; k++) {
     const double *new = fresh + 12 * k, *c = t->centre + 3 * k, *h = t->half + 3 * k;
     double *old = t->poses + 12 * k, turned = 0.0, shifted = 0.0;
@@ -74,12 +74,12 @@ EXPORT int64_t place(Table *t, const double *fresh) {
       for (int i = 0; i < 4; i++) old[4 * r + i] = row[i];
     }
     t->travel[k] += sqrt(shifted) + t->radius[k] * sqrt(turned / 2);
-    if (t->travel[k] > LONGEST_TRAVEL) outcome = GONE_TOO_FAR;
+    if (t->travel[k] > LONGEST_TRAVEL) outcome = TRAVEL_EXCEEDED;
   }
   return outcome;
 }
 
-/* The distance of the sphere of one piece from the box of another; -inf from inside of it. */
+/* Distance of one object's bounding sphere from another's box; -inf if the centre is inside of it. */
 static double box_to_sphere(const Table *t, int64_t box, int64_t sphere, const double *between) {
   const double *pose = t->poses + 12 * box, *half = t->half + 3 * box;
   double outside = 0.0;
@@ -101,7 +101,7 @@ static double lower_bound(const Table *t, int64_t i, int64_t j) {
   return larger(bound, box_to_sphere(t, j, i, back));
 }
 
-/* Sorts pieces by where they begin; they nearly are, as things move little between two questions. */
+/* Sorts objects by their lower ends; insertion, as the order changes little between two queries. */
 static void sort(const Table *t, int32_t *order, int64_t n) {
   for (int64_t k = 1; k < n; k++) {
     const int32_t piece = order[k];
@@ -125,7 +125,7 @@ static inline double square_gap(const double *low, const double *high, const dou
   return gap;
 }
 
-/* Two pieces whose boxes are near each other. */
+/* Adds a pair whose boxes are near each other. */
 static void consider(const Table *t, int64_t one, int64_t other, Answer *answer) {
   if (!t->allowed[t->bodies * t->body[one] + t->body[other]] || !t->active[other]) return;
   const double reach = answer->reach;
@@ -146,8 +146,8 @@ static void consider(const Table *t, int64_t one, int64_t other, Answer *answer)
   answer->found++;
 }
 
-/* Considers the pairs of a piece with what stands, going down a tree of boxes; see standing.py. */
-static void considered_standing(const Table *t, int64_t one, Answer *answer) {
+/* Adds the pairs of an object with static ones, down the AABB tree of build_static_tree. */
+static void consider_static(const Table *t, int64_t one, Answer *answer) {
   const double *low = t->low + 3 * one, *high = t->high + 3 * one, reach = answer->reach;
   int64_t waiting[64] = {0};
   int depth = 1;
@@ -167,7 +167,7 @@ static void considered_standing(const Table *t, int64_t one, Answer *answer) {
   }
 }
 
-/* Writes the square gaps between the box of one of the moving pieces, in their order, and those of others. */
+/* Writes the squared gaps between the box of one moving object, in their order, and those of others. */
 static void square_gaps(const Table *t, int64_t one, int64_t first, int64_t end) {
   const int64_t n = t->moving;
   const double *low = t->sorted_boxes, *high = low + 3 * n;
@@ -180,7 +180,7 @@ static void square_gaps(const Table *t, int64_t one, int64_t first, int64_t end)
              square(larger(larger(a[2] - high[2 * n + k], low[2 * n + k] - b[2]), 0.0));
 }
 
-/* Returns how many pairs there are; only the first `room` of them are written. Of two moving pieces, the one
+/* Returns how many pairs there are; only the first `room` of them are written. Of two moving objects, the one
    that begins first finds the other. Two that stand still are of no interest. */
 EXPORT int64_t near(Table *t, double reach, int32_t *pairs, double *lows, int64_t room) {
   sort(t, t->order, t->moving);
@@ -200,7 +200,7 @@ EXPORT int64_t near(Table *t, double reach, int32_t *pairs, double *lows, int64_
     square_gaps(t, k, k + 1, end);
     for (int64_t m = k + 1; m < end; m++)
       if (gap[m] <= reach * reach) consider(t, one, t->order[m], &answer);
-    if (n < t->count) considered_standing(t, one, &answer);
+    if (n < t->count) consider_static(t, one, &answer);
   }
   return answer.found;
 }
@@ -220,10 +220,10 @@ static inline int comes_before(const Found *a, const Found *b) {
   return a->i != b->i ? a->i < b->i : a->j < b->j;
 }
 
-/* So many are sorted by insertion, before runs of them are merged. */
+/* Length of the runs that are sorted by insertion before they are merged. */
 #define RUN 8
 
-/* Sorts by merging runs of growing length; `spare` has as much room. Returns where the result is. */
+/* Merge sort; `spare` is as long as `found`. Returns the one that holds the result. */
 static Found *sorted(Found *found, Found *spare, int64_t n) {
   for (int64_t k = 1; k < n; k++) {
     const Found one = found[k];
@@ -255,7 +255,7 @@ EXPORT int64_t rank(
   int64_t count = 0, kept = 0, slots = 2;
   while (slots < 2 * n) slots *= 2;
   Found *memory = malloc((2 * n + 1) * sizeof(Found)), *found = memory;
-  int64_t *known = calloc(slots, sizeof(int64_t)); /* bodies that were there, and 1 */
+  int64_t *known = calloc(slots, sizeof(int64_t)); /* pairs of bodies that were found, plus 1 */
   if (!found || !known) {
     free(memory);
     free(known);
@@ -280,7 +280,7 @@ EXPORT int64_t rank(
   return kept;
 }
 
-/* Writes pairs in an order, that body first which is before the other in the model. */
+/* Writes pairs in an order; the first body of each precedes the second in the model. */
 EXPORT void gather(
     const Table *t, const int32_t *pairs, const double *distances, const double *witnesses,
     const int64_t *order, int64_t n, int32_t *pieces, int32_t *bodies, double *distance, double *witness) {

@@ -1,7 +1,8 @@
 """Collision filter: the pairs of bodies that are checked.
 
-Not looked at are bodies that are rigidly connected, bodies joined by one articulation, and what rules except.
-Rules are data: a model keeps them under the name :data:`RULES`, for whoever makes a scene of it.
+Pairs that are rigidly connected, joined by one articulation, or excepted by a rule are not checked. The
+result is known elsewhere as an allowed collision matrix. Rules are data: a model keeps them under the name
+:data:`RULES`, and every scene of the model uses them.
 """
 
 from __future__ import annotations
@@ -22,23 +23,23 @@ from .broadphase import Flags
 from .objects import matches_pattern
 
 RULES = "geometry/rules"
-"""Where a model keeps its rules; what it includes below a prefix has them below that prefix."""
+"""Name of the data entry that holds a model's rules; an included model has its entry below its prefix."""
 
 _FREE_SPEEDS = 6
 _WILDCARDS = "*?["
 
 
 class Rule(NamedTuple):
-    """Whether pairs of bodies are looked at; the last rule that is about a pair decides.
+    """Rule of the collision filter; the last rule that applies to a pair decides.
 
     Attributes
     ----------
     a, b
         Names of bodies, or patterns in which ``*`` is any text, also across slashes.
     check
-        Whether to look at such pairs. True brings back what is adjacent, or excepted by an earlier rule.
+        Whether such pairs are checked. True includes pairs that are adjacent or excepted by an earlier rule.
     why
-        For people.
+        Reason, for readers.
     """
 
     a: str
@@ -48,12 +49,12 @@ class Rule(NamedTuple):
 
 
 def parse_rules(entries: Any) -> tuple[Rule, ...]:
-    """Return rules from what a model or document keeps of them.
+    """Return rules from their data in a model or document.
 
     Raises
     ------
     InvalidValueError
-        If an entry is no ``(a, b, check, why)``.
+        If an entry is not ``(a, b, check, why)``.
     """
     if isinstance(entries, str | Rule) or not isinstance(entries, Iterable):
         raise InvalidValueError(f"Rules are a sequence of kv.geometry.Rule, not {entries!r}.")
@@ -71,12 +72,12 @@ def parse_rules(entries: Any) -> tuple[Rule, ...]:
 
 
 def read_rules(model: ModelView) -> tuple[Rule, ...]:
-    """Return the rules that a model keeps: those of what it includes, about bodies there, and then its own.
+    """Return the rules that a model keeps: first those of included models, below their prefix, then its own.
 
     Raises
     ------
     InvalidValueError
-        If an entry is no ``(a, b, check, why)``.
+        If an entry is not ``(a, b, check, why)``.
     """
     found: list[Rule] = []
     for name, entries in model.data.items():
@@ -87,12 +88,12 @@ def read_rules(model: ModelView) -> tuple[Rule, ...]:
 
 
 def rules_as_data(rules: Iterable[Rule]) -> tuple[tuple[str, str, bool, str], ...]:
-    """Return rules as a model can keep them: ``edit.write(RULES, rules_as_data(rules))``."""
+    """Return rules as data for a model: ``edit.write(RULES, rules_as_data(rules))``."""
     return tuple((rule.a, rule.b, rule.check, rule.why) for rule in parse_rules(rules))
 
 
 def check_frame_names(what: str, names: Iterable[str], model: ModelView) -> None:
-    """Raise an error for a name that no frame has, given for ``what``; patterns may match nothing."""
+    """Raise UnknownNameError for a name, no pattern, that no frame has; ``what`` begins the message."""
     frames = model.frames
     for name in dict.fromkeys(names):
         if not any(sign in name for sign in _WILDCARDS) and name not in frames and name != WORLD:
@@ -100,13 +101,13 @@ def check_frame_names(what: str, names: Iterable[str], model: ModelView) -> None
 
 
 def allowed_pairs(model: ModelView, bodies: Sequence[str], rules: Sequence[Rule]) -> Flags:
-    """Return (B, B) flags, 1 for pairs that are looked at."""
+    """Return (B, B) flags, 1 for pairs that are checked."""
     table = 1 - adjacent_pairs(model, bodies)
-    place = {name: k for k, name in enumerate(bodies)}
-    meant: dict[str, list[int]] = {}
+    index = {name: k for k, name in enumerate(bodies)}
+    matches: dict[str, list[int]] = {}
     for rule in rules:
-        ones, others = (_matching_bodies(name, place, meant) for name in (rule.a, rule.b))
-        if len(ones) == len(others) == 1:  # of which there may be one for each pair
+        ones, others = (_matching_bodies(name, index, matches) for name in (rule.a, rule.b))
+        if len(ones) == len(others) == 1:  # fast, as there may be one such rule for each pair
             table[ones[0], others[0]] = table[others[0], ones[0]] = rule.check
         else:
             table[np.ix_(ones, others)] = table[np.ix_(others, ones)] = rule.check
@@ -114,33 +115,33 @@ def allowed_pairs(model: ModelView, bodies: Sequence[str], rules: Sequence[Rule]
     return np.ascontiguousarray(table)
 
 
-def _matching_bodies(name: str, place: Mapping[str, int], meant: dict[str, list[int]]) -> list[int]:
-    """Return the bodies that a name or pattern means, and remember it."""
-    if name not in meant:
+def _matching_bodies(name: str, index: Mapping[str, int], matches: dict[str, list[int]]) -> list[int]:
+    """Return the indices of the bodies that a name or pattern matches, and cache them in ``matches``."""
+    if name not in matches:
         is_pattern = any(sign in name for sign in _WILDCARDS)
-        some = place if is_pattern else (name,) if name in place else ()
-        meant[name] = [place[body] for body in some if matches_pattern(body, (name,))]
-    return meant[name]
+        candidates = index if is_pattern else (name,) if name in index else ()
+        matches[name] = [index[body] for body in candidates if matches_pattern(body, (name,))]
+    return matches[name]
 
 
 def adjacent_pairs(model: ModelView, bodies: Sequence[str]) -> Flags:
     """Return (B, B) flags, 1 for pairs that are rigidly connected or joined by one articulation.
 
-    What hangs on something that does not move at all is joined only to the body that it hangs on: a door to
-    its cupboard, and not to the wall. What moves freely, with six speeds, is joined to nothing. The ends of a
-    loop are joined where it is closed.
+    A link whose parent never moves is joined only to the body that carries it: a door to its cupboard, and
+    not to the wall. A freely moving link, with six speeds, is joined to nothing. The ends of a closed loop
+    are joined to each other.
     """
     frames = dict(model.frames)
     groups = {name: _rigid_group(name, frames) for name in bodies}
     numbers = {group: k for k, group in enumerate(dict.fromkeys(groups.values()))}
     number = np.array([numbers[groups[name]] for name in bodies], dtype=int)
     table: Flags = (number[:, None] == number[None, :]).astype(np.uint8)
-    place = {name: k for k, name in enumerate(bodies)}
+    index = {name: k for k, name in enumerate(bodies)}
 
     def bodies_at(frame: str) -> npt.NDArray[np.bool_]:
         group = _rigid_group(frame, frames)
         if group == WORLD:
-            return np.asarray(np.arange(len(bodies)) == _supporting_body(frame, frames, place))
+            return np.asarray(np.arange(len(bodies)) == _supporting_body(frame, frames, index))
         return np.asarray(number == numbers.get(group, -1))
 
     for one, other in _joined_frames(model, frames, numbers):
@@ -152,7 +153,7 @@ def adjacent_pairs(model: ModelView, bodies: Sequence[str]) -> Flags:
 def _joined_frames(
     model: ModelView, frames: Mapping[str, Frame], groups: Iterable[str]
 ) -> Iterator[tuple[str, str]]:
-    """Yield pairs of frames that an articulation joins: groups and their parents, and the ends of loops."""
+    """Yield pairs of frames joined by an articulation: rigid groups and their parents, and ends of loops."""
     for group in groups:
         if group != WORLD and len(model.speeds_of(group, frames[group].parent)) < _FREE_SPEEDS:
             yield group, frames[group].parent
@@ -161,14 +162,14 @@ def _joined_frames(
 
 
 def _rigid_group(name: str, frames: Mapping[str, Frame]) -> str:
-    """Return the frame with which one is rigidly connected and that moves in its parent; or the world."""
+    """Return the root of a frame's rigid group: its frame that moves in its parent, or the world."""
     while name != WORLD and all(isinstance(factor, Pose) for factor in frames[name].factors):
         name = frames[name].parent
     return name
 
 
-def _supporting_body(name: str, frames: Mapping[str, Frame], place: Mapping[str, int]) -> int:
-    """Return the number of the nearest body at or above a frame that does not move; -1 if there is none."""
-    while name not in place and name != WORLD:
+def _supporting_body(name: str, frames: Mapping[str, Frame], index: Mapping[str, int]) -> int:
+    """Return the index of the nearest body at or above a frame that never moves; -1 if there is none."""
+    while name not in index and name != WORLD:
         name = frames[name].parent
-    return place.get(name, -1)
+    return index.get(name, -1)

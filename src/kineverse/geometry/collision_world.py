@@ -334,7 +334,7 @@ class _NearestByBodies:
         self._least[key] = min(self._least.get(key, math.inf), distance)
 
     def has_nearer(self, k: int, low: float) -> bool:
-        """Return True if another pair of the same bodies is nearer than a lower bound, beyond the accuracy."""
+        """Return True if another pair of the same bodies is nearer than a lower bound, by the accuracy."""
         return low > self._least.get(self._keys[k], math.inf) + ACCURACY
 
 

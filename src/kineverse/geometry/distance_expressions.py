@@ -1,12 +1,13 @@
 """Signed distances as expressions.
 
-With the nearest points fixed in their bodies, at a_p and b_p, and the normal n from a to b in the world,
+Let the nearest points be fixed in their bodies, at a_p and b_p, and let n be the normal from a to b, fixed in
+the world. Then
 
     d = nᵀ (world_T_b b_p - world_T_a a_p)
 
-has at the state where these were found the value and, for all coordinates, the derivatives of the signed
-distance: how the points slide along the surfaces and how n turns has no part in them (envelope theorem). In
-penetration d is negative and n is the same, so nothing happens to the gradient at contact.
+equals the signed distance at the state of the query, and so do its derivatives by all coordinates: by the
+envelope theorem, neither the sliding of the points along the surfaces nor the rotation of n contributes to
+first order. In penetration d is negative and n keeps its direction, so the gradient is continuous at contact.
 """
 
 from __future__ import annotations
@@ -28,17 +29,17 @@ _ROWS = ("point_a", "point_b", "normal")
 
 @dataclass(frozen=True, eq=False)
 class PairDistance:
-    """The distance of two bodies as an expression of the coordinates that move them.
+    """Signed distance of two bodies as an expression of the coordinates that move them.
 
     Attributes
     ----------
     a, b
         The bodies.
     expression
-        The signed distance [m], a scalar; exact with its gradient where the parameters are up to date.
+        The signed distance [m], a scalar. Value and gradient are exact for up-to-date parameters.
     parameters
-        (3, 3) symbols: the nearest point of a in a, that of b in b, and the normal in the world. Their own
-        values are those at the state where this was made.
+        (3, 3) symbols: the nearest point of a in a, the nearest point of b in b, and the normal in the world.
+        Their default values are those at the state of construction.
     """
 
     a: str
@@ -47,14 +48,14 @@ class PairDistance:
     parameters: tuple[tuple[Symbol, ...], ...]
 
     def values(self, closest: DistanceResult, world_T_a: Floats, world_T_b: Floats) -> dict[Symbol, float]:
-        """Return values of the parameters, for a state.
+        """Return the values of the parameters at a state.
 
         Parameters
         ----------
         closest
-            How near the two bodies are.
+            Distance of the two bodies at the state.
         world_T_a, world_T_b
-            (4, 4) where they are then.
+            (4, 4) poses of the two bodies at the state.
         """
         rows = _parameter_rows(closest, world_T_a, world_T_b)
         return {
@@ -72,16 +73,18 @@ def distance_parameters(
 ) -> DistanceParameters:
     """Return symbols for the nearest points and the normal of two bodies.
 
-    Those that the model has already, of a scene before or from its document; others have their values now.
+    Symbols that the model already contains are reused; new ones have the present values as defaults.
     """
     known = {symbol.path: symbol for symbol in model.symbols}
 
-    def of(path: str, value: float) -> Symbol:
+    def symbol_at(path: str, value: float) -> Symbol:
         return known[path] if path in known else parameter(path, value)
 
     path = f"distance/{_escape_to(closest.a)}/to/{_escape_to(closest.b)}"
     return tuple(
-        tuple(of(f"{path}/{name}/{axis}", float(value)) for axis, value in zip("xyz", row, strict=True))
+        tuple(
+            symbol_at(f"{path}/{name}/{axis}", float(value)) for axis, value in zip("xyz", row, strict=True)
+        )
         for name, row in zip(_ROWS, _parameter_rows(closest, world_T_a, world_T_b), strict=True)
     )
 
@@ -96,7 +99,7 @@ def distance_expression(model: ModelView, a: str, b: str, parameters: DistancePa
 
 
 def _escape_to(body: str) -> str:
-    """Return a name without a part ``to``, which stands between two names; no two become the same."""
+    """Return a body's name with its parts ``to`` escaped, as ``to`` separates two names; it is injective."""
     return re.sub(r"(^|/)(to_*)(?=/|$)", r"\1\2_", body)
 
 

@@ -1,7 +1,7 @@
 """Distance of two convex solids by GJK, in Python.
 
-This is the iteration of :mod:`.narrow_source`, a thousand times slower, with the same two bounds: an answer
-is given only once they meet.
+This is the iteration of :mod:`.narrowphase_c`, a thousand times slower, with the same two bounds: it returns
+a distance only once they meet.
 """
 
 from __future__ import annotations
@@ -15,52 +15,52 @@ from .shapes import Core, Solid
 from .support import PlacedSolid, support
 
 _STEPS = 200
-_MET, _STUCK = 1e-11, 1e-7
-"""Both bounds have to meet to the first, or if no step is better any more, to the second; of what is larger
-than 1 m this part."""
+_CONVERGED, _ACCEPTED = 1e-11, 1e-7
+"""Tolerances of the two bounds: to converge, and to accept when no step improves any more. They are absolute
+[m] up to a size of 1 m, and relative beyond."""
 
 
 def gjk_distance(a: PlacedSolid, b: PlacedSolid) -> tuple[float, Floats, Floats] | None:
-    """Return the distance of two solids [m], the nearest point (3,) of the first, and the normal from it.
+    """Return the distance of two solids [m], the nearest point (3,) of the first, and the normal from there.
 
-    None if they touch, or if that is not certain.
+    None if they touch, or if the bounds do not meet.
     """
-    (_, _, at_a), (_, _, at_b) = a, b
-    size = max(1.0, a[0].radius, b[0].radius, float(np.linalg.norm(at_b - at_a)))
-    way = at_b - at_a
+    (_, _, position_a), (_, _, position_b) = a, b
+    size = max(1.0, a[0].radius, b[0].radius, float(np.linalg.norm(position_b - position_a)))
+    direction = position_b - position_a
     points: list[Floats] = []
     origins: list[Floats] = []
     high, low, weights = np.inf, -np.inf, np.zeros(0)
     for _ in range(_STEPS):
-        length = float(np.linalg.norm(way))
+        length = float(np.linalg.norm(direction))
         if not length > 0.0:
             return None
-        point = support(a, way / length)
-        corner = support(b, -way / length) - point
-        low = max(low, float(way @ corner) / length)
-        if high - low <= _MET * size:
+        point = support(a, direction / length)
+        corner = support(b, -direction / length) - point
+        low = max(low, float(direction @ corner) / length)
+        if high - low <= _CONVERGED * size:
             break
-        nearest = _nearest([*points, corner])
+        nearest = _nearest_to_origin([*points, corner])
         if nearest is None:
             return None
         kept, some, found = nearest
         if not (nearer := float(np.linalg.norm(found))) < high:
             break
         points, origins = [[*points, corner][k] for k in kept], [[*origins, point][k] for k in kept]
-        way, high, weights = found, nearer, some
-    if not (high > 0.0 and high - low <= _STUCK * size):
+        direction, high, weights = found, nearer, some
+    if not (high > 0.0 and high - low <= _ACCEPTED * size):
         return None
-    return high, weights @ np.array(origins), way / high
+    return high, weights @ np.array(origins), direction / high
 
 
 def gjk_distance_to_faces(
     a: PlacedSolid, faces: Faces, rotation: Floats, position: Floats
 ) -> tuple[float, Floats, Floats] | None:
-    """Return what :func:`gjk_distance` does, for a convex solid and triangles at a pose; None in touch."""
-    solid, rotation_a, at_a = a
+    """Return the :func:`gjk_distance` of a convex solid from triangles at a pose; None if they touch."""
+    solid, rotation_a, position_a = a
     corners = (faces.vertices @ rotation.T + position)[faces.faces]
-    # In the frame of the solid it lies in its box, so that a triangle is no nearer than its own box there.
-    seen = (corners - at_a) @ rotation_a - solid.centre
+    # In the frame of the solid, the distance of both bounding boxes is a lower bound.
+    seen = (corners - position_a) @ rotation_a - solid.centre
     apart = np.maximum(np.maximum(seen.min(axis=1) - solid.half, -solid.half - seen.max(axis=1)), 0.0)
     lows = np.linalg.norm(apart, axis=1)
     best: tuple[float, Floats, Floats] | None = None
@@ -80,10 +80,10 @@ def gjk_distance_to_faces(
     return best
 
 
-def _nearest(points: list[Floats]) -> tuple[tuple[int, ...], Floats, Floats] | None:
-    """Return which of up to four points, with which weights, make the point of their hull nearest to 0.
+def _nearest_to_origin(points: list[Floats]) -> tuple[tuple[int, ...], Floats, Floats] | None:
+    """Return the point nearest to 0 in the hull of up to four points: their indices, weights, and the point.
 
-    None if 0 is inside of all four.
+    None if 0 is inside of the hull.
     """
     best: tuple[tuple[int, ...], Floats, Floats] | None = None
     for count in range(1, len(points) + 1):

@@ -18,7 +18,7 @@ import numpy as np
 import numpy.typing as npt
 
 from kineverse._extras import install_command
-from kineverse.errors import FormatError, MissingDependencyError
+from kineverse.errors import FormatError, MissingDependencyError, summarize_error
 from kineverse.formats.resource_paths import locate_mesh
 from kineverse.formats.root_folder import is_below
 from kineverse.model.body import Mesh
@@ -27,21 +27,21 @@ Floats: TypeAlias = npt.NDArray[np.float64]
 Integers: TypeAlias = npt.NDArray[np.int64]
 
 LARGEST_FILE = 256 * 2**20
-"""No mesh file above this size is read [bytes]: a description is not trusted with memory."""
+"""Largest mesh file that is read [bytes]; descriptions are not trusted with memory."""
 
 _ARCHIVES = (".zip", ".gz", ".bz2", ".tgz", ".xz")
 
 
 @dataclass(frozen=True, slots=True)
 class MeshFile:
-    """A mesh file that is there and not too large, with the SHA-256 of its content."""
+    """Existing mesh file of an acceptable size, with the SHA-256 of its content."""
 
     path: Path
     digest: str
 
     @property
     def kind(self) -> str:
-        """The ending of its name, in lower case, with the dot."""
+        """Suffix of the file name, in lower case, with the dot."""
         return self.path.suffix.lower()
 
 
@@ -63,7 +63,7 @@ def find_mesh_file(mesh: Mesh) -> MeshFile:
     Raises
     ------
     FormatError
-        If there is none, or it lies outside of the root of the description.
+        If there is no such file, or it lies outside of the root of the description.
     OSError
         If it cannot be read, or is larger than :data:`LARGEST_FILE`.
     """
@@ -87,7 +87,8 @@ def read_faces(file: MeshFile) -> Faces:
     Raises
     ------
     FormatError
-        If it cannot be read as what its name says, holds no triangles, or numbers that are not finite.
+        If it cannot be read as a mesh of that suffix, holds no triangles, or holds numbers that are not
+        finite.
     """
     key = (file.digest, file.kind)
     with _reading:
@@ -101,9 +102,8 @@ def _read_file(file: MeshFile) -> Faces:
         found = load_mesh_parts(file)
     except MissingDependencyError:
         raise
-    except Exception as error:  # Parsers of other people's formats raise anything at all.
-        reason = (str(error).strip().splitlines() or [type(error).__name__])[0]
-        raise FormatError(f"{file.path} cannot be read as a mesh: {reason}") from error
+    except Exception as error:  # Parsers of trimesh raise all kinds of exceptions.
+        raise FormatError(f"{file.path} cannot be read as a mesh: {summarize_error(error)}") from error
     sizes = np.cumsum([0, *(len(part.vertices) for part in found[:-1])])
     vertices = np.concatenate([np.asarray(part.vertices, dtype=float) for part in found]) * unit_length(
         file.path
@@ -127,7 +127,7 @@ def load_mesh_parts(file: MeshFile) -> list[Any]:
     MissingDependencyError
         If trimesh is not installed.
     OSError
-        If there are no triangles; whatever trimesh raises for what it cannot read.
+        If there are no triangles. Other exceptions of trimesh for unreadable content pass through.
     """
     try:
         import trimesh
@@ -145,7 +145,7 @@ def load_mesh_parts(file: MeshFile) -> list[Any]:
 
 
 def _check_packing(file: MeshFile) -> None:
-    """Refuse what is small and becomes large: archives, and meshes whose parts are packed together."""
+    """Raise OSError for archives, and for packed meshes that unpack to more than :data:`LARGEST_FILE`."""
     if file.kind in _ARCHIVES:
         raise OSError(f"{file.path} is an archive, and no mesh. Unpack it, and name the mesh in it")
     if zipfile.is_zipfile(file.path):
@@ -157,7 +157,7 @@ def _check_packing(file: MeshFile) -> None:
 
 
 class _FolderFiles(Mapping[str, bytes]):
-    """The files in and below the folder of a mesh: its materials, pictures and buffers, and no others."""
+    """Files in and below the folder of a mesh, for its materials, pictures and buffers."""
 
     def __init__(self, folder: Path) -> None:
         self._folder = os.path.realpath(folder)
@@ -182,8 +182,8 @@ class _FolderFiles(Mapping[str, bytes]):
 def unit_length(path: Path) -> float:
     """Return the length of a file's unit [m].
 
-    Only COLLADA says what its numbers mean; like RViz this honours the unit and ignores the up axis, which
-    is what the authors of robot descriptions have come to rely on.
+    Only COLLADA states its unit. As RViz does, this function applies the unit and ignores the up axis,
+    because robot descriptions rely on that.
     """
     if path.suffix.lower() != ".dae":
         return 1.0
@@ -198,7 +198,7 @@ def unit_length(path: Path) -> float:
 
 @contextmanager
 def _without_logging(name: str) -> Iterator[None]:
-    """Keep a library from logging: a missing texture of a mesh costs it its colour, nothing else."""
+    """Silence the logger of a library: a missing texture only costs a mesh its colour."""
     log, nowhere = logging.getLogger(name), logging.NullHandler()
     before = log.propagate
     log.addHandler(nowhere)

@@ -1,34 +1,34 @@
 """C text: GJK distances and penetration depths of convex solids, after :mod:`.support_c`.
 
-With v = b - a the nearest point to the origin of {b - a}, found by the iteration of Gilbert, Johnson and
-Keerthi (IEEE J. Robotics and Automation 4, 1988), the distance of two cores is ``|v|``, and that of two
-solids is less by their radii, also where these overlap. Every step has a support point w in direction v, and
-``vᵀw / |v| <= distance of the cores <= |v|``: an answer is given only once the two meet, so it is right
-however the steps went. What is deeper in each other goes to :mod:`.penetration_source`, and what neither can
-tell for certain is left to coal. What is remembered is what the same poses would give again: an answer
-follows from the poses alone.
+The iteration of Gilbert, Johnson and Keerthi (IEEE J. Robotics and Automation 4, 1988) finds the point v = b
+- a of the Minkowski difference {b - a} that is nearest to the origin. The distance of two cores is then
+``|v|``; that of two solids is less by their radii, also where these overlap. Every step has a support point w
+in direction v, and ``vᵀw / |v| <= distance of the cores <= |v|``. A distance is returned only once both
+bounds meet, so it is right whatever the steps were. Deeper penetration is left to :data:`PENETRATION`, and
+uncertain pairs to coal. Results are remembered only for equal poses, so they depend on the poses alone.
 
-The depth is the distance of the origin from the surface of {b - a}. As van den Bergen found it (Proximity
-queries and penetration depth computation on 3D game objects, 2001), a polytope inside of {b - a} grows at the
-face that is nearest to the origin until that face is on the surface. Its distance is never more than the
-depth, and how far {b - a} reaches along its normal never less: an answer is given only once the two meet.
+The depth is the distance of the origin from the surface of {b - a}. In the expanding polytope algorithm of
+van den Bergen (Proximity queries and penetration depth computation on 3D game objects, 2001), a polytope
+inside of {b - a} grows at the face nearest to the origin until that face lies on the surface. The distance of
+the face is a lower bound of the depth, and the support of {b - a} along its normal an upper bound. A depth is
+returned only once both bounds meet.
 """
 
 SIMPLEX = r"""
-/* The two bounds of a distance have to meet to this [m], or if no step is better any more, to the second. */
+/* Tolerances of the two bounds: to converge, and to accept when no step improves any more [m]. */
 #define MET 1e-10
 #define STUCK 1e-9
-/* Nearer than this the direction from core to core is not known well enough [m]. */
+/* Below this distance the direction between the cores is too uncertain [m]. */
 #define LEAST 1e-5
 #define STEPS 64
 
-/* Some points of {b - a} with the points a that they come from. */
+/* Points of {b - a}, with the points a that they come from. */
 typedef struct {
   int n;
   Vector w[4], a[4];
 } Simplex;
 
-/* The nearest point to the origin of a simplex, and the points with weights that make it. */
+/* Point of a simplex nearest to the origin, and the points and weights that it is made of. */
 typedef struct {
   int n, which[3];
   double weight[3], square;
@@ -63,7 +63,7 @@ static inline Part on_triangle(const Simplex *s, int i, int j, int k) {
   return other.square < one.square ? other : one;
 }
 
-/* None of the points if the origin is inside. */
+/* Has no points if the origin is inside. */
 static Part nearest(const Simplex *s) {
   if (s->n == 1) return at_corner(s, 0);
   if (s->n == 2) return on_segment(s, 0, 1);
@@ -82,7 +82,7 @@ static Part nearest(const Simplex *s) {
 }
 
 static void keep(Simplex *s, const Part *part) {
-  for (int k = 0; k < part->n; k++) { /* which is in order, so nothing is overwritten too early */
+  for (int k = 0; k < part->n; k++) { /* indices ascend, so nothing is overwritten too early */
     s->w[k] = s->w[part->which[k]];
     s->a[k] = s->a[part->which[k]];
   }
@@ -91,7 +91,7 @@ static void keep(Simplex *s, const Part *part) {
 """
 
 NARROW = r"""
-/* Writes the points of both and the normal in the world, for a in the frame of the first piece. */
+/* Writes the points of both and the normal in the world, for a in the frame of the first object. */
 static void write(const Table *t, int64_t i, Vector a, Vector normal, double distance, double *witness) {
   const double *pose = t->poses + 12 * i;
   const Vector world_a = turned(pose, 4, 1, a), world_n = turned(pose, 4, 1, normal);
@@ -145,7 +145,7 @@ static double measured(const Table *t, int64_t i, int64_t j, double limit, doubl
     const Part next = nearest(&s);
     if (!next.n) return deep(t, i, j, &pair, &s, witness, low);
     const double nearer = sqrt(next.square);
-    if (!(nearer < high)) break; /* What was found before is the better one. */
+    if (!(nearer < high)) break; /* The previous point is the better one. */
     keep(&s, &next);
     part = next;
     v = next.v;
@@ -162,7 +162,7 @@ static double measured(const Table *t, int64_t i, int64_t j, double limit, doubl
   return distance;
 }
 
-/* Measures pairs of pieces, and keeps what is known of their distances. A pair that was measured and of which
+/* Measures pairs of objects, and records bounds of their distances. A pair that was measured and of which
    nothing moved since is not measured again. */
 EXPORT void measure(
     Table *t, const int32_t *pairs, int64_t n, double limit, double *distances, double *witnesses) {
@@ -188,18 +188,18 @@ EXPORT void measure(
 
 
 PENETRATION = r"""
-/* Both bounds of a depth have to meet to the first [m], or when there is no more room, to the second. */
+/* Tolerances of the bounds of a depth: to converge, and to accept when the polytope is full [m]. */
 #define DEEP_MET 1e-9
 #define DEEP_STUCK 1e-7
 #define MOST_CORNERS 160
 #define MOST_FACES (2 * MOST_CORNERS)
-/* What is nearer to a plane than this part of the size of both is in it. */
+/* Points nearer to a plane than this part of the size of both are in it. */
 #define FLAT 1e-13
 
 typedef struct {
   int corner[3], seen;
   Vector normal;
-  double height; /* of the plane over the origin; infinite for a face that is gone */
+  double height; /* of the plane above the origin; infinite for a removed face */
 } Facet;
 
 typedef struct {
@@ -215,7 +215,7 @@ static int add_corner(Polytope *p, Vector w, Vector a) {
   return p->corners++;
 }
 
-/* Puts a face in a place, its corners counter-clockwise seen from outside; returns 0 if it is a line. */
+/* Writes a face, its corners counter-clockwise from outside; returns 0 if it is degenerate. */
 static inline int put_face(Polytope *p, int place, int i, int j, int k) {
   const Vector n = cross(plus(p->w[j], -1.0, p->w[i]), plus(p->w[k], -1.0, p->w[i]));
   const double size = sqrt(dot(n, n));
@@ -308,7 +308,7 @@ static int grow(Polytope *p, int from, Vector w, Vector a, double flat) {
       }
     }
   }
-  /* Only now the edges are as they were when all were looked at. */
+  /* Faces are written last, as the loop above reads the old edges. */
   int round = 0;
   for (int i = start; round < edges; round++) {
     const int j = next[i];

@@ -1,7 +1,7 @@
 """Ray casts against solids, and ray and point queries in a collision world.
 
-A convex solid keeps a ray between the last place where it enters and the first where it leaves: a polytope
-cuts by half-spaces, everything round by quadrics.
+The part of a ray inside of a convex solid is an interval: a polytope cuts the ray by half-spaces, a round
+solid by quadrics.
 """
 
 from __future__ import annotations
@@ -16,19 +16,20 @@ from kineverse.model.body import Box, Capsule, Cone, Cylinder, Ellipsoid, Sphere
 
 from .broadphase import FURTHEST
 from .collision_world import CollisionWorld
+from .distance_queries import check_radius
 from .mesh_files import Faces, Floats
 from .narrowphase import ACCURACY, distance_to_point
 from .results import NearestPoint, RayHit
 from .shapes import Hull, Primitive, Solid
 
 RayEntry = tuple[float, Floats]
-"""How far along the ray, and the outward normal there."""
+"""Distance along the ray [m], and the outward normal at the point of entry."""
 
 _PARALLEL = 1e-14
 
 
 def intersect_ray(solid: Solid, origin: Floats, direction: Floats) -> RayEntry | None:
-    """Return where a ray meets a solid first: the distance [m], 0 from inside, and the normal; None if never.
+    """Return the first point of a ray in a solid: distance [m], 0 from inside, and normal; None if it misses.
 
     Parameters
     ----------
@@ -88,9 +89,9 @@ def _intersect_ellipsoid(radii: Floats, origin: Floats, direction: Floats) -> Ra
 
 
 def _ball_interval(origin: Floats, direction: Floats, radius: float) -> tuple[float, float] | None:
-    """Return the times between which a line is inside a ball; None for never."""
+    """Return the interval of the line parameter inside of a ball; None if the line misses it."""
     a, b = float(direction @ direction), float(origin @ direction)
-    # The distance of the line from the centre, which has more digits than the difference of squares.
+    # The distance of the line from the centre loses fewer digits than the difference of squares.
     nearest = origin - b / a * direction
     inside = radius * radius - float(nearest @ nearest)
     if inside < 0.0:
@@ -106,19 +107,19 @@ def _intersect_capsule(shape: Capsule, origin: Floats, direction: Floats) -> Ray
         _intersect_ellipsoid(np.full(3, shape.radius), origin + end, direction) for end in (half, -half)
     ]
     hits = [hit for hit in found if hit is not None]
-    # From inside any of the three it is inside the capsule.
+    # A ray that starts inside of any of the three starts inside of the capsule.
     return min(hits, key=lambda hit: hit[0]) if hits else None
 
 
 def _intersect_cylinder_or_cone(shape: Cylinder | Cone, origin: Floats, direction: Floats) -> RayEntry | None:
-    """Cut between two discs by the wall x² + y² = r(z)², r linear in z; z runs between ±length/2."""
+    """Intersect the slab |z| <= length/2 with the wall x² + y² = r(z)², where r is linear in z."""
     radius, half = shape.radius, shape.length / 2
     slope = radius / shape.length if isinstance(shape, Cone) else 0.0
     start = radius / 2 if isinstance(shape, Cone) else radius
     caps = _slab_interval(half, origin[2], direction[2])
     if caps is None:
         return None
-    # r(z) = start - slope z; the inside is where q(t) = x² + y² - r² <= 0 and r >= 0, which the caps ensure.
+    # r(z) = start - slope z. Inside, q(t) = x² + y² - r² <= 0; the caps ensure r >= 0.
     r, dr = start - slope * origin[2], -slope * direction[2]
     a = float(direction[:2] @ direction[:2]) - dr * dr
     b = float(origin[:2] @ direction[:2]) - r * dr
@@ -155,14 +156,14 @@ def _intervals_below_zero(a: float, b: float, c: float) -> list[tuple[float, flo
     discriminant = b * b - a * c
     if discriminant < 0.0:
         return [] if a > 0.0 else [(-math.inf, math.inf)]
-    # The root with the larger magnitude first, which loses no digits; the other by Vieta.
+    # The root of larger magnitude first, without cancellation; the other one by Vieta.
     q = -(b + math.copysign(math.sqrt(discriminant), b))
     roots = sorted((q / a, c / q if q else 0.0))
     return [(roots[0], roots[1])] if a > 0.0 else [(-math.inf, roots[0]), (roots[1], math.inf)]
 
 
 def _intersect_triangles(mesh: Faces, origin: Floats, direction: Floats) -> RayEntry | None:
-    """Return the nearest crossing, of either side (Möller and Trumbore 1997)."""
+    """Return the nearest intersection with either side of a triangle (Möller and Trumbore 1997)."""
     corners = mesh.vertices[mesh.faces]
     one, other = corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]
     across = np.cross(direction, other)
@@ -187,21 +188,21 @@ def _intersect_triangles(mesh: Faces, origin: Floats, direction: Floats) -> RayE
 def cast_ray(
     world: CollisionWorld, origin: npt.ArrayLike, direction: npt.ArrayLike, length: float
 ) -> RayHit | None:
-    """Return what a ray meets first within a length [m], None if nothing."""
-    start, way = _check_point(origin, "origin"), _check_vector(direction, "direction")
-    size = float(np.abs(way).max())
+    """Return the first hit of a ray within a length [m], or None."""
+    start, heading = _check_point(origin, "origin"), _check_vector(direction, "direction")
+    size = float(np.abs(heading).max())
     if size == 0.0:
         raise InvalidValueError("The direction of a ray is a vector other than 0.")
     if not length > 0.0:
         raise InvalidValueError(f"The length of a ray is positive [m], not {length!r}.")
-    way = way / size  # first, so that squares neither overflow nor vanish
-    way /= np.linalg.norm(way)
+    heading = heading / size  # first, so that squares neither overflow nor vanish
+    heading /= np.linalg.norm(heading)
     world.prepare()
     table = world.table
-    # How far along the ray each sphere begins, if the ray goes through it.
-    to_centre = table.place - start
-    along = to_centre @ way
-    aside = ((to_centre - np.outer(along, way)) ** 2).sum(axis=1)
+    # Distance along the ray at which each bounding sphere begins, if the ray passes through it.
+    to_centre = table.position - start
+    along = to_centre @ heading
+    aside = ((to_centre - np.outer(along, heading)) ** 2).sum(axis=1)
     through = np.flatnonzero((aside <= (table.radius * (1 + 1e-9)) ** 2) & (along >= -table.radius))
     begins = np.maximum(along[through] - table.radius[through], 0.0)
     best: tuple[float, int, Floats] | None = None
@@ -210,25 +211,24 @@ def cast_ray(
         if along[k] - table.radius[k] > limit:
             break
         rotation, position = table.poses[k, :, :3], table.poses[k, :, 3]
-        entry = intersect_ray(world.solid(k), rotation.T @ (start - position), rotation.T @ way)
+        entry = intersect_ray(world.solid(k), rotation.T @ (start - position), rotation.T @ heading)
         if entry is not None and entry[0] <= limit and (best is None or (entry[0], k) < best[:2]):
             best = entry[0], k, rotation @ entry[1]
             limit = entry[0]
     if best is None:
         return None
     distance, k, normal = best
-    piece = world.objects[k]
-    return RayHit(piece.body, piece.number, distance, start + distance * way, normal)
+    hit = world.objects[k]
+    return RayHit(hit.body, hit.number, distance, start + distance * heading, normal)
 
 
 def find_nearest_point(world: CollisionWorld, point: npt.ArrayLike, radius: float) -> NearestPoint | None:
-    """Return what is nearest to a point within a radius [m], deepest if it is inside; None if nothing is."""
-    place = _check_point(point, "point")
-    if not radius >= 0.0:
-        raise InvalidValueError(f"A radius is a distance from 0 on [m], not {radius!r}.")
+    """Return the body nearest to a point within a radius [m], or in which it is deepest; None if none is."""
+    location = _check_point(point, "point")
+    check_radius(radius)
     world.prepare()
     table = world.table
-    to_point = place - table.place
+    to_point = location - table.position
     lows = np.linalg.norm(to_point, axis=1) - table.radius
     inside = np.einsum("kji,kj->ki", table.poses[:, :, :3], to_point)
     outside = np.maximum(np.abs(inside) - table.half, 0.0)
@@ -237,18 +237,18 @@ def find_nearest_point(world: CollisionWorld, point: npt.ArrayLike, radius: floa
     for k in np.argsort(lows, kind="stable").tolist():
         if lows[k] > (radius if best is None else best.distance) + ACCURACY:
             break
-        distance, nearest, normal = distance_to_point(world.solid(k), table.poses[k], place)
+        distance, nearest, normal = distance_to_point(world.solid(k), table.poses[k], location)
         if distance <= radius and (best is None or distance < best.distance):
-            piece = world.objects[k]
-            best = NearestPoint(piece.body, piece.number, distance, nearest, normal)
+            item = world.objects[k]
+            best = NearestPoint(item.body, item.number, distance, nearest, normal)
     return best
 
 
 def _check_point(values: npt.ArrayLike, what: str) -> Floats:
-    place = _check_vector(values, what)
-    if np.abs(place).max() > FURTHEST:
-        raise InvalidValueError(f"The {what} {place} is further than {FURTHEST:g} m away.")
-    return place
+    point = _check_vector(values, what)
+    if np.abs(point).max() > FURTHEST:
+        raise InvalidValueError(f"The {what} {point} is further than {FURTHEST:g} m away.")
+    return point
 
 
 def _check_vector(values: npt.ArrayLike, what: str) -> Floats:

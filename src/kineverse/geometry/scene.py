@@ -166,7 +166,7 @@ class Scene:
         return self.pairs_between(frame, frame, radius)
 
     def expression(self, a: str, b: str) -> PairDistance:
-        """Return the signed distance of two bodies as an expression, exact to first order at the present state.
+        """Return the signed distance of two bodies as an expression, exact to first order at this state.
 
         At other states, evaluate it with the :meth:`expression_values` of that state. Every call for the same
         pair uses the same symbols; if the model already contains a distance of the pair, those of the model.

@@ -17,17 +17,17 @@ from kineverse.model.body import Box, Capsule, Cone, Cylinder, Ellipsoid, Geomet
 from .mesh_files import Faces, Floats, Integers, MeshFile, find_mesh_file, read_faces
 
 SMALLEST_MESH, LARGEST_MESH = 1e-6, 1e6
-"""A mesh smaller or larger than this is a mistake in its unit or scale [m]."""
+"""Smallest and largest extent of a mesh; beyond them its unit or scale is taken for a mistake [m]."""
 
 THICKNESS = 2e-5
-"""What is thinner than this is made so thick: 20 µm, or 1e-5 of its size if that is more [m]."""
+"""Least thickness of a hull [m]; flat hulls are thickened to it, or to 1e-5 of their size if that is more."""
 
 
 def convex_hull(points: Floats) -> Any:
     """Return the convex hull of (N, 3) points [m] as a ``coal.Convex``.
 
-    Hulls without volume make the algorithms fail, so a flat one, as of a pane of glass, is given
-    :data:`THICKNESS`, half of it on each side.
+    Distance algorithms fail for hulls without volume. A flat hull, such as a pane of glass, is therefore
+    thickened to :data:`THICKNESS`, half of it on each side.
 
     Raises
     ------
@@ -36,18 +36,17 @@ def convex_hull(points: Floats) -> Any:
     """
     import coal
 
-    solid = thicken_flat(points)
     vector = coal.StdVec_Vec3s()
-    for point in solid:
+    for point in thicken_flat(points):
         vector.append(point)
     try:
         return coal.Convex.convexHull(vector, True, "Qt")
-    except Exception as error:  # What qhull says is pages long.
+    except Exception as error:  # The message of qhull is pages long.
         raise InvalidValueError("qhull finds no convex hull of its points.") from error
 
 
 def thicken_flat(points: Floats) -> Floats:
-    """Return the points, or if they are flat, twice as many that are not; see :func:`convex_hull`."""
+    """Return points with a convex hull of volume: a flat set is doubled, see :func:`convex_hull`."""
     check_extent(points)
     unique = np.unique(points, axis=0)
     centred = unique - unique.mean(axis=0)
@@ -63,14 +62,14 @@ def thicken_flat(points: Floats) -> Floats:
 
 
 def check_extent(points: Floats) -> None:
-    """Raise an error for points that no mesh can have meant [m]."""
+    """Raise InvalidValueError for points that are not finite, too close together or too far apart [m]."""
     if not np.isfinite(points).all():
         raise InvalidValueError("its points are not finite.")
     extent = float(np.ptp(points, axis=0).max()) if len(points) else 0.0
     if not SMALLEST_MESH <= extent <= LARGEST_MESH:
         raise InvalidValueError(
-            f"its extent is {extent:g} m, and meshes from {SMALLEST_MESH:g} m to {LARGEST_MESH:g} m are taken. "
-            "Is its scale right?"
+            f"its extent is {extent:g} m, and meshes from {SMALLEST_MESH:g} m to {LARGEST_MESH:g} m are "
+            "taken. Is its scale right?"
         )
     if np.abs(points).max() > LARGEST_MESH:
         raise InvalidValueError(
@@ -91,24 +90,25 @@ class Hull:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Core:
-    """What a solid is made of for our own measuring, see :mod:`.support_source`.
+    """Description of a convex solid by its support function, see :mod:`.support_c`.
 
-    It is the hull of corners; or the sum of a box, an ellipsoid, and a ball, about the origin; or a cone.
+    A core is the hull of corners; or the Minkowski sum of a box, an ellipsoid and a ball about the origin; or
+    a cone.
 
     Attributes
     ----------
     half
-        (3,) half the edges of the box [m].
+        (3,) half edges of the box [m].
     radius
-        Of the ball [m].
+        Radius of the ball [m].
     radii
-        (3,) of the ellipsoid, which is a disc if the last is 0 [m].
+        (3,) radii of the ellipsoid, which is a disc if the last one is 0 [m].
     corners
-        (3, n) in the frame of the solid [m], n a multiple of 8, for which the first one is repeated; n = 0
-        for what is no hull.
+        (3, n) corners in the frame of the solid [m]. The first corner is repeated until n is a multiple of 8;
+        n = 0 for a core that is not a hull.
     tip
-        Of a cone, which is the hull of the tip at (0, 0, tip) and the ellipsoid, a disc, at (0, 0, -tip); 0
-        for everything else [m].
+        Half the height of a cone [m], which is the hull of the tip at (0, 0, tip) and the disc at
+        (0, 0, -tip); 0 for all other cores.
     """
 
     half: Floats
@@ -119,7 +119,7 @@ class Core:
 
     @staticmethod
     def from_corners(points: Floats) -> Core:
-        """Return the hull of (n, 3) corners."""
+        """Return the core that is the hull of (n, 3) corners."""
         missing = -len(points) % 8
         corners = np.ascontiguousarray(np.vstack([points, *missing * [points[:1]]]).T)
         return Core(np.zeros(3), corners=corners)
@@ -127,22 +127,22 @@ class Core:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Solid:
-    """A shape that distances can be computed to. Equal geometries have the same solid; it never changes.
+    """Immutable shape for distance computation; equal geometries share one solid.
 
     Attributes
     ----------
     engine
-        What coal computes with. coal keeps pointers only, so the solid must outlive what is made of it.
+        Geometry of coal. coal keeps pointers only, so the solid must outlive all functors made of it.
     surface
-        What it is, for rays: a primitive, a hull, or triangles.
+        Surface for ray casts: a primitive, a hull, or triangles.
     centre, half
-        The box around it in its own frame: (3,) and (3,) half edges [m].
+        Bounding box in the frame of the solid: (3,) centre and (3,) half edges [m].
     radius
-        Of the sphere about ``centre`` that holds it [m].
+        Radius of the bounding sphere about ``centre`` [m].
     stand_in
-        The same shape as coal should see it beside a cylinder; None if that is ``engine``.
+        Geometry of coal for pairs with a cylinder; None if that is ``engine``.
     core
-        The same shape for our own measuring; None if it is not made like that.
+        Support description for our own GJK; None for triangles.
     """
 
     engine: Any
@@ -155,7 +155,7 @@ class Solid:
 
     @property
     def is_convex(self) -> bool:
-        """Whether it has an inside and a depth: everything but triangles."""
+        """True for all solids but triangle meshes: convex solids have an inside and a depth."""
         return not isinstance(self.surface, Faces)
 
 
@@ -169,9 +169,9 @@ def solid_from_geometry(geometry: Geometry, triangles: bool = False) -> Solid:
     Parameters
     ----------
     geometry
-        A primitive or a mesh; a scale with negative factors mirrors a mesh.
+        A primitive or a mesh; negative factors of a scale mirror the mesh.
     triangles
-        Whether a mesh is kept as it is, a surface without an inside, rather than as its convex hull.
+        Whether a mesh stays a triangle mesh, a surface without an inside, rather than its convex hull.
 
     Raises
     ------
@@ -197,14 +197,14 @@ def solid_from_geometry(geometry: Geometry, triangles: bool = False) -> Solid:
 
 
 def solid_from_points(points: Floats) -> Solid:
-    """Return the solid that is the convex hull of (n, 3) points [m].
+    """Return the solid of the convex hull of (n, 3) points [m].
 
     Raises
     ------
     MissingDependencyError
         If coal is not installed.
     InvalidValueError
-        If they span nothing.
+        If the points span no volume.
     """
     import_coal()
     key = ("hull", points.tobytes())
@@ -216,7 +216,7 @@ def solid_from_points(points: Floats) -> Solid:
 
 @lru_cache(maxsize=4096)
 def scale_solid(solid: Solid, factor: float) -> Solid:
-    """Return a convex solid times a factor; what was given for its radius is kept to."""
+    """Return a convex solid scaled by a factor, with its bounding radius scaled by the same factor."""
     if isinstance(solid.surface, Hull):
         assert solid.core is not None
         made = _hull_solid(factor * solid.core.corners.T)
@@ -227,7 +227,13 @@ def scale_solid(solid: Solid, factor: float) -> Solid:
 
 
 def import_coal() -> Any:
-    """Return coal; raises MissingDependencyError if it is not installed."""
+    """Import coal and return it.
+
+    Raises
+    ------
+    MissingDependencyError
+        If coal is not installed.
+    """
     try:
         import coal
     except ImportError as error:
@@ -255,25 +261,31 @@ def _hull_solid(points: Floats) -> Solid:
 
 
 def _triangle_solid(vertices: Floats, faces: Integers) -> Solid:
-    faces = _with_area(vertices, faces)
-    bvh = import_coal().BVHModelOBBRSS()
-    bvh.beginModel(len(faces), len(vertices))
-    bvh.addVertices(vertices)
-    bvh.addTriangles(np.ascontiguousarray(faces))
-    bvh.endModel()
+    faces = _drop_degenerate(vertices, faces)
+    bvh = build_bvh(vertices, faces)
     used = vertices[np.unique(faces)]
     low, high = used.min(axis=0), used.max(axis=0)
     return _solid_around(bvh, Faces(vertices, faces), (low + high) / 2, (high - low) / 2, used)
 
 
-def _with_area(vertices: Floats, faces: Integers) -> Integers:
-    """Leave out triangles that are lines or points: for coal such a one touches everything."""
+def build_bvh(vertices: Floats, faces: Integers) -> Any:
+    """Return a bounding volume hierarchy of coal over triangles."""
+    bvh = import_coal().BVHModelOBBRSS()
+    bvh.beginModel(len(faces), len(vertices))
+    bvh.addVertices(np.ascontiguousarray(vertices))
+    bvh.addTriangles(np.ascontiguousarray(faces))
+    bvh.endModel()
+    return bvh
+
+
+def _drop_degenerate(vertices: Floats, faces: Integers) -> Integers:
+    """Return the triangles that are not lines or points, with which coal reports contacts everywhere."""
     a, b, c = np.moveaxis(vertices[faces], 1, 0)
     longest = np.max([((p - q) ** 2).sum(axis=1) for p, q in ((a, b), (b, c), (c, a))], axis=0)
-    there = np.linalg.norm(np.cross(b - a, c - a), axis=1) > 1e-14 * longest
-    if not there.any():
+    has_area = np.linalg.norm(np.cross(b - a, c - a), axis=1) > 1e-14 * longest
+    if not has_area.any():
         raise InvalidValueError("all its triangles are lines or points, so that there is nothing to touch.")
-    kept: Integers = faces[there]
+    kept: Integers = faces[has_area]
     return kept
 
 
@@ -312,7 +324,7 @@ def _of_primitive(geometry: Primitive) -> Solid:
         core = Core(np.array(half))
     elif isinstance(geometry, Sphere):
         engine, half, radius = coal.Sphere(x), (x, x, x), x
-        # coal looks only at the wall when the centre of a sphere is inside a cylinder, and not at its ends.
+        # For a sphere whose centre is inside of a cylinder, coal considers only the wall and not the ends.
         stand_in = coal.Capsule(x, 0.0)
         stand_in.computeLocalAABB()
         core = Core(np.zeros(3), x)
@@ -333,7 +345,7 @@ def _of_primitive(geometry: Primitive) -> Solid:
 
 
 SMALLEST_SIZE, LARGEST_SIZE = 1e-7, 1e6
-"""Beyond these sizes a primitive is taken for a mistake [m]."""
+"""Smallest and largest size of a primitive; beyond them a size is taken for a mistake [m]."""
 
 
 def _scale_primitive(geometry: Primitive, factor: float) -> Primitive:
@@ -359,7 +371,7 @@ def _sizes(geometry: Primitive) -> tuple[float, ...]:
 
 
 def solid_surface(solid: Solid) -> Faces | Primitive:
-    """Return the surface of a solid: the primitive that it is, or triangles, seen from outside."""
+    """Return the surface of a solid: its primitive, or triangles that face outwards."""
     return _hull_faces(solid.engine) if isinstance(solid.surface, Hull) else solid.surface
 
 

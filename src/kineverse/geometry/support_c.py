@@ -1,12 +1,12 @@
 """C text: support functions of the cores of convex solids, after the table of :mod:`.broadphase_c`.
 
-A *core* is a hull, or a box plus an ellipsoid, all within a radius: a capsule is a line within one, a
-cylinder a line plus a disc. A cone is the hull of a disc and its tip. What is asked of two is how far
-{b - a}, all differences of their points, reaches.
+A *core* is a hull, or the Minkowski sum of a box, an ellipsoid and a ball: a capsule is a line plus a ball, a
+cylinder a line plus a disc. A cone is the hull of a disc and its tip. The support function of a pair is that
+of the Minkowski difference {b - a}.
 """
 
 SUPPORT = r"""
-/* Corners come in eights, of which the processor takes W at a time; what is found is the same. */
+/* Corners are padded to multiples of 8, of which W are processed at a time; the result is the same. */
 #define LANES 8
 #if defined(__AVX512F__)
 #define W 8
@@ -36,7 +36,7 @@ static inline Vector cross(Vector a, Vector b) {
 typedef double Lanes __attribute__((vector_size(8 * W)));
 typedef int64_t Numbers __attribute__((vector_size(8 * W)));
 
-/* The largest value of each lane, and where it is. */
+/* Largest value of each lane, and its index. */
 typedef struct {
   Lanes value;
   Numbers at;
@@ -56,7 +56,7 @@ static inline Largest larger_of(Largest a, Largest b) {
 #define ACROSS(found, ...) \
   larger_of(found, (Largest){PICK((found).value, __VA_ARGS__), PICK((found).at, __VA_ARGS__)})
 
-/* How far W corners from one on are in a direction. */
+/* Values of W corners along a direction. */
 static inline Largest reaches(const double *corners, int64_t n, Vector way, int64_t from) {
   Lanes x, y, z;
   memcpy(&x, corners + from, sizeof x);
@@ -104,7 +104,7 @@ INLINE Vector corner(const double *corners, int64_t n, Vector way) {
   return (Vector){{corners[k], corners[n + k], corners[2 * n + k]}};
 }
 
-/* The point of a core that is furthest in a direction. */
+/* Support point of a core along a direction. */
 static inline Vector furthest(const Table *t, int64_t piece, Vector way) {
   const int64_t n = t->corner_count[piece];
   if (n) return corner(t->corners[piece], n, way);
@@ -138,7 +138,7 @@ static Vector turned(const double *rotation, int64_t stride, int64_t step, Vecto
   return out;
 }
 
-/* Two pieces: seen from a, b is turned and shifted. */
+/* Pair of objects, in the frame of a. */
 typedef struct {
   const Table *t;
   int64_t i, j;
@@ -156,7 +156,7 @@ static Pair pair_of(const Table *t, int64_t i, int64_t j) {
   return p;
 }
 
-/* The point of {b - a} that is furthest against a direction, and the point a that it comes from. */
+/* Support point of {b - a} against a direction, and the point a that it comes from. */
 static inline Vector against(const Pair *p, Vector way, Vector *a) {
   const Vector back = {{-way.x[0], -way.x[1], -way.x[2]}};
   *a = furthest(p->t, p->i, way);

@@ -104,7 +104,7 @@ class CoalSearch:
         here = table.low[moving, None] - table.high
         apart = np.maximum(np.maximum(here, table.low - table.high[moving, None]), 0.0)
         gaps = np.einsum("ijk,ijk->ij", apart, apart)
-        between = table.place[moving, None] - table.place
+        between = table.position[moving, None] - table.position
         centres = np.einsum("ijk,ijk->ij", between, between)
         near = (gaps <= self._radius**2) & (centres <= self._reach) & self._looked_at
         first, second = np.nonzero(near)

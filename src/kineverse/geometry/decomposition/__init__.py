@@ -1,7 +1,7 @@
 """Convex decomposition of meshes: made offline by CoACD, cached, measured.
 
-Distances to convex solids are fast and have a depth; a mug is not convex. :func:`decompose` takes seconds
-to minutes, so nothing calls it by itself: ``kineverse decompose`` does, and :func:`find_hulls` returns what is
+Distances to convex solids are fast and have a depth; a mug is not convex. :func:`decompose` takes seconds to
+minutes, so nothing calls it by itself: ``kineverse decompose`` does, and :func:`find_hulls` returns what is
 there.
 """
 
