@@ -180,8 +180,8 @@ static void square_gaps(const Table *t, int64_t one, int64_t first, int64_t end)
              square(larger(larger(a[2] - high[2 * n + k], low[2 * n + k] - b[2]), 0.0));
 }
 
-/* Returns how many pairs there are; only the first `room` of them are written. Of two moving objects, the one
-   that begins first finds the other. Two that stand still are of no interest. */
+/* Returns the number of pairs; only the first `room` of them are written. Of two moving objects, the one with
+   the smaller lower end finds the other. Pairs of static objects are skipped. */
 EXPORT int64_t near(Table *t, double reach, int32_t *pairs, double *lows, int64_t room) {
   sort(t, t->order, t->moving);
   Answer answer = {reach, pairs, lows, room, 0};
@@ -248,8 +248,8 @@ static Found *sorted(Found *found, Found *spare, int64_t n) {
   return found;
 }
 
-/* Writes which pairs are the nearest ones of their bodies and within a radius, nearest first; `order` has
-   room for all. Returns how many, -1 if there is no memory. */
+/* Writes the indices of the pairs that are the nearest of their bodies within a radius, nearest first;
+   `order` has room for all. Returns their number, -1 without memory. */
 EXPORT int64_t rank(
     const Table *t, const int32_t *pairs, int64_t n, const double *distances, double radius, int64_t *order) {
   int64_t count = 0, kept = 0, slots = 2;
@@ -301,9 +301,9 @@ EXPORT void gather(
   }
 }
 
-/* All of it: what may be within `reach`, measured, ranked, and the nearest pairs of their bodies in order.
-   Returns how many pairs were measured, and writes how many are `kept`: -1 if some are left to coal, or if
-   there is no room. */
+/* Whole query: pairs that may be within `reach` are measured, ranked, and gathered. Returns the number of
+   measured pairs, and writes the number `kept`: -1 if some pairs are left to coal, or the buffers are too
+   short. */
 EXPORT int64_t search(
     Table *t, double reach, double radius, int64_t room, int32_t *pairs, double *lows, double *distances,
     double *witnesses, int64_t *order, int64_t *kept, int32_t *pieces, int32_t *bodies, double *distance,

@@ -317,7 +317,7 @@ class Narrowphase:
 
 
 def distance_to_point(solid: Solid, pose: Floats, point: Floats) -> tuple[float, Floats, Floats]:
-    """Return the signed distance of a point from a placed solid [m], its nearest surface point, and the normal.
+    """Return the signed distance of a point from a placed solid [m], its nearest point, and the normal there.
 
     Parameters
     ----------

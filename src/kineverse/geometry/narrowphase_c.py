@@ -39,8 +39,8 @@ static inline Part at_corner(const Simplex *s, int i) {
   return (Part){1, {i}, {1.0}, dot(s->w[i], s->w[i]), s->w[i]};
 }
 
-/* The last point of a simplex is where the way to the origin led to, so that what is nearest has it in: edges
-   and faces without it are left out. */
+/* The nearest feature of a simplex contains its last point, which was the support point towards the origin:
+   other edges and faces are skipped. */
 static inline Part on_segment(const Simplex *s, int i, int j) {
   const Vector p = s->w[i], way = plus(s->w[j], -1.0, p);
   const double length = dot(way, way), t = -dot(p, way);
@@ -102,7 +102,7 @@ static void write(const Table *t, int64_t i, Vector a, Vector normal, double dis
   }
 }
 
-/* What is in each other further than its rounding: the radii come to the depth of the cores. */
+/* Distance of overlapping cores: minus their depth and both radii. */
 static double deep(const Table *t, int64_t i, int64_t j, const Pair *p, const Simplex *s, double *witness,
                    double *low) {
   Vector a, normal;
@@ -114,8 +114,8 @@ static double deep(const Table *t, int64_t i, int64_t j, const Pair *p, const Si
   return distance;
 }
 
-/* Writes the points of both and the normal in the world. Returns NaN for what is not solved, and infinity
-   for what is further apart than the limit; `low` is what is known of the distance then. */
+/* Writes the points of both and the normal in the world. Returns NaN for unsolved pairs, and infinity beyond
+   the limit, where `low` is a lower bound of the distance. */
 static double measured(const Table *t, int64_t i, int64_t j, double limit, double *witness, double *low) {
   if (t->corner_count[i] < 0 || t->corner_count[j] < 0) return NAN;
   const Pair pair = pair_of(t, i, j);
@@ -133,7 +133,7 @@ static double measured(const Table *t, int64_t i, int64_t j, double limit, doubl
     const Vector w = against(&pair, v, &a);
     best = larger(best, dot(v, w) / length);
     const double known = best - round_a - round_b;
-    /* Half of the way to what is known from the other side, so that it is of use for some states. */
+    /* Stop only halfway to the upper bound, so that the lower bound is of use at later states. */
     if (known > limit + STUCK && 2.0 * best > high + limit + round_a + round_b) {
       *low = known;
       return INFINITY;
@@ -162,8 +162,8 @@ static double measured(const Table *t, int64_t i, int64_t j, double limit, doubl
   return distance;
 }
 
-/* Measures pairs of objects, and records bounds of their distances. A pair that was measured and of which
-   nothing moved since is not measured again. */
+/* Measures pairs of objects, and records bounds of their distances. Remembered pairs are not
+   measured again. */
 EXPORT void measure(
     Table *t, const int32_t *pairs, int64_t n, double limit, double *distances, double *witnesses) {
   for (int64_t k = 0; k < n; k++) {
@@ -322,9 +322,9 @@ static int grow(Polytope *p, int from, Vector w, Vector a, double flat) {
   return edges >= 3;
 }
 
-/* Returns how deep two cores are in each other, the deepest point a of the first and the normal from it to
-   the second, in the frame of the first; NaN where that is not certain, or where they are not in each other.
-   A simplex of four points is where to begin, if there is one. */
+/* Returns the depth of two cores, the deepest point a of the first and the normal from there to the second,
+   in the frame of the first; NaN if the bounds do not meet, or the cores do not overlap. A simplex of four
+   points is the initial polytope. */
 static double depth_of(const Pair *pair, const Simplex *s, double size, Vector *a, Vector *normal) {
   Polytope p;
   if (!begin(&p, pair, s, size)) return NAN;

@@ -72,9 +72,9 @@ static inline Largest reaches(const double *corners, int64_t n, Vector way, int6
   return (Largest){way.x[0] * x + way.x[1] * y + way.x[2] * z, lane + from};
 }
 
-/* The corner that is furthest in a direction; their number is a multiple of LANES, all x before all y. No
-   branch depends on where it is, as nobody could guess which way that goes; and there are two searches, as
-   each step waits for the one before. */
+/* Furthest corner along a direction; the number of corners is a multiple of LANES, all x before all y. No
+   branch depends on the data, as it would be unpredictable. Two interleaved searches hide the latency of each step.
+   */
 INLINE Vector corner(const double *corners, int64_t n, Vector way) {
   Largest found[PARTS], other[PARTS];
   for (int p = 0; p < PARTS; p++) {

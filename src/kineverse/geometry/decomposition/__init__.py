@@ -1,8 +1,8 @@
 """Convex decomposition of meshes: made offline by CoACD, cached, measured.
 
-Distances to convex solids are fast and have a depth; a mug is not convex. :func:`decompose` takes seconds to
-minutes, so nothing calls it by itself: ``kineverse decompose`` does, and :func:`find_hulls` returns what is
-there.
+Distances to convex solids are fast and have a depth, but many meshes, such as a mug, are not convex.
+:func:`decompose` takes seconds to minutes, so scenes never call it. The command ``kineverse decompose`` fills
+the cache, and :func:`find_hulls` reads it.
 """
 
 from .accuracy import Accuracy

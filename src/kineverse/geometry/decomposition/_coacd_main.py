@@ -2,8 +2,8 @@
 
     python -P _coacd_main.py IN OUT ERROR MEMORY
 
-IN and OUT are archives of numpy; ERROR is in metres, MEMORY in bytes. It ends when its standard input does,
-so that it does not outlive whoever started it.
+IN and OUT are archives of numpy; ERROR is in metres, MEMORY in bytes. The process ends when its standard
+input ends, so it does not outlive its parent.
 """
 
 import contextlib
@@ -13,9 +13,9 @@ import threading
 
 import numpy as np
 
-# The search is shorter than CoACD's own default, which takes three times as long for as many hulls. Its bound
-# on the number of hulls is not used, as it crashes with some. A surface that is not closed is wrapped with a
-# grid of so many cells; with 50, as by default, that takes minutes for an open box.
+# The search is shorter than CoACD's default, which takes three times as long for as many hulls. CoACD's bound
+# on the number of hulls is not used, because some values crash it. An open surface is wrapped with a grid of
+# preprocess_resolution cells; the default of 50 takes minutes for an open box.
 COACD_OPTIONS = {
     "real_metric": True,
     "mcts_nodes": 15,
@@ -27,7 +27,7 @@ COACD_OPTIONS = {
 
 
 def main(source: str, target: str, error: str, memory: str) -> None:
-    """Read a mesh, write hulls."""
+    """Read a mesh and write the hulls of its decomposition."""
     threading.Thread(target=_end_with_standard_input, daemon=True).start()
     _bound_memory(int(memory))
 

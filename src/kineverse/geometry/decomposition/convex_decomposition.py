@@ -1,4 +1,4 @@
-"""Convex decomposition of a mesh, by way of the cache."""
+"""Convex decomposition of a mesh, through the cache."""
 
 from __future__ import annotations
 
@@ -20,21 +20,21 @@ from .mesh_cleanup import CleanMesh, clean_mesh
 from .result import Decomposition, DecompositionSettings
 from .worker import DecompositionError, ResourceLimits, run_coacd
 
-# A hull that stands out of another by less than this part of its size is inside of it.
+# A hull that protrudes from another by less than this part of its size is inside of it.
 _INSIDE = 1e-9
 
 
 def clean_hulls(hulls: list[Floats], whole: Polytope) -> list[Polytope]:
-    """Return the hulls of sets of points, without those that span nothing and those inside of another one.
+    """Return the hulls of sets of points, without degenerate hulls and hulls inside of another one.
 
-    What stands out of the hull of the whole mesh is taken back onto it: where CoACD has wrapped a surface, it
-    is a little larger all around.
+    Points outside of the hull of the whole mesh are projected onto it, because CoACD's wrapping of an open
+    surface is a little larger all around.
     """
     found = []
     for points in hulls:
         try:
             found.append(Polytope.from_points(_project_inside(points, whole)))
-        except InvalidValueError:  # A splinter: a cut has come upon a point or an edge.
+        except InvalidValueError:  # A degenerate part: a cut has met a corner or an edge.
             continue
     found.sort(key=lambda polytope: -polytope.volume)
     kept: list[Polytope] = []
@@ -53,7 +53,7 @@ def _project_inside(points: Floats, whole: Polytope) -> Floats:
 
 
 def reduce_hulls(hulls: list[Polytope], count: int) -> list[Polytope]:
-    """Join hulls until there are at most so many: always the two whose common hull adds least volume."""
+    """Join hulls until ``count`` are left, each time the pair whose common hull adds least volume."""
     hulls = list(hulls)
     joined = (
         {(i, j): _join_hulls(hulls[i], hulls[j]) for j in range(len(hulls)) for i in range(j)}
@@ -72,7 +72,7 @@ def reduce_hulls(hulls: list[Polytope], count: int) -> list[Polytope]:
 
 
 def _join_hulls(one: Polytope, other: Polytope) -> tuple[float, Polytope]:
-    """Return the volume that joining two hulls adds [m³], and what they become."""
+    """Return the volume that joining two hulls adds [m³], and their common hull."""
     both = Polytope.from_points(np.concatenate([one.points, other.points]))
     return both.volume - one.volume - other.volume, both
 
@@ -82,7 +82,7 @@ DEFAULTS, LIMITS = DecompositionSettings(), ResourceLimits()
 
 @dataclass(frozen=True, slots=True)
 class DecompositionOutcome:
-    """What became of one mesh: a decomposition, from the cache or not, or an error."""
+    """Outcome for one mesh: a decomposition, from the cache or new, or an error."""
 
     mesh: Mesh
     decomposition: Decomposition | None = None
@@ -91,23 +91,23 @@ class DecompositionOutcome:
 
 
 def find_hulls(mesh: Mesh, settings: DecompositionSettings | None = None) -> tuple[Floats, ...] | None:
-    """Return the convex pieces of a mesh if they are in the cache, else None.
+    """Return the cached convex hulls of a mesh, or None.
 
     Parameters
     ----------
     mesh
         A mesh; its scale is applied.
     settings
-        What it was decomposed with; if None, the latest of its decompositions is taken.
+        Settings of the decomposition; None selects the latest one of the mesh.
 
     Returns
     -------
-    The corners of each hull, (n, 3) in the frame of the mesh [m], read-only. The order is always the same.
+    The corners of each hull, (n, 3) in the frame of the mesh [m], read-only, in a fixed order.
 
     Raises
     ------
     FormatError, InvalidValueError, MissingDependencyError
-        If the mesh cannot be read, or there can be no decomposition of it.
+        If the mesh cannot be read or decomposed.
     """
     surface = clean_mesh(mesh)
     found = hull_cache.find_entry(surface.digest, settings.key(surface.size) if settings else None)
@@ -121,22 +121,22 @@ def decompose(
     force: bool = False,
     stop: threading.Event | None = None,
 ) -> DecompositionOutcome:
-    """Return a mesh as a union of convex hulls, from the cache or made now, which takes seconds to minutes.
+    """Decompose a mesh into convex hulls, or read them from the cache; it takes seconds to minutes.
 
-    The same mesh and settings give the same hulls.
+    Equal meshes and settings give equal hulls.
 
     Parameters
     ----------
     mesh
         A mesh; its scale is applied.
     settings
-        What is asked for.
+        Settings of the decomposition.
     limits
-        What it may cost.
+        Limits on time and memory.
     force
-        Whether it is made anew though it is in the cache.
+        Whether to ignore the cache.
     stop
-        Ends it, when set, with a :class:`DecompositionError`.
+        Event that ends the computation with a :class:`DecompositionError`.
 
     Raises
     ------
@@ -167,14 +167,14 @@ def decompose_all(
     force: bool = False,
     jobs: int = 1,
 ) -> Iterator[DecompositionOutcome]:
-    """Yield what becomes of each mesh, as soon as it is known; one that is wrong does not stop the others.
+    """Decompose meshes and yield each outcome as soon as it is known; an error does not stop the others.
 
     Parameters
     ----------
     meshes, settings, limits, force
         See :func:`decompose`.
     jobs
-        So many are decomposed at the same time, each on one core.
+        Number of meshes that are decomposed at the same time, each on one core.
 
     Raises
     ------
@@ -199,7 +199,7 @@ def decompose_all(
             for future in as_completed(waiting):
                 yield future.result()
         finally:
-            # Whoever does not want the rest, or presses Ctrl-C, does not wait for it.
+            # A caller that closes the iterator, or presses Ctrl-C, does not wait for the rest.
             stop.set()
             pool.shutdown(wait=False, cancel_futures=True)
 
@@ -208,7 +208,7 @@ def _decompose_surface(
     surface: CleanMesh, settings: DecompositionSettings, limits: ResourceLimits, stop: threading.Event | None
 ) -> Decomposition:
     start = time.perf_counter()
-    error = settings.allowed(surface.size)
+    error = settings.max_error(surface.size)
     found = clean_hulls(run_coacd(surface, error, limits, stop), Polytope.from_points(surface.faces.vertices))
     hulls = reduce_hulls(found, settings.max_hulls)
     if not hulls:

@@ -1,9 +1,8 @@
 """Disk cache of decompositions, by mesh content and settings.
 
-They lie in a folder of the cache that compiled functions are kept in, which only this user can write to, as
-to every file in it. A file ends in the SHA-256 of what is before it; a broken one counts as absent. Files
-arrive by renaming, so any number of processes can share the folder, and what was done before an interruption
-is there.
+The files lie in a folder of the cache of compiled functions; only this user can write to the folder and its
+files. A file ends in the SHA-256 of its content; a damaged file counts as absent. Files are renamed into
+place, so any number of processes can share the folder, and an interruption loses only the unfinished file.
 """
 
 from __future__ import annotations
@@ -27,7 +26,7 @@ from .result import Decomposition
 logger = logging.getLogger("kineverse.geometry")
 
 MAXIMUM_BYTES = 256 * 2**20
-"""When there is more, what was used longest ago is removed."""
+"""Largest size of the cache [bytes]; beyond it, the least recently used files are removed."""
 
 _ENDING = ".hulls"
 _UNFINISHED = ".making-"
@@ -38,21 +37,21 @@ _DIGEST = 32
 
 @dataclass(frozen=True, slots=True)
 class CacheEntry:
-    """A decomposition in the cache, and the size of its file [bytes]."""
+    """Cached decomposition, and the size of its file [bytes]."""
 
     decomposition: Decomposition
     bytes: int
 
 
 def find_entry(mesh: str, settings: str | None = None) -> Decomposition | None:
-    """Return the decomposition of a mesh, else None.
+    """Return the cached decomposition of a mesh, or None.
 
     Parameters
     ----------
     mesh
-        The digest of its surface.
+        Digest of the cleaned mesh.
     settings
-        The key of the settings; those with which it was decomposed last if None.
+        Key of the settings; None selects the latest decomposition.
     """
     folder = _folder()
     if settings is not None:
@@ -63,7 +62,7 @@ def find_entry(mesh: str, settings: str | None = None) -> Decomposition | None:
 
 
 def add_entry(mesh: str, settings: str, decomposition: Decomposition) -> None:
-    """Write a decomposition, whole or not at all; see :func:`find_entry`."""
+    """Write a decomposition atomically; see :func:`find_entry`."""
     folder = _folder()
     content = decomposition.to_bytes()
     handle, name = tempfile.mkstemp(prefix=_UNFINISHED, dir=folder.path)
@@ -79,7 +78,7 @@ def add_entry(mesh: str, settings: str, decomposition: Decomposition) -> None:
 
 
 def list_entries() -> list[CacheEntry]:
-    """Return what is in the cache, by name of the file it was made from."""
+    """Return all entries of the cache, sorted by the name of the mesh file."""
     folder = _folder()
     found = [(_read(folder, name, used=False), size) for _, size, name in _files(folder)]
     kept = [CacheEntry(decomposition, size) for decomposition, size in found if decomposition]
@@ -87,13 +86,13 @@ def list_entries() -> list[CacheEntry]:
 
 
 def clear() -> int:
-    """Remove everything, and return how many decompositions there were."""
+    """Remove all entries, and return their number."""
     folder = _folder()
     return sum(folder.remove(name) for _, _, name in list(_files(folder)))
 
 
 def folder() -> Path:
-    """Return where decompositions are kept."""
+    """Return the path of the cache folder."""
     return _folder().path
 
 

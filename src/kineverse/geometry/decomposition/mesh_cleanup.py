@@ -16,28 +16,28 @@ from kineverse.model.body import Mesh
 from .accuracy import enclosed_volume, is_closed
 
 MOST_FACES = 300_000
-"""A mesh of more triangles is not decomposed: CoACD takes hours and all memory."""
+"""Largest number of triangles that is decomposed; more take CoACD hours and all memory."""
 
-# Pieces of a mesh that do not hang together are decomposed one by one, if they are not more than this.
+# Connected parts of a mesh are decomposed one by one, up to this number.
 _MOST_PARTS = 64
-# What is thinner than this part of its size has no volume.
+# A mesh thinner than this part of its size has no volume.
 _FLAT = 1e-6
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class CleanMesh:
-    """A mesh as it is decomposed.
+    """Cleaned mesh, ready for decomposition.
 
     Attributes
     ----------
     faces
-        Its corners and triangles [m].
+        Vertices and triangles [m].
     parts
-        The number of the part that each triangle belongs to, (F,); parts are decomposed one by one.
+        Connected part of each triangle, (F,); parts are decomposed one by one.
     name
-        The file it is from.
+        Path of the mesh file.
     remarks
-        What is not as it should be.
+        Defects of the mesh.
     """
 
     faces: Faces
@@ -47,18 +47,18 @@ class CleanMesh:
 
     @property
     def size(self) -> float:
-        """The longest edge of its box [m]."""
+        """Longest edge of the bounding box [m]."""
         return float(np.ptp(self.faces.vertices, axis=0).max())
 
     @property
     def digest(self) -> str:
-        """The SHA-256 of its corners and triangles."""
+        """SHA-256 of the vertices and triangles."""
         arrays = self.faces.vertices.astype("<f8"), self.faces.faces.astype("<i8")
         return hashlib.sha256(b"".join(array.tobytes() for array in arrays)).hexdigest()
 
 
 def clean_mesh(mesh: Mesh) -> CleanMesh:
-    """Return the surface of a mesh, scaled; a scale with an odd number of negative factors mirrors it.
+    """Read, scale and clean a mesh; a scale with an odd number of negative factors mirrors it.
 
     Raises
     ------
@@ -67,8 +67,8 @@ def clean_mesh(mesh: Mesh) -> CleanMesh:
     FormatError
         If there is no such file, it cannot be read, or holds no triangles or numbers that are not finite.
     InvalidValueError
-        If it is flat, of an impossible size or has too many triangles, or if its scale is none. The message
-        names the file.
+        If the mesh is flat, of an impossible size or has too many triangles, or if a factor of the scale is 0
+        or not finite. The message names the file.
     """
     scale = np.array(mesh.scale, dtype=float)
     if not all(math.isfinite(factor) and factor for factor in mesh.scale):
@@ -90,7 +90,7 @@ def _prepare(read: Faces, scale: Floats, name: str) -> CleanMesh:
             f"it has {len(read.faces)} triangles, and {MOST_FACES} are taken at most. Simplify it first."
         )
     used, faces = np.unique(read.faces, return_inverse=True)
-    # Adding 0 turns -0 into 0, which is the same place.
+    # Adding 0 turns -0 into 0, which is the same coordinate.
     vertices, same = np.unique(read.vertices[used] * scale + 0.0, axis=0, return_inverse=True)
     faces = same.reshape(-1)[faces.reshape(-1, 3)]
     check_extent(vertices)
@@ -114,13 +114,13 @@ def _prepare(read: Faces, scale: Floats, name: str) -> CleanMesh:
     if volumes and max(volumes) < 0.0:
         faces, volumes = np.ascontiguousarray(faces[:, ::-1]), [-v for v in volumes]
     if not volumes or min(volumes) <= 0.0:
-        # A part inside out is a hole in another one.
+        # A part that faces inwards is a hole in another part.
         parts = np.zeros(len(faces), dtype=np.int64)
     return CleanMesh(Faces(vertices, faces), parts, name, ())
 
 
 def _thickness(vertices: Floats) -> float:
-    """Return the least extent along the principal axes, as a part of the largest."""
+    """Return the ratio of the smallest to the largest extent along the principal axes."""
     centred = vertices - vertices.mean(axis=0)
     axes = np.linalg.eigh(centred.T @ centred)[1]
     extents = np.ptp(centred @ axes, axis=0)
@@ -134,7 +134,7 @@ def _drop_degenerate(vertices: Floats, faces: Integers) -> Integers:
 
 
 def _connected_parts(faces: Integers, count: int) -> Integers:
-    """Return for each triangle the number of the connected part it is in."""
+    """Return the index of the connected part of each triangle."""
     label = np.arange(count)
     while True:
         least = label[faces].min(axis=1)

@@ -16,27 +16,27 @@ from kineverse.geometry.mesh_files import Floats
 from .accuracy import Accuracy
 
 ERROR_OF_SIZE = 0.02
-"""The error that is allowed where none is given, as a part of the longest edge of the mesh's box."""
+"""Default error, as a part of the longest edge of the mesh's bounding box."""
 
 MOST_HULLS = 32
-"""How many hulls are allowed where no number is given."""
+"""Default of the largest number of hulls."""
 
-# Counted up when other hulls come out for the same mesh and settings.
+# Increased when the hulls of equal meshes and settings change.
 _VERSION = 1
 
 
 @dataclass(frozen=True, slots=True)
 class DecompositionSettings:
-    """What a decomposition should be like.
+    """Settings of a decomposition.
 
     Attributes
     ----------
     error
-        How far the hulls may stand out from the mesh [m]; 2 % of the longest edge of its box if None. It is
-        what CoACD aims at by samples of its own, and no bound: with few hulls it cannot be met. What came out
-        is measured, see :class:`Accuracy`.
+        Largest protrusion of the hulls from the mesh [m] that CoACD aims at; 2 % of the longest edge of the
+        bounding box if None. It is no bound: CoACD estimates it from samples, and few hulls cannot meet it.
+        :class:`Accuracy` has the measured values.
     max_hulls
-        At most so many hulls.
+        Largest number of hulls.
 
     Raises
     ------
@@ -55,38 +55,36 @@ class DecompositionSettings:
         if self.max_hulls < 1:
             raise InvalidValueError(f"A decomposition has at least one hull, not {self.max_hulls}.")
 
-    def allowed(self, size: float) -> float:
-        """Return the error that is allowed for a mesh whose box has this longest edge, both [m]."""
+    def max_error(self, size: float) -> float:
+        """Return the error for a mesh whose bounding box has this longest edge, both [m]."""
         return ERROR_OF_SIZE * size if self.error is None else self.error
 
     def key(self, size: float) -> str:
-        """Return what stands for the settings of a mesh of this size [m] in the cache."""
-        told = json.dumps([_VERSION, self.allowed(size).hex(), self.max_hulls])
-        return hashlib.sha256(told.encode()).hexdigest()[:16]
+        """Return the cache key of the settings for a mesh of this size [m]."""
+        content = json.dumps([_VERSION, self.max_error(size).hex(), self.max_hulls])
+        return hashlib.sha256(content.encode()).hexdigest()[:16]
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Decomposition:
-    """Convex hulls whose union stands for a mesh.
+    """Convex hulls whose union approximates a mesh.
 
     Attributes
     ----------
     hulls
-        The corners of each hull, (n, 3) in the frame of the mesh, scaled [m]; read-only.
+        Corners of each hull, (n, 3) in the frame of the mesh, scaled [m]; read-only.
     name
-        The file it was made from.
-    error
-        What was allowed [m].
-    max_hulls
-        How many hulls were allowed.
+        Path of the mesh file.
+    error, max_hulls
+        Settings of the decomposition: error [m] and largest number of hulls.
     accuracy
-        What was measured.
+        Measured volumes and deviations.
     seconds
-        How long it took to make [s].
+        Computation time [s].
     made
-        When it was made, in seconds since 1970.
+        Time of creation, in seconds since 1970.
     remarks
-        What was not as it should be about the mesh.
+        Defects of the mesh.
     """
 
     hulls: tuple[Floats, ...]
@@ -99,7 +97,7 @@ class Decomposition:
     remarks: tuple[str, ...] = field(default=())
 
     def to_bytes(self) -> bytes:
-        """Return it as bytes, which :meth:`from_bytes` reads to the last bit."""
+        """Serialise the decomposition exactly; :meth:`from_bytes` reads it back."""
         facts = {
             "name": self.name,
             "error": self.error,
@@ -120,12 +118,12 @@ class Decomposition:
 
     @staticmethod
     def from_bytes(content: bytes) -> Decomposition:
-        """Read what :meth:`to_bytes` wrote.
+        """Read a decomposition that :meth:`to_bytes` wrote.
 
         Raises
         ------
         FormatError
-            If it is anything else.
+            If the content is anything else.
         """
         try:
             with np.load(io.BytesIO(content), allow_pickle=False) as arrays:
@@ -136,5 +134,5 @@ class Decomposition:
             facts["accuracy"] = Accuracy(**facts["accuracy"])
             facts["remarks"] = tuple(facts["remarks"])
             return Decomposition(hulls, **facts)
-        except Exception as error:  # A broken archive raises whatever zip, numpy or json come upon.
+        except Exception as error:  # zip, numpy and json raise all kinds of errors for a damaged archive.
             raise FormatError("This is no decomposition.") from error

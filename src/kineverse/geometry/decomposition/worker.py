@@ -24,7 +24,7 @@ from .mesh_cleanup import CleanMesh
 PROGRAM = Path(__file__).with_name("_coacd_main.py")
 _POLL = 0.05
 _MAX_MESSAGE = 300
-# What Python, C++ and the loader of libraries say when there is no memory.
+# Messages of Python, C++ and the dynamic loader about a lack of memory.
 _MEMORY_ERRORS = (
     b"MemoryError",
     b"bad_alloc",
@@ -35,19 +35,19 @@ _MEMORY_ERRORS = (
 
 
 class DecompositionError(KineverseError, RuntimeError):
-    """A mesh could not be decomposed: CoACD crashed, ran out of time or memory, or answered nonsense."""
+    """Failed decomposition: CoACD crashed, ran out of time or memory, or returned impossible hulls."""
 
 
 @dataclass(frozen=True, slots=True)
 class ResourceLimits:
-    """What one mesh may cost.
+    """Limits on the resources for one mesh.
 
     Attributes
     ----------
     seconds
-        Of time [s].
+        Time [s].
     memory
-        Of address space [bytes]. Not bounded on Windows, and not reliably on macOS.
+        Address space [bytes]; not bounded on Windows, and not reliably on macOS.
     """
 
     seconds: float = 600.0
@@ -57,25 +57,25 @@ class ResourceLimits:
 def run_coacd(
     surface: CleanMesh, error: float, limits: ResourceLimits, stop: threading.Event | None = None
 ) -> list[Floats]:
-    """Return the corners of convex hulls, (n, 3) each [m], as CoACD makes them.
+    """Run CoACD in a separate process, and return the corners of its convex hulls, (n, 3) each [m].
 
     Parameters
     ----------
     surface
-        What is decomposed.
+        The mesh.
     error
-        CoACD's measure of concavity that is allowed [m].
+        CoACD's threshold of concavity [m].
     limits
-        What it may cost.
+        Limits on time and memory.
     stop
-        Ends it, when set.
+        Event that ends the process.
 
     Raises
     ------
     MissingDependencyError
         If CoACD is not installed.
     DecompositionError
-        If it crashes, answers nothing that could be right, exceeds its limits, or is stopped.
+        If it crashes, returns impossible hulls, exceeds its limits, or is stopped.
     """
     if importlib.util.find_spec("coacd") is None:
         raise MissingDependencyError(f"decomposing meshes needs CoACD: {install_command('decomposition')}")
@@ -83,19 +83,21 @@ def run_coacd(
         source, target, said = (Path(folder) / name for name in ("in.npz", "out.npz", "said.txt"))
         np.savez(source, vertices=surface.faces.vertices, faces=surface.faces.faces, parts=surface.parts)
         with said.open("wb") as errors:
-            status = _run(_command(source, target, error, limits), errors.fileno(), limits, stop)
+            status = _run_process(_command_line(source, target, error, limits), errors.fileno(), limits, stop)
         if status == 0:
-            return _answer(target, surface)
+            return _read_hulls(target, surface)
         raise DecompositionError(_explain_failure(status, said.read_bytes()[-20_000:]))
 
 
-def _command(source: Path, target: Path, error: float, limits: ResourceLimits) -> list[str]:
-    # With -P the program's neighbours cannot be imported by accident.
+def _command_line(source: Path, target: Path, error: float, limits: ResourceLimits) -> list[str]:
+    # -P keeps the program from importing its neighbours by accident.
     return [sys.executable, "-P", str(PROGRAM), str(source), str(target), repr(error), str(limits.memory)]
 
 
-def _run(command: list[str], errors: int, limits: ResourceLimits, stop: threading.Event | None) -> int:
-    # Its threads make it hardly any faster, and several meshes are decomposed side by side.
+def _run_process(
+    command: list[str], errors: int, limits: ResourceLimits, stop: threading.Event | None
+) -> int:
+    # Threads hardly speed CoACD up, and several meshes are decomposed in parallel.
     environment = {**os.environ, "OMP_NUM_THREADS": "1", "OPENBLAS_NUM_THREADS": "1"}
     end = time.monotonic() + limits.seconds
     with subprocess.Popen(
@@ -117,8 +119,8 @@ def _run(command: list[str], errors: int, limits: ResourceLimits, stop: threadin
         return process.wait()
 
 
-def _answer(target: Path, surface: CleanMesh) -> list[Floats]:
-    """Read the hulls, and do not trust them."""
+def _read_hulls(target: Path, surface: CleanMesh) -> list[Floats]:
+    """Read the hulls, and check that they lie near the mesh."""
     try:
         with np.load(target, allow_pickle=False) as arrays:
             points, sizes = np.asarray(arrays["points"], dtype=float), np.asarray(arrays["sizes"])
