@@ -38,7 +38,7 @@ def test_a_rocker_is_told_by_its_crank() -> None:
     (lock,) = found
     assert (lock.hold, lock.constraints, lock.keys) == ("stands still", ("lock",), (CRANK,))
     ((axis, side),) = lock.when[0].items()
-    assert str(lock) == f"door:velocity stands still: when {side.of('four_bar/crank mod 2π')} (lock)"
+    assert str(lock) == f"door:velocity stands still: when {side.describe('four_bar/crank mod 2π')} (lock)"
     # Where the rocker of lengths 0.12, 0.33, 0.27 on a ground of 0.3 stands, by the two triangles.
     assert [side.lower, side.upper] == pytest.approx(by_triangles(), abs=1e-9)
     assert reasoning.contradictions(model, found) == []

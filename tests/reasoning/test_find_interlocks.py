@@ -47,7 +47,7 @@ def test_the_garage_door_of_the_paper() -> None:
     assert list(result) == [
         Interlock(v(A), "stands still", ("c2",), (IntervalBox({A: above(1.99), B: below(0.3)}),))
     ]
-    assert result.of(A) == result.of("a") == tuple(result)
+    assert result.locks_on(A) == result.locks_on("a") == tuple(result)
     assert result.keys("a") == (B,)
 
 

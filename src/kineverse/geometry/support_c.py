@@ -73,8 +73,8 @@ static inline Largest reaches(const double *corners, int64_t n, Vector way, int6
 }
 
 /* Furthest corner along a direction; the number of corners is a multiple of LANES, all x before all y. No
-   branch depends on the data, as it would be unpredictable. Two interleaved searches hide the latency of each step.
-   */
+   branch depends on the data, as it would be unpredictable. Two interleaved searches hide the latency of each
+   step. */
 INLINE Vector corner(const double *corners, int64_t n, Vector way) {
   Largest found[PARTS], other[PARTS];
   for (int p = 0; p < PARTS; p++) {

@@ -36,13 +36,13 @@ from .polynomial import Polynomial
 
 
 def enclose_loop(term: Term, inputs: list[TaylorSeries]) -> TaylorSeries:
-    """Return the series of a step that is an unknown of an implicit function, from those of its inputs."""
+    """Return the Taylor series of an unknown of an implicit function, from those of its inputs."""
     node, element = term.data
     return _enclose(node.function, tuple(inputs))[element]
 
 
 def find_implicit_functions(terms: Iterable[Term]) -> set[ImplicitFunction]:
-    """Return the implicit functions among terms, and those in their equations."""
+    """Return the implicit functions among terms, including those in their equations."""
     found = {term.data[0].function for term in terms if term.op == "implicit"}
     return found.union(*map(_nested_loops, found))
 
@@ -52,7 +52,7 @@ def _nested_loops(function: ImplicitFunction) -> set[ImplicitFunction]:
     return find_implicit_functions(reachable_terms(tuple(TermGraph({}).elements(function.equations))))
 
 
-# Bisection comes back to the same intervals for every unknown and every case.
+# Bisection revisits the same intervals for every unknown and every case.
 @lru_cache(10_000)
 def _enclose(function: ImplicitFunction, inputs: tuple[TaylorSeries, ...]) -> tuple[TaylorSeries, ...]:
     return tuple(_enclosures(function).enclose_implicit(function, list(inputs)))
@@ -70,18 +70,18 @@ _PRODUCT_AT_MOST = 8
 
 @dataclass(frozen=True, slots=True)
 class AbstractValue:
-    """What is known about a term in a case.
+    """Abstract value of a term in a case.
 
     Attributes
     ----------
     range
-        Between which numbers it lies.
+        Interval that contains the value.
     polynomial
-        What it is, if it is known to be a polynomial.
+        The exact value, if it is known to be a polynomial.
     live
-        The symbols that it depends on, in this case.
+        Symbols that the value depends on in this case.
     doubtful, void
-        Whether it may be, and whether it is, not a number.
+        True if the value may be, or certainly is, not a number.
     """
 
     range: RealInterval = REALS
@@ -92,7 +92,7 @@ class AbstractValue:
 
     @property
     def number(self) -> Fraction | None:
-        """The number that it is, if it is a finite constant."""
+        """The value, if it is a finite constant, else None."""
         p, (low, high) = self.polynomial, self.range
         if p is not None and not p.symbols:
             return p.offset
@@ -104,7 +104,7 @@ NOT_A_NUMBER = AbstractValue(doubtful=True, void=True)
 
 
 def from_number(number: float | Fraction) -> AbstractValue:
-    """Return a number's value."""
+    """Return the abstract value of a number."""
     if number != number:
         return NOT_A_NUMBER
     if math.isinf(number):
@@ -113,7 +113,7 @@ def from_number(number: float | Fraction) -> AbstractValue:
 
 
 def evaluate_term(term: Term, values: dict[int, AbstractValue], sign: Signs) -> AbstractValue:
-    """Return the value of a term that is no symbol, from those of its arguments and deciders."""
+    """Return the abstract value of a term, not a symbol, from those of its arguments and deciders."""
     args = [values[a.index] for a in term.args]
     chosen = live_arguments(term, values, sign)
     if any(values[a.index].void for a in (*chosen, *_needed(term))):
@@ -129,7 +129,7 @@ def evaluate_term(term: Term, values: dict[int, AbstractValue], sign: Signs) -> 
 
 
 def live_arguments(term: Term, values: dict[int, AbstractValue], sign: Signs) -> tuple[Term, ...]:
-    """Return the arguments that the value is made of in this case."""
+    """Return the arguments that the value depends on in this case."""
     if term.op == "less":
         return () if _step_of(term, sign) is not None else term.args
     if term.op == "select":
@@ -149,13 +149,13 @@ def live_arguments(term: Term, values: dict[int, AbstractValue], sign: Signs) ->
 
 
 def _needed(term: Term) -> tuple[Term, ...]:
-    """Return the deciders without which nothing is known."""
+    """Return the deciders that have to be numbers for the value to be one."""
     choices = ("less", "select", ca.OP_IF_ELSE_ZERO, ca.OP_FMIN, ca.OP_FMAX, ca.OP_LT, ca.OP_LE)
     return term.deciders if term.op in (*choices, ca.OP_EQ, ca.OP_NE, ca.OP_NOT, ca.OP_SIGN) else ()
 
 
 def _step_of(term: Term, sign: Signs) -> float | None:
-    """Return the value of ``less`` where it is a step, or away from its ramp."""
+    """Return the value of ``less`` if it is a step, or constant outside of its ramp."""
     signs = [sign(d) for d in term.deciders]
     if len(signs) == 1:
         return None if signs[0] is None else (1 + signs[0]) / 2
@@ -235,7 +235,7 @@ def _unary(term: Term, a: AbstractValue, sign: Signs, live: frozenset[Symbol]) -
     if op == ca.OP_NEG or turn == -1:
         return AbstractValue(
             interval_negate(a.range),
-            None if a.polynomial is None else a.polynomial.scaled(-1),
+            None if a.polynomial is None else a.polynomial.scale(-1),
             live,
         )
     if op == ca.OP_ASSIGN or turn is not None:
@@ -274,7 +274,7 @@ def _product(a: AbstractValue, b: AbstractValue, same: bool, live: frozenset[Sym
             return NOT_A_NUMBER if infinite else from_number(0.0)
     exact = None
     if a.polynomial is not None and b.polynomial is not None:
-        exact = a.polynomial.times(b.polynomial)
+        exact = a.polynomial.multiply(b.polynomial)
     return AbstractValue(
         interval_square(a.range) if same else interval_multiply(a.range, b.range),
         exact,
@@ -289,8 +289,10 @@ def _quotient(a: AbstractValue, b: AbstractValue, sign: int | None, live: frozen
     if sign is None and low <= 0 <= high:
         return AbstractValue(REALS, None, live, doubtful=True)
     below = (max(low, 0.0), high) if sign == 1 else (low, min(high, 0.0)) if sign == -1 else b.range
-    exact = a.polynomial.scaled(1 / b.number) if a.polynomial is not None and b.number else None
-    return AbstractValue(interval_multiply(a.range, interval_reciprocal(below)), exact, live)
+    exact = a.polynomial.scale(1 / b.number) if a.polynomial is not None and b.number else None
+    return AbstractValue(
+        interval_multiply(a.range, interval_reciprocal(below)), exact, live
+    )
 
 
 def _power(a: AbstractValue, b: AbstractValue, sign: int | None, live: frozenset[Symbol]) -> AbstractValue:
@@ -299,7 +301,7 @@ def _power(a: AbstractValue, b: AbstractValue, sign: int | None, live: frozenset
     if n is not None and whole and 0 <= n <= _PRODUCT_AT_MOST and a.polynomial is not None:
         exact: Polynomial | None = Polynomial.constant(1)
         for _ in range(int(n)):
-            exact = None if exact is None else exact.times(a.polynomial)
+            exact = None if exact is None else exact.multiply(a.polynomial)
         return AbstractValue(interval_power(a.range, b.range), exact, live)
     low, high = a.range
     if not whole and (sign == -1 or high < 0):
@@ -350,6 +352,6 @@ def _polynomial_of(piece: tuple[float, ...], start: float, x: AbstractValue) -> 
         distance = x.polynomial - Polynomial.constant(start)
         exact = Polynomial.constant(piece[-1])
         for coefficient in reversed(piece[:-1]):
-            product = None if exact is None else exact.times(distance)
+            product = None if exact is None else exact.multiply(distance)
             exact = None if product is None else product + Polynomial.constant(coefficient)
     return AbstractValue(span, exact, x.live)

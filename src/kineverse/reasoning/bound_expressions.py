@@ -19,7 +19,7 @@ from .polynomial import Polynomial
 
 
 def express_bound(case: Case, term: Term, names: Mapping[int, Symbol]) -> Expression:
-    """Return what a term is in a case, as short as the case allows; ``names`` are of terms that have one."""
+    """Return a term as an expression simplified for a case; ``names`` maps terms to symbols for them."""
     found: dict[int, Expression] = {}
     for part in reachable_terms((term,)):
         value = case.value(part)
@@ -28,7 +28,7 @@ def express_bound(case: Case, term: Term, names: Mapping[int, Symbol]) -> Expres
         elif part.index in names:
             found[part.index] = names[part.index]
         elif part.op != "implicit" and part.op != ca.OP_CONST:
-            chosen = live_arguments(part, case._values, case.sign)
+            chosen = live_arguments(part, case.values, case.sign)
             found[part.index] = _step(part, chosen, found)
         elif part.op == ca.OP_CONST:
             found[part.index] = as_expression(part.data)

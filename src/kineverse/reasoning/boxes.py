@@ -16,9 +16,9 @@ Number = float | Fraction
 
 @dataclass(frozen=True)
 class Interval:
-    """The numbers between two ends, each of which belongs to it or not; infinite ends do not.
+    """Interval of real numbers with open or closed ends; infinite ends are open.
 
-    ``x in interval`` says whether a number is among them.
+    ``x in interval`` tests whether a number lies in the interval.
     """
 
     lower: Number = -math.inf
@@ -28,14 +28,14 @@ class Interval:
 
     @property
     def is_empty(self) -> bool:
-        """Whether no number is in it."""
+        """True if the interval contains no number."""
         if self.lower == self.upper:
             return not (self.lower_closed and self.upper_closed)
         return self.lower > self.upper
 
     @property
     def is_everything(self) -> bool:
-        """Whether every number is in it."""
+        """True if the interval contains every number."""
         return self.lower == -math.inf and self.upper == math.inf
 
     def __contains__(self, number: Number) -> bool:
@@ -43,18 +43,18 @@ class Interval:
         return above and (number < self.upper or (self.upper_closed and number == self.upper))
 
     def intersection(self, other: Interval) -> Interval:
-        """Return what is in both."""
+        """Return the intersection with another interval, which may be empty."""
         low, low_open = max((self.lower, not self.lower_closed), (other.lower, not other.lower_closed))
         high, high_closed = min((self.upper, self.upper_closed), (other.upper, other.upper_closed))
         return Interval(low, high, not low_open, high_closed)
 
     def covers(self, other: Interval) -> bool:
-        """Whether all of the other, which is not empty, is in this one."""
+        """Return True if this interval contains another one, which is not empty."""
         starts = (self.lower, not self.lower_closed) <= (other.lower, not other.lower_closed)
         return starts and (self.upper, self.upper_closed) >= (other.upper, other.upper_closed)
 
-    def joined(self, other: Interval) -> Interval | None:
-        """Return the union if it is an interval; neither is empty."""
+    def join(self, other: Interval) -> Interval | None:
+        """Return the union with another interval if it is an interval, else None; neither is empty."""
         first, second = sorted((self, other), key=lambda i: (i.lower, not i.lower_closed))
         touch = second.lower == first.upper and (second.lower_closed or first.upper_closed)
         if second.lower >= first.upper and not touch:
@@ -62,19 +62,19 @@ class Interval:
         high, closed = max((self.upper, self.upper_closed), (other.upper, other.upper_closed))
         return Interval(first.lower, high, first.lower_closed, closed)
 
-    def outside(self) -> Iterator[Interval]:
-        """Yield what is below and what is above it."""
+    def complement(self) -> Iterator[Interval]:
+        """Yield the interval below this one and the interval above it, as far as they exist."""
         if self.lower > -math.inf:
             yield Interval(upper=self.lower, upper_closed=not self.lower_closed)
         if self.upper < math.inf:
             yield Interval(lower=self.upper, lower_closed=not self.upper_closed)
 
-    def rounded(self) -> Interval:
-        """Return it with ends that are floats."""
+    def to_floats(self) -> Interval:
+        """Return the interval with its ends as floats."""
         return Interval(float(self.lower), float(self.upper), self.lower_closed, self.upper_closed)
 
-    def of(self, name: str) -> str:
-        """Return the condition on something of that name, as ``0 < b <= 0.3``."""
+    def describe(self, name: str) -> str:
+        """Format the condition that a quantity of this name lies in the interval, as ``0 < b <= 0.3``."""
         if self.lower == self.upper:
             return f"{name} = {float(self.lower):.12g}"
         below = f"{float(self.lower):.12g} <{'=' if self.lower_closed else ''} "
@@ -92,9 +92,9 @@ EVERYTHING = Interval()
 
 
 class IntervalBox(Mapping[Expression, Interval]):
-    """A conjunction of conditions: intervals of coordinates, or of sums of several of them; the rest is free.
+    """Conjunction of conditions: intervals of coordinates, or of sums of coordinates; all others are free.
 
-    The empty box, without conditions, is everywhere.
+    The box without conditions covers the whole space.
     """
 
     __slots__ = ("_sides",)
@@ -120,13 +120,13 @@ class IntervalBox(Mapping[Expression, Interval]):
         return hash(tuple(self._sides.items()))
 
     def __str__(self) -> str:
-        return " and ".join(side.of(axis_name(axis)) for axis, side in self._sides.items()) or "always"
+        return " and ".join(side.describe(axis_name(axis)) for axis, side in self._sides.items()) or "always"
 
     def __repr__(self) -> str:
-        return f"<Box: {self}>"
+        return f"<IntervalBox: {self}>"
 
     def intersection(self, other: IntervalBox) -> IntervalBox | None:
-        """Return what is in both, None if nothing is."""
+        """Return the intersection with another box, or None if it is empty."""
         sides = dict(self._sides)
         for axis, side in other.items():
             sides[axis] = sides[axis].intersection(side) if axis in sides else side
@@ -135,35 +135,35 @@ class IntervalBox(Mapping[Expression, Interval]):
         return IntervalBox(sides)
 
     def covers(self, other: IntervalBox) -> bool:
-        """Whether all of the other is in this one."""
+        """Return True if this box contains another one."""
         return all(axis in other and side.covers(other[axis]) for axis, side in self._sides.items())
 
-    def without(self, other: IntervalBox) -> list[IntervalBox]:
-        """Return what is in this one and not in the other, as boxes that do not overlap."""
+    def subtract(self, other: IntervalBox) -> list[IntervalBox]:
+        """Return the difference of this box and another one, as boxes that do not overlap."""
         if self.intersection(other) is None:
             return [self]
         rest, parts = dict(self._sides), []
         for axis, side in other.items():
             own = rest.get(axis, EVERYTHING)
-            for beyond in side.outside():
+            for beyond in side.complement():
                 part = own.intersection(beyond)
                 if not part.is_empty:
                     parts.append(IntervalBox({**rest, axis: part}))
             rest[axis] = own.intersection(side)
         return parts
 
-    def rounded(self) -> IntervalBox:
-        """Return it with ends that are floats."""
-        return IntervalBox({axis: side.rounded() for axis, side in self._sides.items()})
+    def to_floats(self) -> IntervalBox:
+        """Return the box with the ends of its intervals as floats."""
+        return IntervalBox({axis: side.to_floats() for axis, side in self._sides.items()})
 
 
 def axis_name(axis: Expression) -> str:
-    """Return what an axis is called: a symbol's name, a sum, or ``angle mod 2π``."""
+    """Return the name of an axis: that of a symbol, a sum, or ``angle mod 2π``."""
     if not isinstance(axis, Symbol) and len(axis.symbols) == 1 and axis == wrap_to_turn(axis.symbols[0]):
         return f"{axis.symbols[0]} mod 2π"
     return str(axis)
 
 
 def wrap_to_turn(angle: Symbol) -> Expression:
-    """Return an angle less whole turns, in [0, 2π)."""
+    """Return an angle modulo 2π, in [0, 2π)."""
     return angle - math.tau * floor(angle / math.tau)

@@ -1,4 +1,4 @@
-"""Case splits: intervals of coordinates with signs of terms, refined until each has an answer."""
+"""Case splits: intervals of coordinates with signs of terms, refined until each case has an answer."""
 
 from __future__ import annotations
 
@@ -22,26 +22,31 @@ from .domain import Domain
 from .polynomial import LinearForm, Polynomial, linear_form_expression
 
 NEGLIGIBLE = 1e-12
-"""Constants up to this are what rounding left of 0."""
+"""Largest constant that is taken for 0 with a rounding error."""
 _SAME = 1e-12
 _CLOSE_ROOTS = 1e-9
 
 
 class Case:
-    """Intervals of coordinates and sums of them, and signs of terms that hold there.
+    """Case: intervals of coordinates and of sums of coordinates, and signs of terms.
 
     Parameters
     ----------
     roots
-        What is evaluated.
+        Terms that are evaluated.
     domain
-        Which configurations there are.
+        Domain of configurations.
     axes, signs
-        What is known beyond them.
+        Further intervals of linear forms, and known signs of terms by index.
     order
-        All terms that the roots are made of.
+        All terms below the roots, arguments first.
     before, narrowed
-        Values in a larger case, and the symbols by which this one is smaller.
+        Values in a larger case, and the symbols whose intervals are smaller in this one.
+
+    Attributes
+    ----------
+    values
+        Abstract values of all terms, by index.
     """
 
     def __init__(
@@ -67,51 +72,51 @@ class Case:
             s: Fraction(i.lower) for s, i in places.items() if i.lower == i.upper and not math.isinf(i.lower)
         }
         self._order = reachable_terms(roots) if order is None else order
-        self._values: dict[int, AbstractValue] = {}
+        self.values: dict[int, AbstractValue] = {}
         for term in self._order:
             known = None if before is None else before[term.index]
             if known is not None and known.live.isdisjoint(narrowed):
-                self._values[term.index] = known
+                self.values[term.index] = known
                 continue
-            value = self._values[term.index] = self._evaluated(term)
+            value = self.values[term.index] = self._evaluate(term)
             if value.polynomial is None:
                 self.sign(term)  # from the bottom up, as graphs may be deeper than Python's stack
 
-    # -- what holds ----------------------------------------------------------------------------------------
+    # -- values and signs ----------------------------------------------------------------------------------
 
     def value(self, term: Term) -> AbstractValue:
-        """Return what is known about a term."""
-        return self._values[term.index]
+        """Return the abstract value of a term."""
+        return self.values[term.index]
 
     def sign(self, term: Term) -> int | None:
-        """Return the sign of a term if it is the same everywhere in this case."""
+        """Return the sign of a term if it is constant in this case, else None."""
         if term.op == ca.OP_NEG:
             inner = self.sign(term.args[0])
             return None if inner is None else -inner
         if term.index in self._signs:
             return self._signs[term.index]
         if term.index not in self._found:
-            self._found[term.index] = self._sign(self._values[term.index], term)
+            self._found[term.index] = self._sign(self.values[term.index], term)
         return self._found[term.index]
 
     def interval(self, axis: LinearForm) -> Interval:
-        """Return where a symbol, or a sum of several, is."""
+        """Return the interval of a symbol or of a linear form."""
         known = self._axes.get(axis)
         if len(axis) == 1:
-            return known if known is not None else self._domain.of(axis[0][0])
+            return known if known is not None else self._domain.limits_of(axis[0][0])
         total = self._sum({((s, 1),): f for s, f in axis})
         return total if known is None else total.intersection(known)
 
     @property
     def is_empty(self) -> bool:
-        """Whether the conditions contradict each other, as far as can be told from each by itself."""
+        """True if the interval of an axis is empty."""
         return any(self.interval(axis).is_empty for axis in self._axes)
 
     def box(self) -> IntervalBox:
-        """Return the conditions, without those that limits make anyway."""
+        """Return the conditions of the case, without those implied by the limits."""
         sides = {}
         for axis, side in self._axes.items():
-            limit = self._domain.of(axis[0][0]) if len(axis) == 1 else Interval()
+            limit = self._domain.limits_of(axis[0][0]) if len(axis) == 1 else Interval()
             low = side.lower == limit.lower and side.lower_closed == limit.lower_closed
             high = side.upper == limit.upper and side.upper_closed == limit.upper_closed
             sides[linear_form_expression(axis)] = Interval(
@@ -123,7 +128,7 @@ class Case:
         return IntervalBox(sides)
 
     def is_at_equality(self, roots: tuple[Term, ...]) -> bool:
-        """Whether a comparison is half true in this case, and terms are made of it."""
+        """Return True if a comparison that the roots depend on has equal sides, thus the value 0.5."""
         seen, stack = set[int](), list(roots)
         while stack:
             term = stack.pop()
@@ -134,16 +139,16 @@ class Case:
                 if len(term.deciders) == 1 and self.sign(term.deciders[0]) == 0:
                     return True
                 continue
-            args = live_arguments(term, self._values, self.sign)
+            args = live_arguments(term, self.values, self.sign)
             if term.op == ca.OP_MUL:
-                zero = [a for a in args if self._values[a.index].number == 0]
+                zero = [a for a in args if self.values[a.index].number == 0]
                 args = tuple(zero[:1]) or args
             stack += [*args, *term.deciders]
         return False
 
-    def _evaluated(self, term: Term) -> AbstractValue:
+    def _evaluate(self, term: Term) -> AbstractValue:
         if term.op != ca.OP_PARAMETER:
-            value = evaluate_term(term, self._values, self.sign)
+            value = evaluate_term(term, self.values, self.sign)
         else:
             value = AbstractValue(polynomial=Polynomial.symbol(term.data), live=frozenset((term.data,)))
         if value.void:
@@ -152,9 +157,9 @@ class Case:
         p, live = value.polynomial, value.live
         if not live.isdisjoint(self._pinned):
             live = live.difference(self._pinned)
-            # A sum stays one where a part of it has one value: it is the same condition as beside that.
+            # A linear form is not reduced by pinned symbols, so that it is the same axis as in other cases.
             if p is not None and p.degree > 1:
-                p = p.at(self._pinned)
+                p = p.substitute(self._pinned)
         if p is None or p.degree != 1:
             span = value.range if p is None or p.symbols else enclose_number(p.offset)
             return AbstractValue(span, p, live, value.doubtful)
@@ -164,17 +169,17 @@ class Case:
         return AbstractValue(span, p, live, value.doubtful)
 
     def _on_spheres(self, value: AbstractValue) -> AbstractValue:
-        """Return what is known beyond that where quaternions have length one."""
+        """Return the value refined by the unit length of quaternions."""
         p = value.polynomial
         if p is None or p.degree < 2 or not self._domain.spheres:
             return value
-        p = self._domain.reduced(p)
-        low, high = self._domain.span(p) or value.range
+        p = self._domain.reduce(p)
+        low, high = self._domain.form_range(p) or value.range
         span = (max(low, value.range[0]), min(high, value.range[1]))
         return AbstractValue(span, p, p.symbols, value.doubtful)
 
     def _line(self, p: Polynomial) -> Interval:
-        axis, scale = p.axis()
+        axis, scale = p.linear_form()
         return _as_linear_form(self.interval(axis), scale, p.offset)
 
     def _sum(self, terms: Mapping[exact.Monomial, Fraction]) -> Interval:
@@ -214,16 +219,16 @@ class Case:
             return 1
         return -1 if high < 0 else 0 if low == high == 0 else None
 
-    # -- what does not -------------------------------------------------------------------------------------
+    # -- splitting -----------------------------------------------------------------------------------------
 
     def doubts(self, roots: tuple[Term, ...]) -> list[Term]:
-        """Return the terms whose signs are unknown and would tell more about others, inner ones first."""
+        """Return the deciding terms below the roots whose signs are unknown, inner ones first."""
         found: dict[int, Term] = {}
         seen: set[int] = set()
         stack = list(roots)
         while stack:
             term = stack.pop()
-            value = self._values[term.index]
+            value = self.values[term.index]
             if term.index in seen or (value.polynomial is not None and not value.doubtful):
                 continue
             seen.add(term.index)
@@ -231,14 +236,14 @@ class Case:
                 if self.sign(decider) is None:
                     found[decider.index] = decider
                 stack.append(decider)
-            stack += live_arguments(term, self._values, self.sign)
+            stack += live_arguments(term, self.values, self.sign)
         return [found[index] for index in sorted(found)]
 
     def split(self, term: Term) -> list[Case] | str:
-        """Return the cases in which a term has a sign, or why they cannot be told apart."""
+        """Return the cases in which a term has a constant sign, or the reason why there is no such split."""
         while term.op == ca.OP_NEG:
             (term,) = term.args
-        value = self._values[term.index]
+        value = self.values[term.index]
         p = value.polynomial
         names = " and ".join(sorted(map(str, value.live)))
         if value.void:
@@ -246,8 +251,8 @@ class Case:
         if value.doubtful:
             return f"a condition on {names} may be no number"
         if p is not None and p.degree == 1:
-            axis, scale = p.axis()
-            return self._divided(term, axis, [-p.offset / scale], _SAME, lambda x: scale * x + p.offset)
+            axis, scale = p.linear_form()
+            return self._divide(term, axis, [-p.offset / scale], _SAME, lambda x: scale * x + p.offset)
         if len(value.live) != 1:
             return f"{names} occur together in a condition that is not linear"
         (symbol,) = value.live
@@ -256,27 +261,27 @@ class Case:
         if p is not None:
             coefficients = p.coefficients()
             found = exact.roots(coefficients, side)
-            return self._divided(
+            return self._divide(
                 term, axis, found, _CLOSE_ROOTS, lambda x: exact.evaluate_polynomial(coefficients, x)
             )
         order = reachable_terms((term,))
 
-        def look(low: float, high: float) -> tuple[RealInterval, RealInterval | None]:
+        def ranges(low: float, high: float) -> tuple[RealInterval, RealInterval | None]:
             span = Interval(_exact(low), _exact(high), not math.isinf(low), not math.isinf(high))
             inner = Case((term,), self._domain, {**self._axes, axis: span}, self._signs, order)
-            rates = root_isolation.slope_ranges(order, inner._values, inner.sign, symbol)
+            rates = root_isolation.slope_ranges(order, inner.values, inner.sign, symbol)
             return inner.value(term).range, rates[term.index]
 
-        # A look at a loop that stands on others takes many times as long as one at a single loop.
+        # One evaluation of nested loops takes many times as long as that of a single loop.
         most = root_isolation.MAX_EVALUATIONS // max(1, len(find_implicit_functions(order))) ** 3
-        crossings = root_isolation.isolate_roots(look, float(side.lower), float(side.upper), most)
+        crossings = root_isolation.isolate_roots(ranges, float(side.lower), float(side.upper), most)
         if crossings is None:
             endless = f"{names} has no limits, and " if side.is_everything else ""
             return f"{endless}where a condition on {names} changes cannot be made certain"
-        signs = lambda x: sum(look(float(x), float(x))[0])  # noqa: E731
-        return self._divided(term, axis, list(map(Fraction, crossings)), _CLOSE_ROOTS, signs)
+        signs = lambda x: sum(ranges(float(x), float(x))[0])  # noqa: E731
+        return self._divide(term, axis, list(map(Fraction, crossings)), _CLOSE_ROOTS, signs)
 
-    def _divided(
+    def _divide(
         self,
         term: Term,
         axis: LinearForm,
@@ -293,7 +298,7 @@ class Case:
                 cuts.append(cut)
         pieces: list[tuple[Interval, int]] = []
         inner = whole
-        if len(axis) > 1:  # what is known of its parts anyway is no condition on a sum
+        if len(axis) > 1:  # the intervals of its symbols are no condition on the linear form
             whole = self._axes.get(axis, Interval())
         start, closed = whole.lower, whole.lower_closed
         for cut in sorted(cuts):
@@ -306,9 +311,7 @@ class Case:
                 known = sign if sign == 0 else _sign_of(at(_inner_point(side.intersection(inner))))
                 signs = {**self._signs, term.index: known}
                 axes, narrowed = {**self._axes, axis: side}, frozenset(s for s, _ in axis)
-                cases.append(
-                    Case(self._roots, self._domain, axes, signs, self._order, self._values, narrowed)
-                )
+                cases.append(Case(self._roots, self._domain, axes, signs, self._order, self.values, narrowed))
         return [case for case in cases if not case.is_empty]
 
 
@@ -356,15 +359,15 @@ MAX_CASES = 1000
 
 @dataclass(frozen=True)
 class Unclear:
-    """No answer yet: which terms' signs would help, and what can be said if they stay unknown."""
+    """Request for the signs of terms, with the answer for the case that they stay unknown."""
 
-    about: tuple[Term, ...]
-    otherwise: object = None
+    terms: tuple[Term, ...]
+    fallback: object = None
 
 
 @dataclass(frozen=True)
 class Unanswered:
-    """No answer, and why."""
+    """Reason for a missing answer."""
 
     reason: str
 
@@ -372,7 +375,7 @@ class Unanswered:
 def distinguish(
     start: Case, question: Callable[[Case], AnswerT | Unclear]
 ) -> Iterator[tuple[Case, AnswerT | Unanswered]]:
-    """Yield cases that cover everything, each with its answer."""
+    """Split a case until each part has an answer; yield the parts with their answers."""
     stack, done = [start], 0
     while stack:
         case = stack.pop()
@@ -385,14 +388,14 @@ def distinguish(
             yield case, Unanswered(f"there are more than {MAX_CASES} cases to distinguish")
             continue
         reason: str | None = None
-        for term in answer.about:
+        for term in answer.terms:
             parts = case.split(term)
             if not isinstance(parts, str):
                 stack += parts
                 break
             reason = reason or parts
         else:
-            if answer.otherwise is not None:
-                yield case, answer.otherwise  # type: ignore[misc]
+            if answer.fallback is not None:
+                yield case, answer.fallback  # type: ignore[misc]
             else:
                 yield case, Unanswered(reason or "nothing decides it")

@@ -1,4 +1,4 @@
-"""Independent check of interlocks by evaluation at points; no code shared with what finds them."""
+"""Independent check of interlocks by evaluation at points, without code of the search for interlocks."""
 
 import math
 import random
@@ -21,7 +21,7 @@ TINY, ANY, BOTH_WAYS = 1e-12, (-math.inf, math.inf), ("stands still", "has no va
 
 
 def contradictions(model: ModelView, found: Interlocks, points: int = 20, seed: int = 0) -> list[str]:
-    """Return claims that are wrong at one of many points, in boxes and beside them, and locks not claimed."""
+    """Return claims that are wrong at a sample point, inside or outside of the boxes, and missing locks."""
     given = model.constraints.items()
     rows = {n: Constraint(to_plain(c.lower), to_plain(c.expression), to_plain(c.upper)) for n, c in given}
     limits: _Limits = {}
@@ -33,8 +33,8 @@ def contradictions(model: ModelView, found: Interlocks, points: int = 20, seed: 
     chance, wrong, home = random.Random(seed), dict[str, None](), default_point(model)
     known = {n for k in found for n in k.constraints} | {u.constraint for u in found.undecided}
     unmet = {c.expression for n, c in rows.items() if n not in known and not c.order} & limits.keys()
-    told = [box for item in found for box in item.when] + [box for u in found.undecided for box in u.where]
-    boxes = [IntervalBox({})] * 5 + list(dict.fromkeys(told))
+    claimed = [box for item in found for box in item.when] + [box for u in found.undecided for box in u.where]
+    boxes = [IntervalBox({})] * 5 + list(dict.fromkeys(claimed))
     for box in boxes:
         for _ in range(min(points, 1 + 50 * points // len(boxes))):
             point = _point(sorted(symbols, key=str), box, limits, chance)

@@ -1,4 +1,4 @@
-"""Effects of one constraint: blocked speeds, kept positions, and the regions where."""
+"""Effects of one constraint: blocked speeds, ranges of positions, and their regions."""
 
 from __future__ import annotations
 
@@ -23,39 +23,53 @@ from .regions import Region, merge_boxes
 
 @dataclass
 class SpeedEffect:
-    """Where what is held cannot increase (``up``) or decrease, and where it even must do the opposite."""
+    """Regions in which a quantity cannot increase or decrease, or is forced to do the opposite."""
 
     held: Expression
-    up: Region = field(default_factory=Region)
-    down: Region = field(default_factory=Region)
-    up_beyond: Region = field(default_factory=Region)
-    down_beyond: Region = field(default_factory=Region)
+    blocks_increase: Region = field(default_factory=Region)
+    blocks_decrease: Region = field(default_factory=Region)
+    forces_decrease: Region = field(default_factory=Region)
+    forces_increase: Region = field(default_factory=Region)
 
 
 def find_speed_effect(
     constraint: Constraint,
-    follow: Mapping[Symbol, Expression],
+    dependent: Mapping[Symbol, Expression],
     given: Mapping[Symbol, float],
     domain: Domain,
     unknown: list[tuple[str, IntervalBox]],
 ) -> SpeedEffect:
-    """Return what a constraint of order 1 or higher stops, in plain coordinates; note what is unknown.
+    """Find the effect of a constraint of order 1 or higher, in plain coordinates.
 
-    ``follow`` says by what coordinates are told that follow others.
+    Parameters
+    ----------
+    constraint
+        The constraint.
+    dependent
+        Expressions that replace dependent and periodic coordinates.
+    given
+        Numbers that replace symbols.
+    domain
+        Domain of configurations.
+    unknown
+        List to which reasons and regions are appended where the effect is unknown.
     """
     terms = TermGraph(given)
     held, weight, offset = _alone(constraint)
     ends = (constraint.lower, constraint.upper, offset, weight)
-    lower, upper, rest, factor = (terms.term(apply_substitution(part, follow)) for part in ends)
+    lower, upper, rest, factor = (terms.term(apply_substitution(part, dependent)) for part in ends)
     above, below = terms.subtract(upper, rest), terms.subtract(rest, lower)
     blocked = SpeedEffect(held)
     whole = terms.term(held) if not isinstance(held, Symbol) else None
     start = Case((factor, above, below, *([] if whole is None else [whole])), domain)
-    sides = [(above, below, blocked.up, blocked.up_beyond), (below, above, blocked.down, blocked.down_beyond)]
+    sides = [
+        (above, below, blocked.blocks_increase, blocked.forces_decrease),
+        (below, above, blocked.blocks_decrease, blocked.forces_increase),
+    ]
     if whole is not None and start.value(whole).range[0] >= -1e-300:
-        # A norm cannot be less than 0 in the first place: if it has no room, everything stands.
+        # A norm is never negative: an upper bound of 0 makes the quantity stand still.
         _collect(start, factor, sides[0], unknown)
-        blocked.down = blocked.up
+        blocked.blocks_decrease = blocked.blocks_increase
         return blocked
     for side in sides:
         _collect(start, factor, side, unknown)
@@ -65,7 +79,8 @@ def find_speed_effect(
 def _alone(constraint: Constraint) -> tuple[Expression, Expression, Expression]:
     """Return (held, weight, offset): the constrained expression is ``weight·held + offset``.
 
-    A single speed, if the expression is affine in one; otherwise the expression itself.
+    The held quantity is a single speed if the expression is affine in one, and otherwise the expression
+    itself.
     """
     expression = constraint.expression
     if isinstance(expression, Symbol):
@@ -87,12 +102,12 @@ def _collect(
     room, other, where, beyond = side
 
     def ask(case: Case) -> int | str | Unclear:
-        turned = case.sign(factor)
-        if turned is None:
+        factor_sign = case.sign(factor)
+        if factor_sign is None:
             return Unclear((*case.doubts((factor,)), factor))
-        if turned == 0:
+        if factor_sign == 0:
             return 1
-        wanted = room if turned > 0 else other
+        wanted = room if factor_sign > 0 else other
         value = case.value(wanted)
         sign = case.sign(wanted)
         if sign is not None:
@@ -108,14 +123,14 @@ def _collect(
         elif isinstance(answer, str):
             unknown.append((answer, case.box()))
         elif isinstance(answer, int) and answer <= 0:
-            telling = not case.is_at_equality((factor, room if case.sign(factor) == 1 else other))
-            where.add(case.box(), telling)
+            reported = not case.is_at_equality((factor, room if case.sign(factor) == 1 else other))
+            where.add(case.box(), reported)
             if answer < 0:
-                beyond.add(case.box(), telling)
+                beyond.add(case.box(), reported)
 
 
 def _ramp(case: Case, terms: tuple[Term, ...]) -> str | None:
-    """Return the reason if a smooth step is under way."""
+    """Return the reason for an unknown sign if a smooth step is on its ramp, else None."""
     for term in reachable_terms(terms):
         if term.op == "less" and len(term.deciders) == 2 and case.value(term).range == (0.0, 1.0):
             return (
@@ -129,11 +144,11 @@ _SAME = 1e-9
 
 @dataclass(frozen=True)
 class PositionEffect:
-    """How something is kept, where; ``range`` if that is by numbers."""
+    """Restriction of a position in a region; ``range`` is set if its bounds are numbers."""
 
     held: Expression
     hold: Hold
-    where: tuple[IntervalBox, ...]
+    boxes: tuple[IntervalBox, ...]
     lower: Expression | None
     upper: Expression | None
     range: tuple[float, float] | None
@@ -141,7 +156,7 @@ class PositionEffect:
 
 @dataclass(frozen=True)
 class _Query:
-    """What is common to all questions about one constraint."""
+    """Context of all case splits for one constraint."""
 
     terms: TermGraph
     domain: Domain
@@ -156,25 +171,25 @@ class _Leaf:
     lower: Expression
     upper: Expression
     tighter: tuple[bool, bool]
-    telling: bool
+    reported: bool
 
 
 def find_position_effects(
     constraint: Constraint,
-    follow: Mapping[Symbol, Expression],
+    dependent: Mapping[Symbol, Expression],
     given: Mapping[Symbol, float],
     domain: Domain,
     unknown: list[tuple[str, IntervalBox]],
 ) -> list[PositionEffect]:
-    """Return how a constraint of order 0 keeps what it is about, in plain coordinates.
+    """Find the restrictions of positions by a constraint of order 0, in plain coordinates.
 
-    ``follow`` says by what coordinates are told that follow others.
+    The parameters are those of :func:`find_speed_effect`.
     """
     terms = TermGraph(given)
-    asked = _Query(terms, domain, {terms.term(e).index: s for s, e in follow.items()}, unknown)
+    query = _Query(terms, domain, {terms.term(e).index: s for s, e in dependent.items()}, unknown)
     expression = terms.term(constraint.expression)
     lower, upper = (
-        terms.term(apply_substitution(end, follow)) for end in (constraint.lower, constraint.upper)
+        terms.term(apply_substitution(end, dependent)) for end in (constraint.lower, constraint.upper)
     )
     form = Case((expression,), domain).value(expression).polynomial
     moves = bool(constraint.lower.symbols or constraint.upper.symbols)
@@ -186,28 +201,28 @@ def find_position_effects(
             for monomial, factor in form.terms.items():
                 if monomial and monomial[0][0] != symbol:
                     rest = rest + float(factor) * monomial[0][0]
-            other, scale = terms.term(apply_substitution(rest, follow)), terms.constant(float(weight))
+            other, scale = terms.term(apply_substitution(rest, dependent)), terms.constant(float(weight))
             low, high = (terms.divide(terms.subtract(end, other), scale) for end in (lower, upper))
             if weight < 0:
                 low, high = high, low
-            found += _find_effects(asked, symbol, low, high)
+            found += _find_effects(query, symbol, low, high)
     elif moves:
-        found += _find_effects(asked, constraint.expression, lower, upper)
+        found += _find_effects(query, constraint.expression, lower, upper)
     elif len(constraint.expression.symbols) > 1:
         found += _joint_limit_effects(
-            asked, constraint, terms.term(apply_substitution(constraint.expression, follow))
+            query, constraint, terms.term(apply_substitution(constraint.expression, dependent))
         )
     return found
 
 
-def _joint_limit_effects(asked: _Query, constraint: Constraint, expression: Term) -> list[PositionEffect]:
-    """Return what a limit by numbers does to coordinates that are not just added.
+def _joint_limit_effects(query: _Query, constraint: Constraint, expression: Term) -> list[PositionEffect]:
+    """Return the effects of constant limits on an expression that is not linear in its coordinates.
 
-    It does nothing where it holds everywhere; and nothing worth telling where it is the limit of one
-    orientation, as a cone is, and leaves it room.
+    There is no effect if the limits always hold. There is none to report if they limit one orientation, as a
+    cone does, and leave it a range.
     """
     low, high = float(constraint.lower), float(constraint.upper)
-    value = Case((expression,), asked.domain).value(expression)
+    value = Case((expression,), query.domain).value(expression)
     least, most = value.range
     if not value.doubtful:
         if low <= least and most <= high:
@@ -217,9 +232,9 @@ def _joint_limit_effects(asked: _Query, constraint: Constraint, expression: Term
                 PositionEffect(constraint.expression, "has no value", (IntervalBox({}),), None, None, None)
             ]
     p = value.polynomial
-    sphere = asked.domain.sphere(value.live)
-    if p is not None and asked.domain.span(p) is not None:
-        # All values between the least and the most occur, so there is room where the limit leaves some.
+    sphere = query.domain.sphere(value.live)
+    if p is not None and query.domain.form_range(p) is not None:
+        # All values between the extremes occur, so the limits leave a range if they overlap with it.
         if min(high, most) - max(low, least) > _SAME:
             return []
         reason = f"it leaves next to no room to the orientation of {_list_names(sphere)}"
@@ -227,7 +242,7 @@ def _joint_limit_effects(asked: _Query, constraint: Constraint, expression: Term
         reason = f"it limits the orientation of {_list_names(sphere)} by more than products of two of these"
     else:
         reason = "it limits several coordinates at once, and they are not just added"
-    asked.unknown.append((reason, IntervalBox({})))
+    query.unknown.append((reason, IntervalBox({})))
     return []
 
 
@@ -235,9 +250,9 @@ def _list_names(symbols: Iterable[Symbol] | None) -> str:
     return ", ".join(str(s) for s in symbols or ())
 
 
-def _find_effects(asked: _Query, held: Expression, low: Term, high: Term) -> list[PositionEffect]:
-    limit = asked.domain.of(held) if isinstance(held, Symbol) else Interval()
-    leaves = list(_leaves(asked, low, high, limit))
+def _find_effects(query: _Query, held: Expression, low: Term, high: Term) -> list[PositionEffect]:
+    limit = query.domain.limits_of(held) if isinstance(held, Symbol) else Interval()
+    leaves = list(_leaves(query, low, high, limit))
     free = _free_range(leaves, limit)
     groups: dict[tuple[Hold, Expression, Expression], list[_Leaf]] = {}
     for leaf in leaves:
@@ -250,7 +265,7 @@ def _find_effects(asked: _Query, held: Expression, low: Term, high: Term) -> lis
         where = _merge_leaves(group)
         if hold == "has no value" or not where:
             continue
-        # A side that never matters is told as the limit it is.
+        # A bound that is never tighter than the limit is reported as the limit.
         if not any(leaf.tighter[0] for leaf in group) and not math.isinf(limit.lower):
             lower = as_expression(float(limit.lower))
         if not any(leaf.tighter[1] for leaf in group) and not math.isinf(limit.upper):
@@ -261,11 +276,11 @@ def _find_effects(asked: _Query, held: Expression, low: Term, high: Term) -> lis
 
 
 def _merge_leaves(leaves: list[_Leaf]) -> tuple[IntervalBox, ...]:
-    return merge_boxes([leaf.box for leaf in leaves], [leaf.box for leaf in leaves if leaf.telling])
+    return merge_boxes([leaf.box for leaf in leaves], [leaf.box for leaf in leaves if leaf.reported])
 
 
 def _join_points(groups: dict[tuple[Hold, Expression, Expression], list[_Leaf]]) -> None:
-    """Put what holds at single values into the group of bounds that are the same there."""
+    """Move leaves at single values into a group whose bounds are equal there."""
     for (hold, lower, upper), leaves in list(groups.items()):
         for leaf in [] if hold != "stays within" else list(leaves):
             at = {
@@ -287,8 +302,8 @@ def _agree(bound: Expression, other: Expression, at: dict[Symbol, float]) -> boo
     return a == b or abs(a - b) <= _SAME * max(1.0, abs(a))
 
 
-def _leaves(asked: _Query, low: Term, high: Term, limit: Interval) -> Iterator[_Leaf]:
-    terms = asked.terms
+def _leaves(query: _Query, low: Term, high: Term, limit: Interval) -> Iterator[_Leaf]:
+    terms = query.terms
     compared = {"room": terms.subtract(high, low)}
     if not math.isinf(limit.lower):
         end = terms.constant(float(limit.lower))
@@ -312,14 +327,14 @@ def _leaves(asked: _Query, low: Term, high: Term, limit: Interval) -> Iterator[_
             signs[name] = sign
         return signs
 
-    start = Case((*bounds, *compared.values()), asked.domain)
+    start = Case((*bounds, *compared.values()), query.domain)
     for case, answer in distinguish(start, ask):
         if not isinstance(answer, dict):
-            asked.unknown.append(
+            query.unknown.append(
                 (answer.reason if isinstance(answer, Unanswered) else str(answer), case.box())
             )
             continue
-        lower, upper = (express_bound(case, bound, asked.names) for bound in bounds)
+        lower, upper = (express_bound(case, bound, query.names) for bound in bounds)
         tighter = (answer.get("low above", 1) > 0, answer.get("high below", 1) > 0)
         rooms = [answer[n] for n in ("room", "high above", "low below") if n in answer]
         hold: Hold = "stays within"
@@ -337,7 +352,7 @@ def _leaves(asked: _Query, low: Term, high: Term, limit: Interval) -> Iterator[_
 
 
 def _free_range(leaves: list[_Leaf], limit: Interval) -> tuple[float, float]:
-    """Return what range is no restriction: the limits, else the most that the constraint leaves."""
+    """Return the range that is no restriction: the limits, or else the widest range that a leaf allows."""
     lows = [-math.inf if leaf.lower.symbols else float(leaf.lower) for leaf in leaves]
     highs = [math.inf if leaf.upper.symbols else float(leaf.upper) for leaf in leaves]
     low, high = float(limit.lower), float(limit.upper)

@@ -16,7 +16,7 @@ from .boxes import Interval
 from .polynomial import Monomial, Polynomial
 
 UnitSphere = tuple[Symbol, ...]
-"""Coordinates whose squares add up to one."""
+"""Coordinates whose squares have the sum 1, such as a unit quaternion."""
 
 _WHOLE = Interval(-1.0, 1.0, True, True)
 _ROUNDING = 1e-12
@@ -25,41 +25,42 @@ EVERYWHERE = Interval()
 
 @dataclass(frozen=True)
 class Domain:
-    """Limits of coordinates, and which of them are an orientation.
+    """Limits of coordinates, and the coordinates that form unit quaternions.
 
     Attributes
     ----------
     limits
-        Of symbols, constant.
+        Constant limits of symbols.
     spheres
-        The quaternions.
+        Unit quaternions.
     """
 
     limits: Mapping[Symbol, Interval]
     spheres: tuple[UnitSphere, ...] = ()
 
-    def of(self, symbol: Symbol) -> Interval:
-        """Return where a symbol may be."""
+    def limits_of(self, symbol: Symbol) -> Interval:
+        """Return the interval in which a symbol lies."""
         limit = self.limits.get(symbol, EVERYWHERE)
         return limit.intersection(_WHOLE) if symbol in self._on_sphere else limit
 
     def sphere(self, symbols: Iterable[Symbol]) -> UnitSphere | None:
-        """Return the quaternion that all of these belong to, None if there is no such one."""
+        """Return the unit quaternion to which all symbols belong, or None."""
         spheres = {self._on_sphere.get(s) for s in symbols}
         return spheres.pop() if len(spheres) == 1 else None
 
-    def reduced(self, p: Polynomial) -> Polynomial:
-        """Return the polynomial with the squares of last elements in terms of the others."""
+    def reduce(self, p: Polynomial) -> Polynomial:
+        """Return the polynomial with squares of the last element of each quaternion eliminated."""
         for sphere in self.spheres:
             last = sphere[-1]
             while any(dict(m).get(last, 0) > 1 for m in p.terms):
                 p = _without_square(p, sphere)
         return p
 
-    def span(self, p: Polynomial) -> RealInterval | None:
-        """Return the least and greatest value of a quadratic form of a quaternion, None for anything else.
+    def form_range(self, p: Polynomial) -> RealInterval | None:
+        """Return the range of a quadratic form of a unit quaternion, None for other polynomials.
 
-        These are the outer eigenvalues of its matrix; a constant is one, too, times the identity.
+        Its ends are the smallest and the largest eigenvalue of the matrix of the form, in which a constant is
+        a multiple of the identity.
         """
         sphere = self.sphere(p.symbols) if p.symbols else None
         if sphere is None or any(sum(power for _, power in m) not in (0, 2) for m in p.terms):

@@ -27,7 +27,7 @@ from .regions import Region, intersect_boxes, merge_boxes
 
 
 def find_orientations(rates: Rates) -> tuple[UnitSphere, ...]:
-    """Return the coordinates whose rates keep the sum of their squares: x·ẋ + y·ẏ + z·ż + w·ẇ = 0."""
+    """Return the groups of coordinates whose rates preserve their norm: x·ẋ + y·ẏ + z·ż + w·ẇ = 0."""
     groups: dict[frozenset[Symbol], list[Symbol]] = {}
     for coordinate in sorted(rates, key=lambda s: s.sort_key):
         groups.setdefault(frozenset(rates[coordinate]), []).append(coordinate)
@@ -45,37 +45,40 @@ def _keep_length(group: list[Symbol], rates: Rates) -> bool:
 
 @dataclass
 class ConstraintEffects:
-    """What a constraint stops or keeps, and with reasons what is unknown about it."""
+    """Effects of a constraint on speeds and positions, and unknown regions with their reasons."""
 
-    blocked: SpeedEffect | None = None
-    kept: list[PositionEffect] = field(default_factory=list)
+    speed: SpeedEffect | None = None
+    positions: list[PositionEffect] = field(default_factory=list)
     unknown: list[tuple[str, IntervalBox]] = field(default_factory=list)
 
 
 def find_effects(
     constraint: Constraint, rates: Rates, given: Mapping[Symbol, float], domain: Domain
 ) -> ConstraintEffects:
-    """Return what a constraint does.
+    """Return the effects of a constraint.
 
-    Conditions on coordinates that follow others are told by those that they follow, and conditions on what
-    goes round without limits by an angle within one turn. Where that is not possible they are told by the
-    names in the constraint, and that it was not is unknown.
+    Conditions on dependent coordinates are expressed by independent ones, and conditions on periodic
+    coordinates without limits by an angle within one turn. If that is not possible, they are expressed by the
+    coordinates that the constraint names, and the effect counts as unknown.
     """
     lower, held, upper = (to_plain(p) for p in (constraint.lower, constraint.expression, constraint.upper))
     bare = Constraint(lower, held, upper)
     named = {s for p in (lower, held, upper) for s in p.symbols}
-    follow = {s: rates.dependent[s] for s in sorted(named, key=str) if s in rates.dependent}
-    turns = _find_periodic(bare, follow, given, domain)
-    if not follow and not turns.stand_ins:
+    dependent = {s: rates.dependent[s] for s in sorted(named, key=str) if s in rates.dependent}
+    periodic = _find_periodic(bare, dependent, given, domain)
+    if not dependent and not periodic.wrapped:
         return _effects_by_order(bare, {}, given, domain)
-    within = Domain({**domain.limits, **dict.fromkeys(turns.stand_ins.values(), TURN)}, domain.spheres)
-    told = {**{s: apply_substitution(e, turns.stand_ins) for s, e in follow.items()}, **turns.stand_ins}
-    found = _restore_coordinates(_effects_by_order(bare, told, given, within), turns)
+    within = Domain({**domain.limits, **dict.fromkeys(periodic.wrapped.values(), TURN)}, domain.spheres)
+    substitutions = {
+        **{s: apply_substitution(e, periodic.wrapped) for s, e in dependent.items()},
+        **periodic.wrapped,
+    }
+    found = _restore_coordinates(_effects_by_order(bare, substitutions, given, within), periodic)
     if not found.unknown:
         return found
     by_name = _effects_by_order(bare, {}, given, domain)
-    if follow:
-        because = f"{_names(follow)} follows {_names(s for e in follow.values() for s in e.symbols)}"
+    if dependent:
+        because = f"{_names(dependent)} follows {_names(s for e in dependent.values() for s in e.symbols)}"
         by_name.unknown += [(f"{because}, and {reason}", box) for reason, box in found.unknown]
     return by_name
 
@@ -85,76 +88,86 @@ def _names(symbols: Iterable[Symbol]) -> str:
 
 
 def _effects_by_order(
-    bare: Constraint, follow: Mapping[Symbol, Expression], given: Mapping[Symbol, float], domain: Domain
+    bare: Constraint, dependent: Mapping[Symbol, Expression], given: Mapping[Symbol, float], domain: Domain
 ) -> ConstraintEffects:
     found = ConstraintEffects()
     if bare.order:
-        found.blocked = find_speed_effect(bare, follow, given, domain, found.unknown)
+        found.speed = find_speed_effect(bare, dependent, given, domain, found.unknown)
     else:
-        found.kept = find_position_effects(bare, follow, given, domain, found.unknown)
+        found.positions = find_position_effects(bare, dependent, given, domain, found.unknown)
     return found
 
 
 def _find_periodic(
-    bare: Constraint, follow: Mapping[Symbol, Expression], given: Mapping[Symbol, float], domain: Domain
+    bare: Constraint, dependent: Mapping[Symbol, Expression], given: Mapping[Symbol, float], domain: Domain
 ) -> PeriodicCoordinates:
-    ends = [apply_substitution(end, follow) for end in (bare.lower, bare.upper)]
+    ends = [apply_substitution(end, dependent) for end in (bare.lower, bare.upper)]
     inner = {s for s in bare.expression.symbols if not s.order}
-    ends += [apply_substitution(bare.expression, follow)] if bare.order else []
+    ends += [apply_substitution(bare.expression, dependent)] if bare.order else []
     free = {s for end in ends for s in end.symbols if s.has_derivative and not s.order} - given.keys()
-    around = (s for s in sorted(free, key=str) if domain.of(s).is_everything)
-    return PeriodicCoordinates(s for s in around if (bare.order or s not in inner) and is_periodic(ends, s))
+    unlimited = (s for s in sorted(free, key=str) if domain.limits_of(s).is_everything)
+    return PeriodicCoordinates(
+        s for s in unlimited if (bare.order or s not in inner) and is_periodic(ends, s)
+    )
 
 
-def _restore_coordinates(found: ConstraintEffects, turns: PeriodicCoordinates) -> ConstraintEffects:
-    """Return a reading about the coordinates that go round, not about what stands in for them."""
-    blocked = found.blocked
+def _restore_coordinates(found: ConstraintEffects, periodic: PeriodicCoordinates) -> ConstraintEffects:
+    """Return effects in terms of the original periodic coordinates."""
+    blocked = found.speed
     if blocked is not None:
-        for region in (blocked.up, blocked.down, blocked.up_beyond, blocked.down_beyond):
-            region.boxes[:] = map(turns.box, region.boxes)
-            region.telling[:] = map(turns.box, region.telling)
+        for region in (
+            blocked.blocks_increase,
+            blocked.blocks_decrease,
+            blocked.forces_decrease,
+            blocked.forces_increase,
+        ):
+            region.boxes[:] = map(periodic.restore_box, region.boxes)
+            region.reported[:] = map(periodic.restore_box, region.reported)
     kept = [
         replace(
             k,
-            where=tuple(map(turns.box, k.where)),
-            lower=None if k.lower is None else turns.expression(k.lower),
-            upper=None if k.upper is None else turns.expression(k.upper),
+            boxes=tuple(map(periodic.restore_box, k.boxes)),
+            lower=None if k.lower is None else periodic.restore_expression(k.lower),
+            upper=None if k.upper is None else periodic.restore_expression(k.upper),
         )
-        for k in found.kept
+        for k in found.positions
     ]
-    return ConstraintEffects(blocked, kept, [(reason, turns.box(box)) for reason, box in found.unknown])
+    return ConstraintEffects(
+        blocked, kept, [(reason, periodic.restore_box(box)) for reason, box in found.unknown]
+    )
 
 
 def interlocks(model: ModelView, values: Mapping[Symbol | str, float] | None = None) -> Interlocks:
-    """Return what locks what in a model, in which intervals: from its constraints alone.
+    """Return the interlocks of a model, derived from its constraints alone.
 
-    Bounds of constraints are taken apart into cases, by the signs of what ``less``, ``where``, minima and
-    maxima, splines and products of truths compare. Each case is a box of intervals; whether a bound lets a
-    speed go, or what range it leaves to a position, follows by exact arithmetic where bounds are
-    polynomials, and by interval arithmetic elsewhere. Nothing is sampled. What cannot be decided is listed as
-    ``undecided``, with the constraint, the reason and the region.
+    An interlock is a restriction of a coordinate that is active in certain intervals of other coordinates.
+    The bounds of constraints are split into cases by the signs of the operands of ``less``, ``where``,
+    minima, maxima, splines and products of truth values. Each case is a box of intervals. The sign of a bound
+    on a speed, and the range left to a position, follow by exact arithmetic for polynomial bounds and by
+    interval arithmetic otherwise. Nothing is sampled. Undecidable cases are listed as ``undecided``, with the
+    constraint, the reason and the region.
 
-    Everything is said about configurations within the constant limits of coordinates. Ordinary limits and
-    speed limits are no interlocks, and neither is a limit of one orientation, as a cone is. Conditions on
-    coordinates that follow others, in a closed loop, are told by the free ones, and what goes round without
-    limits by its angle within a turn, ``crank mod 2π``. Where several free ones would have to be told apart
-    together, they are told as the constraints name them, and listed as undecided. Coordinates that wheels
-    move are named as the constraints name them.
+    All statements hold for configurations within the constant limits of coordinates. Ordinary limits of
+    positions and speeds are no interlocks, and neither is a limit of one orientation, such as a cone.
+    Conditions on dependent coordinates of a closed loop are expressed by the independent ones, and conditions
+    on periodic coordinates without limits by the angle within a turn, ``crank mod 2π``. Conditions that would
+    need several independent coordinates at once are expressed by the coordinates that the constraint names,
+    and are listed as undecided. Coordinates of wheeled bases are named as in the constraints.
 
     Parameters
     ----------
     model
         A model or a snapshot.
     values
-        Numbers for coordinates and parameters that are taken as given. Parameters have the value they were
-        made with, unless they are given here.
+        Numbers for coordinates and parameters that are taken as given. Other parameters have their default
+        values.
 
     Raises
     ------
     ExpressionError
-        If it is not a model.
+        If ``model`` is no model.
     UnknownNameError, InvalidValueError
-        For values of unknown names, or NaN.
+        If a value has an unknown name, or is NaN.
     """
     if not isinstance(model, ModelView):
         raise ExpressionError(
@@ -171,25 +184,25 @@ def interlocks(model: ModelView, values: Mapping[Symbol | str, float] | None = N
     for name, constraint in constraints.items():
         if not _may_lock(constraint):
             continue
-        reading = find_effects(constraint, model.rates, given, domain)
-        if reading.blocked is not None:
-            blocked[name] = reading.blocked
-        kept[name] = reading.kept
-        for reason in dict.fromkeys(reason for reason, _ in reading.unknown):
-            where = merge_boxes(box for other, box in reading.unknown if other == reason)
+        effects = find_effects(constraint, model.rates, given, domain)
+        if effects.speed is not None:
+            blocked[name] = effects.speed
+        kept[name] = effects.positions
+        for reason in dict.fromkeys(reason for reason, _ in effects.unknown):
+            where = merge_boxes(box for other, box in effects.unknown if other == reason)
             undecided.append(Undecided(name, reason, where))
     for name, one in blocked.items():
         found += _speed_interlocks(name, one)
     found += _pair_interlocks(blocked)
     for name, many in kept.items():
-        found += [Interlock(k.held, k.hold, (name,), k.where, k.lower, k.upper) for k in many]
+        found += [Interlock(k.held, k.hold, (name,), k.boxes, k.lower, k.upper) for k in many]
     found += _contradicting_ranges(kept)
     found.sort(key=lambda lock: [order.index(name) for name in lock.constraints])
     return Interlocks(found, undecided)
 
 
 def constant_limits(constraints: Mapping[str, Constraint]) -> dict[Symbol, Interval]:
-    """Return between which numbers symbols stay: what constraints on single symbols say by numbers."""
+    """Return the limits of symbols from constraints on single symbols with constant bounds."""
     limits: dict[Symbol, Interval] = {}
     for constraint in constraints.values():
         symbol = to_plain(constraint.expression)
@@ -202,7 +215,7 @@ def constant_limits(constraints: Mapping[str, Constraint]) -> dict[Symbol, Inter
 
 
 def _may_lock(constraint: Constraint) -> bool:
-    """Return whether it is more than a limit of one coordinate, or speeds, by numbers around 0."""
+    """Return True unless a constraint limits one coordinate by numbers, or one speed by numbers around 0."""
     if constraint.lower.symbols or constraint.upper.symbols:
         return True
     if not constraint.order:
@@ -227,20 +240,20 @@ def _given_values(
 
 
 def _speed_interlocks(name: str, one: SpeedEffect) -> list[Interlock]:
-    both = one.up & one.down
-    void = (one.up_beyond & one.down) | (one.up & one.down_beyond)
+    both = one.blocks_increase & one.blocks_decrease
+    void = (one.forces_decrease & one.blocks_decrease) | (one.blocks_increase & one.forces_increase)
     regions: dict[Hold, Region] = {
         "stands still": both - void,
-        "cannot increase": one.up - both,
-        "cannot decrease": one.down - both,
+        "cannot increase": one.blocks_increase - both,
+        "cannot decrease": one.blocks_decrease - both,
         "has no value": void,
     }
-    found = {hold: region.short() for hold, region in regions.items()}
+    found = {hold: region.cover() for hold, region in regions.items()}
     return [Interlock(one.held, hold, (name,), where) for hold, where in found.items() if where]
 
 
 def _pair_interlocks(blocked: Mapping[str, SpeedEffect]) -> list[Interlock]:
-    """Return where one constraint stops what another one lets go, or even demands."""
+    """Return the interlocks of two constraints that together block or contradict each other."""
     found: list[Interlock] = []
     names = list(blocked)
     for first in names:
@@ -249,16 +262,18 @@ def _pair_interlocks(blocked: Mapping[str, SpeedEffect]) -> list[Interlock]:
             if first == second or a.held != b.held:
                 continue
             pair = tuple(sorted((first, second), key=names.index))
-            void = (a.up_beyond & b.down) | (a.up & b.down_beyond)
-            both = (a.up & b.down) - ((a.up & a.down) | (b.up & b.down))
+            void = (a.forces_decrease & b.blocks_decrease) | (a.blocks_increase & b.forces_increase)
+            both = (a.blocks_increase & b.blocks_decrease) - (
+                (a.blocks_increase & a.blocks_decrease) | (b.blocks_increase & b.blocks_decrease)
+            )
             regions: dict[Hold, Region] = {"stands still": both - void, "has no value": void}
-            holds = {hold: region.short() for hold, region in regions.items()}
+            holds = {hold: region.cover() for hold, region in regions.items()}
             found += [Interlock(a.held, hold, pair, where) for hold, where in holds.items() if where]
     return found
 
 
 def _contradicting_ranges(kept: Mapping[str, list[PositionEffect]]) -> list[Interlock]:
-    """Return where the constant ranges of two constraints leave one position, or none."""
+    """Return the interlocks of two constraints whose constant ranges leave one position, or none."""
     every = [(name, k) for name, many in kept.items() for k in many if k.range is not None]
     found = []
     for i, (first, a) in enumerate(every):
@@ -268,7 +283,7 @@ def _contradicting_ranges(kept: Mapping[str, list[PositionEffect]]) -> list[Inte
             if first == second or a.held != b.held or "has no value" in (a.hold, b.hold):
                 continue
             low, high = max(a.range[0], b.range[0]), min(a.range[1], b.range[1])
-            where = merge_boxes(intersect_boxes(a.where, b.where))
+            where = merge_boxes(intersect_boxes(a.boxes, b.boxes))
             if not where or low < high or (low == high and "stands still" in (a.hold, b.hold)):
                 continue
             if low > high:

@@ -17,23 +17,23 @@ Hold = Literal["stands still", "cannot increase", "cannot decrease", "stays with
 
 @dataclass(frozen=True)
 class Interlock:
-    """What holds a coordinate or a speed, how, by which constraints, and when.
+    """Restriction of a coordinate or a speed by constraints, and the condition under which it is active.
 
     Attributes
     ----------
     held
-        A symbol as the constraints limit it: a position, a speed (or a higher derivative), or where they
-        limit a combination of several, that expression.
+        The restricted quantity: a position, a speed (or a higher derivative), or an expression if the
+        constraints limit a combination of several.
     hold
-        ``stands still``: a speed is 0, a position has one value left. ``cannot increase``,
-        ``cannot decrease``: a speed is at most, or at least, 0. ``stays within``: a position is kept between
+        ``stands still``: a speed is 0, or a position has one value left. ``cannot increase``,
+        ``cannot decrease``: a speed is at most, or at least, 0. ``stays within``: a position lies between
         ``lower`` and ``upper``. ``has no value``: the bounds contradict each other.
     constraints
-        Names of the constraints that do it together.
+        Names of the constraints that together restrict it.
     when
-        Boxes; it holds in each of them.
+        Boxes, in each of which the restriction is active.
     lower, upper
-        Of a position: between what it is kept, or where it stands. Both may depend on other coordinates.
+        Range of a position, or its one value twice. Both may depend on other coordinates.
     """
 
     held: Expression
@@ -45,12 +45,12 @@ class Interlock:
 
     @property
     def is_permanent(self) -> bool:
-        """Whether it holds everywhere."""
+        """True if the restriction is active everywhere."""
         return IntervalBox({}) in self.when
 
     @property
     def keys(self) -> tuple[Symbol, ...]:
-        """The coordinates, speeds and parameters that the conditions are about; sorted."""
+        """Coordinates, speeds and parameters in the conditions, sorted."""
         found = {s for box in self.when for axis in box for s in axis.symbols}
         return tuple(sorted(found, key=lambda s: s.sort_key))
 
@@ -65,7 +65,7 @@ class Interlock:
 
 @dataclass(frozen=True)
 class Undecided:
-    """A constraint about which it is not known whether it holds something, why, and where."""
+    """Constraint whose effect is unknown, with the reason and the region where it is unknown."""
 
     constraint: str
     reason: str
@@ -76,7 +76,7 @@ class Undecided:
 
 
 class Interlocks(Sequence[Interlock]):
-    """All interlocks of a model, in the order of its constraints, and what is ``undecided``."""
+    """Interlocks of a model, in the order of its constraints, and its ``undecided`` constraints."""
 
     def __init__(self, found: Sequence[Interlock], undecided: Sequence[Undecided] = ()) -> None:
         self._found = tuple(found)
@@ -103,18 +103,18 @@ class Interlocks(Sequence[Interlock]):
     def __hash__(self) -> int:
         return hash((self._found, self.undecided))
 
-    def of(self, coordinate: Symbol | str) -> tuple[Interlock, ...]:
-        """Return what holds a coordinate, or its speed; by symbol or by path."""
+    def locks_on(self, coordinate: Symbol | str) -> tuple[Interlock, ...]:
+        """Return the interlocks on a coordinate or its derivatives, given by symbol or path."""
         path = coordinate.path if isinstance(coordinate, Symbol) else coordinate
         return tuple(found for found in self if any(s.path == path for s in found.held.symbols))
 
     def keys(self, coordinate: Symbol | str) -> tuple[Symbol, ...]:
-        """Return what others the locks on a coordinate depend on, as positions; sorted."""
+        """Return the other coordinates that the interlocks on one depend on, as positions, sorted."""
         path = coordinate.path if isinstance(coordinate, Symbol) else coordinate
-        found = {_position(key) for lock in self.of(coordinate) for key in lock.keys}
+        found = {_position(key) for lock in self.locks_on(coordinate) for key in lock.keys}
         found |= {
             _position(s)
-            for lock in self.of(coordinate)
+            for lock in self.locks_on(coordinate)
             for bound in (lock.lower, lock.upper)
             if bound is not None
             for s in bound.symbols
@@ -122,7 +122,7 @@ class Interlocks(Sequence[Interlock]):
         return tuple(sorted((s for s in found if s.path != path), key=lambda s: s.sort_key))
 
     def as_data(self) -> dict[str, Any]:
-        """Return all of it as lists, mappings, texts and numbers, as JSON can say them."""
+        """Return the interlocks as data for JSON: lists, mappings, texts and numbers."""
         return {
             "interlocks": [
                 {

@@ -9,15 +9,15 @@ from .interlock import Interlocks
 
 
 def opening_order(found: Interlocks, goal: Symbol | str) -> tuple[Symbol, ...]:
-    """Return the coordinates that locks on a goal depend on, directly or not: keys first, the goal last.
+    """Return the coordinates that interlocks on a goal depend on, directly or not: keys first, the goal last.
 
-    Surprise first: which way keys have to be moved, and whether they need to be moved at all, is for the
-    state to tell; this is about what may have to come before what.
+    The order does not say in which direction a key has to move, nor whether it has to move at all: that
+    depends on the state.
 
     Raises
     ------
     ModelError
-        If coordinates lock each other in a circle, with the circle.
+        If coordinates lock each other in a cycle, which the message lists.
     """
     start = goal if isinstance(goal, Symbol) else Symbol(goal)
     done: dict[str, Symbol] = {}

@@ -1,4 +1,4 @@
-"""Periodicity in unlimited coordinates, and stand-ins within one turn."""
+"""Periodicity in unlimited coordinates, and their replacement by angles within one turn."""
 
 from __future__ import annotations
 
@@ -26,40 +26,45 @@ _SAME = 1e-12
 
 
 class PeriodicCoordinates:
-    """Stand-ins for coordinates that go round, which stay within a turn.
+    """Replacement of periodic coordinates by angles within one turn.
 
     Parameters
     ----------
     coordinates
-        Those that go round.
+        The periodic coordinates.
+
+    Attributes
+    ----------
+    wrapped
+        Angle within one turn for each coordinate.
     """
 
     def __init__(self, coordinates: Iterable[Symbol]) -> None:
-        self.stand_ins = {s: position(f"{s.path} mod 2π") for s in coordinates}
-        self._back = {inner: s for s, inner in self.stand_ins.items()}
+        self.wrapped = {s: position(f"{s.path} mod 2π") for s in coordinates}
+        self._originals = {inner: s for s, inner in self.wrapped.items()}
 
-    def box(self, box: IntervalBox) -> IntervalBox:
-        """Return a box about the coordinates themselves."""
-        return IntervalBox({self._told(axis): side for axis, side in box.items()})
+    def restore_box(self, box: IntervalBox) -> IntervalBox:
+        """Return a box in terms of the original coordinates."""
+        return IntervalBox({self._restore_axis(axis): side for axis, side in box.items()})
 
-    def expression(self, expression: Expression) -> Expression:
-        """Return an expression in the coordinates themselves."""
+    def restore_expression(self, expression: Expression) -> Expression:
+        """Return an expression in the original coordinates."""
         return apply_substitution(
-            expression, {s: e for s, e in self._back.items() if s in expression.symbols}
+            expression, {s: e for s, e in self._originals.items() if s in expression.symbols}
         )
 
-    def _told(self, axis: Expression) -> Expression:
-        around = self._back.get(axis) if isinstance(axis, Symbol) else None
-        return axis if around is None else wrap_to_turn(around)
+    def _restore_axis(self, axis: Expression) -> Expression:
+        original = self._originals.get(axis) if isinstance(axis, Symbol) else None
+        return axis if original is None else wrap_to_turn(original)
 
 
 def is_periodic(expressions: Sequence[Expression], symbol: Symbol) -> bool:
-    """Return whether expressions are certainly the same at ``symbol`` + 2π; by their form."""
+    """Return True if the form of expressions proves that they are equal at ``symbol`` + 2π."""
     return all(g == 0 for e in expressions for g in _turn_counts(e, {symbol: Fraction(1)}))
 
 
 def _turn_counts(expression: Expression, moving: Mapping[Symbol, Fraction]) -> list[TurnCount]:
-    """Return by how many turns elements are more after turns of symbols, None where that is not certain."""
+    """Return the increments of elements, in turns, after given turns of symbols; None if not certain."""
     terms = TermGraph({})
     roots = tuple(terms.elements(expression))
     found: dict[int, TurnCount] = {}
@@ -96,8 +101,8 @@ def _turn_count(term: Term, args: list[TurnCount]) -> TurnCount:
         )
     if term.op == "implicit":
         node, element = term.data
-        around: TurnCount = _loop_turn_counts(node.function, tuple(known))[element]
-        return around
+        count: TurnCount = _loop_turn_counts(node.function, tuple(known))[element]
+        return count
     return None
 
 
@@ -113,11 +118,11 @@ def _scale_count(term: Term, known: list[Fraction]) -> TurnCount:
 
 @lru_cache(256)
 def _loop_turn_counts(function: ImplicitFunction, inputs: tuple[Fraction, ...]) -> tuple[TurnCount, ...]:
-    """Return how unknowns grow with turns of the inputs: as the seed does, if the equations stay the same."""
+    """Return the increments of unknowns after turns of inputs: those of the seed, for periodic equations."""
     moving = {s: g for s, g in zip(function.inputs, inputs, strict=True) if g}
     ends = dict(zip(function.inputs, function.domain, strict=False))
     if any(math.isfinite(end) for s in moving for end in ends.get(s, ())):
-        return (None,) * len(function.unknowns)  # after a turn it is where the function has no value
+        return (None,) * len(function.unknowns)  # after a turn, outside of the function's domain
     by = _turn_counts(function.seed, moving)
     moving |= {s: g for s, g in zip(function.unknowns, by, strict=True) if g}
     same = None not in by and all(g == 0 for g in _turn_counts(function.equations, moving))

@@ -18,28 +18,28 @@ _ROUNDING = 1e-9
 
 
 def value_at(expression: Expression, point: Mapping[Symbol, float]) -> float:
-    """Return the value of a scalar at a point, which may say more than it needs."""
+    """Return the value of a scalar at a point, which may contain further symbols."""
     function = _function(expression)
     return float(function({symbol: point[symbol] for symbol in function.inputs}))
 
 
 def is_inside(box: IntervalBox, point: Mapping[Symbol, float]) -> bool:
-    """Return whether the conditions of a box hold at a point."""
+    """Return True if a point satisfies the conditions of a box."""
     return all(value_at(axis, point) in side for axis, side in box.items())
 
 
 def default_point(model: ModelView) -> dict[Symbol, float]:
-    """Return the default state, with what follows where it is."""
+    """Return the default state, completed by the dependent coordinates."""
     point = dict(model.default_state())
     settle_point(model, point)
     return point
 
 
 def settle_point(model: ModelView, point: dict[Symbol, float]) -> bool:
-    """Make a point one that the model can be at, and return whether that is possible.
+    """Project a point onto the configurations of the model in place; return False if that is impossible.
 
-    Coordinates whose rates keep their length, as those of a quaternion, get length one. What follows other
-    coordinates is put where these are.
+    Coordinates whose rates preserve their norm, such as those of a quaternion, are normalised. Dependent
+    coordinates are computed from the independent ones.
     """
     rates = model.rates
     for speeds in {frozenset(rates[x]) for x in rates}:

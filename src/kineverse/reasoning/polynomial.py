@@ -25,33 +25,33 @@ _DIGITS_AT_MOST = 4000
 
 @dataclass(frozen=True)
 class Polynomial:
-    """A sum of coefficients times products of powers of symbols."""
+    """Polynomial: a mapping from monomials to rational coefficients."""
 
     terms: Mapping[Monomial, Fraction]
 
     @staticmethod
     def constant(number: Number) -> Polynomial:
-        """Return a number, which is finite."""
+        """Return the constant polynomial of a finite number."""
         return Polynomial({(): Fraction(number)} if number else {})
 
     @staticmethod
     def symbol(symbol: Symbol) -> Polynomial:
-        """Return a symbol."""
+        """Return the polynomial of a symbol."""
         return Polynomial({((symbol, 1),): Fraction(1)})
 
     @cached_property
     def symbols(self) -> frozenset[Symbol]:
-        """The symbols that occur."""
+        """Symbols of the polynomial."""
         return frozenset(s for monomial in self.terms for s, _ in monomial)
 
     @cached_property
     def degree(self) -> int:
-        """The highest sum of powers."""
+        """Total degree."""
         return max((sum(power for _, power in monomial) for monomial in self.terms), default=0)
 
     @property
     def offset(self) -> Fraction:
-        """The constant term."""
+        """Constant term."""
         return self.terms.get((), Fraction(0))
 
     def __add__(self, other: Polynomial) -> Polynomial:
@@ -60,16 +60,16 @@ class Polynomial:
             total[monomial] = total.get(monomial, Fraction(0)) + factor
         return Polynomial({m: f for m, f in total.items() if f})
 
-    def scaled(self, factor: Number) -> Polynomial:
-        """Return a multiple."""
+    def scale(self, factor: Number) -> Polynomial:
+        """Return the polynomial multiplied by a number."""
         exact = Fraction(factor)
         return Polynomial({m: f * exact for m, f in self.terms.items()} if exact else {})
 
     def __sub__(self, other: Polynomial) -> Polynomial:
-        return self + other.scaled(-1)
+        return self + other.scale(-1)
 
-    def times(self, other: Polynomial) -> Polynomial | None:
-        """Return the product, None if it is too large to be worth it."""
+    def multiply(self, other: Polynomial) -> Polynomial | None:
+        """Return the product, or None if it is too large."""
         if self.degree + other.degree > _DEGREE_AT_MOST:
             return None
         total: dict[Monomial, Fraction] = {}
@@ -86,8 +86,8 @@ class Polynomial:
             return None
         return Polynomial({m: f for m, f in total.items() if f})
 
-    def at(self, values: Mapping[Symbol, Fraction]) -> Polynomial:
-        """Return what it is where some symbols have these values."""
+    def substitute(self, values: Mapping[Symbol, Fraction]) -> Polynomial:
+        """Return the polynomial with values substituted for some symbols."""
         total: dict[Monomial, Fraction] = {}
         for monomial, factor in self.terms.items():
             for symbol, power in monomial:
@@ -96,17 +96,17 @@ class Polynomial:
             total[rest] = total.get(rest, Fraction(0)) + factor
         return Polynomial({m: f for m, f in total.items() if f})
 
-    def axis(self) -> tuple[LinearForm, Fraction]:
-        """Return a polynomial of degree 1 as ``scale·axis + offset``: the axis and its scale.
+    def linear_form(self) -> tuple[LinearForm, Fraction]:
+        """Return axis and scale of a polynomial of degree 1, ``scale·axis + offset``.
 
-        The axis is normalised: its largest weight is ±1, its first is positive.
+        The axis is normalised: its largest weight is ±1, and its first weight is positive.
         """
         weights = sorted(((m[0][0], f) for m, f in self.terms.items() if m), key=lambda w: w[0].sort_key)
         scale = max(abs(f) for _, f in weights) * (1 if weights[0][1] > 0 else -1)
         return tuple((s, f / scale) for s, f in weights), scale
 
     def coefficients(self) -> list[Fraction]:
-        """Return those of a polynomial in one symbol, constant first."""
+        """Return the coefficients of a polynomial in one symbol, constant first."""
         result = [Fraction(0)] * (self.degree + 1)
         for monomial, factor in self.terms.items():
             result[monomial[0][1] if monomial else 0] = factor
@@ -114,7 +114,7 @@ class Polynomial:
 
 
 def linear_form_expression(axis: LinearForm) -> Expression:
-    """Return a symbol, or a sum of several with their weights."""
+    """Return a linear form as an expression: a symbol, or a weighted sum of symbols."""
     total = as_expression(0.0)
     for symbol, weight in axis:
         term = symbol if weight == 1 else float(weight) * symbol
@@ -125,7 +125,7 @@ def linear_form_expression(axis: LinearForm) -> Expression:
 
 
 def evaluate_polynomial(coefficients: list[Fraction], x: Fraction) -> Fraction:
-    """Return the value of a polynomial in one symbol."""
+    """Evaluate a polynomial in one symbol by Horner's method."""
     result = Fraction(0)
     for coefficient in reversed(coefficients):
         result = result * x + coefficient
@@ -133,7 +133,7 @@ def evaluate_polynomial(coefficients: list[Fraction], x: Fraction) -> Fraction:
 
 
 def are_close(a: Number, b: Number, share: float) -> bool:
-    """Whether two numbers differ by no more than a share of them, or by that much; not if one is infinite."""
+    """Return True if two finite numbers differ by at most ``share``, relative to the larger one above 1."""
     if math.isinf(a) or math.isinf(b):
         return False
     x, y = Fraction(a), Fraction(b)
@@ -141,16 +141,16 @@ def are_close(a: Number, b: Number, share: float) -> bool:
 
 
 def roots(coefficients: list[Fraction], within: Interval) -> list[Fraction]:
-    """Return all roots in an interval, each once, in order; rational ones of low degree exactly.
+    """Return all real roots in an interval, each once, in order; rational ones of low degree exactly.
 
-    Sturm's theorem says how many there are in between; they are then halved down to one part in 2⁶⁰.
+    Intervals are bisected to a relative width of 2⁻⁶⁰; Sturm's theorem gives the number of roots in each.
     """
     if len(coefficients) == 2:
         found = [-coefficients[0] / coefficients[1]]
     else:
         chain = _sturm(coefficients)
         bound = 1 + max(abs(c / coefficients[-1]) for c in coefficients[:-1])
-        # Always from the same ends, so that a root is the same number whichever interval it is wanted in.
+        # Bisection always starts from the same ends, so a root has the same value for every interval.
         found = sorted(_isolate(chain, -bound, bound))
     return [root for root in found if root in within or _is_near_closed_end(root, within)]
 
@@ -172,12 +172,12 @@ def _isolate(chain: list[list[Fraction]], low: Fraction, high: Fraction) -> Iter
             if count > 1:
                 middle = (a + b) / 2
                 stack.append((a, middle))
-                # Of (middle, b) the end is a root already; what is left of it lies before some number.
+                # The end b is a root already; the other roots of (middle, b) lie below this number.
                 stack.append((middle, b - (b - a) / 2**70))
         elif are_close(a, b, 2.0**-60):
             yield (a + b) / 2
         else:
-            # A number with few digits in the middle finds roots such as 0.5 exactly.
+            # A midpoint with few digits finds roots such as 0.5 exactly.
             middle = (a + b) / 2
             short = Fraction(float(middle))
             middle = short if a < short < b else middle
@@ -185,7 +185,7 @@ def _isolate(chain: list[list[Fraction]], low: Fraction, high: Fraction) -> Iter
 
 
 def _sturm(coefficients: list[Fraction]) -> list[list[Fraction]]:
-    """Return Sturm's chain of the polynomial with the same roots, each of them simple."""
+    """Return Sturm's chain of the square-free polynomial with the same roots."""
     chain = [coefficients, [k * c for k, c in enumerate(coefficients) if k]]
     while len(chain[-1]) > 1:
         rest = _remainder(chain[-2], chain[-1])

@@ -14,53 +14,55 @@ _PRIMES_AT_MOST = 200
 
 @dataclass
 class Region:
-    """A union of boxes, with those of it that are worth telling.
+    """Union of boxes, and the part of it that is reported.
 
-    At equality a comparison is half true. What holds only there is not worth telling; but what holds on both
-    sides and there as well is one box, and not two.
+    At equality, a comparison has the value 0.5. A condition that holds only there is not reported. But a
+    condition that holds there and on both sides gives one box, and not two.
     """
 
     boxes: list[IntervalBox] = field(default_factory=list)
-    telling: list[IntervalBox] = field(default_factory=list)
+    reported: list[IntervalBox] = field(default_factory=list)
 
-    def add(self, box: IntervalBox, telling: bool) -> None:
-        """Add a box."""
+    def add(self, box: IntervalBox, reported: bool) -> None:
+        """Add a box to the region, and to its reported part if ``reported``."""
         self.boxes.append(box)
-        if telling:
-            self.telling.append(box)
+        if reported:
+            self.reported.append(box)
 
     def __and__(self, other: Region) -> Region:
-        return Region(intersect_boxes(self.boxes, other.boxes), intersect_boxes(self.telling, other.telling))
+        return Region(
+            intersect_boxes(self.boxes, other.boxes), intersect_boxes(self.reported, other.reported)
+        )
 
     def __or__(self, other: Region) -> Region:
-        return Region(self.boxes + other.boxes, self.telling + other.telling)
+        return Region(self.boxes + other.boxes, self.reported + other.reported)
 
     def __sub__(self, other: Region) -> Region:
-        left = ((box, part) for box in self.telling for part in subtract_boxes([box], other.boxes))
-        telling = [part for box, part in left if not _is_sliver(part, box)]
-        return Region(subtract_boxes(self.boxes, other.boxes), telling)
+        left = ((box, part) for box in self.reported for part in subtract_boxes([box], other.boxes))
+        reported = [part for box, part in left if not _is_sliver(part, box)]
+        return Region(subtract_boxes(self.boxes, other.boxes), reported)
 
-    def short(self) -> tuple[IntervalBox, ...]:
-        """Return few large boxes that are the region, none if nothing of it is worth telling."""
-        return merge_boxes(self.boxes, self.telling)
+    def cover(self) -> tuple[IntervalBox, ...]:
+        """Return a cover of the region by few large boxes; none if no part of it is reported."""
+        return merge_boxes(self.boxes, self.reported)
 
 
 def _is_sliver(part: IntervalBox, box: IntervalBox) -> bool:
-    """Whether a part has a single value where the box has an interval: at the edge of what was taken away."""
+    """Return True if a part has a single value on an axis where its box has an interval."""
     flat = (axis for axis, side in part.items() if side.lower == side.upper)
     return any(box.get(axis, EVERYTHING).lower != box.get(axis, EVERYTHING).upper for axis in flat)
 
 
 def subtract_boxes(boxes: Iterable[IntervalBox], others: Iterable[IntervalBox]) -> list[IntervalBox]:
-    """Return what is in some of the boxes and in none of the others."""
+    """Return the difference of two unions of boxes."""
     rest = list(boxes)
     for other in others:
-        rest = [part for box in rest for part in box.without(other)]
+        rest = [part for box in rest for part in box.subtract(other)]
     return rest
 
 
 def intersect_boxes(boxes: Iterable[IntervalBox], others: Iterable[IntervalBox]) -> list[IntervalBox]:
-    """Return what is in some of the boxes and in some of the others."""
+    """Return the intersection of two unions of boxes."""
     second = list(others)
     pairs = (box.intersection(other) for box in boxes for other in second)
     return _maximal_boxes([box for box in pairs if box is not None])
@@ -69,11 +71,12 @@ def intersect_boxes(boxes: Iterable[IntervalBox], others: Iterable[IntervalBox])
 def merge_boxes(
     boxes: Iterable[IntervalBox], wanted: Iterable[IntervalBox] | None = None
 ) -> tuple[IntervalBox, ...]:
-    """Return the same set by few large boxes, in an order that only depends on the set.
+    """Return a cover of a union of boxes by few large boxes, in an order that depends on the set only.
 
-    They are the largest boxes within the set, as prime implicants are in the minimisation of truth tables,
-    without those that others cover together. Where that would be very many, some remain smaller. If only part
-    of the set is wanted, boxes that have nothing of it, or only what others have as well, are left out.
+    The cover consists of maximal boxes within the set, which correspond to the prime implicants in the
+    minimisation of truth tables; boxes that the others cover are removed. If there are too many maximal
+    boxes, smaller ones remain. If only a part of the set is ``wanted``, boxes that do not contribute to that
+    part are removed.
     """
     found = _join_adjacent(list(boxes))
     matter = found if wanted is None else _join_adjacent(list(wanted))
@@ -84,11 +87,11 @@ def merge_boxes(
         others = [other for other in found if other is not box]
         if not subtract_boxes(intersect_boxes([box], matter), others):
             found = others
-    return tuple(sorted((box.rounded() for box in found), key=lambda b: (len(b), str(b))))
+    return tuple(sorted((box.to_floats() for box in found), key=lambda b: (len(b), str(b))))
 
 
 def _join_adjacent(boxes: list[IntervalBox]) -> list[IntervalBox]:
-    """Join boxes that differ in one axis only, until there are none."""
+    """Join boxes that differ in one axis only, until none are left."""
     while True:
         before = len(boxes)
         for axis in sorted({axis for box in boxes for axis in box}, key=axis_name):
@@ -106,7 +109,7 @@ def _join_adjacent(boxes: list[IntervalBox]) -> list[IntervalBox]:
 def _unite(sides: list[Interval]) -> list[Interval]:
     united: list[Interval] = []
     for side in sorted(sides, key=lambda i: (i.lower, not i.lower_closed)):
-        joined = united[-1].joined(side) if united else None
+        joined = united[-1].join(side) if united else None
         if joined is None:
             united.append(side)
         else:
@@ -115,7 +118,7 @@ def _unite(sides: list[Interval]) -> list[Interval]:
 
 
 def _prime_boxes(boxes: list[IntervalBox]) -> list[IntervalBox]:
-    """Return all of the largest boxes within the set, by joining pairs along an axis until nothing is new."""
+    """Return all maximal boxes within the set, by joining pairs along an axis until there are no new ones."""
     primes = boxes
     while True:
         new: list[IntervalBox] = []
@@ -138,13 +141,13 @@ def _joined_boxes(a: IntervalBox, b: IntervalBox) -> Iterator[IntervalBox]:
     if len(empty) > 1:
         return
     for axis in empty or axes:
-        joined = a.get(axis, EVERYTHING).joined(b.get(axis, EVERYTHING))
+        joined = a.get(axis, EVERYTHING).join(b.get(axis, EVERYTHING))
         if joined is not None:
             yield IntervalBox({**both, axis: joined})
 
 
 def _maximal_boxes(boxes: list[IntervalBox]) -> list[IntervalBox]:
-    """Return the boxes without those that lie in another one."""
+    """Return the boxes that no other box contains."""
     kept: list[IntervalBox] = []
     for box in sorted(dict.fromkeys(boxes), key=len):
         if not any(other.covers(box) for other in kept):

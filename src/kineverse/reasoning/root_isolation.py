@@ -25,7 +25,7 @@ from kineverse.symbols import Symbol
 from .abstract_values import AbstractValue, Signs, enclose_loop, live_arguments
 
 RangeFunction = Callable[[float, float], tuple[RealInterval, RealInterval | None]]
-"""Between which numbers a function, and its slope, are on an interval."""
+"""Ranges of a function and of its slope on an interval; the slope is None at possible jumps."""
 
 MAX_EVALUATIONS = 3000
 _WIDTH = 1e-13
@@ -35,7 +35,7 @@ _CLOSE = 1e-9
 def slope_ranges(
     order: Sequence[Term], values: dict[int, AbstractValue], sign: Signs, symbol: Symbol
 ) -> dict[int, RealInterval | None]:
-    """Return between which numbers the derivatives of terms lie, None where there may be jumps."""
+    """Return the ranges of the derivatives of terms, None where there may be jumps."""
     found: dict[int, RealInterval | None] = {}
     for term in order:
         if symbol not in values[term.index].live:
@@ -89,30 +89,30 @@ def _slope(
 
 
 def isolate_roots(
-    look: RangeFunction, low: float, high: float, most: int = MAX_EVALUATIONS
+    ranges: RangeFunction, low: float, high: float, most: int = MAX_EVALUATIONS
 ) -> list[float] | None:
-    """Return the isolated zeros in an interval, up to 1e-9; None if ``most`` looks do not make that certain.
+    """Return the isolated roots in an interval, to 1e-9; None if ``most`` evaluations do not isolate them.
 
-    Between them, and up to the ends, the sign is one and the same.
+    Between the roots, and between them and the ends, the sign is constant.
     """
     if math.isinf(low) or math.isinf(high):
-        span, rate = look(low, high)
+        span, rate = ranges(low, high)
         if not (_has_sign(span) or _is_monotone(rate)):
             return None
-    stack, found, looks = [(low, high)], list[float](), 0
+    stack, found, evaluations = [(low, high)], list[float](), 0
     while stack:
         a, b = stack.pop()
-        looks += 1
-        span, rate = look(a, b)
+        evaluations += 1
+        span, rate = ranges(a, b)
         if _has_sign(span):
             continue
         if _is_monotone(rate):
-            zero = _crossing(look, a, b)
+            zero = _crossing(ranges, a, b)
             if zero is None:
                 return None
             found += zero
             continue
-        if looks > most or b - a < _CLOSE * max(1.0, abs(a), abs(b)):
+        if evaluations > most or b - a < _CLOSE * max(1.0, abs(a), abs(b)):
             return None
         middle = _middle(a, b)
         stack += [(a, middle), (middle, b)]
@@ -120,9 +120,9 @@ def isolate_roots(
     return [z for k, z in enumerate(found) if not k or z - found[k - 1] > _CLOSE * max(1.0, abs(z))]
 
 
-def _crossing(look: RangeFunction, low: float, high: float) -> list[float] | None:
-    """Return the zero of a monotone function if there is one; None if it may be zero on an interval."""
-    first, last = _sign_at(look, low), _sign_at(look, high)
+def _crossing(ranges: RangeFunction, low: float, high: float) -> list[float] | None:
+    """Return the root of a monotone function, if there is one; None if it may be zero on an interval."""
+    first, last = _sign_at(ranges, low), _sign_at(ranges, high)
     if first and first == last:
         return []
     if (math.isinf(low) and not first) or (math.isinf(high) and not last):
@@ -134,9 +134,9 @@ def _crossing(look: RangeFunction, low: float, high: float) -> list[float] | Non
         middle = _middle(a, b)
         if not a < middle < b:
             break
-        here = _sign_at(look, middle)
+        here = _sign_at(ranges, middle)
         if not here:
-            # So close to zero that rounding hides the sign; is it one a little further on each side?
+            # Rounding hides the sign; the signs a little further on each side decide below.
             a = b = middle
         elif first:
             a, b = (middle, b) if here == first else (a, middle)
@@ -144,7 +144,7 @@ def _crossing(look: RangeFunction, low: float, high: float) -> list[float] | Non
             a, b = (a, middle) if here == last else (middle, b)
     zero = a if not first and a == low else b if not last and b == high else _middle(a, b)
     near = _CLOSE * max(1.0, abs(zero))
-    below, above = _sign_at(look, max(low, zero - near)), _sign_at(look, min(high, zero + near))
+    below, above = _sign_at(ranges, max(low, zero - near)), _sign_at(ranges, min(high, zero + near))
     if (zero > low and (not below or (first and below != first))) or (
         zero < high and (not above or (last and above != last))
     ):
@@ -152,8 +152,8 @@ def _crossing(look: RangeFunction, low: float, high: float) -> list[float] | Non
     return [zero]
 
 
-def _sign_at(look: RangeFunction, x: float) -> int:
-    span, _ = look(x, x)
+def _sign_at(ranges: RangeFunction, x: float) -> int:
+    span, _ = ranges(x, x)
     return 1 if span[0] > 0 else -1 if span[1] < 0 else 0
 
 
