@@ -1,4 +1,4 @@
-"""Random convex shapes, how far they reach in a direction, and the same in MuJoCo."""
+"""Random convex shapes, their support functions, and their MuJoCo geoms."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ _AROUND = 256
 
 @dataclass
 class Convex:
-    """A shape by its kind: what Kineverse calls it, its solid, its support, and its MuJoCo geom."""
+    """A shape of a kind: its solid, its support function, and its MuJoCo geom."""
 
     kind: str
     solid: Solid
@@ -128,5 +128,5 @@ class MujocoPairs:
 
 
 def gap(a: Convex, b: Convex, poses: np.ndarray, n: np.ndarray) -> np.ndarray:
-    """Return how far apart two shapes are along unit directions; no distance is less than any gap."""
+    """Return the gaps between two shapes along unit directions, which are lower bounds of the distance."""
     return -a.support(n, poses[0]) - b.support(-n, poses[1])

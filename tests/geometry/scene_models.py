@@ -1,4 +1,4 @@
-"""Small models for scenes, and the slow way to ask them."""
+"""Small models for scenes, and brute-force distances."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ def body(*geometries: Geometry, at: tuple[float, float, float] = (0, 0, 0)) -> B
 
 
 def arm_among_boxes(links: int = 5, boxes: int = 8, seed: int = 0) -> kv.Model:
-    """A chain of capsules with a hand of two pieces that slides on a rail, among boxes; and a free ball."""
+    """A chain of capsules with a hand of two shapes that slides on a rail, among boxes; and a free ball."""
     rng = np.random.default_rng(seed)
     model = kv.Model()
     with model.edit() as edit:
@@ -48,7 +48,7 @@ def random_state(model: kv.Model, rng: np.random.Generator) -> kv.State:
 
 
 def brute_force(scene: Scene, state: kv.State) -> dict[tuple[str, str], float]:
-    """Return the distances of all pairs of bodies that are looked at, every pair of pieces measured."""
+    """Return the distances of all checked pairs of bodies, every pair of shapes measured."""
     model = scene.model
     placed = []
     for name in scene.bodies:

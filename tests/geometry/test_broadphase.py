@@ -1,4 +1,4 @@
-"""The sweep: no pair is missed, bounds are bounds, and C does what numpy does."""
+"""The broad phase: no pair is missed, bounds hold, and C agrees with numpy."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ def library():
 
 
 class Cloud:
-    """Pieces of random points, and brute force: the distance of two is that of their nearest points."""
+    """Objects of random points, with brute-force distances between their nearest points."""
 
     def __init__(self, seed: int, count: int, moving: int) -> None:
         self.rng = np.random.default_rng(seed)
@@ -45,7 +45,7 @@ class Cloud:
         return np.concatenate([rotation, self.rng.normal(size=(count, 3, 1))], axis=2)
 
     def step(self, size: float) -> np.ndarray:
-        """Return new poses of what moves, a little further."""
+        """Return new poses of the moving objects, a little further on."""
         old = self.table.poses[: self.table.moving]
         turn = Rotation.from_rotvec(self.rng.normal(size=(len(old), 3)) * size).as_matrix()
         shift = self.rng.normal(size=(len(old), 3, 1)) * size
@@ -68,7 +68,7 @@ class Cloud:
     reach=st.sampled_from([0.0, 0.1, 0.5, 2.0]),
     step=st.sampled_from([0.001, 0.03, 0.4]),
 )
-def test_no_pair_is_missed_and_bounds_are_bounds(seed, count, reach, step):
+def test_find_near_pairs_misses_none_and_bounds_hold(seed, count, reach, step):
     cloud = Cloud(seed, count, moving=count // 2 + 1)
     table = cloud.table
     for _ in range(6):
@@ -87,7 +87,7 @@ def test_no_pair_is_missed_and_bounds_are_bounds(seed, count, reach, step):
 @pytest.mark.compiler
 @settings(max_examples=attempts(40))
 @given(seed=st.integers(0, 10**6), count=st.integers(2, 60), reach=st.sampled_from([0.0, 0.1, 0.5, 9.0]))
-def test_numpy_and_c_agree(library, seed, count, reach):
+def test_find_near_pairs_agrees_in_numpy_and_c(library, seed, count, reach):
     one, other = Cloud(seed, count, count // 2), Cloud(seed, count, count // 2)
     one.table.active[1] = other.table.active[1] = 0
     for _ in range(4):
@@ -117,7 +117,7 @@ def _sorted(pairs, lows):
 
 
 @pytest.mark.compiler
-def test_a_pose_that_is_not_finite_changes_nothing(library):
+def test_place_objects_refuses_poses_that_are_not_finite(library):
     cloud = Cloud(3, 5, 4)
     fresh = np.ascontiguousarray(cloud.step(0.1))
     fresh[2, 1, 3] = np.nan
@@ -127,8 +127,8 @@ def test_a_pose_that_is_not_finite_changes_nothing(library):
     assert not cloud.table.travel.any()
 
 
-def test_carried_bounds_spare_the_measuring():
-    """Two discs a metre wide, half a metre apart: boxes and spheres overlap, what was measured does not."""
+def test_recorded_distances_bound_later_ones():
+    """Two discs a metre wide, half a metre apart: boxes and spheres overlap, the recorded distance does not."""
     table = ObjectTable(2, np.arange(2, dtype=np.int32), 1 - np.eye(2, dtype=np.uint8))
     for k in range(2):
         table.set_solid(k, np.zeros(3), np.array([1.0, 1.0, 1.0]), 1.8)
@@ -148,7 +148,7 @@ def test_carried_bounds_spare_the_measuring():
 
 @settings(max_examples=attempts(60))
 @given(seed=st.integers(0, 10**6), count=st.integers(0, 70))
-def test_a_tree_has_every_piece_once_below_boxes_that_hold_it(seed, count):
+def test_static_tree_contains_every_object_once_in_enclosing_boxes(seed, count):
     rng = np.random.default_rng(seed)
     low = rng.normal(size=(80, 3)).round(1)  # with some in the same place
     high = low + rng.uniform(0, 1, (80, 3))
@@ -170,7 +170,7 @@ def test_a_tree_has_every_piece_once_below_boxes_that_hold_it(seed, count):
 
 
 @pytest.mark.compiler
-def test_what_stands_is_found_where_it_was_put_last(library):
+def test_find_near_pairs_sees_static_objects_at_their_last_pose(library):
     cloud = Cloud(5, 12, 2)
     table = cloud.table
     for _ in range(3):
@@ -181,8 +181,8 @@ def test_what_stands_is_found_where_it_was_put_last(library):
         np.testing.assert_array_equal(found, expected)
 
 
-def test_a_tree_of_nothing_holds_nothing():
-    """A scene may have no piece that can be used."""
+def test_static_tree_of_no_objects_is_empty():
+    """A scene may have no usable shape."""
     corners = np.empty((0, 3))
     boxes, leaves = build_static_tree(corners, corners, np.empty(0, dtype=np.int32))
     assert (leaves == -1).all()

@@ -1,4 +1,4 @@
-"""Meshes as unions of convex hulls: what CoACD makes of them, the cache, and what was measured."""
+"""Convex decomposition: results of CoACD, the cache, and the measured accuracy."""
 
 from __future__ import annotations
 
@@ -80,7 +80,7 @@ def made(name):
 
 
 @pytest.mark.parametrize("name", SHAPES)
-def test_every_corner_is_within_the_error_of_the_union(name):
+def test_decomposition_covers_every_corner_within_the_error(name):
     mesh, result = made(name)
     hulls = [spatial.ConvexHull(hull).equations for hull in result.hulls]
     beyond = np.min([(mesh.vertices @ e[:, :3].T + e[:, 3]).max(axis=1) for e in hulls], axis=0)
@@ -90,7 +90,7 @@ def test_every_corner_is_within_the_error_of_the_union(name):
 
 
 @pytest.mark.parametrize("name", SHAPES)
-def test_every_hull_is_convex(name):
+def test_decomposition_hulls_are_convex(name):
     for hull in made(name)[1].hulls:
         oracle = spatial.ConvexHull(hull)
         assert len(oracle.vertices) == len(hull)
@@ -98,7 +98,7 @@ def test_every_hull_is_convex(name):
 
 
 @pytest.mark.parametrize("name", SHAPES)
-def test_the_union_is_between_the_mesh_and_its_one_hull(name):
+def test_decomposition_volume_lies_between_mesh_and_hull(name):
     mesh, result = made(name)
     solid = trimesh.boolean.union(mesh.split(), engine="manifold")
     union = trimesh.boolean.union([trimesh.convex.convex_hull(h) for h in result.hulls], engine="manifold")
@@ -111,7 +111,7 @@ def test_the_union_is_between_the_mesh_and_its_one_hull(name):
 
 
 @pytest.mark.parametrize("name", SHAPES)
-def test_what_stands_out_is_within_the_error(name):
+def test_decomposition_excess_is_within_the_error(name):
     mesh, result = made(name)
     assert result.accuracy.excess <= result.error
     # An oracle of its own: the hulls' corners outside of the mesh, and how far they are from it.
@@ -122,14 +122,14 @@ def test_what_stands_out_is_within_the_error(name):
     assert distances[outside].max(initial=0.0) <= result.accuracy.excess + 2e-5
 
 
-def test_parts_that_are_convex_are_found_exactly():
+def test_decomposition_finds_convex_parts_exactly():
     _, result = made("overlapping")
     assert len(result.hulls) == 2
     assert result.accuracy.volume == pytest.approx(0.002 - 0.05**3, rel=1e-2)
     assert result.accuracy.excess == 0.0
 
 
-def test_the_same_mesh_gives_the_same_hulls(file):
+def test_decomposition_is_reproducible(file):
     mesh = file(finger())
     first, second = (
         decompose(mesh, DecompositionSettings(0.0014), force=True).decomposition for _ in range(2)
@@ -139,7 +139,7 @@ def test_the_same_mesh_gives_the_same_hulls(file):
         np.testing.assert_array_equal(one, other)
 
 
-def test_a_surface_that_is_not_closed_is_wrapped_and_said_so(file):
+def test_open_surface_is_wrapped_with_a_remark(file):
     half = trimesh.Trimesh(cube().vertices, cube().faces[:11])
     result = decompose(file(half), DecompositionSettings(0.1)).decomposition
     assert result.accuracy.mesh_volume is None
@@ -155,7 +155,7 @@ def _surface(mesh):
     return Faces(np.array(mesh.vertices), np.array(mesh.faces, dtype=np.int64))
 
 
-def test_measures_of_an_ell_and_its_hull():
+def test_accuracy_of_the_hull_of_an_ell():
     mesh = _surface(ell())
     measured = measure_accuracy(mesh, [Polytope.from_points(mesh.vertices)])
     # The middle of the slanted face of the hull is 75 mm from the sides of both legs.
@@ -165,7 +165,7 @@ def test_measures_of_an_ell_and_its_hull():
     assert measured.volume == pytest.approx(measured.hull_volume, rel=1e-12)
 
 
-def test_measures_of_an_ell_and_one_leg():
+def test_accuracy_of_one_leg_of_an_ell():
     leg = cube((0.2, 0.05, 0.05), (0.1, 0.025, 0.025)).vertices
     measured = measure_accuracy(_surface(ell()), [Polytope.from_points(np.array(leg))])
     assert measured.uncovered == pytest.approx(0.15, abs=1e-5)
@@ -174,7 +174,7 @@ def test_measures_of_an_ell_and_one_leg():
 
 
 @pytest.mark.parametrize("overlap", [0.0, 0.3, 1.0])
-def test_the_volume_of_a_union_counts_what_overlaps_once(overlap):
+def test_union_volume_counts_overlaps_once(overlap):
     cubes = [
         Polytope.from_points(np.array(cube((1, 1, 1), (k * (1 - overlap), 0, 0)).vertices)) for k in range(2)
     ]
@@ -182,7 +182,7 @@ def test_the_volume_of_a_union_counts_what_overlaps_once(overlap):
     assert measured.volume == pytest.approx(2 - overlap, rel=1e-2)
 
 
-def test_a_surface_is_closed_if_every_edge_is_passed_both_ways():
+def test_is_closed_needs_every_edge_in_both_directions():
     faces = np.array(cube().faces, dtype=np.int64)
     assert is_closed(faces)
     assert is_closed(faces[:, ::-1])
@@ -191,7 +191,7 @@ def test_a_surface_is_closed_if_every_edge_is_passed_both_ways():
     assert not is_closed(np.concatenate([faces, faces]))
 
 
-def test_hulls_are_joined_where_that_adds_least():
+def test_reduce_hulls_joins_where_volume_grows_least():
     row = [Polytope.from_points(np.array(cube((1, 1, 1), (x, 0, 0)).vertices)) for x in (0, 1, 2, 10)]
     joined = reduce_hulls(row, 2)
     assert sorted(round(one.volume, 9) for one in joined) == [1.0, 3.0]
@@ -199,7 +199,7 @@ def test_hulls_are_joined_where_that_adds_least():
     assert reduce_hulls(row, 4) == row
 
 
-def test_hulls_inside_of_others_and_splinters_are_left_out():
+def test_clean_hulls_drops_contained_and_degenerate_hulls():
     large, small = (np.array(cube((e, e, e)).vertices) for e in (1.0, 0.5))
     line = np.outer(np.arange(4.0), [1, 0, 0])
     (one,) = clean_hulls([small, line, large], Polytope.from_points(2 * large))
@@ -208,7 +208,7 @@ def test_hulls_inside_of_others_and_splinters_are_left_out():
     np.testing.assert_allclose(np.abs(one.points), 0.5, atol=1e-6)
 
 
-def test_a_part_inside_out_is_a_hole_and_stays_with_what_is_around_it(file):
+def test_part_that_faces_inwards_is_a_hole(file):
     hole = cube((0.05, 0.05, 0.05))
     hole.invert()
     hollow = clean_mesh(file(trimesh.util.concatenate([cube(), hole]), "hollow.stl"))
@@ -236,7 +236,7 @@ def plain(tmp_path, monkeypatch):
     fake_coacd(tmp_path / "fake", monkeypatch, ONE_HULL)
 
 
-def test_what_is_in_the_cache_is_not_made_again(file, plain, monkeypatch):
+def test_decompose_reads_the_cache(file, plain, monkeypatch):
     mesh = file(cube())
     assert find_hulls(mesh) is None
     first = decompose(mesh)
@@ -254,21 +254,21 @@ def test_what_is_in_the_cache_is_not_made_again(file, plain, monkeypatch):
     assert find_hulls(file(cube(), scale=(1.0, 2.0, 1.0))) is None
 
 
-def test_without_settings_the_latest_counts(file, plain):
+def test_find_hulls_without_settings_returns_the_latest(file, plain):
     mesh = file(cube())
     decompose(mesh, DecompositionSettings(max_hulls=5))
     latest = decompose(mesh, DecompositionSettings(error=0.01))
     assert hull_cache.find_entry(clean_mesh(mesh).digest).error == latest.decomposition.error == 0.01
 
 
-def test_a_scale_is_applied_and_may_mirror(file, plain):
+def test_decompose_applies_scale_and_mirroring(file, plain):
     mesh = file(ell(), scale=(-1.0, 2.0, 0.5))
     (hull,) = decompose(mesh).decomposition.hulls
     np.testing.assert_allclose(hull.min(axis=0), [-0.2, 0, 0], atol=1e-7)
     np.testing.assert_allclose(hull.max(axis=0), [0, 0.4, 0.025], atol=1e-7)
 
 
-def test_the_folder_is_this_users_and_files_are_whole(file, plain, cache, caplog):
+def test_cache_folder_is_private_and_damaged_files_are_dropped(file, plain, cache, caplog):
     mesh = file(cube())
     decompose(mesh)
     folder = cache / "decompositions"
@@ -286,7 +286,7 @@ def test_the_folder_is_this_users_and_files_are_whole(file, plain, cache, caplog
         Decomposition.from_bytes(b"no archive")
 
 
-def test_the_cache_is_bounded_listed_and_cleared(file, plain, monkeypatch):
+def test_cache_is_bounded_listed_and_cleared(file, plain, monkeypatch):
     small, large = file(cube(), "small.stl"), file(cube((1, 1, 1)), "large.stl")
     decompose(small)
     decompose(large)
@@ -331,7 +331,7 @@ WRONG = {
 
 
 @pytest.mark.parametrize("name", WRONG)
-def test_a_failure_of_coacd_is_an_error_that_names_the_file(file, tmp_path, monkeypatch, capfd, name):
+def test_coacd_failure_is_an_error_that_names_the_file(file, tmp_path, monkeypatch, capfd, name):
     body, message = WRONG[name]
     fake_coacd(tmp_path / "fake", monkeypatch, body)
     limits = ResourceLimits(seconds=1.0 if name == "hangs" else 100.0)
@@ -343,13 +343,13 @@ def test_a_failure_of_coacd_is_an_error_that_names_the_file(file, tmp_path, monk
 
 
 @pytest.mark.skipif(sys.platform != "linux", reason="the memory of a process is bounded on Linux only")
-def test_memory_is_bounded(file, tmp_path, monkeypatch):
+def test_coacd_memory_is_bounded(file, tmp_path, monkeypatch):
     fake_coacd(tmp_path / "fake", monkeypatch, "bytearray(3 * 2**30)\n" + ONE_HULL)
     with pytest.raises(DecompositionError, match="more memory"):
         decompose(file(cube()), limits=ResourceLimits(memory=2 * 2**30))
 
 
-def test_what_is_done_before_an_interruption_is_kept(file, tmp_path, monkeypatch):
+def test_decompose_all_keeps_results_before_an_interruption(file, tmp_path, monkeypatch):
     fake_coacd(tmp_path / "fake", monkeypatch, "while len(mesh.vertices) > 8: pass\n" + ONE_HULL)
     good, endless = file(cube(), "good.stl"), file(ell(), "endless.stl")
     outcomes = decompose_all([good, endless], jobs=2)
@@ -359,7 +359,7 @@ def test_what_is_done_before_an_interruption_is_kept(file, tmp_path, monkeypatch
     assert find_hulls(endless) is None
 
 
-def test_a_process_does_not_outlive_whoever_started_it(tmp_path, monkeypatch):
+def test_coacd_process_does_not_outlive_its_parent(tmp_path, monkeypatch):
     fake_coacd(tmp_path / "fake", monkeypatch, "while True: pass")
     box = cube()
     np.savez(tmp_path / "in.npz", vertices=box.vertices, faces=box.faces, parts=np.zeros(12, dtype=int))
@@ -400,7 +400,7 @@ BAD = {
 
 
 @pytest.mark.parametrize("name", BAD)
-def test_meshes_that_cannot_be_decomposed_are_refused_by_file(file, monkeypatch, name):
+def test_decompose_refuses_unsuitable_meshes_and_names_the_file(file, monkeypatch, name):
     mesh, kind, message = BAD[name]
     monkeypatch.setattr(convex_decomposition, "run_coacd", None)
     bad = file(mesh(), name)
@@ -411,7 +411,7 @@ def test_meshes_that_cannot_be_decomposed_are_refused_by_file(file, monkeypatch,
 
 
 @pytest.mark.parametrize("content", [b"", b"this is no mesh", b"solid x\nendsolid x\n"])
-def test_files_that_are_no_meshes_are_refused(tmp_path, content):
+def test_decompose_refuses_files_that_are_no_meshes(tmp_path, content):
     (tmp_path / "none.stl").write_bytes(content)
     with pytest.raises(FormatError, match=r"none\.stl"):
         decompose(Mesh("none.stl", folder=str(tmp_path)))
@@ -420,24 +420,24 @@ def test_files_that_are_no_meshes_are_refused(tmp_path, content):
 
 
 @pytest.mark.parametrize("scale", [(0.0, 1.0, 1.0), (np.nan, 1.0, 1.0), (np.inf, 1.0, 1.0)])
-def test_a_scale_that_is_none_is_refused(file, scale):
+def test_decompose_refuses_an_invalid_scale(file, scale):
     with pytest.raises(InvalidValueError, match="scale"):
         decompose(file(cube(), scale=scale))
 
 
-def test_meshes_of_too_many_triangles_are_refused(file, monkeypatch):
+def test_decompose_refuses_too_many_triangles(file, monkeypatch):
     monkeypatch.setattr("kineverse.geometry.decomposition.mesh_cleanup.MOST_FACES", 10)
     with pytest.raises(InvalidValueError, match="12 triangles"):
         decompose(file(cube()))
 
 
 @pytest.mark.parametrize("asked", [{"error": 0.0}, {"error": np.nan}, {"error": -1.0}, {"max_hulls": 0}])
-def test_settings_that_make_no_sense_are_refused(asked):
+def test_decomposition_settings_refuse_invalid_values(asked):
     with pytest.raises(InvalidValueError):
         DecompositionSettings(**asked)
 
 
-def test_one_bad_mesh_does_not_stop_the_others(file, plain, tmp_path):
+def test_decompose_all_continues_after_an_error(file, plain, tmp_path):
     meshes = [Mesh("gone.stl", folder=str(tmp_path)), file(cube(), "a.stl"), file(ell(), "b.stl")]
     found = {outcome.mesh.uri: outcome for outcome in decompose_all(meshes, jobs=2)}
     assert "gone.stl" in str(found["gone.stl"].error)

@@ -1,4 +1,4 @@
-"""Which bodies move with which symbols, and what that does to distances."""
+"""Dependence of bodies and distances on symbols."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from kineverse.geometry import Scene
 from kineverse.model.body import Box
 
 
-def test_opening_the_fridge_moves_its_door_and_its_handle_and_nothing_else():
+def test_bodies_moved_by_a_hinge_are_the_door_and_its_handle():
     scene = Scene(kv.load("kitchen"))
     wanted = ("kitchen/fridge_door", "kitchen/fridge_door_handle")
     assert scene.bodies_moved_by("kitchen/fridge_door") == wanted
@@ -23,7 +23,7 @@ def test_opening_the_fridge_moves_its_door_and_its_handle_and_nothing_else():
 
 
 @pytest.mark.parametrize("base", ["DifferentialDrive", "OmniBase"])
-def test_wheels_move_the_whole_robot(base):
+def test_bodies_moved_by_a_wheel_are_the_whole_robot(base):
     model = kv.Model()
     with model.edit() as edit:
         options = {"radius": 0.1, "track": 0.4} if base == "DifferentialDrive" else {}
@@ -42,7 +42,7 @@ def test_wheels_move_the_whole_robot(base):
     }
 
 
-def test_the_crank_of_a_loop_moves_what_follows_it():
+def test_bodies_moved_by_a_crank_include_those_of_dependent_coordinates():
     model = kv.load("articulations/four_bar")
     scene = Scene(model)
     (crank,) = model.degrees_of_freedom
@@ -52,7 +52,7 @@ def test_the_crank_of_a_loop_moves_what_follows_it():
         assert set(scene.bodies_moved_by(follower)) <= moved
 
 
-def test_only_distances_that_are_listed_change():
+def test_pairs_affected_by_contains_every_pair_whose_distance_changes():
     model = arm_among_boxes()
     scene = Scene(model)
     rng = np.random.default_rng(0)
@@ -80,7 +80,7 @@ def _pair(known, names):
     return next(pair for pair in known if frozenset(pair) == names)
 
 
-def test_a_symbol_that_nobody_knows_is_an_error():
+def test_bodies_moved_by_refuses_an_unknown_symbol():
     scene = Scene(kv.load("kitchen"))
     with pytest.raises(kv.errors.UnknownNameError, match="kitchen/fridge_door"):
         scene.bodies_moved_by("kitchen/fridge_dor")

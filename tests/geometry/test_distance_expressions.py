@@ -23,7 +23,7 @@ def slopes(scene, state, pair, symbols, step=1e-5):
     return np.array(found)
 
 
-def test_the_gradient_is_that_of_the_distance():
+def test_gradient_of_a_distance_expression_matches_finite_differences():
     model = arm_among_boxes()
     scene = Scene(model)
     rng = np.random.default_rng(7)
@@ -48,7 +48,7 @@ def test_the_gradient_is_that_of_the_distance():
 
 @pytest.mark.parametrize("geometry", [Box((0.4, 0.3, 0.2)), Sphere(0.2), Capsule(0.1, 0.3), Cylinder(0.2, 0.3),
                                       Ellipsoid((0.2, 0.3, 0.1))])  # fmt: skip
-def test_it_is_signed_and_finite_across_contact(geometry):
+def test_distance_expression_is_signed_and_finite_across_contact(geometry):
     """A thing comes down on a table, through it, and the distance falls at the same rate all the way."""
     model = kv.Model()
     height, turn = kv.position("height"), kv.position("turn")
@@ -71,7 +71,7 @@ def test_it_is_signed_and_finite_across_contact(geometry):
         assert slope[1] == pytest.approx(turning, abs=2e-3)
 
 
-def test_it_is_a_constraint_and_survives_a_document(tmp_path):
+def test_distance_expression_as_constraint_survives_a_document(tmp_path):
     model = arm_among_boxes(boxes=2)
     scene = Scene(model)
     state = random_state(model, np.random.default_rng(3))
@@ -91,7 +91,7 @@ def test_it_is_a_constraint_and_survives_a_document(tmp_path):
     assert rows is not None
 
 
-def test_its_symbols_are_the_same_every_time():
+def test_distance_expression_reuses_its_symbols():
     model = arm_among_boxes(boxes=2)
     scene = Scene(model)
     rng = np.random.default_rng(3)
@@ -103,7 +103,7 @@ def test_its_symbols_are_the_same_every_time():
     assert not any(key.path.startswith("distance/") for key in one.expression.gradient())
 
 
-def test_no_two_pairs_of_bodies_share_symbols():
+def test_distance_expressions_of_different_pairs_have_different_symbols():
     """The word that stands between two names may be a part of them too."""
     model = kv.Model()
     slide = kv.position("slide")
@@ -133,7 +133,7 @@ def test_no_two_pairs_of_bodies_share_symbols():
     assert "distance/a/to/b/point_a/x" in paths  # as in documents that there are
 
 
-def test_another_scene_takes_over_the_parameters_that_the_model_has(tmp_path):
+def test_distance_expression_reuses_parameters_of_the_model(tmp_path):
     """A program that reads its own document again speaks of the same distance, at whatever state it begins."""
     model = kv.load("kitchen")
     pair = "kitchen/fridge_door_handle", "kitchen/sink_area"

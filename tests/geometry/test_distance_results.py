@@ -1,4 +1,4 @@
-"""Lists of pairs whose entries are made when they are looked at."""
+"""Sequences of distance results, whose entries are made on access."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ def scene():
     return scene
 
 
-def test_it_is_a_sequence_of_pairs(scene):
+def test_distance_results_are_a_sequence(scene):
     found = scene.pairs_within(0.5)
     assert isinstance(found, DistanceResults)
     assert len(found) == len(list(found)) > 5
@@ -28,7 +28,7 @@ def test_it_is_a_sequence_of_pairs(scene):
     assert not scene.pairs_within(0.0)[:0]
 
 
-def test_its_arrays_and_its_entries_say_the_same(scene):
+def test_arrays_of_distance_results_match_the_entries(scene):
     found = scene.pairs_within(0.5)
     order = {name: k for k, name in enumerate(scene.bodies)}
     for k, pair in enumerate(found):
@@ -41,7 +41,7 @@ def test_its_arrays_and_its_entries_say_the_same(scene):
         np.testing.assert_array_equal(alone.point_a, pair.point_a)
 
 
-def test_it_stays_when_the_scene_moves_on(scene):
+def test_distance_results_stay_valid_after_an_update(scene):
     found = scene.pairs_within(0.5)
     before = found.distances.copy(), found.normals.copy(), [str(pair) for pair in found]
     scene.update(random_state(scene.model, np.random.default_rng(1)))
@@ -51,7 +51,7 @@ def test_it_stays_when_the_scene_moves_on(scene):
     assert [str(pair) for pair in found] == before[2]
 
 
-def test_its_text_lists_the_nearest(scene):
+def test_repr_of_distance_results_lists_the_nearest(scene):
     found = scene.pairs_within(0.5)
     text = repr(found).splitlines()
     assert text[0] == f"<{len(found)} pairs"

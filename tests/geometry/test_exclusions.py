@@ -1,4 +1,4 @@
-"""What scenes do not look at, and why; and solids as triangles."""
+"""Excluded shapes and pairs with their reasons; surfaces of solids."""
 
 from __future__ import annotations
 
@@ -40,7 +40,7 @@ def with_bad_bodies(folder):
     return model
 
 
-def test_shapes_that_cannot_be_used_are_named_and_the_rest_can_be_asked(tmp_path):
+def test_find_unusable_shapes_names_them_and_leave_out_excludes_them(tmp_path):
     model = with_bad_bodies(tmp_path)
     problems = find_unusable_shapes(model)
     assert set(problems) == {
@@ -75,14 +75,14 @@ def test_shapes_that_cannot_be_used_are_named_and_the_rest_can_be_asked(tmp_path
 
 
 @pytest.mark.parametrize("option", ["leave_out", "triangles", "decomposed"])
-def test_names_that_mean_no_body_are_refused(option):
+def test_scene_refuses_unknown_names_in_options(option):
     model = arm_among_boxes(boxes=1)
     with pytest.raises(kv.errors.UnknownNameError, match=f"{option}= names 'hnad'.*hand"):
         Scene(model, **{option: ["hnad"]})
     assert Scene(model, **{option: ["nothing*"]}).bodies == Scene(model).bodies
 
 
-def test_every_pair_is_looked_at_or_there_is_a_reason():
+def test_excluded_pairs_have_a_reason_and_checked_pairs_none():
     model = arm_among_boxes()
     with model.edit() as edit:
         edit.add_frame("hand/camera", "hand", kv.translation(0, 0, 0.1), body(Sphere(0.02)))
@@ -108,7 +108,7 @@ def test_every_pair_is_looked_at_or_there_is_a_reason():
 
 
 @given(st.integers(0, 2**32 - 1), st.integers(4, 60))
-def test_hulls_are_closed_surfaces_seen_from_outside(seed, count):
+def test_solid_surface_of_a_hull_is_closed_and_faces_outwards(seed, count):
     points = np.random.default_rng(seed).normal(size=(count, 3))
     solid = solid_from_geometry(Box((1, 1, 1)))
     assert solid_surface(solid) == Box((1, 1, 1))
@@ -120,7 +120,7 @@ def test_hulls_are_closed_surfaces_seen_from_outside(seed, count):
     np.testing.assert_allclose(np.cross(b - a, c - a).sum(axis=0), 0.0, atol=1e-9)
 
 
-def test_of_many_missing_meshes_a_few_are_listed_each_in_one_short_line(tmp_path):
+def test_error_for_many_missing_meshes_lists_a_few_in_short_lines(tmp_path):
     model = kv.Model()
     with model.edit() as edit:
         for k in range(20):

@@ -1,4 +1,4 @@
-"""Meshes as hulls and as triangles; bad ones are named, and the scene goes on without them."""
+"""Meshes as hulls and as triangles; errors name unusable meshes, and other queries still work."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from kineverse.geometry.shapes import THICKNESS, convex_hull, solid_from_geometr
 from kineverse.model.body import Body, Box, Capsule, Cone, Cylinder, Ellipsoid, Mesh, Shape, Sphere
 
 
-def test_hulls_are_those_of_scipy():
+def test_convex_hulls_match_scipy():
     rng = np.random.default_rng(0)
     for scale in (1.0, 1e-3, 10.0):
         points = rng.normal(size=(300, 3)) * scale
@@ -31,7 +31,7 @@ def saved(mesh: trimesh.Trimesh, folder, name: str) -> Mesh:
 
 
 @pytest.mark.parametrize("ending", ["stl", "obj", "dae", "ply"])
-def test_a_mesh_is_its_hull_or_its_triangles(tmp_path, ending):
+def test_mesh_is_its_hull_or_its_triangles(tmp_path, ending):
     torus = trimesh.creation.torus(0.5, 0.1)
     mesh = saved(torus, tmp_path, f"torus.{ending}")
     model = kv.Model()
@@ -46,7 +46,7 @@ def test_a_mesh_is_its_hull_or_its_triangles(tmp_path, ending):
         assert scene.distance("torus", "ball").distance == pytest.approx(above, abs=0.02)
 
 
-def test_scale_stretches_and_mirrors(tmp_path):
+def test_mesh_scale_stretches_and_mirrors(tmp_path):
     corner = trimesh.Trimesh(
         [[0, 0, 0], [1, 0, 0], [0, 1, 0], [0, 0, 1]], [[0, 2, 1], [0, 1, 3], [0, 3, 2], [1, 2, 3]]
     )
@@ -63,7 +63,7 @@ def test_scale_stretches_and_mirrors(tmp_path):
         assert solid_from_geometry(scaled) is solid_from_geometry(scaled)
 
 
-def test_files_of_equal_content_are_one_solid(tmp_path):
+def test_mesh_files_of_equal_content_share_a_solid(tmp_path):
     one = saved(trimesh.creation.box((1, 2, 3)), tmp_path, "one.stl")
     (tmp_path / "other.stl").write_bytes((tmp_path / "one.stl").read_bytes())
     assert solid_from_geometry(one) is solid_from_geometry(Mesh("other.stl", folder=str(tmp_path)))
@@ -71,7 +71,7 @@ def test_files_of_equal_content_are_one_solid(tmp_path):
     assert solid_from_geometry(one) is not solid_from_geometry(one, triangles=True)
 
 
-def test_a_flat_mesh_is_given_a_thickness(tmp_path):
+def test_flat_mesh_is_thickened(tmp_path):
     pane = trimesh.Trimesh([[0, 0, 0], [1, 0, 0], [1, 1, 0], [0, 1, 0]], [[0, 1, 2], [0, 2, 3]])
     solid = solid_from_geometry(saved(pane, tmp_path, "pane.stl"))
     np.testing.assert_allclose(2 * solid.half, [1, 1, THICKNESS], atol=1e-9)
@@ -142,14 +142,14 @@ def check(model, *names):
 
 
 @pytest.mark.parametrize("name", BAD_MESHES)
-def test_a_bad_mesh_is_named_with_its_body(tmp_path, name):
+def test_unusable_mesh_is_named_with_its_body(tmp_path, name):
     if BAD_MESHES[name] is not None:
         (tmp_path / name).write_bytes(BAD_MESHES[name])
     check(with_a_bad_one(Mesh(name, folder=str(tmp_path))), name)
 
 
 @pytest.mark.parametrize("name", BAD_MESHES)
-def test_a_bad_mesh_is_also_none_as_triangles(tmp_path, name):
+def test_unusable_mesh_is_refused_as_triangles(tmp_path, name):
     if BAD_MESHES[name] is not None:
         (tmp_path / name).write_bytes(BAD_MESHES[name])
     scene = Scene(with_a_bad_one(Mesh(name, folder=str(tmp_path))), triangles=["bad"])
@@ -158,7 +158,7 @@ def test_a_bad_mesh_is_also_none_as_triangles(tmp_path, name):
         scene.distance("good", "bad")
 
 
-def test_triangles_without_an_area_are_not_there(tmp_path):
+def test_degenerate_triangles_are_ignored(tmp_path):
     """For coal one that is a point or a line touches everything."""
     corners, degenerate = "v 0 0 0\nv 1 0 0\nv 0 1 0\nv 0 0 1\nv .5 0 0\n", "f 1 1 2\nf 2 2 2\nf 1 2 5\n"
     (tmp_path / "open.obj").write_text(corners + "f 1 2 3\nf 1 2 4\n" + degenerate)
@@ -169,23 +169,23 @@ def test_triangles_without_an_area_are_not_there(tmp_path):
 
 
 @pytest.mark.parametrize("shape", BAD_SHAPES, ids=str)
-def test_sizes_that_cannot_be_are_named_with_their_body(shape):
+def test_impossible_sizes_are_named_with_their_body(shape):
     check(with_a_bad_one(shape), type(shape).__name__.lower())
 
 
 @pytest.mark.parametrize("scale", [(0, 1, 1), (1, np.nan, 1), (1, 1, np.inf)])
-def test_a_scale_that_flattens_is_refused(tmp_path, scale):
+def test_scale_with_a_factor_of_zero_is_refused(tmp_path, scale):
     mesh = saved(trimesh.creation.box(), tmp_path, "box.stl")
     check(with_a_bad_one(Mesh(mesh.uri, scale=scale, folder=mesh.folder)), "box.stl", "scale")
 
 
-def test_an_enormous_file_is_not_read(tmp_path, monkeypatch):
+def test_mesh_file_above_the_limit_is_not_read(tmp_path, monkeypatch):
     monkeypatch.setattr(mesh_files, "LARGEST_FILE", 100)
     mesh = saved(trimesh.creation.icosphere(), tmp_path, "large.stl")
     check(with_a_bad_one(mesh), "large.stl", "MiB")
 
 
-def test_several_bad_ones_are_listed(tmp_path):
+def test_error_lists_several_unusable_shapes(tmp_path):
     model = with_a_bad_one(Sphere(0.0))
     with model.edit() as edit:
         edit.add_frame("worse", "world", np.eye(4), body(Mesh("gone.stl", folder=str(tmp_path))))
@@ -195,7 +195,7 @@ def test_several_bad_ones_are_listed(tmp_path):
         scene.pairs_within(1.0)
 
 
-def test_a_pose_that_is_not_finite_moves_nothing():
+def test_update_with_poses_that_are_not_finite_moves_nothing():
     model = kv.Model()
     x = kv.position("x")
     with model.edit() as edit:
@@ -212,7 +212,7 @@ def test_a_pose_that_is_not_finite_moves_nothing():
     assert scene.distance("odd", "ball").distance == pytest.approx(0.0, abs=1e-6)
 
 
-def test_wrong_names_and_values_are_errors():
+def test_scene_refuses_wrong_names_and_values():
     model = with_a_bad_one(Sphere(0.5))
     scene = Scene(model)
     with pytest.raises(kv.errors.UnknownNameError, match=r"'x'|x: call"):
@@ -237,7 +237,7 @@ def test_wrong_names_and_values_are_errors():
         Scene(model, rules=[("good",), 3])
 
 
-def test_without_coal_the_extra_is_named(monkeypatch):
+def test_missing_coal_error_names_the_extra(monkeypatch):
     monkeypatch.setitem(__import__("sys").modules, "coal", None)
     with pytest.raises(kv.errors.MissingDependencyError, match=r"\[geometry\]"):
         Scene(with_a_bad_one(Sphere(0.5)))

@@ -1,4 +1,4 @@
-"""Distances of pairs against MuJoCo, and against what a distance is."""
+"""Distances of pairs against MuJoCo, and against the definition of a distance."""
 
 from __future__ import annotations
 
@@ -47,7 +47,7 @@ def measured(a, b, poses):
 
 
 @pytest.mark.parametrize(("one", "other"), PAIRS)
-def test_signed_distances_are_those_of_mujoco(one, other, shapes, mujoco_pairs):
+def test_signed_distances_match_mujoco(one, other, shapes, mujoco_pairs):
     rng = np.random.default_rng([KINDS.index(one), KINDS.index(other)])
     exact = one in EXACT and other in EXACT
     tolerance = 1e-6 if exact else 1e-4
@@ -74,7 +74,7 @@ def test_signed_distances_are_those_of_mujoco(one, other, shapes, mujoco_pairs):
 
 
 @pytest.mark.parametrize(("one", "other"), PAIRS)
-def test_depth_is_the_shortest_way_out(one, other, shapes):
+def test_depth_is_the_shortest_separating_translation(one, other, shapes):
     rng = np.random.default_rng([2, KINDS.index(one), KINDS.index(other)])
     directions = rng.normal(size=(2000, 3))
     directions /= np.linalg.norm(directions, axis=1, keepdims=True)
@@ -87,7 +87,7 @@ def test_depth_is_the_shortest_way_out(one, other, shapes):
 
 
 @pytest.mark.parametrize(("one", "other"), PAIRS)
-def test_in_touch_the_normal_is_still_right(one, other, shapes):
+def test_normal_of_touching_solids_is_right(one, other, shapes):
     rng = np.random.default_rng([3, KINDS.index(one), KINDS.index(other)])
     a, b = shapes[one][0], shapes[other][1]
     for wanted in (0.0, 1e-12, 1e-9, 1e-7, 2e-6, -1e-12, -1e-9, -1e-7, -2e-6):
@@ -102,7 +102,7 @@ def test_in_touch_the_normal_is_still_right(one, other, shapes):
 
 
 @pytest.mark.parametrize(("one", "other"), PAIRS)
-def test_almost_in_touch_the_normal_shows_the_gap(one, other, shapes):
+def test_normal_of_almost_touching_solids_confirms_the_gap(one, other, shapes):
     rng = np.random.default_rng([6, KINDS.index(one), KINDS.index(other)])
     a, b = shapes[one][0], shapes[other][1]
     for space in (1e-5, 1e-4, 1e-3):
@@ -120,7 +120,7 @@ def test_almost_in_touch_the_normal_shows_the_gap(one, other, shapes):
 
 
 @pytest.mark.parametrize("other", [Box((2.0, 0.004, 0.002)), Capsule(0.001, 2.0), Box((0.002, 2.0, 2.0))])
-def test_needles_and_plates_in_touch_touch(other):
+def test_needles_and_plates_touch_with_distance_zero(other):
     rng = np.random.default_rng(7)
     solids = solid_from_geometry(Box((0.0002, 0.11, 0.21))), solid_from_geometry(other)
     for _ in range(60):
@@ -138,7 +138,7 @@ def test_needles_and_plates_in_touch_touch(other):
         np.testing.assert_allclose(point_a, point_b, atol=2e-5)
 
 
-def test_where_coal_fails_altogether_there_is_still_a_way_out(shapes, monkeypatch):
+def test_search_separates_solids_when_coal_fails(shapes, monkeypatch):
     monkeypatch.setattr(Narrowphase, "_is_unit_normal", lambda narrow: False)
     rng = np.random.default_rng(13)
     for one, other in PAIRS:
@@ -162,7 +162,7 @@ def test_where_coal_fails_altogether_there_is_still_a_way_out(shapes, monkeypatc
         (Ellipsoid((4.4, 0.0024, 0.0044)), Ellipsoid((0.78, 0.58, 0.0008)), 0.0, (0.0, 0.0, 0.0052)),
     ],
 )
-def test_where_thin_things_touch_the_normal_shows_their_depth(one, other, turn, position):
+def test_depth_of_thin_solids_matches_the_gap_along_the_normal(one, other, turn, position):
     """Here coal has a depth and a normal of length one that have nothing to do with each other."""
     rotation = Rotation.from_rotvec([0, 0, turn]).as_matrix()
     poses = np.stack([np.eye(4)[:3], np.column_stack([rotation, position])])
@@ -177,7 +177,7 @@ def test_where_thin_things_touch_the_normal_shows_their_depth(one, other, turn, 
 
 
 @pytest.mark.parametrize(("one", "other"), PAIRS)
-def test_centre_on_centre_there_is_a_way_out(one, other, shapes):
+def test_concentric_solids_have_a_separating_translation(one, other, shapes):
     a, b = shapes[one][0], shapes[other][1]
     poses = np.stack([np.eye(4)[:3]] * 2)
     distance, point_a, point_b, normal = measured(a, b, poses)
@@ -188,7 +188,7 @@ def test_centre_on_centre_there_is_a_way_out(one, other, shapes):
 
 
 @pytest.mark.parametrize(("one", "other"), PAIRS)
-def test_what_is_small_or_large_is_as_near_as_its_enlargement(one, other, shapes):
+def test_distances_scale_with_the_solids(one, other, shapes):
     rng = np.random.default_rng([4, KINDS.index(one), KINDS.index(other)])
     a, b = shapes[one][0], shapes[other][1]
     for factor in (2.0**-9, 2.0**-7, 2.0**-5, 2.0**10):
@@ -204,7 +204,7 @@ def test_what_is_small_or_large_is_as_near_as_its_enlargement(one, other, shapes
             assert gap(a, b, poses, normal) == pytest.approx(distance, abs=1e-4)
 
 
-def test_triangles_have_distances_and_in_touch_a_normal():
+def test_triangle_meshes_have_distances_and_contact_normals():
     box = trimesh.creation.box((1, 1, 1)).subdivide().subdivide()
     surface = _triangle_solid(np.array(box.vertices), np.array(box.faces))
     for solid, reach in (
@@ -227,7 +227,7 @@ def test_triangles_have_distances_and_in_touch_a_normal():
             assert normal @ (point_b - point_a) == pytest.approx(distance, abs=1e-6)
 
 
-def test_triangles_of_a_convex_body_are_as_far_as_its_hull(shapes):
+def test_distances_of_a_triangle_mesh_match_its_hull(shapes):
     rng = np.random.default_rng(11)
     apart = 0
     for _ in range(150):
@@ -255,7 +255,7 @@ STRAYS += [("ellipsoid", seed) for seed in (24, 348, 551, 1693)] + [("cylinder",
 
 
 @pytest.mark.parametrize(("kind", "seed"), STRAYS)
-def test_coal_is_not_believed_where_its_iterations_stray(kind, seed):
+def test_wrong_distances_of_coal_are_corrected(kind, seed):
     """There coal alone says up to a metre less, or touch; of the hull, its triangles, or both."""
     rng = np.random.default_rng(seed)
     points = rng.normal(size=(9, 3)) * 10 ** rng.uniform(-1.5, 0.2, 3)
@@ -285,7 +285,7 @@ CASES = ("any", "flat", "sliver", "small", "far", "touching", "deep")
 @pytest.mark.compiler
 @pytest.mark.parametrize("case", CASES)
 @pytest.mark.parametrize("kind", ["cone", "cylinder", "hull"])
-def test_the_tool_that_checks_many_pairs_finds_nothing(kind, case):
+def test_distances_tool_finds_no_errors(kind, case):
     """``python tools/distances.py --pairs 100000 cone hull`` does so at length."""
     assert collision_library.prepare(wait=True)
     for count in distances.check((kind, "hull"), case, 15, seed=1).values():
@@ -293,6 +293,6 @@ def test_the_tool_that_checks_many_pairs_finds_nothing(kind, case):
         assert count.apart + count.inside + count.unsolved > 0
 
 
-def test_the_tool_finds_what_is_off(monkeypatch):
+def test_distances_tool_reports_errors(monkeypatch):
     monkeypatch.setattr(distances, "by_c", lambda solids, poses: (0.5, np.array([0.0, 0.0, 1.0])))
     assert distances.check(("cone", "hull"), "far", 3, seed=1)["C"].off == 3

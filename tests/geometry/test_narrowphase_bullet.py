@@ -22,7 +22,7 @@ FURTHER = {
     "hull": (-MARGIN, -0.85 * MARGIN),  # the margin goes on top
     "cone": (-MARGIN, -0.85 * MARGIN),
 }
-"""By how much more than the truth Bullet may say that something is away [m]; it has no ellipsoids."""
+"""Largest excess of Bullet's distances over the true ones [m]; it has no ellipsoids."""
 
 PAIRS = list(itertools.combinations_with_replacement(FURTHER, 2))
 SLACK = 1e-4
@@ -54,7 +54,7 @@ def body_of(shape, client):
 
 
 @pytest.mark.parametrize(("one", "other"), PAIRS)
-def test_distances_are_those_of_bullet_with_its_margins(one, other, shapes):
+def test_distances_match_bullet_within_its_margins(one, other, shapes):
     rng = np.random.default_rng([list(FURTHER).index(kind) for kind in (one, other)])
     least, most = np.add(FURTHER[one], FURTHER[other])
     signs = []

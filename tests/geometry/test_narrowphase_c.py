@@ -1,4 +1,4 @@
-"""Distances in C: certain by themselves, equal to coal's, and the same as the slow way in a scene."""
+"""Distances in C: bounded by their witnesses, equal to coal's, and to brute force in a scene."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ def library():
 
 
 def placed(shapes, poses):
-    """Return the table of two pieces that stand at (3, 4) poses."""
+    """Return a table of two objects at (3, 4) poses."""
     table = ObjectTable(2, np.arange(2, dtype=np.int32), 1 - np.eye(2, dtype=np.uint8))
     for k, shape in enumerate(shapes):
         solid = shape.solid
@@ -49,7 +49,7 @@ def measured(table, limit=np.inf):
 
 @settings(max_examples=attempts(200))
 @given(kind=kinds, other=kinds, seed=seeds, spread=st.sampled_from([0.05, 0.3, 1.0, 30.0]))
-def test_a_distance_is_certain(kind, other, seed, spread):
+def test_witness_points_and_normal_bound_the_distance(kind, other, seed, spread):
     """The points are of the bodies and so no nearer; the normal shows a gap, so that nothing is nearer.
 
     In each other, moving them by the depth along the normal separates them, and no other way is shorter.
@@ -80,7 +80,7 @@ def test_a_distance_is_certain(kind, other, seed, spread):
 
 @settings(max_examples=attempts(100))
 @given(kind=kinds, other=kinds, seed=seeds)
-def test_the_other_way_round_it_is_the_same(kind, other, seed):
+def test_distance_is_symmetric(kind, other, seed):
     rng = np.random.default_rng(seed)
     shapes = random_shape(kind, rng), random_shape(other, rng)
     poses = [random_pose(rng, 0.4) for _ in shapes]
@@ -93,7 +93,7 @@ def test_the_other_way_round_it_is_the_same(kind, other, seed):
 
 @settings(max_examples=attempts(100))
 @given(kind=kinds, other=kinds, seed=seeds, limit=st.sampled_from([0.0, 0.1, 0.5]))
-def test_a_limit_changes_no_distance_within_it(kind, other, seed, limit):
+def test_limit_changes_no_distance_within_it(kind, other, seed, limit):
     rng = np.random.default_rng(seed)
     shapes = random_shape(kind, rng), random_shape(other, rng)
     poses = [random_pose(rng, 0.4) for _ in shapes]
@@ -110,7 +110,7 @@ def test_a_limit_changes_no_distance_within_it(kind, other, seed, limit):
         assert limit + (distance - limit) / 2 - 1e-9 <= low <= distance + 1e-9
 
 
-def test_parallel_faces_edges_and_what_touches():
+def test_distances_of_parallel_faces_edges_and_contacts():
     rng = np.random.default_rng(1)
     box, other = random_shape("box", rng), random_shape("box", rng)
     upright = np.eye(4)[:3]
@@ -125,7 +125,7 @@ def test_parallel_faces_edges_and_what_touches():
 
 
 @pytest.mark.parametrize("kind", ["box", "ellipsoid"])
-def test_the_depth_of_what_is_in_the_same_place(kind):
+def test_depth_of_concentric_solids(kind):
     """The origin is the centre of the difference, and all beginnings of the search are degenerate."""
     shape, upright = random_shape(kind, np.random.default_rng(3)), np.eye(4)[:3]
     distance, (point_a, point_b, normal) = measured(placed((shape, shape), (upright, upright)))
@@ -139,7 +139,7 @@ def test_the_depth_of_what_is_in_the_same_place(kind):
     kinds=st.tuples(*[st.sampled_from(["box", "hull"])] * 2),
     spread=st.sampled_from([0.0, 0.05, 0.1]),
 )
-def test_the_depth_of_polytopes_is_that_of_their_difference(seed, kinds, spread):
+def test_depth_of_polytopes_matches_their_minkowski_difference(seed, kinds, spread):
     """The depth is how far the origin is from the nearest face of the hull of all differences of corners."""
     rng = np.random.default_rng(seed)
     shapes = [random_shape(kind, rng) for kind in kinds]
@@ -159,7 +159,7 @@ def test_the_depth_of_polytopes_is_that_of_their_difference(seed, kinds, spread)
 
 @pytest.mark.parametrize("thickness", [1e-3, 1e-5, 1e-7])
 @pytest.mark.parametrize("kind", KINDS)
-def test_a_flat_hull_is_certain_too(kind, thickness):
+def test_distances_of_a_flat_hull_are_bounded(kind, thickness):
     rng = np.random.default_rng(7)
     for _ in range(8):
         shape = random_shape(kind, rng)
@@ -171,7 +171,7 @@ def test_a_flat_hull_is_certain_too(kind, thickness):
         assert normal @ (point_b - point_a) == pytest.approx(distance, abs=1e-9)
 
 
-def test_what_did_not_move_is_not_measured_again():
+def test_static_pairs_are_not_measured_again():
     """Neither is it another distance, where the memory of C gives way or is cleared."""
     model = arm_among_boxes()
     state = random_state(model, np.random.default_rng(0))
@@ -198,7 +198,7 @@ def test_what_did_not_move_is_not_measured_again():
 
 @settings(max_examples=attempts(12))
 @given(seed=seeds, radius=st.sampled_from([0.0, 0.1, 0.4]))
-def test_a_scene_finds_the_same_with_c_and_without_and_by_brute_force(seed, radius):
+def test_scene_agrees_with_c_with_coal_and_with_brute_force(seed, radius):
     model, rng = arm_among_boxes(seed=seed % 7), np.random.default_rng(seed)
     quick, slow = Scene(model), Scene(model)
     state = random_state(model, rng)
@@ -221,7 +221,7 @@ def test_a_scene_finds_the_same_with_c_and_without_and_by_brute_force(seed, radi
 
 @settings(max_examples=attempts(60))
 @given(seed=seeds, count=st.integers(0, 40), radius=st.sampled_from([0.0, 0.5, np.inf]))
-def test_ranks_in_numpy_and_c_agree(seed, count, radius):
+def test_rank_pairs_agrees_in_numpy_and_c(seed, count, radius):
     rng = np.random.default_rng(seed)
     body = rng.integers(5, size=12).astype(np.int32)
     table = ObjectTable(6, body, np.ones((5, 5), dtype=np.uint8))
@@ -237,7 +237,7 @@ def test_ranks_in_numpy_and_c_agree(seed, count, radius):
     assert distances[order].tolist() == sorted(distances[order].tolist())
 
 
-def test_without_a_compiler_coal_measures_everything():
+def test_measure_without_a_compiler_leaves_all_pairs_to_coal():
     library = CollisionLibrary()
     rng = np.random.default_rng(0)
     table = placed([random_shape("box", rng)] * 2, [random_pose(rng, 1.0) for _ in range(2)])
@@ -256,7 +256,7 @@ def narrower():
 
 @settings(max_examples=attempts(30))
 @given(counts=st.tuples(*[st.integers(8, 90)] * 2), seed=seeds, spread=st.sampled_from([0.0, 0.3, 2.0]))
-def test_many_corners_are_found_whatever_the_processor_takes_at_a_time(narrower, counts, seed, spread):
+def test_support_of_many_corners_is_independent_of_the_vector_width(narrower, counts, seed, spread):
     """Each corner is the furthest one in its direction: a ball of them leaves none out of what is measured."""
     rng = np.random.default_rng(seed)
     solids = []

@@ -1,4 +1,4 @@
-"""Rays against MuJoCo and trimesh, points against what a distance is."""
+"""Rays against MuJoCo and trimesh, points against the definition of a distance."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ from kineverse.model.body import Box, Cylinder, Sphere
 
 
 @pytest.mark.parametrize("kind", KINDS)
-def test_rays_are_those_of_mujoco(kind):
+def test_ray_hits_match_mujoco(kind):
     rng = np.random.default_rng(KINDS.index(kind))
     shapes = [random_shape(kind, rng) for _ in range(4)]
     pairs = MujocoPairs(shapes)
@@ -53,7 +53,7 @@ def test_rays_are_those_of_mujoco(kind):
     assert hits > 100
 
 
-def test_rays_meet_triangles_where_trimesh_says():
+def test_ray_hits_on_triangles_match_trimesh():
     rng = np.random.default_rng(0)
     mesh = trimesh.creation.torus(0.5, 0.15, major_sections=24, minor_sections=12)
     solid = _triangle_solid(np.array(mesh.vertices), np.array(mesh.faces))
@@ -73,7 +73,7 @@ def test_rays_meet_triangles_where_trimesh_says():
 
 
 @pytest.mark.parametrize("kind", KINDS)
-def test_a_point_is_as_far_as_the_support_says(kind):
+def test_point_distance_matches_the_support_function(kind):
     """The largest of all gaps between a plane at the point and the shape."""
     rng = np.random.default_rng(3)
     directions = rng.normal(size=(4000, 3))
@@ -88,7 +88,7 @@ def test_a_point_is_as_far_as_the_support_says(kind):
         assert (directions @ point - shape.support(directions, pose)).max() <= distance + 1e-5
 
 
-def test_the_first_of_many_is_hit():
+def test_ray_returns_the_first_of_several_hits():
     model = arm_among_boxes()
     scene = Scene(model)
     rng = np.random.default_rng(2)
@@ -118,7 +118,7 @@ def test_the_first_of_many_is_hit():
     assert hits > 3
 
 
-def test_rays_and_points_in_words():
+def test_ray_and_point_queries_of_a_simple_scene():
     model = kv.Model()
     with model.edit() as edit:
         edit.add_frame("wall", "world", kv.translation(2, 0, 0), body(Box((0.2, 4, 4))))
@@ -138,7 +138,7 @@ def test_rays_and_points_in_words():
 
 
 @pytest.mark.parametrize("origin", [(0, 0), (0, 0, np.nan), "here"])
-def test_a_ray_from_nowhere_is_refused(origin):
+def test_ray_refuses_an_invalid_origin(origin):
     model = kv.Model()
     with model.edit() as edit:
         edit.add_frame("wall", "world", np.eye(4), body(Box((1, 1, 1))))
@@ -150,7 +150,7 @@ def test_a_ray_from_nowhere_is_refused(origin):
         scene.ray((0, 0, 0), (0, 0, 0))
 
 
-def test_rays_of_any_direction_and_from_far_away():
+def test_ray_takes_directions_of_any_length_and_far_origins():
     model = kv.Model()
     with model.edit() as edit:
         edit.add_frame("speck", "world", kv.translation(1.0, 0, 0), body(Sphere(1e-4)))

@@ -1,4 +1,4 @@
-"""A scene answers what brute force answers, at every state, after every edit, in every thread."""
+"""Queries of a scene match brute force, at every state, after every edit, in every thread."""
 
 from __future__ import annotations
 
@@ -21,8 +21,8 @@ def model():
 
 
 @pytest.fixture(params=["numpy", pytest.param("c", marks=pytest.mark.compiler)])
-def either_sweep(request, monkeypatch):
-    """Both ways to find what is near."""
+def either_broadphase(request, monkeypatch):
+    """Broad phase in numpy and in C."""
     library = bindings.CollisionLibrary()
     if request.param == "c":
         assert library.prepare(wait=True)
@@ -33,7 +33,7 @@ def either_sweep(request, monkeypatch):
         monkeypatch.setattr(module, "collision_library", library)
 
 
-def test_what_is_near_is_what_brute_force_finds(model, either_sweep):
+def test_pairs_within_match_brute_force(model, either_broadphase):
     scene = Scene(model)
     rng = np.random.default_rng(1)
     state = random_state(model, rng)
@@ -53,7 +53,7 @@ def test_what_is_near_is_what_brute_force_finds(model, either_sweep):
 
 
 @pytest.mark.parametrize("jump", [1e5, 1e12])
-def test_after_a_jump_of_any_size_answers_are_as_before(model, either_sweep, jump):
+def test_pairs_within_are_exact_after_jumps_of_any_size(model, either_broadphase, jump):
     scene = Scene(model)
     state = model.default_state()
     for rail in (0.0, jump, *(np.arange(8) * 3e-5).tolist()):
@@ -66,7 +66,7 @@ def test_after_a_jump_of_any_size_answers_are_as_before(model, either_sweep, jum
     assert scene.distance("base", "box0").distance == pytest.approx(expected["base", "box0"], abs=1e-6)
 
 
-def test_what_is_beyond_all_measure_is_refused_with_its_name(model, either_sweep):
+def test_update_refuses_poses_that_are_too_far_away(model, either_broadphase):
     scene = Scene(model)
     state = model.default_state()
     scene.update(state)
@@ -83,7 +83,7 @@ def test_what_is_beyond_all_measure_is_refused_with_its_name(model, either_sweep
     assert Scene(far, leave_out=["post"]).bodies == ()
 
 
-def test_most_pairs_are_settled_without_measuring(model):
+def test_bounds_spare_most_distance_computations(model):
     scene = Scene(model)
     state = model.default_state()
     scene.update(state)
@@ -96,7 +96,7 @@ def test_most_pairs_are_settled_without_measuring(model):
     assert measured < 0.3 * len(brute_force(scene, state))
 
 
-def test_one_against_all_and_lists_of_pairs(model):
+def test_distances_to_and_distances_match_brute_force(model):
     scene = Scene(model)
     state = random_state(model, np.random.default_rng(4))
     scene.update(state)
@@ -116,7 +116,7 @@ def test_one_against_all_and_lists_of_pairs(model):
     assert boxes.distance == pytest.approx(boxes.normal @ (boxes.point_b - boxes.point_a), abs=1e-9)
 
 
-def test_answers_do_not_depend_on_what_was_asked_before(model):
+def test_results_do_not_depend_on_earlier_queries(model):
     rng = np.random.default_rng(6)
     states = [random_state(model, rng) for _ in range(6)]
     used = Scene(model)
@@ -135,7 +135,7 @@ def test_answers_do_not_depend_on_what_was_asked_before(model):
     assert (first.a, first.b, first.distance) == (same.a, same.b, same.distance)
 
 
-def test_parts_of_a_scene_against_each_other(model):
+def test_self_pairs_and_pairs_between_select_subtrees(model):
     scene = Scene(model)
     state = random_state(model, np.random.default_rng(8))
     scene.update(state)
@@ -147,7 +147,7 @@ def test_parts_of_a_scene_against_each_other(model):
     }
 
 
-def test_two_scenes_in_two_threads_answer_as_alone(model):
+def test_scenes_in_two_threads_are_independent(model):
     rng = np.random.default_rng(9)
     states = [[random_state(model, rng) for _ in range(40)] for _ in range(2)]
 
@@ -172,7 +172,7 @@ def test_two_scenes_in_two_threads_answer_as_alone(model):
     assert together == alone
 
 
-def test_a_vector_is_a_state(model):
+def test_update_takes_a_vector_of_inputs(model):
     by_name, by_vector = Scene(model), Scene(model)
     state = random_state(model, np.random.default_rng(2))
     by_name.update(dict(state))
@@ -186,7 +186,7 @@ def test_a_vector_is_a_state(model):
 
 @pytest.fixture
 def counted(monkeypatch):
-    """How often pieces are made, solids are asked for, and poses are compiled."""
+    """Numbers of objects made, solids requested, and poses compiled."""
     counts = {"pieces": 0, "solids": 0, "compiled": 0}
 
     def counting(key, function):
@@ -204,7 +204,7 @@ def counted(monkeypatch):
     return counts
 
 
-def test_an_edit_changes_what_it_touches(counted):
+def test_edit_rebuilds_only_the_objects_it_changes(counted):
     model = arm_among_boxes()
     scene = Scene(model)
     state = random_state(model, np.random.default_rng(3))
@@ -246,7 +246,7 @@ def test_an_edit_changes_what_it_touches(counted):
     assert after(remove) == {"pieces": 0, "solids": 0, "compiled": 0}
 
 
-def test_what_is_picked_up_goes_with_the_hand():
+def test_attached_body_moves_with_its_new_parent():
     model = arm_among_boxes(boxes=1)
     state = random_state(model, np.random.default_rng(5))
     scene = Scene(model)
@@ -264,7 +264,7 @@ def test_what_is_picked_up_goes_with_the_hand():
     }
 
 
-def test_a_pose_is_that_of_now_also_right_after_an_edit():
+def test_pose_is_current_right_after_an_edit():
     model = arm_among_boxes(boxes=1)
     scene = Scene(model)
     state = model.default_state()
@@ -274,7 +274,7 @@ def test_a_pose_is_that_of_now_also_right_after_an_edit():
     np.testing.assert_allclose(scene.pose("box0"), model.fk("box0")(state), atol=1e-12)
 
 
-def test_after_an_edit_a_new_symbol_needs_a_value():
+def test_query_after_an_edit_needs_values_of_new_symbols():
     model = arm_among_boxes(boxes=1)
     scene = Scene(model)
     scene.update(model.default_state())
@@ -286,7 +286,7 @@ def test_after_an_edit_a_new_symbol_needs_a_value():
     assert scene.distance("flap", "box0").distance > 0
 
 
-def test_after_an_edit_the_last_state_may_be_impossible():
+def test_query_after_an_edit_reports_an_impossible_last_state():
     model = arm_among_boxes(boxes=1)
     scene = Scene(model)
     scene.update(model.default_state())
@@ -299,7 +299,7 @@ def test_after_an_edit_the_last_state_may_be_impossible():
     assert scene.distance("flap", "box0").distance > 0
 
 
-def test_an_edit_that_a_scene_cannot_follow_is_said_until_it_is_mended():
+def test_query_fails_after_an_invalid_edit_until_it_is_mended():
     model = arm_among_boxes(boxes=1)
     scene = Scene(model)
     scene.update(model.default_state())
@@ -320,7 +320,7 @@ def test_an_edit_that_a_scene_cannot_follow_is_said_until_it_is_mended():
 # -- rules -------------------------------------------------------------------------------------------------
 
 
-def test_neighbours_are_not_looked_at(model):
+def test_adjacent_bodies_are_not_checked(model):
     scene = Scene(model)
     assert not scene.checks_pair("link0", "link1")
     assert not scene.checks_pair("link4", "hand")  # rigidly connected
@@ -331,14 +331,14 @@ def test_neighbours_are_not_looked_at(model):
     assert scene.checks_pair("ball/body", "box0")
 
 
-def test_a_door_is_joined_to_what_it_hangs_on_and_not_to_the_wall():
+def test_door_is_adjacent_to_its_cupboard_and_not_to_the_wall():
     model = kv.load("kitchen")
     scene = Scene(model)
     assert not scene.checks_pair("kitchen/fridge_door", "kitchen/fridge")
     assert scene.checks_pair("kitchen/fridge_door", "kitchen/wall")
 
 
-def test_where_a_loop_is_closed_its_ends_are_joined(tmp_path):
+def test_ends_of_a_closed_loop_are_adjacent(tmp_path):
     model = kv.load("articulations/four_bar")
     model.save(tmp_path / "four_bar.kv.json")
     parts = kv.Model()
@@ -352,7 +352,7 @@ def test_where_a_loop_is_closed_its_ends_are_joined(tmp_path):
         assert not scene.in_collision
 
 
-def test_rules_are_data_and_the_last_one_decides(tmp_path):
+def test_rules_are_kept_as_data_and_the_last_one_decides(tmp_path):
     model = arm_among_boxes()
     scene = Scene(model)
     assert scene.checks_pair("hand", "box0")
@@ -368,7 +368,7 @@ def test_rules_are_data_and_the_last_one_decides(tmp_path):
     assert again.checks_pair("link1", "link0")
 
 
-def test_rules_come_along_where_a_model_is_included(tmp_path):
+def test_rules_of_an_included_model_hold_below_its_prefix(tmp_path):
     part = arm_among_boxes(boxes=2)
     rules = (Rule("hand", why="whatever it meets"), Rule("hand", "box1", check=True))
     with part.edit() as edit:
@@ -389,12 +389,12 @@ def test_rules_come_along_where_a_model_is_included(tmp_path):
 @pytest.mark.parametrize(
     "entry", [("hand", "box0", "no"), ("hand", "box0", 1), ("hand", 3), (), 7, ("", "*")]
 )
-def test_what_is_no_rule_is_refused(model, entry):
+def test_scene_refuses_malformed_rules(model, entry):
     with pytest.raises(kv.errors.InvalidValueError, match="A rule is"):
         Scene(model, rules=[entry])
 
 
-def test_rules_mean_what_their_patterns_match(model):
+def test_rule_with_a_pattern_equals_one_rule_for_each_match(model):
     """A rule for each pair, or a pattern for all of them: the same."""
     scene = Scene(model)
     named = [Rule(a, b) for a in scene.bodies if a.startswith("link") for b in scene.bodies if b[:3] == "box"]
@@ -406,7 +406,7 @@ def test_rules_mean_what_their_patterns_match(model):
     assert not one.checks_pair("box1", "link0")
 
 
-def test_pairs_that_never_touched_are_a_rule(model):
+def test_find_never_colliding_excepts_pairs_that_never_touch(model):
     rng = np.random.default_rng(0)
     states = [random_state(model, rng) for _ in range(30)]
     scene = Scene(model)
@@ -422,7 +422,7 @@ def test_pairs_that_never_touched_are_a_rule(model):
         scene.find_never_colliding([])
 
 
-def test_bodies_without_collision_shapes_are_what_is_seen_of_them():
+def test_visual_shapes_replace_missing_collision_shapes():
     model = kv.Model()
     with model.edit() as edit:
         edit.add_frame("seen", "world", np.eye(4), Body(visuals=(Shape(Box((1, 1, 1))),)))
@@ -436,7 +436,7 @@ def test_bodies_without_collision_shapes_are_what_is_seen_of_them():
     assert objects.bodies_with_visual_collision(model) == ["seen"]
 
 
-def test_what_is_chosen_follows_the_model():
+def test_selected_pairs_follow_the_model():
     """The pairs between two frames are kept until the model changes, and are those of all that are near."""
     scene = Scene(arm := arm_among_boxes())
     scene.update(random_state(arm, np.random.default_rng(2)))

@@ -1,4 +1,4 @@
-"""Scenes whose meshes are the hulls they were decomposed into."""
+"""Scenes with decomposed meshes."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ def model(tmp_path, monkeypatch):
     return model
 
 
-def test_a_ball_is_in_a_tray_and_not_in_its_hull(model):
+def test_decomposed_tray_is_hollow_and_its_hull_is_not(model):
     tray_mesh = model.bodies["tray"].collisions[0].geometry
     decompose(tray_mesh)
     scenes = [kv.geometry.Scene(model, decomposed=which) for which in ((), ("t*",))]
@@ -43,7 +43,7 @@ def test_a_ball_is_in_a_tray_and_not_in_its_hull(model):
         assert hull < 0.0 if height < 0.05 else hull > 0.0
 
 
-def test_what_is_not_in_the_cache_is_its_hull_and_the_log_says_so(model, caplog):
+def test_decomposed_mesh_outside_of_the_cache_is_its_hull_with_a_warning(model, caplog):
     scene = kv.geometry.Scene(model, decomposed=("*",))
     assert "kineverse decompose" in caplog.text
     assert "tray.stl" in caplog.text
@@ -51,7 +51,7 @@ def test_what_is_not_in_the_cache_is_its_hull_and_the_log_says_so(model, caplog)
     assert scene.distance("tray", "ball").distance < 0.0
 
 
-def test_what_is_missing_is_an_error_of_the_question(model, tmp_path, caplog):
+def test_missing_decomposed_mesh_fails_at_the_query(model, tmp_path, caplog):
     (tmp_path / "tray.stl").unlink()
     scene = kv.geometry.Scene(model, decomposed=("*",))
     scene.update({"height": 0.0})
@@ -59,7 +59,7 @@ def test_what_is_missing_is_an_error_of_the_question(model, tmp_path, caplog):
         scene.distance("tray", "ball")
 
 
-def test_hulls_of_the_same_content_are_shared(tmp_path, monkeypatch):
+def test_solids_of_equal_hulls_are_shared(tmp_path, monkeypatch):
     from kineverse.geometry.shapes import solid_from_points
 
     monkeypatch.setenv("KINEVERSE_CACHE_DIR", str(tmp_path / "cache"))

@@ -1,4 +1,4 @@
-"""Robots and kitchens with their meshes, as they are published."""
+"""Scenes of published robots and kitchens with their meshes."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from formats.urdf_texts import shared
 from kineverse.geometry import Scene
 
 
-def test_a_shipped_robot_beside_the_shipped_kitchen():
+def test_scene_of_the_shipped_robot_and_kitchen():
     model = kv.load("kitchen")
     model.include("pr2")
     scene = Scene(model)
@@ -32,7 +32,7 @@ def test_a_shipped_robot_beside_the_shipped_kitchen():
             }
 
 
-def test_the_pr2_beside_the_iai_kitchen(monkeypatch):
+def test_scene_of_the_pr2_in_the_iai_kitchen(monkeypatch):
     packages = [shared("pr2"), shared("iai_kitchen")]
     monkeypatch.setenv("KINEVERSE_PACKAGE_PATH", ":".join(map(str, packages)))
     robot = next(path for path in packages[0].rglob("*.urdf"))

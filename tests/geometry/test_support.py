@@ -1,4 +1,4 @@
-"""How far solids reach, and the search for the widest gap, against what is known without it."""
+"""Support functions and the search for the widest gap, against closed forms."""
 
 from __future__ import annotations
 
@@ -28,14 +28,14 @@ def placed(shapes, poses):
 
 
 @pytest.mark.parametrize(("one", "other"), PAIRS)
-def test_gaps_are_those_of_the_shapes(one, other):
+def test_directional_gaps_match_the_support_functions(one, other):
     shapes, poses, ways = two(one, other, 0, 0.3)
     found = directional_gaps(*placed(shapes, poses), ways)
     np.testing.assert_allclose(found, gap(*shapes, poses, ways), rtol=0, atol=1e-12)
 
 
 @pytest.mark.parametrize("kind", KINDS)
-def test_the_furthest_point_is_on_the_solid_and_on_its_plane(kind):
+def test_support_point_lies_on_the_solid_and_on_the_support_plane(kind):
     (shape, _), poses, ways = two(kind, "box", 1, 0.3)
     solid = placed([shape], poses[:1])[0]
     ways = np.concatenate([ways, poses[0, :, :3].T, -poses[0, :, :3].T])  # along the axes there are faces
@@ -46,7 +46,7 @@ def test_the_furthest_point_is_on_the_solid_and_on_its_plane(kind):
 
 
 @pytest.mark.parametrize(("one", "other"), PAIRS)
-def test_the_widest_gap_is_the_distance(one, other):
+def test_widest_gap_equals_the_distance(one, other):
     """In each other there may be several summits, of which the highest may be missed."""
     for seed, spread in itertools.product(range(3), (0.05, 0.5)):
         shapes, poses, ways = two(one, other, seed, spread)

@@ -1,4 +1,4 @@
-"""Models made of nothing but constraints."""
+"""Models of constraints only."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The checker fails where it has to: wrong claims, missing claims, boxes that are too large or too small."""
+"""The checker: it reports wrong claims, missing claims, and boxes that are too large or too small."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ def lock(*boxes: IntervalBox, hold: str = "stands still", held: kv.Symbol = SPEE
     return Interlock(held, hold, ("lock",), boxes)  # type: ignore[arg-type]
 
 
-def test_the_right_answer_passes() -> None:
+def test_contradictions_accepts_the_right_interlocks() -> None:
     assert reasoning.contradictions(garage(), Interlocks([lock(SHUT)])) == []
     assert interlocks(garage()) == Interlocks([lock(SHUT)])
 
@@ -52,11 +52,11 @@ def test_the_right_answer_passes() -> None:
         [lock(SHUT), lock(IntervalBox({A: Interval(lower=1)}), held=B.derivative())],
     ],
 )
-def test_wrong_answers_do_not(wrong: list[Interlock]) -> None:
+def test_contradictions_reports_wrong_interlocks(wrong: list[Interlock]) -> None:
     assert reasoning.contradictions(garage(), Interlocks(wrong))
 
 
-def test_what_is_unknown_is_not_held_against_anybody() -> None:
+def test_contradictions_accepts_undecided_constraints() -> None:
     assert reasoning.contradictions(garage(), Interlocks([], [Undecided("lock", "of tiredness")])) == []
     elsewhere = Undecided("lock", "of tiredness", (IntervalBox({B: Interval(lower=0.3)}),))
     assert reasoning.contradictions(garage(), Interlocks([], [elsewhere]))
@@ -80,14 +80,14 @@ def test_ranges() -> None:
     assert reasoning.contradictions(subject, Interlocks([kept(0, B + 0.5), nothing]))
 
 
-def test_it_is_short_and_shares_nothing_with_what_it_checks() -> None:
+def test_checker_is_short_and_independent() -> None:
     text = Path(reasoning.certify.__file__).read_text(encoding="utf-8")
     assert len([line for line in text.splitlines() if line.strip()]) < 100
     own = {line.split()[1] for line in text.splitlines() if line.startswith("from .")}
     assert own == {".boxes", ".point_evaluation", ".interlock"}
 
 
-def test_a_claim_is_looked_at_where_its_constraint_is_unknown() -> None:
+def test_contradictions_checks_claims_of_undecided_constraints() -> None:
     """Some of a constraint may be known: what is told of it has to be true all the same."""
     subject = model(lock=(0, SPEED, np.sin(B * B) > 0.5))
     found = interlocks(subject)
@@ -98,18 +98,18 @@ def test_a_claim_is_looked_at_where_its_constraint_is_unknown() -> None:
         assert reasoning.contradictions(subject, wrong) == [f"a:velocity {hold}: not so by lock"]
 
 
-def test_standing_still_is_a_value() -> None:
+def test_contradictions_accepts_a_single_value_as_standing_still() -> None:
     assert reasoning.contradictions(garage(), Interlocks([lock(SHUT, hold="has no value")]))
 
 
-def test_two_speeds_of_any_sign_are_no_norm() -> None:
+def test_contradictions_distinguishes_a_sum_of_speeds_from_a_norm() -> None:
     """Their sum happens to be 0 as often as not where both are at one of their ends."""
     subject = model(lock=(0, SPEED + B.derivative(), kv.position("c") > 0.5))
     for seed in range(5):
         assert reasoning.contradictions(subject, interlocks(subject), seed=seed) == []
 
 
-def test_one_demands_what_the_other_forbids() -> None:
+def test_contradictions_reports_constraints_that_exclude_each_other() -> None:
     """Nothing stands still there: no speed is allowed at all."""
     subject = model(moves=(0.5, SPEED, 1), lock=(-1, SPEED, B > 0.3))
     found = interlocks(subject)

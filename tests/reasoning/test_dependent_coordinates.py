@@ -1,4 +1,4 @@
-"""Conditions on what follows: told by the coordinates that are free, and by angles within a turn."""
+"""Conditions on dependent coordinates: expressed by independent ones, and by angles within a turn."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ def rocker_locked() -> kv.Model:
     return locked("four_bar", ROCKER < 1.9)
 
 
-def test_a_rocker_is_told_by_its_crank() -> None:
+def test_lock_on_a_rocker_is_expressed_by_its_crank() -> None:
     model = rocker_locked()
     found = interlocks(model)
     assert found.undecided == ()
@@ -47,7 +47,7 @@ def test_a_rocker_is_told_by_its_crank() -> None:
 
 
 def by_triangles() -> list[float]:
-    """Return at which angles of the crank the rocker is at 1.9."""
+    """Return the angles of the crank at which the rocker is at 1.9."""
 
     def excess(angle: float) -> float:
         x, y = 0.12 * math.cos(angle) - 0.3, 0.12 * math.sin(angle)
@@ -63,7 +63,7 @@ def by_triangles() -> list[float]:
     ]
 
 
-def test_the_checker_sees_an_interval_that_is_wrong() -> None:
+def test_contradictions_reports_a_wrong_crank_interval() -> None:
     model = rocker_locked()
     (lock,) = interlocks(model)
     ((axis, side),) = lock.when[0].items()
@@ -72,7 +72,7 @@ def test_the_checker_sees_an_interval_that_is_wrong() -> None:
     assert reasoning.contradictions(model, Interlocks([wrong]))
 
 
-def test_a_crank_with_limits() -> None:
+def test_lock_on_a_rocker_with_a_limited_crank() -> None:
     model = locked("slider_crank", kv.position("slider_crank/slider") > 0.3)
     crank = kv.position("slider_crank/crank")
     with model.edit() as edit:
@@ -86,14 +86,14 @@ def test_a_crank_with_limits() -> None:
     assert reasoning.contradictions(model, interlocks(model)) == []
 
 
-def test_what_a_linkage_never_reaches() -> None:
+def test_lock_that_a_linkage_never_reaches_is_omitted() -> None:
     always = locked("slider_crank", kv.position("slider_crank/slider") > 0.5)
     assert [str(lock) for lock in interlocks(always)] == ["door:velocity stands still: always (lock)"]
     never = locked("slider_crank", kv.position("slider_crank/slider") > 0.1)
     assert interlocks(never) == Interlocks([])
 
 
-def test_a_range_that_follows_is_told_by_its_name() -> None:
+def test_range_of_a_dependent_coordinate_keeps_its_name() -> None:
     """The condition is about the crank, the bound is where the slider is."""
     model = kv.load("articulations/slider_crank")
     slider = kv.position("slider_crank/slider")
@@ -110,7 +110,7 @@ def test_a_range_that_follows_is_told_by_its_name() -> None:
 
 
 @pytest.mark.parametrize("name", ["second", "third"])
-def test_gears(name: str) -> None:
+def test_lock_on_a_gear_is_expressed_by_its_driver(name: str) -> None:
     model = kv.load("articulations/gearbox")
     gear = model.articulations[f"gearbox/{name}"].position
     with model.edit() as edit:
@@ -125,7 +125,7 @@ def test_gears(name: str) -> None:
     assert reasoning.contradictions(model, found) == []
 
 
-def test_a_mimic_that_is_not_linear() -> None:
+def test_lock_on_a_nonlinear_mimic_joint() -> None:
     model = kv.load("articulations/mimic")
     tip = model.articulations["mimic/tip"].position
     with model.edit() as edit:
@@ -137,7 +137,7 @@ def test_a_mimic_that_is_not_linear() -> None:
     assert reasoning.contradictions(model, interlocks(model)) == []
 
 
-def test_a_switch_on_a_wheel_without_limits() -> None:
+def test_lock_on_a_wheel_without_limits_is_periodic() -> None:
     wheel = kv.position("wheel")
     subject = of_constraints(lock=(-1, DOOR.derivative(), np.sin(wheel) < 0.5))
     (lock,) = interlocks(subject)

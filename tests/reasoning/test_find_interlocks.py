@@ -1,4 +1,4 @@
-"""What is found, example by example; every answer also goes through the checker."""
+"""Interlocks, example by example; the checker checks every result."""
 
 from __future__ import annotations
 
@@ -41,7 +41,7 @@ def above(x: float) -> Interval:
     return Interval(lower=x)
 
 
-def test_the_garage_door_of_the_paper() -> None:
+def test_interlock_of_the_garage_door() -> None:
     unlocked = 1 - kv.logic.less(B, 0.3) * kv.logic.less(1.99, A)
     result = found(c1=(0, A, 2), c2=(-unlocked, v(A), unlocked))
     assert list(result) == [
@@ -64,7 +64,7 @@ def lockbox() -> kv.Model:
     )
 
 
-def test_the_lockbox_and_the_order_in_which_it_opens() -> None:
+def test_interlocks_and_opening_order_of_a_lockbox() -> None:
     subject = lockbox()
     result = interlocks(subject)
     assert said(result) == [
@@ -79,13 +79,13 @@ def test_the_lockbox_and_the_order_in_which_it_opens() -> None:
     assert [str(s) for s in reasoning.opening_order(result, "a")] == ["f", "e", "d", "b", "c", "a"]
 
 
-def test_an_order_that_does_not_exist() -> None:
+def test_opening_order_refuses_a_cycle() -> None:
     result = found(one=(0, v(A), B > 1), two=(0, v(B), A > 1))
     with pytest.raises(kv.errors.ModelError, match="a -> b -> a"):
         reasoning.opening_order(result, A)
 
 
-def test_an_oven_with_a_child_lock() -> None:
+def test_interlocks_of_an_oven_with_a_child_lock() -> None:
     # Hot or locked, the door stays shut once it is shut; while it is open the knob cannot be turned on.
     shut, hot, locked = A < 0.02, B > 60, C > 0.5
     free = ~(shut & (hot | locked))
@@ -103,7 +103,7 @@ def test_an_oven_with_a_child_lock() -> None:
     assert result.keys(A) == (B, C)
 
 
-def test_nested_locks() -> None:
+def test_interlocks_of_nested_locks() -> None:
     inner = ~((C > 0.5) & (D > 0.5))
     outer = kv.where(inner, 1 - kv.logic.less(B, 0.3), kv.where(B < 0.1, 0, 1))
     # Where a selection is by a comparison that is half true, it holds: so some of these include their ends.
@@ -126,11 +126,11 @@ def test_nested_locks() -> None:
         ((B < 0.3) | (C < 0.5), kv.maximum(B < 0.3, C < 0.5)),
     ],
 )
-def test_equal_logic_gives_equal_boxes(one: kv.Expression, other: kv.Expression) -> None:
+def test_equivalent_logic_gives_equal_boxes(one: kv.Expression, other: kv.Expression) -> None:
     assert list(found(lock=(-one, v(A), one))) == list(found(lock=(-other, v(A), other)))
 
 
-def test_each_side_by_itself() -> None:
+def test_directions_of_a_speed_are_locked_independently() -> None:
     assert said(found(ratchet=(0, v(A), 1))) == ["a:velocity cannot decrease: always (ratchet)"]
     assert said(found(pawl=(-(B > 1), v(A), 2))) == ["a:velocity cannot decrease: when b < 1 (pawl)"]
     assert (
@@ -145,7 +145,7 @@ def test_each_side_by_itself() -> None:
     )
 
 
-def test_two_constraints_together() -> None:
+def test_two_constraints_combine_to_an_interlock() -> None:
     result = found(up=(-1, v(A), B > 1), down=(-(C > 1), v(A), 1))
     assert said(result) == [
         "a:velocity cannot increase: when b < 1 (up)",
@@ -154,7 +154,7 @@ def test_two_constraints_together() -> None:
     ]
 
 
-def test_two_ranges_that_leave_one_value_or_none() -> None:
+def test_two_ranges_leave_one_value_or_none() -> None:
     result = found(
         limits=(0, A, 2),
         low=(0, A, kv.where(B < 1, 0.5, 2)),
@@ -165,7 +165,7 @@ def test_two_ranges_that_leave_one_value_or_none() -> None:
     assert "a stands still at 0.5: when b <= 1 and d <= 1 (low, meets)" in said(result)
 
 
-def test_conditions_that_limits_decide_are_dropped() -> None:
+def test_conditions_implied_by_limits_are_omitted() -> None:
     key = (B < 2) & (C < 0.5)
     assert said(found(range=(0, B, 1), lock=(-key, v(A), key))) == [
         "a:velocity stands still: when c > 0.5 (lock)"
@@ -178,7 +178,7 @@ def test_conditions_that_limits_decide_are_dropped() -> None:
     assert said(found(range=(0, B, 1), lock=(-always, v(A), always))) == []
 
 
-def test_thresholds_are_exact() -> None:
+def test_thresholds_of_polynomials_are_exact() -> None:
     (lock,) = found(lock=(-(3 * B < 0.9), v(A), 3 * B < 0.9))
     assert lock.when == (IntervalBox({B: above(0.9 / 3)}),)
     (lock,) = found(lock=(-1, v(A), kv.logic.less(2 - B, 1.25)))
@@ -206,7 +206,7 @@ def test_thresholds_of_functions(condition: kv.Expression, threshold: float) -> 
     assert box[B].upper == math.inf
 
 
-def test_functions_with_several_thresholds() -> None:
+def test_functions_with_several_thresholds_give_intervals() -> None:
     assert said(found(lock=(-1, v(A), B**2 > 0.25))) == [
         "a:velocity cannot increase: when -0.5 < b < 0.5 (lock)"
     ]
@@ -218,7 +218,7 @@ def test_functions_with_several_thresholds() -> None:
     assert said(found(range=(-1, B, 1), lock=(-1, v(A), B**2 < 2))) == []
 
 
-def test_speeds_that_shrink() -> None:
+def test_shrinking_speed_limit_becomes_an_interlock_at_zero() -> None:
     assert said(found(range=(0, B, 1), lock=(-1, v(A), B))) == [
         "a:velocity cannot increase: when b <= 0 (lock)"
     ]
@@ -237,7 +237,7 @@ def test_speeds_that_shrink() -> None:
     )
 
 
-def test_factors_and_turned_expressions() -> None:
+def test_factors_and_negated_expressions_of_speeds() -> None:
     free = B > 1
     assert said(found(lock=(-free, -2 * v(A), 1))) == ["a:velocity cannot increase: when b < 1 (lock)"]
     assert said(found(range=(0, B, 1), lock=(0, (B - 0.5) * v(A), 1))) == [
@@ -253,7 +253,7 @@ def test_factors_and_turned_expressions() -> None:
     assert str(lock) == "a:acceleration stands still: when b < 1 (lock)"
 
 
-def test_sums_of_coordinates() -> None:
+def test_conditions_on_sums_of_coordinates() -> None:
     result = found(b=(-1, B, 1), c=(-1, C, 1), lock=(-1, v(A), 2 * B + C < 0.5))
     (lock,) = result
     ((axis, side),) = lock.when[0].items()
@@ -263,7 +263,7 @@ def test_sums_of_coordinates() -> None:
     assert found(b=(-1, B, 1), c=(-1, C, 1), lock=(-1, v(A), 2 * B + C < 4)) == Interlocks([])
 
 
-def test_positions_within_numbers() -> None:
+def test_positions_within_constant_ranges() -> None:
     assert said(found(lock=(0, A, 2 * (B > 0.3)))) == ["a stands still at 0: when b < 0.3 (lock)"]
     result = found(range=(0, A, 1.5), lock=(0, A, kv.where(B < 0.3, 0.2, 1.5)))
     assert said(result) == ["a stays within [0, 0.2]: when b <= 0.3 (lock)"]
@@ -271,7 +271,7 @@ def test_positions_within_numbers() -> None:
     assert result[0].upper == 0.2
 
 
-def test_positions_within_others() -> None:
+def test_positions_within_ranges_of_other_coordinates() -> None:
     assert said(found(a=(0, A, 2), b=(-1, B, 3), lock=(0, A, B))) == [
         "a has no value: when b < 0 (lock)",
         "a stays within [0, b]: when 0 < b < 2 (lock)",
@@ -290,14 +290,14 @@ def test_positions_within_others() -> None:
     assert said(found(a=(0, A, 2), b=(0, B, 1), lock=(0, A, B + 2))) == []
 
 
-def test_a_range_as_a_table_over_another() -> None:
+def test_range_tabulated_over_another_coordinate() -> None:
     result = found(
         a=(0, A, 1), b=(0, B, 1), lock=(0, A, kv.spline(B, [0, 0.4, 0.6, 1], [0.2, 0.2, 1, 1], slopes=(0, 0)))
     )
     assert any(lock.upper is not None and lock.upper.symbols == (B,) for lock in result)
 
 
-def test_locks_on_speed_and_with_parameters() -> None:
+def test_interlocks_with_speeds_and_parameters_as_keys() -> None:
     threshold = kv.parameter("threshold", 0.3)
     subject = model(brake=(-(v(B) < 0.1), v(A), v(B) < 0.1), lock=(-(threshold < B), v(C), threshold < B))
     result = interlocks(subject)
@@ -312,13 +312,13 @@ def test_locks_on_speed_and_with_parameters() -> None:
         interlocks(subject, {"nothing": 1})
 
 
-def test_augmented_conditions_count_by_their_value() -> None:
+def test_augmented_conditions_are_read_by_their_value() -> None:
     handle = B.augment({v(C): 3.0})
     free = handle > 0.3
     assert said(found(lock=(-free, v(A), free))) == ["a:velocity stands still: when b < 0.3 (lock)"]
 
 
-def test_results_as_data() -> None:
+def test_interlocks_as_data() -> None:
     result = found(lock=(-(B > 0.3), v(A), B > 0.3))
     side = {"lower": None, "upper": 0.3, "lower_closed": False, "upper_closed": False}
     assert result.as_data() == {
@@ -342,6 +342,6 @@ def test_results_as_data() -> None:
 
 
 @pytest.mark.parametrize("wrong", [None, "kitchen", A, {}])
-def test_what_is_no_model(wrong) -> None:
+def test_interlocks_refuses_other_types(wrong) -> None:
     with pytest.raises(kv.errors.ExpressionError, match="model"):
         interlocks(wrong)

@@ -13,14 +13,14 @@ from kineverse.reasoning import Interlocks, interlocks
 
 
 @pytest.mark.parametrize("name", ["pr2", "kitchen", "fetch", "hsr"])
-def test_robots_and_kitchens_have_none(name: str) -> None:
+def test_robots_and_kitchens_have_no_interlocks(name: str) -> None:
     model = kv.load(name)
     assert interlocks(model) == Interlocks([])
     assert interlocks(model.snapshot()) == Interlocks([])
     assert reasoning.contradictions(model, Interlocks([]), points=3) == []
 
 
-def test_a_dependent_coordinate_as_the_key() -> None:
+def test_dependent_coordinate_as_key() -> None:
     model = kv.load("articulations/four_bar")
     door = kv.position("door")
     rocker = max(model.rates.dependent, key=str)
@@ -33,7 +33,7 @@ def test_a_dependent_coordinate_as_the_key() -> None:
     assert reasoning.contradictions(model, result) == []
 
 
-def test_a_driven_coordinate() -> None:
+def test_wheel_driven_coordinate_as_key() -> None:
     model = kv.Model()
     drive = kv.articulations.DifferentialDrive(
         name="base", parent="world", child="base", radius=0.1, track=0.4
@@ -60,7 +60,7 @@ MECHANISMS = [
 
 
 @pytest.mark.parametrize("kind", MECHANISMS, ids=lambda kind: kind.__name__)
-def test_mechanisms_of_the_library(kind: type[mechanisms.Mechanism]) -> None:
+def test_interlocks_of_library_mechanisms_pass_the_checker(kind: type[mechanisms.Mechanism]) -> None:
     model = kv.Model()
     with model.edit() as edit:
         edit.apply(kind(name="it", parent="world"))
@@ -69,7 +69,7 @@ def test_mechanisms_of_the_library(kind: type[mechanisms.Mechanism]) -> None:
     assert reasoning.contradictions(model, result) == []
 
 
-def test_what_some_of_them_say() -> None:
+def test_texts_of_interlocks_of_mechanisms() -> None:
     model = kv.Model()
     with model.edit() as edit:
         edit.apply(mechanisms.GarageDoor(name="garage", parent="world", form="published"))

@@ -1,4 +1,4 @@
-"""Limits of orientations: decided by the eigenvalues of what is quadratic in a quaternion of length one."""
+"""Limits of orientations: decided by the eigenvalues of quadratic forms of a unit quaternion."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ def limited(lower, expression, upper) -> kv.Model:
 
 @pytest.mark.parametrize("cone", [0.05, 0.7, math.pi])
 @pytest.mark.parametrize("axis", [(0, 0, 1), (1, 2, 3)])
-def test_cone_and_twist_leave_room(cone: float, axis: tuple[float, float, float]) -> None:
+def test_cone_and_twist_are_no_interlocks(cone: float, axis: tuple[float, float, float]) -> None:
     """They are limits of one joint, like those of a hinge, and lock nothing."""
     model = ball(cone=cone, twist=1.0, axis=axis)
     assert interlocks(model) == Interlocks([])
@@ -40,11 +40,11 @@ def test_cone_and_twist_leave_room(cone: float, axis: tuple[float, float, float]
 
 
 def leaning(axis: int = 2) -> kv.Expression:
-    """How far the z axis points up: an entry of the rotation matrix, quadratic in q."""
+    """The vertical component of the z axis: an entry of the rotation matrix, quadratic in q."""
     return kv.quaternion(*Q)[axis, axis]
 
 
-def test_entries_of_a_rotation_are_within_one() -> None:
+def test_limits_beyond_rotation_matrix_entries_have_no_value() -> None:
     assert interlocks(limited(-1 - 1e-6, leaning(), 1 + 1e-6)) == Interlocks([])
     model = limited(1.001, leaning(), 2)
     (lock,) = interlocks(model)
@@ -58,14 +58,14 @@ def test_entries_of_a_rotation_are_within_one() -> None:
     ]
 
 
-def test_a_void_that_is_none_is_found_out() -> None:
+def test_contradictions_reports_a_wrong_void() -> None:
     model = limited(0.5, leaning(), 2)
     assert interlocks(model) == Interlocks([])
     wrong = Interlock(leaning(), "has no value", ("limit",), (reasoning.IntervalBox({}),))
     assert reasoning.contradictions(model, Interlocks([wrong]))
 
 
-def test_bounds_are_those_of_all_rotations() -> None:
+def test_form_range_matches_random_rotations() -> None:
     """The sum of two entries of a rotation matrix, beside many rotations of scipy."""
     pose = kv.quaternion(*Q)
     expression = pose[0, 1] + 0.5 * pose[1, 0]
@@ -77,7 +77,7 @@ def test_bounds_are_those_of_all_rotations() -> None:
     assert interlocks(limited(highest, expression, 9)) == Interlocks([])
 
 
-def test_conditions() -> None:
+def test_conditions_on_orientations() -> None:
     """What an orientation always is decides; what it may be is named."""
     model = ball()
     with model.edit() as edit:
@@ -91,12 +91,12 @@ def test_conditions() -> None:
     assert reasoning.contradictions(model, found) == []
 
 
-def test_more_than_products_of_two() -> None:
+def test_limit_of_higher_degree_on_an_orientation_is_undecided() -> None:
     (unknown,) = interlocks(limited(-1, leaning() * leaning(0) + leaning(1) ** 3, 0.3)).undecided
     assert "more than products of two of these" in unknown.reason
 
 
-def test_wheels_are_no_orientation() -> None:
+def test_find_orientations_ignores_wheels() -> None:
     """A differential drive has two wheels for three coordinates, whose squares add up to nothing fixed."""
     model = kv.Model()
     with model.edit() as edit:

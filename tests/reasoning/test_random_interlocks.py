@@ -1,4 +1,4 @@
-"""Locks made up by chance: whatever is found agrees with evaluation; and sets of boxes obey the laws of sets."""
+"""Random interlocks agree with evaluation; operations on boxes obey the laws of sets."""
 
 from __future__ import annotations
 
@@ -38,7 +38,7 @@ sums = st.builds(lambda x, y, t: kv.logic.less(x + 2 * y, t), *[st.sampled_from(
 
 
 def logic(leaves: st.SearchStrategy[kv.Expression]) -> st.SearchStrategy[kv.Expression]:
-    """Return truths that are made of others."""
+    """Return truth values composed of others."""
     return st.recursive(
         leaves,
         lambda inner: st.one_of(
@@ -60,7 +60,7 @@ LIMITS = {str(x): (-1, x, 1) for x in SYMBOLS}
 
 @settings(max_examples=attempts(15))
 @given(truths, truths)
-def test_locks_on_speeds(one: kv.Expression, other: kv.Expression) -> None:
+def test_random_speed_locks_pass_the_checker(one: kv.Expression, other: kv.Expression) -> None:
     subject = model(**LIMITS, lock=(-0.5 * one, kv.velocity("x"), other))
     result = interlocks(subject)
     assert result.undecided == ()
@@ -69,7 +69,7 @@ def test_locks_on_speeds(one: kv.Expression, other: kv.Expression) -> None:
 
 @settings(max_examples=attempts(12))
 @given(truths, NUMBERS, NUMBERS)
-def test_ranges_of_positions(truth: kv.Expression, low: float, high: float) -> None:
+def test_random_position_ranges_pass_the_checker(truth: kv.Expression, low: float, high: float) -> None:
     x = kv.position("x")
     bounds = kv.where(truth, low, -1), kv.where(truth, SYMBOLS[0] + high, 1)
     subject = model(**LIMITS, x=(-2, x, 2), lock=(bounds[0], x, bounds[1]))
@@ -80,7 +80,7 @@ def test_ranges_of_positions(truth: kv.Expression, low: float, high: float) -> N
 
 @settings(max_examples=attempts(15))
 @given(logic(comparisons(POLYNOMIALS)), logic(comparisons(POLYNOMIALS)))
-def test_de_morgan(one: kv.Expression, other: kv.Expression) -> None:
+def test_de_morgan_gives_equal_interlocks(one: kv.Expression, other: kv.Expression) -> None:
     left, right = (
         interlocks(model(**LIMITS, lock=(-1, kv.velocity("x"), e))) for e in (~(one & other), ~one | ~other)
     )
@@ -104,7 +104,9 @@ def holds(box: IntervalBox, point: list[float]) -> bool:
 
 
 @given(st.lists(boxes, max_size=5), st.lists(boxes, max_size=3), points)
-def test_sets_of_boxes(some: list[IntervalBox], others: list[IntervalBox], point: list[float]) -> None:
+def test_box_operations_obey_set_laws(
+    some: list[IntervalBox], others: list[IntervalBox], point: list[float]
+) -> None:
     here, there = (any(holds(box, point) for box in set_) for set_ in (some, others))
     assert any(holds(box, point) for box in merge_boxes(some)) == here
     assert any(holds(box, point) for box in subtract_boxes(some, others)) == (here and not there)
@@ -113,7 +115,7 @@ def test_sets_of_boxes(some: list[IntervalBox], others: list[IntervalBox], point
 
 
 @given(st.lists(st.integers(-12, 12).map(lambda k: Fraction(k, 4)), min_size=1, max_size=4), st.booleans())
-def test_roots_of_polynomials(wanted: list[Fraction], closed: bool) -> None:
+def test_roots_finds_all_roots_of_polynomials(wanted: list[Fraction], closed: bool) -> None:
     coefficients = [Fraction(1)]
     for root in wanted:
         longer = [Fraction(0), *coefficients]

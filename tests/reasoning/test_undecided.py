@@ -1,4 +1,4 @@
-"""What cannot be decided is said, with the constraint, the reason and where."""
+"""Undecided constraints are reported with reason and region."""
 
 from __future__ import annotations
 
@@ -23,25 +23,25 @@ def undecided(lower, upper, **others) -> tuple[reasoning.Undecided, ...]:
     return result.undecided
 
 
-def test_two_coordinates_in_what_is_not_linear() -> None:
+def test_nonlinear_condition_on_two_coordinates_is_undecided() -> None:
     (unknown,) = undecided(-1, B * C < 0.3)
     assert unknown.reason == "b and c occur together in a condition that is not linear"
     assert unknown.where == (IntervalBox({}),)
     assert str(unknown).startswith("lock: unknown, as b and c occur together")
 
 
-def test_only_where_it_matters() -> None:
+def test_undecided_region_excludes_decided_cases() -> None:
     (unknown,) = undecided(-1, (np.sin(B * C) < 0.3) & (B < 0.5))
     assert unknown.where == (IntervalBox({B: Interval(upper=0.5)}),)
 
 
-def test_what_limits_decide_is_decided() -> None:
+def test_condition_decided_by_limits_is_not_undecided() -> None:
     assert undecided(-1, B * C < 1.5) == ()
     assert undecided(-1, kv.norm([B, C]) < 2) == ()
     assert undecided(-1, 2 + np.sin(B * C)) == ()
 
 
-def test_no_numbers() -> None:
+def test_bounds_that_are_not_numbers_are_undecided() -> None:
     (unknown,) = undecided(-1, np.sqrt(B) + 0.1)
     assert (unknown.reason, unknown.where) == (
         "a bound is not a number",
@@ -55,7 +55,7 @@ def test_no_numbers() -> None:
     assert undecided(-1, kv.where(B > 0, np.sqrt(B), 0.0)) == ()
 
 
-def test_no_limits_and_many_thresholds() -> None:
+def test_many_thresholds_without_limits_are_undecided() -> None:
     angle = kv.position("angle")
     (unknown,) = undecided(-1, np.sin(angle**2) < 0.3)
     reason = "angle has no limits, and where a condition on angle changes cannot be made certain"
@@ -63,20 +63,20 @@ def test_no_limits_and_many_thresholds() -> None:
     assert undecided(-1, np.arctan(angle) < 0.3) == ()
 
 
-def test_thresholds_that_are_only_touched() -> None:
+def test_threshold_that_is_only_touched_is_undecided() -> None:
     assert undecided(-1, (B - 0.25) ** 2 > 0) == ()  # a polynomial: exact
     (unknown,) = undecided(-1, np.cos(B) < 1)
     assert "cannot be made certain" in unknown.reason
 
 
-def test_ramps() -> None:
+def test_ramp_of_a_smooth_comparison_is_undecided() -> None:
     (unknown,) = undecided(-1, kv.logic.less(B, 0.1, contrast=100))
     assert unknown.reason == "a comparison of contrast 100 is on its ramp, 0.4 wide"
     side = unknown.where[0][B]
     assert (side.lower, side.upper) == pytest.approx((-0.1, 0.3))
 
 
-def test_too_many_cases() -> None:
+def test_too_many_cases_are_undecided() -> None:
     many = [kv.position(f"x{i}") for i in range(9)]
     parity = kv.logic.less(many[0], 0.5)
     for x in many[1:]:
@@ -86,13 +86,13 @@ def test_too_many_cases() -> None:
     assert f"there are more than {MAX_CASES} cases to distinguish" in {u.reason for u in unknown}
 
 
-def test_several_coordinates_at_once() -> None:
+def test_nonlinear_limit_of_several_coordinates_is_undecided() -> None:
     subject = model(both=(0, A * A + B * B, 1))
     (unknown,) = interlocks(subject).undecided
     assert unknown.reason == "it limits several coordinates at once, and they are not just added"
 
 
-def test_what_winds_with_the_crank() -> None:
+def test_condition_on_a_winding_angle_is_undecided() -> None:
     """The angle between crank and coupler comes back after a turn with a turn less: there is no period."""
     four_bar = kv.load("articulations/four_bar")
     angle = kv.position("four_bar/coupler")
@@ -107,7 +107,7 @@ def test_what_winds_with_the_crank() -> None:
     assert reasoning.contradictions(four_bar, found) == []
 
 
-def test_what_follows_several() -> None:
+def test_condition_on_a_coordinate_of_several_drivers_is_undecided() -> None:
     """A box of three motors cannot say it; what is known is told by the name."""
     delta = kv.load("articulations/delta_robot")
     with delta.edit() as edit:
