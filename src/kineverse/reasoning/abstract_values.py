@@ -290,9 +290,7 @@ def _quotient(a: AbstractValue, b: AbstractValue, sign: int | None, live: frozen
         return AbstractValue(REALS, None, live, doubtful=True)
     below = (max(low, 0.0), high) if sign == 1 else (low, min(high, 0.0)) if sign == -1 else b.range
     exact = a.polynomial.scale(1 / b.number) if a.polynomial is not None and b.number else None
-    return AbstractValue(
-        interval_multiply(a.range, interval_reciprocal(below)), exact, live
-    )
+    return AbstractValue(interval_multiply(a.range, interval_reciprocal(below)), exact, live)
 
 
 def _power(a: AbstractValue, b: AbstractValue, sign: int | None, live: frozenset[Symbol]) -> AbstractValue:
