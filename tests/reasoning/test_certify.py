@@ -98,7 +98,7 @@ def test_contradictions_checks_claims_of_undecided_constraints() -> None:
         assert reasoning.contradictions(subject, wrong) == [f"a:velocity {hold}: not so by lock"]
 
 
-def test_contradictions_accepts_a_single_value_as_standing_still() -> None:
+def test_contradictions_reports_no_value_claimed_for_a_speed_of_zero() -> None:
     assert reasoning.contradictions(garage(), Interlocks([lock(SHUT, hold="has no value")]))
 
 
@@ -109,7 +109,7 @@ def test_contradictions_distinguishes_a_sum_of_speeds_from_a_norm() -> None:
         assert reasoning.contradictions(subject, interlocks(subject), seed=seed) == []
 
 
-def test_contradictions_reports_constraints_that_exclude_each_other() -> None:
+def test_constraints_that_exclude_each_other_have_no_value() -> None:
     """Nothing stands still there: no speed is allowed at all."""
     subject = model(moves=(0.5, SPEED, 1), lock=(-1, SPEED, B > 0.3))
     found = interlocks(subject)

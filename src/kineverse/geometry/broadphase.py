@@ -265,8 +265,10 @@ PLACED, TRAVEL_EXCEEDED = -1, -2
 def place_objects(table: ObjectTable, fresh: Floats) -> int:
     """Move the moving objects to new poses (moving, 3, 4) and add to their travel.
 
-    Returns ------- The index of the first object whose pose is not finite or too far away; then nothing has
-    changed. Otherwise :data:`PLACED`, or :data:`TRAVEL_EXCEEDED` if the travel of an object is above
+    Returns
+    -------
+    The index of the first object whose pose is not finite or too far away; then nothing has changed.
+    Otherwise :data:`PLACED`, or :data:`TRAVEL_EXCEEDED` if the travel of an object is above
     :data:`LONGEST_TRAVEL`.
     """
     bad = ~(np.abs(fresh) <= FURTHEST).all(axis=(1, 2))

@@ -232,7 +232,7 @@ static double above(const Polytope *p, int i, int j, int k, Vector w) {
   return size > 0.0 ? dot(n, plus(w, -1.0, p->w[i])) / size : 0.0;
 }
 
-/* Four corners far from each other, whether or not the origin is between them. */
+/* Four corners far from each other; the origin may be outside of them. */
 static int spread(Polytope *p, const Pair *pair, double size) {
   Vector w[8], a[8];
   int first = 0, second = 0, third = -1;
@@ -281,8 +281,8 @@ static int begin(Polytope *p, const Pair *pair, const Simplex *s, double size) {
          put_face(p, 3, i, 2, 3);
 }
 
-/* Puts a corner above a face, in place of all faces that it sees or is in the plane of; returns 0 where these
-   are not in one piece. New faces come where those were, so that there are few to be looked through. */
+/* Adds a corner above a face and replaces all faces that are visible from it or coplanar with it; returns 0
+   if these are not connected. New faces reuse the slots of removed ones, which keeps searches short. */
 static int grow(Polytope *p, int from, Vector w, Vector a, double flat) {
   int16_t waiting[MOST_FACES], gone[MOST_FACES], next[MOST_CORNERS];
   int depth = 0, count = 0, edges = 0, start = 0;

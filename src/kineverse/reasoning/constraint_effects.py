@@ -55,28 +55,28 @@ def find_speed_effect(
         List to which reasons and regions are appended where the effect is unknown.
     """
     terms = TermGraph(given)
-    held, weight, offset = _alone(constraint)
+    held, weight, offset = _isolate_speed(constraint)
     ends = (constraint.lower, constraint.upper, offset, weight)
     lower, upper, rest, factor = (terms.term(apply_substitution(part, dependent)) for part in ends)
-    above, below = terms.subtract(upper, rest), terms.subtract(rest, lower)
-    blocked = SpeedEffect(held)
+    upper_slack, lower_slack = terms.subtract(upper, rest), terms.subtract(rest, lower)
+    effect = SpeedEffect(held)
     whole = terms.term(held) if not isinstance(held, Symbol) else None
-    start = Case((factor, above, below, *([] if whole is None else [whole])), domain)
+    start = Case((factor, upper_slack, lower_slack, *([] if whole is None else [whole])), domain)
     sides = [
-        (above, below, blocked.blocks_increase, blocked.forces_decrease),
-        (below, above, blocked.blocks_decrease, blocked.forces_increase),
+        (upper_slack, lower_slack, effect.blocks_increase, effect.forces_decrease),
+        (lower_slack, upper_slack, effect.blocks_decrease, effect.forces_increase),
     ]
     if whole is not None and start.value(whole).range[0] >= -1e-300:
         # A norm is never negative: an upper bound of 0 makes the quantity stand still.
-        _collect(start, factor, sides[0], unknown)
-        blocked.blocks_decrease = blocked.blocks_increase
-        return blocked
+        _collect_regions(start, factor, sides[0], unknown)
+        effect.blocks_decrease = effect.blocks_increase
+        return effect
     for side in sides:
-        _collect(start, factor, side, unknown)
-    return blocked
+        _collect_regions(start, factor, side, unknown)
+    return effect
 
 
-def _alone(constraint: Constraint) -> tuple[Expression, Expression, Expression]:
+def _isolate_speed(constraint: Constraint) -> tuple[Expression, Expression, Expression]:
     """Return (held, weight, offset): the constrained expression is ``weight·held + offset``.
 
     The held quantity is a single speed if the expression is affine in one, and otherwise the expression
@@ -93,13 +93,13 @@ def _alone(constraint: Constraint) -> tuple[Expression, Expression, Expression]:
     return expression, as_expression(1.0), as_expression(0.0)
 
 
-def _collect(
+def _collect_regions(
     start: Case,
     factor: Term,
     side: tuple[Term, Term, Region, Region],
     unknown: list[tuple[str, IntervalBox]],
 ) -> None:
-    room, other, where, beyond = side
+    slack, opposite, blocks, forces = side
 
     def ask(case: Case) -> int | str | Unclear:
         factor_sign = case.sign(factor)
@@ -107,29 +107,29 @@ def _collect(
             return Unclear((*case.doubts((factor,)), factor))
         if factor_sign == 0:
             return 1
-        wanted = room if factor_sign > 0 else other
-        value = case.value(wanted)
-        sign = case.sign(wanted)
+        chosen = slack if factor_sign > 0 else opposite
+        value = case.value(chosen)
+        sign = case.sign(chosen)
         if sign is not None:
             return sign
         if value.void:
             return "a bound is not a number"
-        surely = 0 if value.range[1] <= 0 and not value.doubtful else None
-        return Unclear((*case.doubts((wanted,)), wanted), surely)
+        fallback = 0 if value.range[1] <= 0 and not value.doubtful else None
+        return Unclear((*case.doubts((chosen,)), chosen), fallback)
 
     for case, answer in distinguish(start, ask):
         if isinstance(answer, Unanswered):
-            unknown.append((_ramp(case, (room, other)) or answer.reason, case.box()))
+            unknown.append((_ramp_reason(case, (slack, opposite)) or answer.reason, case.box()))
         elif isinstance(answer, str):
             unknown.append((answer, case.box()))
         elif isinstance(answer, int) and answer <= 0:
-            reported = not case.is_at_equality((factor, room if case.sign(factor) == 1 else other))
-            where.add(case.box(), reported)
+            reported = not case.is_at_equality((factor, slack if case.sign(factor) == 1 else opposite))
+            blocks.add(case.box(), reported)
             if answer < 0:
-                beyond.add(case.box(), reported)
+                forces.add(case.box(), reported)
 
 
-def _ramp(case: Case, terms: tuple[Term, ...]) -> str | None:
+def _ramp_reason(case: Case, terms: tuple[Term, ...]) -> str | None:
     """Return the reason for an unknown sign if a smooth step is on its ramp, else None."""
     for term in reachable_terms(terms):
         if term.op == "less" and len(term.deciders) == 2 and case.value(term).range == (0.0, 1.0):

@@ -113,17 +113,17 @@ def _find_periodic(
 
 def _restore_coordinates(found: ConstraintEffects, periodic: PeriodicCoordinates) -> ConstraintEffects:
     """Return effects in terms of the original periodic coordinates."""
-    blocked = found.speed
-    if blocked is not None:
+    speed = found.speed
+    if speed is not None:
         for region in (
-            blocked.blocks_increase,
-            blocked.blocks_decrease,
-            blocked.forces_decrease,
-            blocked.forces_increase,
+            speed.blocks_increase,
+            speed.blocks_decrease,
+            speed.forces_decrease,
+            speed.forces_increase,
         ):
             region.boxes[:] = map(periodic.restore_box, region.boxes)
             region.reported[:] = map(periodic.restore_box, region.reported)
-    kept = [
+    positions = [
         replace(
             k,
             boxes=tuple(map(periodic.restore_box, k.boxes)),
@@ -133,7 +133,7 @@ def _restore_coordinates(found: ConstraintEffects, periodic: PeriodicCoordinates
         for k in found.positions
     ]
     return ConstraintEffects(
-        blocked, kept, [(reason, periodic.restore_box(box)) for reason, box in found.unknown]
+        speed, positions, [(reason, periodic.restore_box(box)) for reason, box in found.unknown]
     )
 
 
@@ -179,24 +179,24 @@ def interlocks(model: ModelView, values: Mapping[Symbol | str, float] | None = N
     order = list(constraints)
     found: list[Interlock] = []
     undecided: list[Undecided] = []
-    blocked: dict[str, SpeedEffect] = {}
-    kept: dict[str, list[PositionEffect]] = {}
+    speed_effects: dict[str, SpeedEffect] = {}
+    position_effects: dict[str, list[PositionEffect]] = {}
     for name, constraint in constraints.items():
         if not _may_lock(constraint):
             continue
         effects = find_effects(constraint, model.rates, given, domain)
         if effects.speed is not None:
-            blocked[name] = effects.speed
-        kept[name] = effects.positions
+            speed_effects[name] = effects.speed
+        position_effects[name] = effects.positions
         for reason in dict.fromkeys(reason for reason, _ in effects.unknown):
             where = merge_boxes(box for other, box in effects.unknown if other == reason)
             undecided.append(Undecided(name, reason, where))
-    for name, one in blocked.items():
+    for name, one in speed_effects.items():
         found += _speed_interlocks(name, one)
-    found += _pair_interlocks(blocked)
-    for name, many in kept.items():
+    found += _pair_interlocks(speed_effects)
+    for name, many in position_effects.items():
         found += [Interlock(k.held, k.hold, (name,), k.boxes, k.lower, k.upper) for k in many]
-    found += _contradicting_ranges(kept)
+    found += _contradicting_ranges(position_effects)
     found.sort(key=lambda lock: [order.index(name) for name in lock.constraints])
     return Interlocks(found, undecided)
 
@@ -252,13 +252,13 @@ def _speed_interlocks(name: str, one: SpeedEffect) -> list[Interlock]:
     return [Interlock(one.held, hold, (name,), where) for hold, where in found.items() if where]
 
 
-def _pair_interlocks(blocked: Mapping[str, SpeedEffect]) -> list[Interlock]:
+def _pair_interlocks(speed_effects: Mapping[str, SpeedEffect]) -> list[Interlock]:
     """Return the interlocks of two constraints that together block or contradict each other."""
     found: list[Interlock] = []
-    names = list(blocked)
+    names = list(speed_effects)
     for first in names:
         for second in names:
-            a, b = blocked[first], blocked[second]
+            a, b = speed_effects[first], speed_effects[second]
             if first == second or a.held != b.held:
                 continue
             pair = tuple(sorted((first, second), key=names.index))
@@ -272,9 +272,9 @@ def _pair_interlocks(blocked: Mapping[str, SpeedEffect]) -> list[Interlock]:
     return found
 
 
-def _contradicting_ranges(kept: Mapping[str, list[PositionEffect]]) -> list[Interlock]:
+def _contradicting_ranges(position_effects: Mapping[str, list[PositionEffect]]) -> list[Interlock]:
     """Return the interlocks of two constraints whose constant ranges leave one position, or none."""
-    every = [(name, k) for name, many in kept.items() for k in many if k.range is not None]
+    every = [(name, k) for name, many in position_effects.items() for k in many if k.range is not None]
     found = []
     for i, (first, a) in enumerate(every):
         for second, b in every[i + 1 :]:
