@@ -11,8 +11,8 @@ with model.edit() as edit:
     edit.apply(kv.Prismatic(name="safe/bolt", parent="world", child="bolt", lower=0, upper=0.03))
     edit.apply(kv.Revolute(name="safe/door", parent="world", child="door", lower=0, upper=1.5))
     # The bolt moves only while the key is turned, and the closed door only while the bolt is back.
-    edit.constrain("safe/key_lock", *speed_lock(bolt, key > 1.5))
-    edit.constrain("safe/bolt_lock", *speed_lock(door, bolt > 0.02, at=door < 0.01))
+    edit.constrain("safe/key_lock", *speed_lock(bolt, open_if=key > 1.5))
+    edit.constrain("safe/bolt_lock", *speed_lock(door, open_if=bolt > 0.02, engaged_if=door < 0.01))
 
 found = interlocks(model)
 for lock in found:
