@@ -1,4 +1,4 @@
-"""Inverses, products, determinants and squared norms of stacks of small matrices."""
+"""Inverses, products, determinants and squared norms of small matrices and of stacks of them."""
 
 from __future__ import annotations
 

@@ -24,7 +24,7 @@ import numpy as np
 import numpy.typing as npt
 
 from kineverse.estimation.linear_algebra import invert_matrices
-from kineverse.estimation.robust import Outliers
+from kineverse.estimation.robust import CHI_SQUARED_6, Outliers
 from kineverse.lie import Array
 
 from .maximum_likelihood import Scored
@@ -40,7 +40,7 @@ RowIndices: TypeAlias = "npt.NDArray[np.int_]"
 Name = TypeVar("Name")
 
 # 99.9 % quantile of χ² of poses and of positions, the final tolerance of the annealing.
-_CHI_SQUARED = {6: 22.5, 3: 16.3}
+_CHI_SQUARED = {6: CHI_SQUARED_6, 3: 16.3}
 # Factor on the tolerance in each round of the annealing, and solver steps of a round.
 _ANNEALING, _FEW_STEPS = 2.0, 6
 # Largest number of rounds of reclassification, and of inlier sets that are shared between families.
