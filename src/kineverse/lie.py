@@ -19,7 +19,6 @@ import numpy as np
 import numpy.typing as npt
 
 Array: TypeAlias = npt.NDArray[np.float64]
-Stack: TypeAlias = Array
 
 EXACT_TOLERANCE = 1e-15
 """Distance to 0, 1 or -1 below which an entry of a rotation is exactly that."""
