@@ -84,7 +84,7 @@ class UrdfLinkReader:
         return UrdfLink(name, Body(tuple(visuals), tuple(collisions), inertia), element[3])
 
     def assign_materials(self, links: dict[str, UrdfLink]) -> None:
-        """Assign the materials that were referenced before their definition."""
+        """Give visuals the materials that were referenced before their definition."""
         for name, index, material, element in self._undefined_materials:
             color, texture = self.materials.final_appearance(material, element)
             link = links[name]
