@@ -6,7 +6,7 @@ model = kv.load("kitchen")
 scene = kv.geometry.Scene(model)
 state = model.default_state().updated({"kitchen/fridge_door": 0.3})
 scene.update(state)
-for pair in scene.within(0.002):  # [m]
+for pair in scene.pairs_within(0.002):  # [m]
     print(pair)
 
 scene.update(model.default_state())
