@@ -307,7 +307,9 @@ def test_a_library_without_the_function_is_compiled_again(
 
 
 @pytest.mark.compiler
-def test_hand_written_c_is_compiled_again_if_the_cache_has_another_library(folder: Path, another_library: bytes) -> None:
+def test_hand_written_c_is_compiled_again_if_the_cache_has_another_library(
+    folder: Path, another_library: bytes
+) -> None:
     def declare(code: ctypes.CDLL) -> None:
         code.answer.restype = ctypes.c_int
 

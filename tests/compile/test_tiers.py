@@ -192,7 +192,9 @@ def test_functions_stay_interpreted_if_the_compiler_fails(
         h.batch([[1.0, 2.0]])
 
 
-def test_functions_stay_interpreted_if_the_compiler_hangs(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+def test_functions_stay_interpreted_if_the_compiler_hangs(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
     # What hangs is a child of the compiler, as with gcc: both have to go.
     group = tmp_path / "group"
     script = f"(echo $$ > {group}; while :; do sleep 0.1; done) & wait"
