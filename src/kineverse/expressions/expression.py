@@ -93,6 +93,16 @@ class Expression(ArrayMethods):
         return math.prod(self._shape)
 
     @property
+    def sx(self) -> SX:
+        """CasADi graph of shape (rows, columns), in which opaque nodes are symbols; for use inside the library."""
+        return self._sx
+
+    @property
+    def nodes(self) -> frozenset[Node]:
+        """Opaque nodes that the graph refers to."""
+        return self._nodes
+
+    @property
     def casadi(self) -> SX:
         """CasADi's ``SX`` of the values, nodes lowered: (n, m) as stored, see :mod:`.layout`."""
         from .graph import expand_nodes

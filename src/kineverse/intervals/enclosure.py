@@ -103,7 +103,7 @@ class _Solver:
         self._equations = terms.elements(function.equations)
         self._by_unknowns = terms.elements(function.by_unknowns)
         self._by_inputs = terms.elements(function.by_inputs)
-        inputs = ca.vertcat(*(s._sx for s in function.inputs))
+        inputs = ca.vertcat(*(s.sx for s in function.inputs))
         solution = ca.densify(expand_nodes(function.apply(function.inputs)))
         self._solve = ca.Function("solve", [inputs], [solution])
 

@@ -116,7 +116,7 @@ class TermGraph:
 
     def _graph(self, expression: Expression) -> list[Term]:
         """Return the terms of the elements, column by column as in CasADi; those of nodes are known."""
-        sx = ca.densify(expression._sx)
+        sx = ca.densify(expression.sx)
         elements = ca.symvar(sx)
         function = ca.Function("terms", [ca.vertcat(*elements)] if elements else [], [sx])
         inputs = [self._leaf(element) for element in elements]

@@ -220,7 +220,7 @@ def _matrix(value: Any) -> Any:
 
 def _trends(a: Expression, b: Expression) -> list[Expression]:
     """Return the gradients of two expressions, alternating by key; empty if none is overridden."""
-    if not (a._nodes or b._nodes):
+    if not (a.nodes or b.nodes):
         return []
     one, other = a.gradient(), b.gradient()
     nothing = as_expression(np.zeros(a.shape))

@@ -71,7 +71,7 @@ class Constraint:
         """Slope and offset of an expression that is linear in one symbol; None for any other."""
         if isinstance(self.expression, Symbol):
             return 1.0, 0.0
-        if not self.expression._nodes and len(self.expression.symbols) == 1:
+        if not self.expression.nodes and len(self.expression.symbols) == 1:
             (symbol,) = self.expression.symbols
             slope = self.expression.partial([symbol])[0]
             if not slope.symbols:
@@ -107,6 +107,6 @@ def coordinates(*expressions: Expression) -> frozenset[str]:
     paths: set[str] = set()
     for expression in expressions:
         paths.update(s.path for s in expression.symbols)
-        if expression._nodes:
+        if expression.nodes:
             paths.update(s.path for s in gradient_keys(expression))
     return frozenset(paths)

@@ -60,14 +60,14 @@ class Placement:
                 continue
             rotation, position = _with_offset(rotation, position, offset)
             steps.append(ChainStep(rotation, position, nodes, factor))
-            nodes = nodes | factor._nodes if factor._nodes else nodes
+            nodes = nodes | factor.nodes if factor.nodes else nodes
             if isinstance(factor, OneAxisTransform):
                 if factor.is_rotation:
                     rotation = ca.mtimes(rotation, factor.rotation)
                 else:
                     position = ca.mtimes(rotation, factor.offset) + position
             else:
-                sx = factor._sx
+                sx = factor.sx
                 position = ca.mtimes(rotation, sx[:3, 3]) + position
                 rotation = ca.mtimes(rotation, sx[:3, :3])
             offset = IDENTITY
@@ -239,11 +239,11 @@ def _axis_twists(
     else:
         direction = ca.mtimes(step.rotation, ca.SX(ca.DM(motion.direction)))
     for key, entry in motion.amount.gradient(heuristic).items():
-        along = direction * entry._sx
+        along = direction * entry.sx
         if motion.is_rotation:
-            yield key, ca.cross(along, tip - step.position), along, entry._nodes
+            yield key, ca.cross(along, tip - step.position), along, entry.nodes
         else:
-            yield key, along, ca.SX(3, 1), entry._nodes
+            yield key, along, ca.SX(3, 1), entry.nodes
 
 
 def _twists(step: ChainStep, tip: SX, heuristic: bool) -> Iterator[tuple[Symbol, SX, SX, frozenset[Node]]]:
@@ -252,11 +252,11 @@ def _twists(step: ChainStep, tip: SX, heuristic: bool) -> Iterator[tuple[Symbol,
     entries = factor.gradient(heuristic)
     if not entries:
         return
-    factor_rotation, factor_position = factor._sx[:3, :3].T, factor._sx[:3, 3]
+    factor_rotation, factor_position = factor.sx[:3, :3].T, factor.sx[:3, 3]
     arm = tip - step.position
     for key, entry in entries.items():
-        spin = ca.mtimes(ca.sparsify(entry._sx[:3, :3]), factor_rotation)
-        linear = ca.sparsify(entry._sx[:3, 3])
+        spin = ca.mtimes(ca.sparsify(entry.sx[:3, :3]), factor_rotation)
+        linear = ca.sparsify(entry.sx[:3, 3])
         velocity, omega = ca.SX(3, 1), ca.SX(3, 1)
         if spin.nnz():
             local = ca.sparsify(ca.vertcat(spin[2, 1], spin[0, 2], spin[1, 0]))
@@ -266,4 +266,4 @@ def _twists(step: ChainStep, tip: SX, heuristic: bool) -> Iterator[tuple[Symbol,
                 linear = linear - ca.cross(local, factor_position)
         if linear.nnz():
             velocity = velocity + ca.mtimes(step.rotation, linear)
-        yield key, velocity, omega, entry._nodes
+        yield key, velocity, omega, entry.nodes

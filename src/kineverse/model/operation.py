@@ -93,7 +93,7 @@ class Writes:
         result: dict[tuple[str, str], Any] = {}
         for name, frame in self.frames.items():
             value = _as_frame(name, frame)
-            if any(isinstance(f, Expression) and f._nodes for f in value.factors):
+            if any(isinstance(f, Expression) and f.nodes for f in value.factors):
                 value = Frame(
                     value.parent,
                     tuple(to_plain(f) if isinstance(f, Expression) else f for f in value.factors),
@@ -101,7 +101,7 @@ class Writes:
             result[FRAMES, name] = value
         for name, triple in self.constraints.items():
             c = as_constraint(triple)
-            if c.lower._nodes or c.expression._nodes or c.upper._nodes:
+            if c.lower.nodes or c.expression.nodes or c.upper.nodes:
                 c = Constraint(to_plain(c.lower), to_plain(c.expression), to_plain(c.upper))
             result[CONSTRAINTS, name] = c
         for coordinate, row in self.rates.items():
@@ -114,7 +114,7 @@ class Writes:
         for kind, values in others:
             for name, datum in values.items():
                 _check_value(kind, name, datum)
-                if isinstance(datum, Articulation) and datum.follows is not None and datum.follows._nodes:
+                if isinstance(datum, Articulation) and datum.follows is not None and datum.follows.nodes:
                     datum = replace(datum, follows=to_plain(datum.follows))
                 result[kind, name] = datum
         return result

@@ -118,7 +118,7 @@ class Composed(Node):
         return repr([s.sort_key for s in options])
 
     def _inner(self) -> Node:
-        (node,) = self.arguments[0]._nodes
+        (node,) = self.arguments[0].nodes
         return node
 
     def _value(self) -> Expression:
@@ -144,7 +144,7 @@ class Composed(Node):
 
 def to_plain(expression: Expression) -> Expression:
     """Replace carried coordinates by plain symbols, inside nodes as well."""
-    if not expression._nodes:
+    if not expression.nodes:
         return expression
     images: dict[Node, Expression] = {}
     for node in topological_order(leaves(expression)[1], _parts, images.__contains__):

@@ -80,7 +80,7 @@ class StateSamples:
         stacked = ca.vertcat(*lower(expressions))
         # One set for all expressions: in a long chain, most poses contain most joints.
         symbols = [SYMBOLS[leaf.element_hash()] for leaf in ca.symvar(stacked)]
-        vector = ca.vertcat(*(symbol._sx for symbol in symbols)) if symbols else ca.SX(0, 1)
+        vector = ca.vertcat(*(symbol.sx for symbol in symbols)) if symbols else ca.SX(0, 1)
         function = ca.Function("samples", [vector], [stacked])
         if symbols:
             numbers = np.array(function(np.array([self.values_of(symbol) for symbol in symbols]))).T

@@ -24,13 +24,13 @@ SIDES = 16
 
 def find_norm_components(expression: Expression) -> tuple[float, list[Expression]] | None:
     """Return factor and components of ``factor·norm(components)``; None for any other expression."""
-    if len(expression._nodes) != 1:
+    if len(expression.nodes) != 1:
         return None
-    (node,) = expression._nodes
+    (node,) = expression.nodes
     if not isinstance(node, Norm):
         return None
-    factor = ca.jacobian(expression._sx, node.sx)
-    rest = ca.simplify(ca.substitute(expression._sx, node.sx, 0))
+    factor = ca.jacobian(expression.sx, node.sx)
+    rest = ca.simplify(ca.substitute(expression.sx, node.sx, 0))
     if not factor.is_constant() or not float(factor) > 0 or not rest.is_zero():
         return None
     return float(factor), list(node.arguments[0])

@@ -399,8 +399,8 @@ class SymbolicView:
             chosen = [s.derivative() if s.order == 0 and s.has_derivative else s for s in symbols]
         zero = as_expression(np.zeros(6))
         parts = [by_speed.get(s, zero) for s in chosen]
-        nodes = NO_NODES.union(*(p._nodes for p in parts))
-        sx = ca.horzcat(*(p._sx for p in parts)) if parts else ca.SX(6, 0)
+        nodes = NO_NODES.union(*(p.nodes for p in parts))
+        sx = ca.horzcat(*(p.sx for p in parts)) if parts else ca.SX(6, 0)
         return from_casadi(ca.densify(sx), (6, len(parts)), nodes)
 
     def speeds_of(self, frame: str, relative_to: str = WORLD) -> tuple[Symbol, ...]:

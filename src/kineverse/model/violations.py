@@ -84,7 +84,7 @@ class Checks:
             # All elements of a missing solution are NaN, so one element suffices.
             parts += [as_expression(-math.inf), loop.value[0], as_expression(math.inf)]
         stacked = ca.vertcat(*lower(parts)) if parts else ca.SX(0, 1)
-        inputs = ca.vertcat(*(s._sx for s in self.symbols)) if self.symbols else ca.SX(0, 1)
+        inputs = ca.vertcat(*(s.sx for s in self.symbols)) if self.symbols else ca.SX(0, 1)
         self._function = ca.Function("constraints", [inputs], [stacked])
 
     def evaluate(

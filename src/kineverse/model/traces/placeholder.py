@@ -160,7 +160,7 @@ def fill_read_nodes(expression: Expression, replacement: Callable[[ReadNode], Ex
     Nodes are built again from their new arguments. Unlike in a substitution, overridden gradient entries stay
     overridden.
     """
-    if not expression._nodes:
+    if not expression.nodes:
         return expression
     images: dict[Node, Expression] = {}
     for node in topological_order(leaves(expression)[1], _below, images.__contains__):

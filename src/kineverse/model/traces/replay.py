@@ -108,7 +108,7 @@ def _close(pairs: list[ExpressionPair]) -> bool:
         return True
     flat = [e for pair in values for e in pair]
     symbols = sorted({s for e in flat for s in e.symbols}, key=lambda s: s.sort_key)
-    inputs = ca.vertcat(*(s._sx for s in symbols)) if symbols else ca.SX(0, 1)
+    inputs = ca.vertcat(*(s.sx for s in symbols)) if symbols else ca.SX(0, 1)
     columns = lower(flat)
     both = ca.Function("both", [inputs], [ca.vertcat(*columns[::2]), ca.vertcat(*columns[1::2])])
     random = np.random.default_rng(_SEED)

@@ -116,7 +116,7 @@ class Trace:
 
 def _check_size(reply: QueryResult) -> None:
     """Refuse results of exponential size: each of several nested substitutions can double the size."""
-    if sum(ca.n_nodes(part._sx) for part in reply.parts if isinstance(part, Expression)) > MAX_ANSWER:
+    if sum(ca.n_nodes(part.sx) for part in reply.parts if isinstance(part, Expression)) > MAX_ANSWER:
         raise UntraceableError(f"an answer on the way to it is made of more than {MAX_ANSWER:,} nodes.")
 
 
