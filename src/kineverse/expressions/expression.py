@@ -94,7 +94,7 @@ class Expression(ArrayMethods):
 
     @property
     def sx(self) -> SX:
-        """CasADi graph of shape (rows, columns), in which opaque nodes are symbols; for use inside the library."""
+        """CasADi graph, in which opaque nodes are symbols; see :attr:`casadi` for the whole graph."""
         return self._sx
 
     @property
