@@ -113,9 +113,12 @@ def __getattr__(name: str) -> object:
 
     below: dict[str, str] = {}
     for package in (expressions, spatial, logic, errors, loops, formats, model, articulations):
-        public = (*vars(package), *getattr(package, "__all__", ()))
-        below |= {n: f"kv.{package.__name__.removeprefix('kineverse.')}.{n}" for n in public if n[0] != "_"}
-    raise unknown_attribute_error("The package kineverse", name, __dir__(), below | dict(MODULE_SYNONYMS))
+        own = [
+            n for n, value in vars(package).items() if getattr(value, "__module__", "") == package.__name__
+        ]
+        public = [n for n in getattr(package, "__all__", own) if n[0] != "_"]
+        below |= {n: f"kv.{package.__name__.removeprefix('kineverse.')}.{n}" for n in public}
+    raise unknown_attribute_error("The package kineverse", name, __dir__(), MODULE_SYNONYMS, below)
 
 
 def __dir__() -> list[str]:

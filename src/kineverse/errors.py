@@ -133,7 +133,11 @@ def suggest(name: str, available: Iterable[str], what: str = "name", limit: int 
 
 
 def unknown_attribute_error(
-    owner: str, name: str, available: Iterable[str], elsewhere: Mapping[str, str]
+    owner: str,
+    name: str,
+    available: Iterable[str],
+    elsewhere: Mapping[str, str],
+    below: Mapping[str, str] | None = None,
 ) -> UnknownAttributeError:
     """Return the error for an unknown attribute, with similar names or the equivalent of a foreign name.
 
@@ -147,14 +151,20 @@ def unknown_attribute_error(
         The known attributes.
     elsewhere
         From names in other libraries to their equivalents here.
+    below
+        From names in the packages below the object to their full names.
     """
+    below = below or {}
     problem = f"{owner} has no {name!r}."
     if name.startswith("_"):
         return UnknownAttributeError(problem)
     if name in elsewhere:
         return UnknownAttributeError(f"{problem} Here that is {elsewhere[name]}.")
+    if name in below:
+        return UnknownAttributeError(f"{problem} Here that is {below[name]}.")
     public = sorted({one for one in available if not one.startswith("_")})
-    by_lower: dict[str, str] = {one.lower(): one for one in public}
+    by_lower: dict[str, str] = {one.lower(): place for one, place in below.items()}
+    by_lower |= {one.lower(): one for one in public}
     close = [by_lower[match] for match in difflib.get_close_matches(name.lower(), by_lower, n=3, cutoff=0.6)]
     if close:
         return UnknownAttributeError(f"{problem} Did you mean {' or '.join(map(repr, close))}?")

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from operator import attrgetter
 from typing import Any
 
 import numpy as np
@@ -118,6 +119,22 @@ MESSAGES: dict[str, tuple[Callable[[kv.Model], Any], str]] = {
         lambda _: kv.estimation.Trackr,
         "The package kineverse.estimation has no 'Trackr'. Did you mean 'Tracker'?",
     ),
+    "a mistyped name of a package below": (
+        lambda _: kv.PistonRod,
+        "The package kineverse has no 'PistonRod'. Did you mean 'kv.articulations.PistonAndRod' or 'kv.spatial.position_of'?",
+    ),
+    "what a package below imports": (
+        lambda _: kv.np,
+        "The package kineverse has no 'np'. dir(...) lists what there is.",
+    ),
+    "a mistyped name in kv.model": (
+        lambda _: kv.model.AddFram,
+        "The package kineverse.model has no 'AddFram'. Did you mean 'AddFrame' or 'Frame'?",
+    ),
+    "a mistyped name in kv.formats": (
+        lambda _: kv.formats.from_byte,
+        "The package kineverse.formats has no 'from_byte'. Did you mean 'from_bytes' or 'to_bytes'?",
+    ),
     "a name of another package": (
         lambda _: kv.reasoning.interlock_,
         "The package kineverse.reasoning has no 'interlock_'. Did you mean 'Interlock' or 'interlocks' or 'IntervalBox'?",
@@ -222,7 +239,16 @@ def test_messages(case: str) -> None:
 
 
 def test_attributes_are_missing_as_python_has_it() -> None:
-    for thing in (kv, kv.articulations, room(), room().snapshot(), room().edit(), kv.State()):
+    for thing in (
+        kv,
+        kv.articulations,
+        kv.model,
+        kv.formats,
+        room(),
+        room().snapshot(),
+        room().edit(),
+        kv.State(),
+    ):
         assert not hasattr(thing, "forward_kinematic")
         assert getattr(thing, "__wrapped__", None) is None
         with pytest.raises(AttributeError):
@@ -243,7 +269,7 @@ def test_names_of_others_are_no_names_here() -> None:
         assert not [name for name in names if name in dir(owner)]
     for words in MODULE_SYNONYMS.values():
         for name in (word.rstrip(",") for word in words.split() if word.startswith("kv.")):
-            assert name.split(".")[1] in dir(kv)
+            assert attrgetter(name.removeprefix("kv."))(kv) is not None
     for words in (*MODEL_SYNONYMS.values(), *STATE_SYNONYMS.values()):
         for owner, name in ((room(), "model."), (kv.State(), "state.")):
             for word in (w for w in words.split() if w.startswith(name)):

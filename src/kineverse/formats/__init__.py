@@ -2,6 +2,9 @@
 
 from typing import TYPE_CHECKING
 
+from kineverse._synonyms import MODULE_SYNONYMS
+from kineverse.errors import unknown_attribute_error
+
 from . import urdf
 from .file_formats import register_file_formats
 from .loader import load
@@ -21,4 +24,4 @@ def __getattr__(name: str) -> object:
 
     if name in ("document_hash", "from_bytes", "to_bytes"):
         return getattr(importlib.import_module("kineverse.formats.document"), name)
-    raise AttributeError(f"module 'kineverse.formats' has no attribute {name!r}")
+    raise unknown_attribute_error("The package kineverse.formats", name, __all__, MODULE_SYNONYMS)

@@ -1,5 +1,10 @@
 """Layer 3: the model, its data and constraints, and the operations it is made of."""
 
+from typing import TYPE_CHECKING
+
+from kineverse._synonyms import MODULE_SYNONYMS
+from kineverse.errors import unknown_attribute_error
+
 from .articulation import Articulation
 from .body import Body, Box, Capsule, Cone, Cylinder, Ellipsoid, Inertia, Mesh, Pose, Shape, Sphere
 from .compare import compare_models
@@ -49,3 +54,9 @@ __all__ = [
     "Writes",
     "compare_models",
 ]
+
+
+if not TYPE_CHECKING:  # a type checker finds unknown names itself
+
+    def __getattr__(name: str) -> object:
+        raise unknown_attribute_error("The package kineverse.model", name, __all__, MODULE_SYNONYMS)
