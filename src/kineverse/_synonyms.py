@@ -26,7 +26,6 @@ RENAMED: Mapping[str, str] = {
     "quaternion_of": "kv.spatial.to_quaternion",
     "rotation_vector": "kv.spatial.log_so3",
     "rpy_of": "kv.spatial.to_rpy",
-    "snapped": "kv.lie.round_exact",
     "transform_like": "kv.spatial.as_transform",
     "twist_exponential": "kv.spatial.exp_se3",
     "twist_logarithm": "kv.spatial.log_se3",
