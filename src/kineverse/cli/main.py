@@ -35,7 +35,7 @@ examples:
   kineverse convert kitchen kitchen.kv.json           write it in another format
   kineverse diff kitchen kitchen.kv.json              what two models differ in
   kineverse fit poses.csv --child door                learn a joint from recorded poses
-  kineverse demo --headless                           a picture of kitchen and robot
+  kineverse demo --headless                           track a simulated kitchen; numbers and a picture
 """
 
 

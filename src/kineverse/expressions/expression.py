@@ -541,7 +541,7 @@ def notify_access(expression: Expression) -> Expression:
 def from_casadi(sx: SX, shape: ArrayShape, nodes: frozenset[Node]) -> Expression:
     """Wrap an ``SX`` that only contains known symbols and the symbols of ``nodes``.
 
-    A scalar that consists of one symbol is that :class:`Symbol`, so ``v[0]`` can be used as a key.
+    A scalar that consists of one symbol is that :class:`.Symbol`, so ``v[0]`` can be used as a key.
     """
     if not shape and sx.is_symbolic():
         symbol = SYMBOLS.get(sx.element_hash())
