@@ -100,6 +100,16 @@ class Expression(ArrayMethods):
         return expand_nodes(self)
 
     @property
+    def sx(self) -> SX:
+        """CasADi's ``SX`` of the values, nodes as symbols: (n, m) as stored, see :mod:`.layout`."""
+        return self._sx
+
+    @property
+    def nodes(self) -> frozenset[Node]:
+        """The opaque nodes of the graph, without those inside of them."""
+        return self._nodes
+
+    @property
     def symbols(self) -> tuple[Symbol, ...]:
         """The free symbols V(e) of the values, sorted by path and order (2022 paper, III-A)."""
         from .graph import free_symbols

@@ -104,7 +104,7 @@ class NodeGraph:
 
     def owner(self, expression: Expression) -> Node | None:
         """Return the node of a scalar expression that is one node, None for any other expression."""
-        return None if expression.shape else self._owners.get(expression._sx.element_hash())
+        return None if expression.shape else self._owners.get(expression.sx.element_hash())
 
     def check_ref(self, ref: Any) -> int:
         """Return the place of an earlier node after checking that it is one."""
@@ -166,7 +166,7 @@ class NodeGraph:
                 f"more than {MAX_NESTING} nodes with a gradient of their own inside one another"
             )
         self.check_elements(shape, len(refs))
-        below = NO_NODES.union(*(self.expression(part)._nodes for part in parts if self.depths[part]))
+        below = NO_NODES.union(*(self.expression(part).nodes for part in parts if self.depths[part]))
         compositions = max(map(self._compositions.__getitem__, below), default=0) + (kind is Composed)
         if compositions > MAX_COMPOSITIONS:
             raise InvalidDocumentError(f"more than {MAX_COMPOSITIONS} compositions of compositions")
@@ -187,11 +187,11 @@ class NodeGraph:
         compositions
             Nesting depth of compositions.
         """
-        (node,) = expression._nodes
+        (node,) = expression.nodes
         self._owners.update(dict.fromkeys(node.elements, node))
         self._below[node] = below
         self._compositions[node] = compositions
-        self.add(expression._sx, node.shape, depth, expression)
+        self.add(expression.sx, node.shape, depth, expression)
 
     def check_elements(self, shape: layout.ArrayShape, arguments: int = 1) -> None:
         """Check the number of elements in all arguments of a node with a gradient of its own."""

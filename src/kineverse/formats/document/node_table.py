@@ -256,10 +256,10 @@ class _Program:
         inputs = []
         leaf_of: list[_Leaf] = []
         for owner in owners:
-            sx, shape = (owner._sx, ()) if isinstance(owner, Symbol) else (owner.sx, owner.shape)
-            inputs.append(layout.column(sx, shape))
+            shape = () if isinstance(owner, Symbol) else owner.shape
+            inputs.append(layout.column(owner.sx, shape))
             leaf_of.extend((owner, i) for i in range(math.prod(shape)))
-        columns = [layout.column(e._sx, e._shape) for e in expressions]
+        columns = [layout.column(e.sx, e.shape) for e in expressions]
         given = ca.vertcat(*inputs) if inputs else ca.SX(0, 1)
         outputs = self._run(ca.Function("document", [given], [ca.vertcat(*columns)]), leaf_of)
         offset = 0

@@ -147,9 +147,9 @@ def _newton_work(graph: NodeGraph, residual: Expression, unknowns: tuple[Symbol,
     implicit function inside, whose arguments contain the unknowns, is written out in each step again.
     """
     n = len(unknowns)
-    size = ca.n_nodes(residual._sx)
+    size = ca.n_nodes(residual.sx)
     for inner in topological_order(leaves(residual)[1], _arguments_of, lambda _: False):
-        size += sum(ca.n_nodes(part._sx) for part in inner.arguments)
+        size += sum(ca.n_nodes(part.sx) for part in inner.arguments)
         if isinstance(inner, Implicit):
             again = any(collect_symbols(a).intersection(unknowns) for a in inner.arguments)
             size += graph.work[inner.function.key] if again else 0
@@ -192,7 +192,7 @@ def _symbol(graph: NodeGraph, node: list[Any]) -> None:
     if type(role) is not str or role not in ROLES:
         raise InvalidDocumentError(f"{describe_value(role)} is not a role; roles are {', '.join(ROLES)}")
     symbol = Symbol(graph.before + check_entity_name(path), check_integer(order, MAX_ORDER), role, value)
-    graph.add(symbol._sx, (), 0, symbol)
+    graph.add(symbol.sx, (), 0, symbol)
 
 
 def _elementary(graph: NodeGraph, node: list[Any]) -> None:

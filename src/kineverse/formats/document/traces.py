@@ -272,4 +272,4 @@ def _cost(question: Query) -> int:
 def _nodes(part: Expression | float) -> int:
     if not isinstance(part, Expression):
         return 1
-    return int(ca.n_nodes(part._sx)) + COST_OF_NODE_BELOW * len(part._nodes)
+    return int(ca.n_nodes(part.sx)) + COST_OF_NODE_BELOW * len(part.nodes)

@@ -104,7 +104,7 @@ class CurveApproximation:
         """Return a motion's positions at the Chebyshev points of an interval."""
         x = chebyshev_points(lower, upper)
         if motion.curve is not None:
-            function = ca.Function("curve", [symbol._sx], [expand_nodes(motion.curve)])
+            function = ca.Function("curve", [symbol.sx], [expand_nodes(motion.curve)])
             inner = np.array([float(function(v)) for v in x])
             return np.asarray(np.polynomial.polynomial.polyval(inner, motion.coefficients))
         return np.array([sum(self._series(motion, symbol, (v, v))[0]) / 2 for v in x.tolist()])

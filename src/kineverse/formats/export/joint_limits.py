@@ -102,7 +102,7 @@ def _classify_constraint(
         return CoordinateLimit(name, expression.symbols[0], *line, lower, upper)
     symbols = expression.symbols
     names = ", ".join(map(str, symbols))
-    slopes = None if expression._nodes else expression.partial(symbols)
+    slopes = None if expression.nodes else expression.partial(symbols)
     if slopes is None or slopes.symbols:
         reason = f"is no multiple of one coordinate, but a curve over {names}"
         return NonlinearLimit(name, expression, lower, upper, reason)
