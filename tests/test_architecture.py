@@ -2,10 +2,15 @@
 
 from __future__ import annotations
 
+import ast
 import re
 import runpy
 import tomllib
 from pathlib import Path
+
+import pytest
+
+import kineverse as kv
 
 ROOT = Path(__file__).parents[1]
 PAGE = (ROOT / "docs" / "architecture.md").read_text("utf-8")
@@ -28,3 +33,15 @@ def test_the_tree_is_that_of_the_sources() -> None:
     """``python tools/source_tree.py --write`` draws it anew."""
     block = PAGE.partition("## Source tree\n\n```text\n")[2].partition("```")[0]
     assert block == runpy.run_path(str(ROOT / "tools" / "source_tree.py"))["tree"]()
+
+
+@pytest.mark.parametrize("package", ["formats", "geometry", "view"])
+def test_private_attributes_of_expressions_are_read_by_no_package_above(package: str) -> None:
+    private = {slot for slot in kv.Expression.__slots__ if not slot.startswith("__")}
+    reads = [
+        f"{path}:{node.lineno}: {ast.unparse(node)}"
+        for path in sorted((ROOT / "src" / "kineverse" / package).rglob("*.py"))
+        for node in ast.walk(ast.parse(path.read_text("utf-8")))
+        if isinstance(node, ast.Attribute) and node.attr in private and ast.unparse(node.value) != "self"
+    ]
+    assert not reads, "\n".join(reads)

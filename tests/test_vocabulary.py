@@ -12,6 +12,7 @@ from pathlib import Path
 import pytest
 
 import kineverse as kv
+from kineverse._synonyms import RENAMED
 
 SRC = Path(__file__).parents[1] / "src"
 CLAUSE = re.compile(
@@ -131,8 +132,24 @@ def test_the_face_is_small() -> None:
         ("Writes", "kv.model.Writes"),
         ("less", "kv.logic.less"),
         ("to_bytes", "kv.formats.to_bytes"),
+        ("Tracker", "kv.estimation.Tracker"),
+        ("Scene", "kv.geometry.Scene"),
+        ("interlocks", "kv.reasoning.interlocks"),
     ],
 )
 def test_a_name_that_lives_below_is_answered_with_its_place(name: str, place: str) -> None:
     with pytest.raises(AttributeError, match=re.escape(place)):
         getattr(kv, name)
+
+
+@pytest.mark.parametrize(("name", "place"), RENAMED.items())
+def test_an_earlier_name_is_answered_with_its_place(name: str, place: str) -> None:
+    with pytest.raises(AttributeError, match=re.escape(place)):
+        getattr(kv, name)
+    value: object = kv
+    for part in place.split(".")[1:]:
+        value = getattr(value, part)
+
+
+def test_dir_lists_the_face() -> None:
+    assert [name for name in dir(kv) if not name.startswith("_")] == [n for n in kv.__all__ if n[0] != "_"]

@@ -101,10 +101,13 @@ model.registry.register_collection(
 model.registry.register_service("read_mesh", "kineverse.geometry.mesh_files:read_mesh")
 
 
+_LAZY = ("estimation", "geometry", "reasoning")
+
+
 def __getattr__(name: str) -> object:
     import importlib
 
-    if name in ("estimation", "geometry", "reasoning"):
+    if name in _LAZY:
         return importlib.import_module(f"kineverse.{name}")
     if name == "show":
         return importlib.import_module("kineverse.view.show").show
@@ -112,14 +115,14 @@ def __getattr__(name: str) -> object:
     from .errors import unknown_attribute_error
 
     below: dict[str, str] = {}
-    for package in (expressions, spatial, logic, errors, loops, formats, model, articulations):
-        own = [
-            n for n, value in vars(package).items() if getattr(value, "__module__", "") == package.__name__
-        ]
-        public = [n for n in getattr(package, "__all__", own) if n[0] != "_"]
-        below |= {n: f"kv.{package.__name__.removeprefix('kineverse.')}.{n}" for n in public}
-    raise unknown_attribute_error("The package kineverse", name, __dir__(), MODULE_SYNONYMS, below)
+    if not name.startswith("_"):
+        lazy = (importlib.import_module(f"kineverse.{package}") for package in _LAZY)
+        for package in (*lazy, expressions, spatial, logic, errors, loops, formats, model, articulations):
+            path, values = package.__name__, vars(package)
+            defined = [n for n in values if getattr(values[n], "__module__", "") == path and n[0] != "_"]
+            below |= {n: f"kv.{path.removeprefix('kineverse.')}.{n}" for n in values.get("__all__", defined)}
+    raise unknown_attribute_error("The package kineverse", name, __all__, MODULE_SYNONYMS, below)
 
 
 def __dir__() -> list[str]:
-    return sorted({*globals(), *__all__})
+    return sorted({*(name for name in globals() if name.startswith("__")), *__all__})

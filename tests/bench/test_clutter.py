@@ -25,7 +25,7 @@ def scene(arm, tmp_path):
 
 
 def names(finder, angles):
-    finder.put(angles)
+    finder.update(angles)
     finder.find()
     return {frozenset(pair[:2]) for pair in finder.distances()}
 

@@ -145,7 +145,7 @@ def test_consistency_is_judged_right(kitchen):
     assert honest.states == (~near).sum() < truth.size
     proud = _evaluate_consistency(kitchen, truth, bound, [FilterRun(q, bound / 9)])
     assert proud.nees == pytest.approx(9 * honest.nees)
-    assert "nis" not in proud.plain()
+    assert "nis" not in proud.to_json()
 
 
 def test_lost_runs_are_counted_and_left_out():

@@ -1,4 +1,4 @@
-"""Draw the pictures of the docs: the gallery, what is near, and the demo. With names, some of them."""
+"""Draw the pictures of the docs: the gallery, proximity, and the demo. With names, some of them."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ from kineverse.view.rasterizer import TriangleSoup
 FOLDER = Path(__file__).resolve().parents[2] / "docs" / "pictures"
 WIDTH, GAP = 480, 4
 LARGEST = 24_000
-OTHERS = {"near": near.drawn, "living": living.drawn}
+OTHERS = {"near": near.draw_proximity, "living": living.draw_living_kitchen}
 
 
 def main() -> int:
@@ -40,7 +40,7 @@ def main() -> int:
             missing += 1
             sys.stderr.write(f"configurations.py does not say how '{name}' is drawn\n")
             continue
-        write(name, drawn(name, TAKES[name]))
+        write(name, draw_gallery_scene(name, TAKES[name]))
     return missing
 
 
@@ -51,7 +51,7 @@ def write(name: str, pixels: np.ndarray) -> None:
     sys.stdout.write(f"{name}.png: {len(data)} bytes\n")
 
 
-def drawn(name: str, take: Take) -> np.ndarray:
+def draw_gallery_scene(name: str, take: Take) -> np.ndarray:
     """Return the panels of a scene side by side, or all in one."""
     model = kv.Model()
     if take.together:

@@ -1,4 +1,4 @@
-"""In which configurations the scenes of the gallery are drawn, and from where."""
+"""Configurations in which the gallery is drawn, and cameras."""
 
 from __future__ import annotations
 
@@ -42,7 +42,7 @@ def through(name: str, *values: float) -> tuple[dict[str, float], ...]:
 
 
 BOARD = -math.pi / 2 + 0.35
-"""From where what is drawn on an upright board is looked at."""
+"""Camera of what is drawn on an upright board."""
 
 USER = math.pi + 0.5
 """From where one looks who uses a mechanism."""

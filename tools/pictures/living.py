@@ -1,13 +1,19 @@
-"""The picture of the scene that lives: both kitchens after a while, and the axis that was learned."""
+"""Picture of the living kitchen: truth and estimate after a while, and the identified axis."""
 
 from __future__ import annotations
 
+import sys
+from pathlib import Path
+
 import numpy as np
+
+sys.path.append(str(Path(__file__).resolve().parents[2] / "examples"))
+
 from living_kitchen.picture import picture
 from living_kitchen.simulation import Simulation
 
 
-def drawn() -> np.ndarray:
+def draw_living_kitchen() -> np.ndarray:
     """Return the picture, (height, width, 3) bytes."""
     simulation = Simulation()
     for _ in range(156):

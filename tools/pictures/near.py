@@ -1,4 +1,4 @@
-"""The picture of what is near: the shipped robot's hands at the fridge of the shipped kitchen."""
+"""Picture of nearest points: the hands of the shipped robot at the fridge of the shipped kitchen."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ STATE = {
 EYE = Camera((-0.75, -2.5, 1.75), (0.74, -1.53, 1.02), field_of_view=0.3)
 
 
-def drawn() -> np.ndarray:
+def draw_proximity() -> np.ndarray:
     """Return the picture, (height, width, 3) bytes."""
     model = kv.Model()
     for name in ("kitchen", "pr2"):

@@ -2,7 +2,7 @@
 
 Locks are constraints with expressions as bounds. :func:`speed_lock` and :func:`position_lock` return the
 triple (lower, expression, upper), for ``edit.constrain(name, *triple)`` and for the constraints of an
-operation's :class:`Writes`; :func:`tabulated_limit` returns a bound. Conditions are expressions of logic,
+operation's :class:`.Writes`; :func:`tabulated_limit` returns a bound. Conditions are expressions of logic,
 such as ``bolt > 0.3``.
 """
 

@@ -1,4 +1,4 @@
-"""Arm among static boxes: the workload of distance queries, and what answers them."""
+"""Arm among static boxes: the workload of distance queries."""
 
 from __future__ import annotations
 
@@ -54,15 +54,15 @@ class Clutter:
     angles: Array
 
     def kind(self, link: int) -> str:
-        """Return what a link is."""
+        """Return the shape of a link, one of :data:`KINDS`."""
         return KINDS[link % len(KINDS)]
 
     def axis(self, link: int) -> tuple[int, int, int]:
-        """Return what the joint of a link turns about; it is at the end of the link before."""
+        """Return the axis of a link's joint, which is at the end of the previous link."""
         return ((0, 0, 1), (0, 1, 0))[link % 2]
 
     def model(self, folder: Path) -> Model:
-        """Return it as a model; hulls are written to files in a folder."""
+        """Build the model; hulls are written to files in a folder."""
         model = Model()
         with model.edit() as edit:
             parent = "world"
@@ -138,7 +138,7 @@ def _link_centres(angles: Array) -> Array:
 
 
 def _clearance(points: Array, size: Array, pose: Array) -> float:
-    """Return how near the nearest of some points is to a box."""
+    """Return the least distance of points from a box [m]."""
     inside = (points - pose[:3, 3]) @ pose[:3, :3]
     return float(np.linalg.norm(np.maximum(np.abs(inside) - size / 2, 0.0), axis=1).min())
 

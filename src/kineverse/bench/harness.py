@@ -132,14 +132,14 @@ class Contender:
     Attributes
     ----------
     name
-        Who, and how.
+        Library and method.
     sample
-        Does the work and returns what it took, in ``unit``.
+        Does the work and returns its cost, in ``unit``.
     results
         Returns the arrays that the work gives, which must be equal to those of the others; None if there is
         nothing to compare.
     unit
-        ``s`` for times, or what is counted.
+        ``s`` for times, or the unit of the count.
     """
 
     name: str
@@ -158,7 +158,7 @@ def time_calls(
     run
         Does all of them.
     count
-        How many that are.
+        Their number.
     prepare
         Called before, outside of the time; ``run`` is given what it returns.
     """
@@ -182,7 +182,7 @@ def time_contenders(
     what
         The benchmark.
     contenders
-        Who takes part.
+        The participants.
     rounds
         Number of turns of each contender, after one that is not counted.
     progress
@@ -225,7 +225,7 @@ class Contenders:
     Attributes
     ----------
     contenders
-        Who takes part.
+        The participants.
     missing
         A line for each other one.
     """
@@ -258,7 +258,7 @@ def _ignore_warning(warning: str) -> None:
 
 
 def install_advice(module: str) -> str:
-    """Return how to get a peer."""
+    """Return the advice to install a peer."""
     distribution = DISTRIBUTIONS.get(module, module)
     if module in IN_THE_EXTRA:
         called = "" if distribution == module else f" (the package {distribution!r})"

@@ -87,7 +87,7 @@ def _chain_joint(number: int) -> Revolute:
 
 
 def large_model_contenders(large: Model) -> Iterator[Contender]:
-    """Yield what is done with it, and the same with an empty one where that is to be no different."""
+    """Yield edits of a large model; where size should not matter, also those of an empty model."""
     yield Contender(TO_EMPTY, time_calls(_append_operations, _APPENDED, Model))
     yield Contender(TO_LARGE, time_calls(_append_operations, _APPENDED, large.copy))
 
@@ -130,7 +130,7 @@ def _append_operations(model: Model) -> None:
 
 
 def count_reruns(large: Model) -> int:
-    """Return how many operations are run when the one that others read is replaced."""
+    """Return the number of operations that run again when the one they read is replaced."""
     heard: list[Diff] = []
     listener = large.listen(heard.append)
     with large.edit() as edit:
@@ -182,7 +182,7 @@ def read_document(text: str) -> Model:
 
 
 def time_document(nodes: int) -> DocumentTimes:
-    """Return what a document of about so many nodes takes, once each."""
+    """Measure writing and reading of a document of about so many nodes, once each."""
     model = make_document_model(nodes)
     with no_collection():
         times = [perf_counter()]

@@ -40,7 +40,7 @@ class Machine:
 
 
 def describe_machine() -> Machine:
-    """Return where this is."""
+    """Return the properties of this machine."""
     return Machine(
         tier=_evaluation_tier(),
         compiler=compiler_information(),

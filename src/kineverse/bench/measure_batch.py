@@ -29,7 +29,7 @@ def measure(settings: BenchmarkSettings) -> BenchmarkResult:
     """Measure batches, on one core unless the label says otherwise."""
     robot = find_robot(settings)
     configurations = robot.configurations(settings.rows)
-    points = robot.of_chain(configurations)
+    points = robot.select_chain(configurations)
     with tempfile.TemporaryDirectory(prefix="kineverse-bench-") as folder:
         field = Contenders(list(_ours(robot, points)))
         field.contenders += _of_the_graph(robot, points, Path(folder), field.missing)

@@ -68,7 +68,7 @@ def pose_and_jacobian(robot: BenchmarkRobot) -> CompiledFunction:
 
 
 def _table_compiled(times: int) -> Iterator[Measurement]:
-    """Yield how long C for a matrix of constants takes to be generated and compiled; nothing is kept."""
+    """Measure generation and compilation of C for a matrix of constants, without cache."""
     compiler = toolchain()
     if compiler is None:
         return
@@ -87,7 +87,7 @@ def _table_compiled(times: int) -> Iterator[Measurement]:
 
 def _ours(robot: BenchmarkRobot, configurations: Array) -> Iterator[Contender]:
     function = pose_and_jacobian(robot)
-    points = list(robot.of_chain(configurations))
+    points = list(robot.select_chain(configurations))
     evaluator = function.bind()
 
     # Inputs that change without being written in between are in evaluators of their own. More of them would

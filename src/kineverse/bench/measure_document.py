@@ -22,7 +22,7 @@ PINOCCHIO, XML, MJB = "pinocchio, archive", "mujoco, MJCF", "mujoco, MJB"
 
 
 def measure(settings: BenchmarkSettings) -> BenchmarkResult:
-    """Measure documents of a robot in a kitchen, beside what peers keep robots in, and how they grow."""
+    """Measure documents of a robot in a kitchen beside the peers' formats, and their growth."""
     robot = find_robot(settings)
     home = robot.model.copy()
     home.include("kitchen")
@@ -108,7 +108,7 @@ def _times(growth: list[DocumentTimes]) -> Iterator[Measurement]:
 
 
 def _linear(small: DocumentTimes, large: DocumentTimes) -> Iterator[Comparison]:
-    """Yield how many times as long a node takes in the large model as in the small one."""
+    """Yield the ratio of the times per node of a large and a small model."""
     ratio = large.nodes / small.nodes
     before = _ways(small)
     for what, time in _ways(large).items():

@@ -138,7 +138,7 @@ def _edited_text(robot: BenchmarkRobot) -> str:
 
 
 def measure(settings: BenchmarkSettings) -> BenchmarkResult:
-    """Measure what edits of a large model and of a robot cost."""
+    """Measure edits of a large model and of a robot."""
     robot = find_robot(settings)
     large = make_large_model(settings.operations)
     measured = time_contenders(

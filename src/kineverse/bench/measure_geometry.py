@@ -1,4 +1,4 @@
-"""``geometry``: what is near, with distances, points and normals, while things move step by step."""
+"""``geometry``: pairs within a radius, with distances, points and normals, from step to step of a motion."""
 
 from __future__ import annotations
 
@@ -127,7 +127,7 @@ def check_distances(entries: Sequence[SearchEntry], rows: Array) -> None:
 
 
 def _distances(finder: ProximitySearch, row: Array) -> dict[tuple[str, str], float]:
-    finder.put(row)
+    finder.update(row)
     finder.find()
     least: dict[tuple[str, str], float] = {}
     for a, b, distance in finder.distances():
@@ -182,11 +182,11 @@ def _sample(finder: ProximitySearch, rows: Array, whole: bool) -> Callable[[], f
     states = list(rows)
 
     def sample() -> float:
-        put, find = finder.put, finder.find
+        update, find = finder.update, finder.find
         updating = asking = 0.0
         for state in states:
             start = perf_counter()
-            put(state)
+            update(state)
             there = perf_counter()
             find()
             asking += perf_counter() - there

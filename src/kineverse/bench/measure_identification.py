@@ -1,4 +1,4 @@
-"""``identification``: what connects two parts, from twenty noisy poses of both, and from one more."""
+"""``identification``: the joint between two parts, from twenty noisy poses of both, and from one more."""
 
 from __future__ import annotations
 
@@ -97,7 +97,7 @@ def _ours(parents: Array, children: Array) -> Iterator[Contender]:
 
 
 def _scipy(parents: Array, children: Array) -> Contender:
-    """Return what one would write with scipy: frames on both sides of the hinge, angles, and true poses."""
+    """Return a fit by scipy: unknown frames on both sides of the hinge, angles, and true poses."""
     optimize: Any = importlib.import_module("scipy.optimize")
     a, b = parents[:_COUNT], children[:_COUNT]
     scale = np.array([1.0 / _POSITION] * 3 + [1.0 / _ORIENTATION] * 3)

@@ -78,7 +78,7 @@ def _for_mujoco(robot: BenchmarkRobot, folder: Path) -> str:
 
 
 def _results(robot: BenchmarkRobot, load: Callable[[], dict[str, Any]]) -> Callable[[], Sequence[Array]]:
-    """Return what gives pose and Jacobian, with columns in the order of the chain."""
+    """Return a function for pose and Jacobian, with columns in the order of the chain."""
 
     def results() -> list[Array]:
         said = load()

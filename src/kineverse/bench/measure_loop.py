@@ -134,7 +134,7 @@ def _link_transform(angle: ca.SX, length: float) -> ca.SX:
 
 
 def _closing_angles(crank: float) -> Array:
-    """Return near what angles coupler and rocker meet: two circles intersect there."""
+    """Return approximate angles at which coupler and rocker meet, from the intersection of two circles."""
     pin = _CRANK * np.array([np.cos(crank), np.sin(crank)])
     way = np.array([_GROUND, 0.0]) - pin
     distance = np.linalg.norm(way)

@@ -1,4 +1,4 @@
-"""``memory``: what a loaded robot takes in a fresh process, over what the imports take."""
+"""``memory``: memory of a loaded robot in a fresh process, without that of the imports."""
 
 from __future__ import annotations
 

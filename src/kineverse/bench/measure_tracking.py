@@ -57,7 +57,7 @@ def measure(settings: BenchmarkSettings) -> BenchmarkResult:
 
 
 def _readings(model: Model, frames: list[str], count: int) -> list[Array]:
-    """Return what is seen of a kitchen whose doors are far from their limits, where limits change nothing."""
+    """Return noisy poses of a kitchen whose doors are far from their limits, which thus have no effect."""
     rng = np.random.default_rng(0)
     symbols = model.degrees_of_freedom
     low, high = np.array([model.limits(s) for s in symbols]).T

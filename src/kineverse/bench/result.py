@@ -100,11 +100,11 @@ class BenchmarkResult:
     work
         Description of the work.
     measurements
-        What each contender needed.
+        Results of the contenders.
     comparisons
-        What that means.
+        Ratios of measurements.
     missing
-        Who could not take part, and what to do about it.
+        Missing peers, each with the advice to install it.
     """
 
     name: str
@@ -117,7 +117,7 @@ class BenchmarkResult:
 def compare_speed(
     measured: Mapping[str, Measurement], ours: str, theirs: str, at_least: float | None = None
 ) -> Comparison:
-    """Return how many times as fast we are as a peer.
+    """Return the speed relative to a peer.
 
     It is the median, over the rounds, of the ratio within a round, as a machine that slows down for a while
     does so for both.

@@ -60,7 +60,7 @@ class BenchmarkRobot:
 
     @cached_property
     def mimics(self) -> dict[str, tuple[str, float, float]]:
-        """The joints that follow others: whom, the multiplier and the offset; read from the file itself."""
+        """Mimic joints: their driver, multiplier and offset, read from the file itself."""
         joints = ElementTree.parse(self.file).iterfind("joint")
         return {
             joint.get("name", ""): (
@@ -76,7 +76,7 @@ class BenchmarkRobot:
         """Return configurations [rad], [m] in [-1, 1], shape (count, coordinates); always the same ones."""
         return np.random.default_rng(0).uniform(-1.0, 1.0, (count, len(self.coordinates)))
 
-    def of_chain(self, configurations: Array) -> Array:
+    def select_chain(self, configurations: Array) -> Array:
         """Return the columns of the coordinates that move the frame."""
         columns = [self.coordinates.index(symbol) for symbol in self.chain]
         return np.ascontiguousarray(configurations[:, columns])
@@ -220,7 +220,7 @@ class KitchenRobot:
         return _make_scene(self.model)
 
     def whole_scene(self) -> Scene:
-        """Return a scene without rules, so that what overlaps in the robot itself is looked at as well."""
+        """Return a scene without rules, so that overlapping links of the robot are checked too."""
         return Scene(self.model)
 
 

@@ -208,7 +208,7 @@ def print_notes(lines: Iterable[str]) -> None:
 
 
 def _suggest_unit(text: str, kind: str, lower: float, upper: float) -> str:
-    """Return what the same number means in a smaller unit, if it is within the limits in that."""
+    """Suggest a smaller unit in which the same number is within the limits."""
     if has_unit(text):
         return ""
     name, _, number = text.rpartition("=")

@@ -1,4 +1,4 @@
-"""``kineverse bench``: how fast things are, here."""
+"""``kineverse bench``: benchmarks on this machine."""
 
 from __future__ import annotations
 

@@ -72,7 +72,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def run(arguments: argparse.Namespace) -> int:
-    """Read, write, and say what was written."""
+    """Read, write, and report the written file."""
     to_stdout = arguments.target == STDOUT
     if not to_stdout:
         # Before the model is loaded: a name that cannot be written to should not take seconds to be found.
@@ -126,7 +126,7 @@ def _save_model(model: kv.Model, arguments: argparse.Namespace) -> SaveResult:
 
 
 def check_writable(target: str, source: str, force: bool = False) -> None:
-    """Look whether a file can be written, as far as that can be known before there is a model.
+    """Check that a file can be written, as far as possible before the model is loaded.
 
     Raises
     ------
@@ -197,7 +197,7 @@ def _print_report(
 
 
 def _omission_notes(arguments: argparse.Namespace, saved: SaveResult) -> list[str]:
-    """Return what the file does not say, for standard error."""
+    """Format the omissions of the file, for standard error."""
     from kineverse.cli.format_values import format_count
 
     count = format_count(len(saved.left_out), "thing")
@@ -207,7 +207,7 @@ def _omission_notes(arguments: argparse.Namespace, saved: SaveResult) -> list[st
 
 
 def _approximation_errors(saved: SaveResult) -> str:
-    """Return by how much frames are off at most, and which ones."""
+    """Format the largest approximation errors, with their frames."""
     from kineverse.cli.format_values import format_count, format_pose_difference
 
     errors = saved.errors

@@ -1,4 +1,4 @@
-"""``kineverse diff``: what two models differ in."""
+"""``kineverse diff``: differences of two models."""
 
 from __future__ import annotations
 

@@ -35,7 +35,7 @@ class ModelComparisonReport:
         """Return the paragraphs of the report, with at most so many differences each."""
         result = [_operation_lines(self.found, most)] if any(self.found.operations.values()) else []
         for kind in ORDER:
-            differences = self.found.of_kind(kind)
+            differences = self.found.by_kind(kind)
             if differences:
                 result.append([colorize(kind, "bold"), *_difference_lines(differences, most)])
         result.append(_totals(self.found))
@@ -46,7 +46,7 @@ class ModelComparisonReport:
         operations = {WORDS[sign]: list(tags) for sign, tags in self.found.operations.items()}
         return {
             "operations": operations if self.found.operations_compared else None,
-            **{kind: _kind_to_json(self.found.of_kind(kind)) for kind in ORDER},
+            **{kind: _kind_to_json(self.found.by_kind(kind)) for kind in ORDER},
             "alike": self.found.alike,
         }
 

@@ -93,7 +93,7 @@ def validate_file(
     root: str | None = None,
     loops: LoopTreatment = "solve",
 ) -> ValidationResult:
-    """Return what is found in a file; nothing is raised for what is wrong with it.
+    """Validate a file; its faults are listed in the result and not raised.
 
     Parameters
     ----------
@@ -128,7 +128,7 @@ def validate_file(
 
 
 def _frozen_operations(model: kv.Model) -> list[str]:
-    """Return which operations of a document cannot follow when what they read is changed, and why."""
+    """List the operations of a document that cannot follow changes of the values they read, with reasons."""
     operations = {tag: model.history.operation(tag) for tag in model.history.tags}
     return [
         f"operation {tag!r} is frozen: {operation.frozen}"

@@ -1,4 +1,4 @@
-"""``kineverse fit``: from recorded poses of two parts to the model of what connects them."""
+"""``kineverse fit``: identification of the joint between two parts from recorded poses."""
 
 from __future__ import annotations
 
@@ -177,7 +177,7 @@ class LearnedJoint:
 def fit_joint(
     pair: RecordedPair, stated: tuple[float, float | None] | None, families: str | None, thins: bool
 ) -> LearnedJoint:
-    """Return what is learned from poses; if it thins, from so many as tell something of their own.
+    """Identify the joint between two parts; with ``thins``, from an independent subset of the poses.
 
     Raises
     ------
@@ -206,7 +206,7 @@ def fit_joint(
 def identify_joint(
     pair: RecordedPair, stated: tuple[float, float | None] | None, families: str | None
 ) -> tuple[IdentificationResult, ObservationNoise]:
-    """Return what was found, and how far observations are off.
+    """Identify the joint between two parts, and return it with the noise of the observations.
 
     Raises
     ------
@@ -244,7 +244,7 @@ def make_covariance(position: float, orientation: float | None) -> Array:
 
 
 def count_independent(found: IdentificationResult, pair: RecordedPair) -> int:
-    """Return how many of the poses tell something of their own, by what the best joint leaves of them."""
+    """Return the effective sample size of the poses, from the residuals of the most probable joint."""
     from kineverse.estimation.recordings import effective_sample_size, spaced_indices
 
     count = len(pair.lines)
@@ -266,7 +266,7 @@ def count_independent(found: IdentificationResult, pair: RecordedPair) -> int:
 
 
 def write_results(arguments: argparse.Namespace, pair: RecordedPair, learned: LearnedJoint) -> dict[str, Any]:
-    """Write what was asked for, and return where it is."""
+    """Write the requested files, and return their paths."""
     fit = learned.fit
     if arguments.picture:
         from kineverse.experiments.plots import SIZE, draw_fit

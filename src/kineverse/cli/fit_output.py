@@ -35,7 +35,7 @@ _MOST_LISTED = 10
 
 
 def format_fit(source: str, pair: RecordedPair, learned: LearnedJoint) -> str:
-    """Return what was found: the joint, how sure that is, and what else it could be."""
+    """Format the identified joint, its probability and its alternatives."""
     found, best, count = learned.found, learned.fit, len(pair.child_poses)
     said = f"{best.family}, {_format_percent(best.probability)}"
     if found.is_ambiguous:
@@ -115,7 +115,7 @@ def _format_parameters(fit: Fit) -> list[tuple[str, str]]:
 
 
 def _format_outliers(outliers: Sequence[int], count: int, what: str) -> list[str]:
-    """Return which poses do not fit at all, from 0, in words."""
+    """Format the indices of the outliers, from 0."""
     if not outliers:
         return []
     numbers = ", ".join(map(str, outliers[:_MOST_LISTED]))

@@ -24,7 +24,7 @@ _NOTHING = 1e-9
 
 
 def format_contents(model: ModelView) -> str:
-    """Return how many of everything a model has."""
+    """Format the numbers of frames, degrees of freedom and constraints of a model."""
     counts = (model.frames, "frame"), (model.degrees_of_freedom, "DoF"), (model.constraints, "constraint")
     return ", ".join(format_count(len(some), noun) for some, noun in counts)
 
@@ -101,7 +101,7 @@ def _format_body(body: Body) -> str:
 
 
 def format_delta(delta: Delta) -> list[str]:
-    """Return what differs in one part of a value, in one line or several."""
+    """Format the difference of one part of a value, in one line or several."""
     if delta.what == "place":
         return [f"in the world {_format_transform_delta(delta)}"]
     if delta.what == "transform":
@@ -124,7 +124,7 @@ def format_delta(delta: Delta) -> list[str]:
 
 
 def _format_transform_delta(delta: Delta) -> str:
-    """Return how far apart two transforms are, at the default state and elsewhere."""
+    """Format the distance of two transforms, at the default state and elsewhere."""
     here, worst = delta.at_default, (delta.distance, delta.angle)
     if max(worst) == 0.0:
         return "is written in another way"

@@ -113,7 +113,7 @@ def format_sections(summary: ModelSummary, frames: bool = False, constraints: bo
 
 
 def summary_to_json(summary: ModelSummary) -> dict[str, Any]:
-    """Return the summary as what JSON can say; a limit that is not there is null."""
+    """Convert the summary to JSON; an absent limit is null."""
 
     def finite(value: float) -> float | None:
         return value if abs(value) < float("inf") else None
@@ -155,7 +155,7 @@ def summary_to_json(summary: ModelSummary) -> dict[str, Any]:
 
 
 def _format_contacts(pairs: Sequence[DistanceResult]) -> str:
-    """Return how many pairs touch, and which is the deepest."""
+    """Format the number of touching pairs and the deepest pair."""
     from kineverse.cli.summary import CONTACT_DEPTH
 
     pair, depth = pairs[0], -pairs[0].distance

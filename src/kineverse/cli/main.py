@@ -35,7 +35,7 @@ examples:
   kineverse convert kitchen kitchen.kv.json           write it in another format
   kineverse diff kitchen kitchen.kv.json              what two models differ in
   kineverse fit poses.csv --child door                learn a joint from recorded poses
-  kineverse demo --headless                           a picture of kitchen and robot
+  kineverse demo --headless                           track a simulated kitchen; numbers and a picture
 """
 
 
@@ -131,7 +131,7 @@ def _parse_arguments(words: Sequence[str]) -> argparse.Namespace:
 
 
 def _suggest_command(name: str) -> str:
-    """Return what may have been meant by a command that does not exist."""
+    """Suggest similar names for an unknown command."""
     from kineverse.formats.locate import shipped_models
 
     if name in shipped_models() or os.path.exists(name):
@@ -140,7 +140,7 @@ def _suggest_command(name: str) -> str:
 
 
 def format_error(error: BaseException) -> str:
-    """Return what an error says, on one line."""
+    """Format an error on one line."""
     if isinstance(error, OSError) and error.strerror:
         where = f"{error.filename}: " if error.filename else ""
         return f"{where}{error.strerror}"
@@ -149,7 +149,7 @@ def format_error(error: BaseException) -> str:
 
 @contextmanager
 def _log_warnings_to(stream: TextIO, verbose: bool) -> Iterator[None]:
-    """Show what the library logs, on a line each, but for what commands leave to ``--verbose``."""
+    """Print log records of the library, one a line; some of them only with ``--verbose``."""
     handler = logging.StreamHandler(stream)
     handler.setFormatter(logging.Formatter("kineverse: %(message)s"))
     log, quiet = logging.getLogger("kineverse"), [logging.getLogger(name) for name in QUIET]
@@ -167,7 +167,7 @@ def _log_warnings_to(stream: TextIO, verbose: bool) -> Iterator[None]:
 
 
 def _discard_stdout() -> None:
-    """Send what is left of the output nowhere, so that the interpreter does not complain at its end."""
+    """Discard the remaining output, so that the interpreter does not complain at its end."""
     try:
         nowhere = os.open(os.devnull, os.O_WRONLY)
         os.dup2(nowhere, sys.stdout.fileno())

@@ -23,7 +23,7 @@ def colorize(text: str, style: str) -> str:
 
 
 def truncate_lines(lines: Sequence[str], most: int | None, indent: str = "  ") -> list[str]:
-    """Return the first so many lines, and how many more there are; all of them if ``most`` is None."""
+    """Return the first ``most`` lines and the number of the rest; all lines if ``most`` is None."""
     if most is None or len(lines) <= most:
         return list(lines)
     return [*lines[:most], f"{indent}… and {len(lines) - most} more (--all)"]
@@ -110,7 +110,7 @@ def show_progress(
 
 @contextmanager
 def show_activity(what: str) -> Iterator[None]:
-    """Say on standard error what is being done, as long as it is; only if that is a terminal."""
+    """Show an activity on standard error while it lasts, if that is a terminal."""
     if not sys.stderr.isatty():
         yield
         return

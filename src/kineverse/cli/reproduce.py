@@ -77,7 +77,7 @@ def run(arguments: argparse.Namespace) -> int:
 
 
 def _save_figure(report: Report, asked: Path | None) -> None:
-    """Write the figure where it is asked for; without being asked, only if there is what it takes."""
+    """Write the figure; without ``--figure``, only if matplotlib is installed."""
     path = asked or Path(f"{report.name}.png")
     try:
         report.figure.save(path)

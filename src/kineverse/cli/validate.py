@@ -1,4 +1,4 @@
-"""``kineverse validate``: whether files are what they should be."""
+"""``kineverse validate``: faults of files."""
 
 from __future__ import annotations
 
@@ -86,7 +86,7 @@ def run(arguments: argparse.Namespace) -> int:
 
 
 def format_validation(found: ValidationResult, most: int | None) -> list[str]:
-    """Return what was found in one file, with at most so many remarks, and problems of a kind."""
+    """Format the validation of one file, with at most ``most`` remarks and problems of a kind."""
     if found.error is not None:
         return [found.name, f"  {colorize('cannot be read', '!')}: {found.reason}"]
     lines = [f"{found.name}: {found.kind}", f"  {found.contents}", f"  {_format_verdict(found)}"]

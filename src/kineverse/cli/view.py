@@ -76,7 +76,7 @@ def add_page_options(parser: argparse.ArgumentParser) -> None:
 
 
 def page_options(arguments: argparse.Namespace) -> dict[str, Any]:
-    """Return what was said about a page, as it is given to one."""
+    """Return the options of a page as keyword arguments."""
     return {"port": arguments.port, **({"host": arguments.host} if arguments.host else {})}
 
 
@@ -128,7 +128,7 @@ def run(arguments: argparse.Namespace) -> int:
 def _write_picture(
     arguments: argparse.Namespace, model: kv.Model, state: dict[str, float], near: float | None
 ) -> int:
-    """Write a picture of the state, and say what it cannot show."""
+    """Write a picture of the state, and report missing meshes."""
     from kineverse.geometry.exclusions import find_unusable_shapes, label_unusable_shapes
     from kineverse.view import meshes, save_picture
 

@@ -138,7 +138,7 @@ class Batch:
             self._library = ProgramLibrary(program, BATCH_KIND, lambda: generate_batch_source(program), _load)
 
     def __call__(self, x: npt.ArrayLike, out: Any, function: CasadiFunction) -> Any:
-        """Return the outputs at all rows of ``x``, see :meth:`CompiledFunction.batch`.
+        """Return the outputs at all rows of ``x``, see :meth:`.CompiledFunction.batch`.
 
         Parameters
         ----------

@@ -124,7 +124,7 @@ class Evaluator(metaclass=ABCMeta):
     """A function bound to arrays for its input and outputs, for one thread.
 
     Fill :attr:`input`, call, read :attr:`outputs`. Every call rewrites the arrays in :attr:`outputs` in
-    place; copy those that have to outlive the next call. Made by :meth:`CompiledFunction.bind`. It switches
+    place; copy those that have to outlive the next call. Made by :meth:`.CompiledFunction.bind`. It switches
     to C when the function's C is ready.
 
     Attributes

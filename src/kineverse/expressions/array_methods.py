@@ -18,7 +18,7 @@ np: Any = numpy
 
 
 class ArrayMethods:
-    """Base of :class:`Expression`: each method is numpy's function of the same name."""
+    """Base of :class:`.Expression`: each method is numpy's function of the same name."""
 
     __slots__ = ()
 

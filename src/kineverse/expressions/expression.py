@@ -93,21 +93,21 @@ class Expression(ArrayMethods):
         return math.prod(self._shape)
 
     @property
-    def sx(self) -> SX:
-        """CasADi graph, in which opaque nodes are symbols; see :attr:`casadi` for the whole graph."""
-        return self._sx
-
-    @property
-    def nodes(self) -> frozenset[Node]:
-        """Opaque nodes that the graph refers to."""
-        return self._nodes
-
-    @property
     def casadi(self) -> SX:
         """CasADi's ``SX`` of the values, nodes lowered: (n, m) as stored, see :mod:`.layout`."""
         from .graph import expand_nodes
 
         return expand_nodes(self)
+
+    @property
+    def sx(self) -> SX:
+        """CasADi's ``SX`` of the values, nodes as symbols: (n, m) as stored, see :mod:`.layout`."""
+        return self._sx
+
+    @property
+    def nodes(self) -> frozenset[Node]:
+        """The opaque nodes of the graph, without those inside of them."""
+        return self._nodes
 
     @property
     def symbols(self) -> tuple[Symbol, ...]:
@@ -551,7 +551,7 @@ def notify_access(expression: Expression) -> Expression:
 def from_casadi(sx: SX, shape: ArrayShape, nodes: frozenset[Node]) -> Expression:
     """Wrap an ``SX`` that only contains known symbols and the symbols of ``nodes``.
 
-    A scalar that consists of one symbol is that :class:`Symbol`, so ``v[0]`` can be used as a key.
+    A scalar that consists of one symbol is that :class:`.Symbol`, so ``v[0]`` can be used as a key.
     """
     if not shape and sx.is_symbolic():
         symbol = SYMBOLS.get(sx.element_hash())

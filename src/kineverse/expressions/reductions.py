@@ -37,7 +37,7 @@ def prod_axes(a: ExpressionLike, axis: Axis = None, *, keepdims: bool = False) -
 def min_axes(a: ExpressionLike, axis: Axis = None, *, keepdims: bool = False) -> Expression:
     """Return the smallest of all elements, or along one axis or several.
 
-    The gradient is the mean of those of all the elements that are the smallest; see :func:`minimum`.
+    The gradient is the mean of those of all the elements that are the smallest; see :func:`.minimum`.
     """
     return _keep_axes(_extremum(a, axis, "min"), a, axis, keepdims)
 
@@ -45,7 +45,7 @@ def min_axes(a: ExpressionLike, axis: Axis = None, *, keepdims: bool = False) ->
 def max_axes(a: ExpressionLike, axis: Axis = None, *, keepdims: bool = False) -> Expression:
     """Return the largest of all elements, or along one axis or several.
 
-    The gradient is the mean of those of all the elements that are the largest; see :func:`maximum`.
+    The gradient is the mean of those of all the elements that are the largest; see :func:`.maximum`.
     """
     return _keep_axes(_extremum(a, axis, "max"), a, axis, keepdims)
 

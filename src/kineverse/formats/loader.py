@@ -51,7 +51,7 @@ _ADVICE = {
 }
 
 
-def unsupported_format(path: Path) -> FormatError:
+def unsupported_format_error(path: Path) -> FormatError:
     """Return the error for a file of another format, with the format and the remedy."""
     if path.suffix.lower() == ".xacro":
         plain = path.name[: -len(path.suffix)]
@@ -228,7 +228,7 @@ def _format(source: Source, content: bytes) -> FileFormat | None:
         return None
     file_format = registry.find_format(source.path.name, content)
     if file_format is None:
-        raise unsupported_format(source.path)
+        raise unsupported_format_error(source.path)
     return file_format
 
 

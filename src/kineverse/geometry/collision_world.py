@@ -150,7 +150,7 @@ class CollisionWorld:
     # -- the state -----------------------------------------------------------------------------------------
 
     def update(self, state: StateLike | Sequence[float] | Floats) -> None:
-        """Compute all poses at a state, see :meth:`Scene.update`."""
+        """Compute all poses at a state, see :meth:`.Scene.update`."""
         self.synchronize()
         if isinstance(state, Mapping):
             state = self._select_inputs(state)

@@ -209,7 +209,7 @@ class BranchSamples:
     winding
         Slopes of the unknowns over periodic inputs, shape (k, n).
     condition, worst
-        Conditioning within the limits, see :class:`SolvedLoop`.
+        Conditioning within the limits, see :class:`.SolvedLoop`.
     """
 
     def __init__(

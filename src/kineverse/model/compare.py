@@ -392,7 +392,7 @@ class ModelComparison:
         """True if there are no differences beyond the tolerance."""
         return not (self.differences or any(self.operations.values()))
 
-    def of_kind(self, kind: str) -> list[ValueDifference]:
+    def by_kind(self, kind: str) -> list[ValueDifference]:
         """Return the differences of one kind of data."""
         return [found for found in self.differences if found.change.kind == kind]
 

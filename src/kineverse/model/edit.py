@@ -28,7 +28,7 @@ if TYPE_CHECKING:
 
 
 class Edit:
-    """Transaction on a model, opened by :meth:`Model.edit` in a ``with`` block.
+    """Transaction on a model, opened by :meth:`.Model.edit` in a ``with`` block.
 
     The end of the block commits the edit. An exception in it restores the model. In the block, the model
     shows the edit so far; other threads wait.

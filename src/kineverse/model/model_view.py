@@ -31,7 +31,7 @@ from .violations import Checks, Violations, find_violations
 
 
 class ModelView(SymbolicView):
-    """Read access to a model: data, kinematics, constraints. Base of :class:`Model` and :class:`Snapshot`.
+    """Read access to a model: data, kinematics, constraints. Base of :class:`.Model` and :class:`.Snapshot`.
 
     This class adds the queries that take or return numbers to those of :class:`SymbolicView`.
     """

@@ -187,7 +187,7 @@ def project(
     fixed: Iterable[Symbol | str] = (),
     tolerance: float = TOLERANCE,
 ) -> State:
-    """Project a state onto the manifold of equality constraints, see :meth:`ModelView.project`."""
+    """Project a state onto the manifold of equality constraints, see :meth:`.ModelView.project`."""
     tolerance = as_tolerance(tolerance)
     fixed_symbols = _fixed_coordinates(equalities, fixed)
     symbols = equalities.symbols

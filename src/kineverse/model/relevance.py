@@ -80,7 +80,7 @@ class Relevance:
         bounds: bool,
         closure: bool,
     ) -> list[str]:
-        """Return the names of relevant constraints, sorted; see :meth:`Model.constraints_for`."""
+        """Return the names of relevant constraints, sorted; see :meth:`.Model.constraints_for`."""
         if isinstance(subject, Expression) or not isinstance(subject, Iterable):
             subject = [subject]
         expressions = list(subject)

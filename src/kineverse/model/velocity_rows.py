@@ -86,7 +86,7 @@ def velocity_rows(
     Parameters
     ----------
     constraints
-        Constraints by name, from :attr:`Model.constraints` or :meth:`Model.constraints_for`.
+        Constraints by name, from :attr:`.Model.constraints` or :meth:`.Model.constraints_for`.
     dt
         Control period Δt [s].
     rates

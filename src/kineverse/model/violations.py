@@ -97,7 +97,7 @@ class Checks:
 def find_violations(
     checks: Checks, values: StateLike, known: Iterable[Symbol], tolerance: float
 ) -> Violations:
-    """Return the violations at ``values``, see :meth:`ModelView.violations`."""
+    """Return the violations at ``values``, see :meth:`.ModelView.violations`."""
     tolerance = as_tolerance(tolerance)
     known = (*known, *checks.symbols)
     state = as_state(values, known)

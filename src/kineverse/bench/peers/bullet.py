@@ -36,21 +36,21 @@ class BulletSearch:
         self._joints = list(range(LINKS))
         self.found: list[Any] = []
 
-    def put(self, angles: Array) -> None:
-        """Move what moves."""
+    def update(self, angles: Array) -> None:
+        """Set the joint angles [rad]."""
         rows = angles[:, None].tolist()
         self._bullet.resetJointStatesMultiDof(
             self._arm, self._joints, targetValues=rows, physicsClientId=self._client
         )
 
     def find(self) -> object:
-        """Find what is near."""
+        """Find the pairs within the radius."""
         ask, arm, client = self._bullet.getClosestPoints, self._arm, self._client
         self.found = [ask(arm, body, RADIUS, physicsClientId=client) for body in self._bodies]
         return self.found
 
     def distances(self) -> PairDistances:
-        """Return what was found."""
+        """Return the pairs of the last search."""
         for contact in itertools.chain(*self.found):
             yield f"link{contact[3]}", f"box{self._bodies[contact[2]] + contact[4]}", contact[8]
 

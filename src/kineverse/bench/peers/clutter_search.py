@@ -19,14 +19,14 @@ PairDistances: TypeAlias = Iterator[tuple[str, str, float]]
 class ProximitySearch(Protocol):
     """Search for the pairs that are within :data:`RADIUS`, with points and normals."""
 
-    def put(self, angles: Array) -> None:
-        """Move what moves."""
+    def update(self, angles: Array) -> None:
+        """Set the joint angles [rad]."""
 
     def find(self) -> object:
-        """Find what is near."""
+        """Find the pairs within the radius."""
 
     def distances(self) -> PairDistances:
-        """Return the names and the distance of what was found last [m]; of a pair the least one counts."""
+        """Return the pairs of the last search, with names and the least distance [m]."""
 
 
 class KineverseSearch:
@@ -36,17 +36,17 @@ class KineverseSearch:
         self.scene, self._radius = scene, radius
         self.found: Any = ()
 
-    def put(self, angles: Array) -> None:
-        """Move what moves."""
+    def update(self, angles: Array) -> None:
+        """Set the joint angles [rad]."""
         self.scene.update(angles)
 
     def find(self) -> object:
-        """Find what is near."""
+        """Find the pairs within the radius."""
         self.found = self.scene.pairs_within(self._radius)
         return self.found
 
     def distances(self) -> PairDistances:
-        """Return what was found."""
+        """Return the pairs of the last search."""
         return ((near.a, near.b, near.distance) for near in self.found)
 
 
@@ -72,14 +72,14 @@ class CoalSearch:
         self._request, self._result = coal.DistanceRequest(), coal.DistanceResult()
         self.found: list[tuple[int, int, float, Array, Array, Array]] = []
 
-    def put(self, angles: Array) -> None:
-        """Move what moves."""
+    def update(self, angles: Array) -> None:
+        """Set the joint angles [rad]."""
         self._scene.update(angles)
         for transform, pose in zip(self._transforms, self._table.poses[: self._table.moving], strict=False):
             transform.setTransform(pose[:, :3], pose[:, 3])
 
     def find(self) -> object:
-        """Find what is near."""
+        """Find the pairs within the radius."""
         transforms, request, result = self._transforms, self._request, self._result
         functors, found = self._functors, []
         for i, j in self._near():
@@ -95,7 +95,7 @@ class CoalSearch:
         return found
 
     def distances(self) -> PairDistances:
-        """Return what was found."""
+        """Return the pairs of the last search."""
         return ((self._names[i], self._names[j], distance) for i, j, distance, *_ in self.found)
 
     def _near(self) -> Iterable[tuple[int, int]]:
@@ -130,20 +130,20 @@ class MujocoSearch:
         self.names = [self.model.geom(k).name for k in range(self.model.ngeom)]
         self.found: Any = None
 
-    def put(self, angles: Array) -> None:
-        """Move what moves."""
+    def update(self, angles: Array) -> None:
+        """Set the joint angles [rad]."""
         self.data.qpos[:] = angles
         self._mujoco.mj_kinematics(self.model, self.data)
 
     def find(self) -> object:
-        """Find what is near."""
+        """Find the pairs within the radius."""
         self._mujoco.mj_collision(self.model, self.data)
         contact = self.data.contact
         self.found = contact.geom, contact.dist, contact.pos, contact.frame
         return self.found
 
     def distances(self) -> PairDistances:
-        """Return what was found."""
+        """Return the pairs of the last search."""
         for (a, b), distance in zip(self.found[0].tolist(), self.found[1].tolist(), strict=True):
             yield self.names[a], self.names[b], distance
 
@@ -158,7 +158,7 @@ class MujocoPairSearch(MujocoSearch):
         self._radii = self.model.geom_rbound.copy()
 
     def find(self) -> object:
-        """Find what is near."""
+        """Find the pairs within the radius."""
         at, links, boxes = self.data.geom_xpos, self._links, self._boxes
         apart = at[links, None] - at[boxes]
         reach = self._radii[links, None] + self._radii[boxes] + RADIUS
@@ -174,7 +174,7 @@ class MujocoPairSearch(MujocoSearch):
         return found
 
     def distances(self) -> PairDistances:
-        """Return what was found."""
+        """Return the pairs of the last search."""
         return ((self.names[i], self.names[j], distance) for i, j, distance, _ in self.found)
 
 

@@ -83,7 +83,7 @@ class NumpyFilter:
                 return x, covariance
 
     def _linear(self, x: Array, seen: Array) -> tuple[Array, Array]:
-        """Return errors (6 m,) and derivatives (6 m, n) of what is said at x."""
+        """Return errors (6 m,) and derivatives (6 m, n) of the predicted poses at x."""
         said, jacobian = self._evaluate(x)
         turned = seen[:, :3, :3] @ said[:, :3, :3].transpose(0, 2, 1)
         sine = (

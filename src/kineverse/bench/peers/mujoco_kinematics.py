@@ -51,7 +51,7 @@ class MujocoRobot:
         return self.pose(self.body), self.jacobian[:, self.columns]
 
     def pose(self, body: int) -> Array:
-        """Return where a body is, shape (4, 4)."""
+        """Return the pose of a body, shape (4, 4)."""
         return transform(self.data.xmat[body].reshape(3, 3), self.data.xpos[body])
 
 

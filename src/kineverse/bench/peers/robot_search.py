@@ -48,7 +48,7 @@ class RobotSurroundings:
         return self._world.table.poses[pieces]
 
     def solid(self, piece: int) -> Solid:
-        """Return what a piece is."""
+        """Return the solid of a collision object."""
         return self._world.solid(piece)
 
 
@@ -72,8 +72,8 @@ class MujocoRobotSearch(MujocoSearch):
         self._start(make_mjcf(assets, world))
         self.names = [room.names[int(name)] for name in self.names]
 
-    def put(self, angles: Array) -> None:
-        """Move what moves."""
+    def update(self, angles: Array) -> None:
+        """Set the joint angles [rad]."""
         poses = self._room.update(angles)
         self.data.qpos.reshape(-1, 7)[:] = np.hstack([poses[:, :, 3], to_wxyz(poses)])
         self._mujoco.mj_kinematics(self.model, self.data)
@@ -119,14 +119,14 @@ class BulletRobotSearch:
         }
         self.found: list[tuple[int, int, Any]] = []
 
-    def put(self, angles: Array) -> None:
-        """Move what moves."""
+    def update(self, angles: Array) -> None:
+        """Set the joint angles [rad]."""
         poses, place = self._room.update(angles), self._bullet.resetBasePositionAndOrientation
         for body, at, turn in zip(self._robot, poses[:, :, 3].tolist(), xyzw_quaternions(poses), strict=True):
             place(body, at, turn, physicsClientId=self._client)
 
     def find(self) -> object:
-        """Find what is near."""
+        """Find the pairs within the radius."""
         ask, client = self._bullet.getClosestPoints, self._client
         self.found = [
             (piece, first, ask(one, other, RADIUS, physicsClientId=client))
@@ -136,7 +136,7 @@ class BulletRobotSearch:
         return self.found
 
     def distances(self) -> PairDistances:
-        """Return what was found."""
+        """Return the pairs of the last search."""
         names, others = self._room.names, self._room.others
         for piece, first, contacts in self.found:
             for contact in contacts:

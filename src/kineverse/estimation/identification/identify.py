@@ -26,7 +26,7 @@ from .optimise import InitialGuess
 from .outlier_rejection import RowIndices, find_inliers, log_inlier_prior
 from .projection import complete_fit
 from .result import Fit, IdentificationResult, LazyFit, build_fit
-from .scale import in_metres, in_units, length_scale, log_density
+from .scale import convert_to_metres, convert_to_unit, length_scale, log_density
 from .solver import solver
 from .unwrapping import log_unwrapping_gain, unwrap_screw, unwrap_solution
 
@@ -230,7 +230,7 @@ def prepare_data(
     unit = length_scale(observations) if unit is None else unit
     if outliers is not None and outliers != Outliers():
         outliers = replace(outliers, reach=outliers.reach / unit)
-    return IdentificationData(in_units(observations, unit), unit, stated, outliers, sequential)
+    return IdentificationData(convert_to_unit(observations, unit), unit, stated, outliers, sequential)
 
 
 def solve_with_inliers(
@@ -375,6 +375,6 @@ def _fit(
 ) -> Fit:
     solution = fix_gauge(unwrap_solution(one.scored.solution) if data.sequential else one.scored.solution)
     fit = build_fit(solution, solver.evidence(solution, scale), log_evidence, probability)
-    return in_metres(
+    return convert_to_metres(
         complete_fit(fit, data.observations, one.inliers, scale, sequential=data.sequential), data.unit
     )

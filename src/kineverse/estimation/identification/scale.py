@@ -30,7 +30,7 @@ def length_scale(observations: Observations) -> float:
     return max(1.0, _TIMES * float(np.median(off)))
 
 
-def in_units(observations: Observations, unit: float) -> Observations:
+def convert_to_unit(observations: Observations, unit: float) -> Observations:
     """Return observations with lengths in a unit [m]."""
     if unit == 1.0:
         return observations
@@ -51,7 +51,7 @@ def log_density(count: int, unit: float) -> float:
     return 3.0 * (1 - count) * math.log(unit)
 
 
-def in_metres(fit: Fit, unit: float) -> Fit:
+def convert_to_metres(fit: Fit, unit: float) -> Fit:
     """Return a fit with lengths in a unit [m], converted to metres."""
     if unit == 1.0:
         return fit

@@ -29,7 +29,7 @@ from .alternatives import JointObservations, judge_joint
 from .consistency import ConsistencyTests, TimedResiduals
 from .known_motion import KnownJoint
 from .known_residuals import KnownResiduals, compute_residuals
-from .plausibility import FALSE_ALARMS, check_false_alarms, undetermined
+from .plausibility import FALSE_ALARMS, check_false_alarms, undetermined_verdict
 from .report import JointVerdict, Plausibility
 from .sequential_test import SequentialTest
 from .testability import TestableJoint, TestableJoints, find_testable_joints
@@ -233,7 +233,7 @@ class PlausibilityMonitor:
         joint = monitored.joint
         if monitored.served is None or residuals is None:
             never = f"'{joint.parent}' and '{joint.child}' were not seen together"
-            return undetermined(joint, 0, monitored.reason or never)
+            return undetermined_verdict(joint, 0, monitored.reason or never)
         times = self._times(monitored, first)
         data = JointObservations(
             joint, monitored.served, self._poses(joint, times, first), residuals, np.array(times)

@@ -90,7 +90,7 @@ def check_plausibility(
         parent, child = tracks[joint.parent], tracks[joint.child]
         times = np.flatnonzero(parent.seen & child.seen)
         if not len(times):
-            reasons[joint] = undetermined(
+            reasons[joint] = undetermined_verdict(
                 joint, 0, f"'{joint.parent}' and '{joint.child}' were never seen together"
             )
             continue
@@ -101,7 +101,7 @@ def check_plausibility(
             )
             served_joints[joint] = served
         except KineverseError as error:
-            reasons[joint] = undetermined(joint, len(times), f"its pose cannot be computed. {error}")
+            reasons[joint] = undetermined_verdict(joint, len(times), f"its pose cannot be computed. {error}")
     tested = ConsistencyTests(model, served_joints, relative_to).apply(residuals)
     verdicts = []
     for joint in testable.joints:
@@ -139,7 +139,7 @@ def check_false_alarms(probability: float) -> None:
         )
 
 
-def undetermined(joint: TestableJoint, count: int, reason: str) -> JointVerdict:
+def undetermined_verdict(joint: TestableJoint, count: int, reason: str) -> JointVerdict:
     """Return the verdict on a joint that cannot be tested."""
     return JointVerdict(joint, {}, (math.nan, math.nan), count, reason=reason)
 

@@ -80,8 +80,8 @@ class Tracker:
     model
         The model. Later edits of it have no effect.
     observed
-        Names of frames whose poses are measured, or :class:`ObservedPose`, :class:`ObservedPosition`,
-        :class:`ObservedExpression`.
+        Names of frames whose poses are measured, or :class:`.ObservedPose`, :class:`.ObservedPosition`,
+        :class:`.ObservedExpression`.
     start
         Initial values of some coordinates; others start in the middle of the limits, or at the default state.
     uncertainty

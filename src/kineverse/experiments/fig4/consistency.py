@@ -69,8 +69,8 @@ class FilterConsistency:
     bound: dict[str, float]
     states: int
 
-    def plain(self) -> dict[str, Any]:
-        """Return it as JSON has it: null where nothing was counted."""
+    def to_json(self) -> dict[str, Any]:
+        """Convert to JSON; null where nothing was counted."""
         found: dict[str, Any] = {
             "nees_inside": self.nees_inside,
             "nees_all": self.nees,
@@ -87,7 +87,7 @@ class FilterConsistency:
 def measure_consistency(
     scene: ObservedModel, seeds: Sequence[int], configurations: int, progress: Progress
 ) -> dict[PoseNoise, dict[str, FilterConsistency]]:
-    """Return what both filters make of each level."""
+    """Return the consistency of both filters at each noise level."""
     found = {}
     for noise in progress(LEVELS, "fig4: consistency", "level"):
         truths, runs = [], []

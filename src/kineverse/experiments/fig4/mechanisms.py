@@ -69,7 +69,7 @@ class MechanismErrors:
 
 
 def measure_mechanisms(configurations: int, progress: Progress) -> list[MechanismErrors]:
-    """Return how both filters follow each mechanism at each level."""
+    """Return the errors of both filters for each mechanism at each noise level."""
     jobs = [(name, noise) for name in MECHANISMS for noise in LEVELS]
     return [
         _track_mechanism(name, noise, configurations)

@@ -108,7 +108,7 @@ class ObservedModel:
 
 
 def make_observed_model(model: ModelView) -> ObservedModel:
-    """Return what the papers observe of a model: every frame that moves.
+    """Return the frames of a model that the papers observe: every frame that moves.
 
     Groups of frames that share coordinates come in the model's order, but the first seven only shift, as in
     the papers, whose time per update jumps at the eighth.

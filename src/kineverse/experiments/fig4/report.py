@@ -88,7 +88,10 @@ class Fig4Results:
             ],
             "variants": dict(self.variants),
             "consistency": [
-                {**_noise_to_json(noise), **{filter_name: c.plain() for filter_name, c in by_filter.items()}}
+                {
+                    **_noise_to_json(noise),
+                    **{key: c.to_json() for key, c in by_filter.items()},
+                }
                 for noise, by_filter in self.consistency.items()
             ],
             "mechanisms": [

@@ -49,7 +49,7 @@ def time_updates_by_size(
 
 
 def time_updates(scene: ObservedModel, noise: PoseNoise, configurations: int) -> dict[str, Duration]:
-    """Return how long both filters take for the updates after the first."""
+    """Return the durations of both filters for the updates after the first."""
     _, seen, training = simulate_observations(scene, noise, 0, configurations)
     published = PaperEkf(scene.model, scene.frames)
     published.learn_noise(training)

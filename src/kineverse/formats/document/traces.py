@@ -169,7 +169,7 @@ class TraceConsistency:
             replies = self._replies(trace, reads)
             if replies is None or not self._spend(self._cost_of_writes(trace)):
                 return reads
-            again = trace.written(replies).writes()
+            again = trace.compute_writes(replies).writes()
         except KineverseError as error:
             raise InvalidDocumentError(f"it cannot be followed: {error}") from None
         # Writes have a fixed order of kinds; only the order of names within a kind counts.

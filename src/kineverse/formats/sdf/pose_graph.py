@@ -188,7 +188,7 @@ class PoseGraph:
     placements: list[tuple[PoseNode, SdfScope, str, Element]] = field(default_factory=list)
     canonical: list[tuple[PoseNode, SdfScope, str, Element]] = field(default_factory=list)
 
-    def of_kind(self, kind: str) -> Iterator[PoseNode]:
+    def by_kind(self, kind: str) -> Iterator[PoseNode]:
         """Yield the nodes of one kind."""
         return (node for node in self.nodes if node.kind == kind)
 

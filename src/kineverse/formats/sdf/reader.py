@@ -379,8 +379,8 @@ def _scene(
     remarks: list[str],
 ) -> SdfScene:
     """Return the description of a resolved pose graph."""
-    links = tuple(_link(node) for node in graph.of_kind("link"))
-    resolved = [read_sdf_joint(node, attachments) for node in graph.of_kind("joint")]
+    links = tuple(_link(node) for node in graph.by_kind("link"))
+    resolved = [read_sdf_joint(node, attachments) for node in graph.by_kind("joint")]
     resolved = resolve_gearboxes(resolved, attachments)
     nodes = {part.joint.name: part.node for part in resolved}
 

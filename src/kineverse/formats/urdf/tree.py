@@ -84,7 +84,7 @@ def order_from_root(
         shown = ", ".join(f"{quote(link.name)} (line {link.line})" for link in roots[:_SHOWN])
         more = f" and {len(roots) - _SHOWN} more" if len(roots) > _SHOWN else ""
         text = (
-            f"<link name={quote(roots[1].name)}>: there are {len(roots)} links that are nobody's child, "
+            f"<link name={quote(roots[1].name)}>: there are {len(roots)} links without a parent, "
             f"where one root is expected: {shown}{more}. Connect them by joints.{hint}"
         )
         if remarks.strict:

@@ -58,7 +58,7 @@ def _run_traced(operation: Operation, reader: _RecordingReader, writes: Mapping[
         traced = tuple(
             (cell, map_expressions(cell[0], value, _detach)) for cell, value in effects.writes().items()
         )
-        again = reader.trace(traced).written(reader.results).writes()
+        again = reader.trace(traced).compute_writes(reader.results).writes()
     except UntraceableError:
         raise
     except Exception as error:  # user code, written for other types of values

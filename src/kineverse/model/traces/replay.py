@@ -141,7 +141,7 @@ def replay_agrees(
                     others.append(substitute_results(step.query, others).ask(model))
                 else:
                     others.append(_perturb(change, step.query, reply) if place in free else reply)
-            traced = trace.written(others).writes()
+            traced = trace.compute_writes(others).writes()
         except KineverseError:
             continue  # the perturbation is not valid for the trace
         reader = _ReplayReader(model, trace, others)

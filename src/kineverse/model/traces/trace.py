@@ -83,9 +83,9 @@ class Trace:
                 raise UntraceableError(
                     f"{problem} of {step.query.kind}({asked}), which has changed, decides what it does."
                 )
-        return self.written(new)
+        return self.compute_writes(new)
 
-    def written(self, results: Sequence[QueryResult]) -> Writes:
+    def compute_writes(self, results: Sequence[QueryResult]) -> Writes:
         """Return the writes for given query results."""
         fill = _into(results)
 
