@@ -199,7 +199,7 @@ def test_names_of_any_script(run, robot, tmp_path):
     [
         ("out.txt", ".urdf, .xml"),
         ("out", ".urdf, .xml"),
-        ("", "Which file"),
+        ("", "file to write is empty"),
         ("out.sdf", ".urdf, .xml"),
         ("nowhere/out.kv.json", "the folder nowhere does not exist"),
         ("robot.urdf/out.kv.json", "the folder robot.urdf does not exist"),
