@@ -24,10 +24,10 @@ def scene(arm, tmp_path):
     return Scene(arm.model(tmp_path), rules=RULES)
 
 
-def names(finder, angles):
-    finder.put(angles)
-    finder.find()
-    return {frozenset(pair[:2]) for pair in finder.distances()}
+def names(search, angles):
+    search.update(angles)
+    search.query()
+    return {frozenset(pair[:2]) for pair in search.distances()}
 
 
 def test_peers_find_the_same_pairs(arm, scene):
@@ -58,7 +58,7 @@ def test_mujoco_finds_the_pairs_of_a_robot_in_a_kitchen(robot):
     pytest.importorskip("mujoco")
     ours = SearchEntry("ours", KineverseSearch(robot.scene()), 0.0)
     room = RobotSurroundings(robot.scene(), robot.values[0], "robot/")
-    assert len(names(ours.finder, robot.values[0])) > 20
+    assert len(names(ours.search, robot.values[0])) > 20
     check_distances([ours, SearchEntry("mujoco", MujocoRobotSearch(room), 1e-5)], robot.values)
 
 
@@ -90,7 +90,7 @@ def test_a_missed_pair_is_an_error(arm, scene):
     check_distances([whole, whole], arm.angles)
     with pytest.raises(DisagreementError, match="'forgetful' and 'whole' differ by"):
         check_distances([whole, SearchEntry("forgetful", Forgetful(scene, 0), 1e-6)], arm.angles)
-    furthest = max(distance for *_, distance in whole.finder.distances())
+    furthest = max(distance for *_, distance in whole.search.distances())
     assert furthest > 0.9 * RADIUS
     # Next to the radius, a pair may be there or not.
     check_distances([whole, SearchEntry("forgetful", Forgetful(scene, -1), 2e-2)], arm.angles[:1])

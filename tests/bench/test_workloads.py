@@ -25,7 +25,7 @@ def test_positions_are_those_of_all_joints(tiny):
     positions = robot.positions(configurations)
     assert set(positions) == {"elbow", "finger", "lift", "turn", "thumb"}
     np.testing.assert_allclose(positions["thumb"], 0.1 - 0.5 * positions["finger"])
-    np.testing.assert_array_equal(robot.of_chain(configurations)[:, 1], positions["lift"])
+    np.testing.assert_array_equal(robot.chain_columns(configurations)[:, 1], positions["lift"])
 
 
 def test_shapes_are_left_out_for_libraries_that_load_meshes(robot_file):
@@ -59,7 +59,7 @@ def test_an_unsuitable_robot_is_refused(tiny, tmp_path):
 @pytest.mark.parametrize("rows", [1, CHUNK_SIZE, 2 * CHUNK_SIZE + 3])
 def test_numpy_evaluates_the_graph(tiny, rows):
     robot = find_robot(tiny)
-    points = robot.of_chain(robot.configurations(rows))
+    points = robot.chain_columns(robot.configurations(rows))
     outputs = np.zeros((rows, 4, 4)), np.zeros((rows, 6, 3))
     NumpyGraph(make_casadi_function(robot))(points, outputs)
     model = robot.model

@@ -112,7 +112,7 @@ def test_a_model_that_cannot_be_read_does_not_stop_the_others(run):
 @pytest.mark.parametrize(
     ("words", "message"),
     [
-        ((), "Which model"),
+        ((), "Name a model"),
         (("robot.urdf", "--links", "bsae"), "'base'"),
         (("cube.stl", "--links", "base"), "no link"),
         (("cube.stl", "--error", "0"), "positive length"),

@@ -134,18 +134,18 @@ def test_consistency_is_judged_right(kitchen):
     truth = kitchen.configurations(rng, 400)
     bound = cramer_rao(kitchen, truth, PoseNoise(0.01, 0.02))
     q = truth + rng.normal(0, np.sqrt(bound))
-    honest = _evaluate_consistency(kitchen, truth, bound, [FilterRun(q, bound, nis=1010.0, dof=1000)])
-    assert honest.nees_inside == pytest.approx(1, abs=0.05)
-    assert honest.over_bound == pytest.approx(1, abs=0.03)
-    assert honest.rms == pytest.approx(honest.bound, rel=0.04)
-    assert honest.nis == pytest.approx(1.01)
-    assert honest.nis_band == pytest.approx((1 - 1.96 * math.sqrt(0.002), 1 + 1.96 * math.sqrt(0.002)))
+    consistent = _evaluate_consistency(kitchen, truth, bound, [FilterRun(q, bound, nis=1010.0, dof=1000)])
+    assert consistent.nees_inside == pytest.approx(1, abs=0.05)
+    assert consistent.over_bound == pytest.approx(1, abs=0.03)
+    assert consistent.rms == pytest.approx(consistent.bound, rel=0.04)
+    assert consistent.nis == pytest.approx(1.01)
+    assert consistent.nis_band == pytest.approx((1 - 1.96 * math.sqrt(0.002), 1 + 1.96 * math.sqrt(0.002)))
     lower, upper = kitchen.limits.T
     near = np.minimum(truth - lower, upper - truth) < 3 * np.sqrt(bound)
-    assert honest.states == (~near).sum() < truth.size
-    proud = _evaluate_consistency(kitchen, truth, bound, [FilterRun(q, bound / 9)])
-    assert proud.nees == pytest.approx(9 * honest.nees)
-    assert "nis" not in proud.plain()
+    assert consistent.states == (~near).sum() < truth.size
+    overconfident = _evaluate_consistency(kitchen, truth, bound, [FilterRun(q, bound / 9)])
+    assert overconfident.nees == pytest.approx(9 * consistent.nees)
+    assert "nis" not in overconfident.as_json()
 
 
 def test_lost_runs_are_counted_and_left_out():
