@@ -28,7 +28,7 @@ def test_positions_are_those_of_all_joints(tiny):
     np.testing.assert_array_equal(robot.chain_columns(configurations)[:, 1], positions["lift"])
 
 
-def test_shapes_are_left_out_for_libraries_that_load_meshes(robot_file):
+def test_strip_shapes_removes_visuals_and_collisions(robot_file):
     assert "mesh" in SMALL_ROBOT
     text = strip_shapes(robot_file)
     assert "mesh" not in text
@@ -69,7 +69,7 @@ def test_numpy_evaluates_the_graph(tiny, rows):
             np.testing.assert_allclose(output[k], wanted, rtol=0, atol=1e-14)
 
 
-def test_a_graph_that_numpy_is_not_told_about_is_refused():
+def test_a_graph_with_unsupported_operations_is_refused():
     import casadi as ca
 
     x = ca.SX.sym("x")

@@ -54,7 +54,7 @@ def run(arguments: argparse.Namespace) -> int:
         )
         return 0
     if arguments.name is None:
-        raise UnknownNameError(f"Name an experiment: {', '.join(EXPERIMENTS)}.")
+        raise UnknownNameError(f"Name an experiment. There are: {', '.join(EXPERIMENTS)}.")
     options = Options(quick=arguments.quick, data=arguments.data, model=arguments.model)
     if arguments.figure is not None:
         check_drawing()  # before minutes of computation
