@@ -1,4 +1,4 @@
-"""A robot that is measured quickly, and settings that measure next to nothing."""
+"""Small robot, and minimal settings of benchmarks."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from kineverse.bench import BenchmarkSettings
 
 @pytest.fixture
 def robot_file(tmp_path):
-    """The URDF file of a small robot."""
+    """Return the URDF file of a small robot."""
     file = tmp_path / "small.urdf"
     file.write_text(SMALL_ROBOT, encoding="utf-8")
     return file
@@ -20,7 +20,7 @@ def robot_file(tmp_path):
 
 @pytest.fixture
 def tiny(robot_file):
-    """Settings for everything on the small robot, once."""
+    """Return minimal settings with the small robot."""
     return BenchmarkSettings(
         robot=str(robot_file),
         frame="tip",
@@ -35,7 +35,7 @@ def tiny(robot_file):
 
 @pytest.fixture
 def without(monkeypatch):
-    """Make modules look as if they were not installed."""
+    """Return a function that makes modules appear not installed."""
 
     def hide(*modules):
         for module in modules:

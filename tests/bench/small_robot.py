@@ -1,4 +1,4 @@
-"""A small robot to measure: every kind of joint that peers agree on, and a finger that follows another."""
+"""Small robot with all joint types that peers support, and a mimic joint."""
 
 LIMIT = '<limit lower="-1" upper="1" effort="1" velocity="1"/>'
 

@@ -26,19 +26,19 @@ def run(capsys):
 
 @pytest.fixture
 def asked(monkeypatch, tiny):
-    """Have the command measure next to nothing, and note what it was told to."""
-    heard = []
+    """Run the command with minimal settings, and return its calls of ``run_benchmarks``."""
+    calls = []
 
     def few(names, settings):
-        heard.append((names, settings))
+        calls.append((names, settings))
         return measure(names, tiny)
 
     measure = bench.run_benchmarks
     monkeypatch.setattr(bench, "run_benchmarks", few)
-    return heard
+    return calls
 
 
-def test_the_list_names_all_of_them(run):
+def test_list_names_all_benchmarks(run):
     status, out, err = run("--list")
     assert (status, err) == (0, "")
     assert all(name in out and text in out for name, text in BENCHMARKS.items())
@@ -146,14 +146,14 @@ def test_tables_of_targets_say_whether_they_are_met():
     }
 
 
-def test_targets_are_said_on_request(run, asked):
+def test_targets_are_printed_on_request(run, asked):
     status, out, _ = run("call", "--targets")
     assert status == 0
     assert "target " in out
     assert ">= 8 x" in out
 
 
-def test_bullet_does_not_greet():
+def test_bullet_prints_no_greeting():
     pytest.importorskip("pybullet")
     program = "from kineverse.bench.harness import has_peer; assert has_peer('pybullet')"
     done = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, check=True)
@@ -164,5 +164,5 @@ def test_bullet_does_not_greet():
     ("value", "text"),
     [(2.5, "2.5 s"), (1e-3, "1 ms"), (2.5e-6, "2.5 µs"), (45.6e-9, "45.6 ns"), (0.0, "0 ns")],
 )
-def test_times_are_in_the_unit_that_suits_them(value, text):
+def test_format_quantity_scales_times(value, text):
     assert format_quantity(value, "s") == text

@@ -99,7 +99,7 @@ def test_run_program_reports_the_last_line_of_a_failure(tmp_path):
         run_program("import_time", "no_such_module")
 
 
-def test_large_models_are_as_large_as_asked_for():
+def test_large_models_have_the_requested_size():
     model = make_large_model(100)
     assert len(model.constraints) == 100
     assert len(model.history.tags) >= 100

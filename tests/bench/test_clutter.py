@@ -1,4 +1,4 @@
-"""The arm among boxes: everybody sees the same, and who does not is found out."""
+"""Arm among boxes: all searches find equal pairs, and differences are errors."""
 
 from __future__ import annotations
 
@@ -24,10 +24,10 @@ def scene(arm, tmp_path):
     return Scene(arm.model(tmp_path), rules=RULES)
 
 
-def names(finder, angles):
-    finder.update(angles)
-    finder.find()
-    return {frozenset(pair[:2]) for pair in finder.distances()}
+def names(search, angles):
+    search.update(angles)
+    search.query()
+    return {frozenset(pair[:2]) for pair in search.distances()}
 
 
 def test_peers_find_the_same_pairs(arm, scene):
@@ -58,7 +58,7 @@ def test_mujoco_finds_the_pairs_of_a_robot_in_a_kitchen(robot):
     pytest.importorskip("mujoco")
     ours = SearchEntry("ours", KineverseSearch(robot.scene()), 0.0)
     room = RobotSurroundings(robot.scene(), robot.values[0], "robot/")
-    assert len(names(ours.finder, robot.values[0])) > 20
+    assert len(names(ours.search, robot.values[0])) > 20
     check_distances([ours, SearchEntry("mujoco", MujocoRobotSearch(room), 1e-5)], robot.values)
 
 
@@ -72,8 +72,8 @@ def test_bullet_finds_the_pairs_of_a_robot_in_a_kitchen(robot):
     check_distances(entries, robot.values[::4])
 
 
-class Forgetful(KineverseSearch):
-    """Misses the nearest pair, or the furthest."""
+class IncompleteSearch(KineverseSearch):
+    """Search that misses the nearest pair, or the furthest."""
 
     def __init__(self, scene, which):
         super().__init__(scene)
@@ -85,18 +85,18 @@ class Forgetful(KineverseSearch):
         return iter(found)
 
 
-def test_a_missed_pair_is_an_error(arm, scene):
+def test_check_distances_refuses_a_missed_pair(arm, scene):
     whole = SearchEntry("whole", KineverseSearch(scene), 0.0)
     check_distances([whole, whole], arm.angles)
-    with pytest.raises(DisagreementError, match="'forgetful' and 'whole' differ by"):
-        check_distances([whole, SearchEntry("forgetful", Forgetful(scene, 0), 1e-6)], arm.angles)
-    furthest = max(distance for *_, distance in whole.finder.distances())
+    with pytest.raises(DisagreementError, match="'incomplete' and 'whole' differ by"):
+        check_distances([whole, SearchEntry("incomplete", IncompleteSearch(scene, 0), 1e-6)], arm.angles)
+    furthest = max(distance for *_, distance in whole.search.distances())
     assert furthest > 0.9 * RADIUS
-    # Next to the radius, a pair may be there or not.
-    check_distances([whole, SearchEntry("forgetful", Forgetful(scene, -1), 2e-2)], arm.angles[:1])
+    # A pair near the radius may be missing.
+    check_distances([whole, SearchEntry("incomplete", IncompleteSearch(scene, -1), 2e-2)], arm.angles[:1])
 
 
-def test_more_boxes_stay_away(arm):
+def test_further_boxes_keep_a_distance(arm):
     many = make_clutter(300, steps=40)
     np.testing.assert_array_equal(many.angles.shape, arm.angles.shape)
     assert len(many.sizes) == len(many.poses) == 300

@@ -37,7 +37,7 @@ def test_progress_counts_rounds():
     assert seen == [([0, 1, 2, 3], "game", "round")]
 
 
-def test_the_collector_rests_during_a_turn_and_only_then():
+def test_garbage_collection_is_off_during_samples_only():
     during = []
     time_contenders("game", [Contender("a", lambda: during.append(gc.isenabled()) or 1.0)], 2, silent)
     assert during[1:] == [False, False]
@@ -66,7 +66,7 @@ def test_disagreeing_contenders_are_not_timed():
         ([np.full((2, 2), np.nan)], "differ by nan"),
     ],
 )
-def test_other_shapes_and_nan_are_no_agreement(found, message):
+def test_check_equal_refuses_other_shapes_and_nan(found, message):
     with pytest.raises(DisagreementError, match=message):
         check_equal("game", [("a", [np.zeros((2, 2))]), ("b", found)])
 
@@ -109,7 +109,7 @@ def test_a_missing_peer_is_in_the_comparison():
     assert "theirs" in comparison.name
 
 
-def test_bars():
+def test_bars_are_inclusive_limits():
     measurement = Measurement("load", "s", (0.1, 0.3, 0.2))
     assert (measurement.median, measurement.best) == (0.2, 0.1)
     assert bound_median(measurement, 0.2).status == "met"

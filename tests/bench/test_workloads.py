@@ -25,10 +25,10 @@ def test_positions_are_those_of_all_joints(tiny):
     positions = robot.positions(configurations)
     assert set(positions) == {"elbow", "finger", "lift", "turn", "thumb"}
     np.testing.assert_allclose(positions["thumb"], 0.1 - 0.5 * positions["finger"])
-    np.testing.assert_array_equal(robot.select_chain(configurations)[:, 1], positions["lift"])
+    np.testing.assert_array_equal(robot.chain_columns(configurations)[:, 1], positions["lift"])
 
 
-def test_shapes_are_left_out_for_libraries_that_load_meshes(robot_file):
+def test_strip_shapes_removes_visuals_and_collisions(robot_file):
     assert "mesh" in SMALL_ROBOT
     text = strip_shapes(robot_file)
     assert "mesh" not in text
@@ -59,7 +59,7 @@ def test_an_unsuitable_robot_is_refused(tiny, tmp_path):
 @pytest.mark.parametrize("rows", [1, CHUNK_SIZE, 2 * CHUNK_SIZE + 3])
 def test_numpy_evaluates_the_graph(tiny, rows):
     robot = find_robot(tiny)
-    points = robot.select_chain(robot.configurations(rows))
+    points = robot.chain_columns(robot.configurations(rows))
     outputs = np.zeros((rows, 4, 4)), np.zeros((rows, 6, 3))
     NumpyGraph(make_casadi_function(robot))(points, outputs)
     model = robot.model
@@ -69,7 +69,7 @@ def test_numpy_evaluates_the_graph(tiny, rows):
             np.testing.assert_allclose(output[k], wanted, rtol=0, atol=1e-14)
 
 
-def test_a_graph_that_numpy_is_not_told_about_is_refused():
+def test_a_graph_with_unsupported_operations_is_refused():
     import casadi as ca
 
     x = ca.SX.sym("x")

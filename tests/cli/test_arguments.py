@@ -36,12 +36,12 @@ from kineverse.errors import DuplicateNameError, InvalidValueError
         (" 0.3 ", 0.3),
     ],
 )
-def test_values_in_the_ways_people_write_them(text, value):
+def test_parse_value_accepts_numbers_units_and_parts_of_pi(text, value):
     assert parse_value(text) == pytest.approx(value)
 
 
 @given(st.floats(allow_nan=False, allow_infinity=False))
-def test_numbers_are_read_exactly(value):
+def test_parse_value_reads_numbers_exactly(value):
     assert parse_value(repr(value)) == value
 
 
@@ -72,33 +72,33 @@ def test_numbers_are_read_exactly(value):
         "f(1)",
     ],
 )
-def test_nonfinite_values_are_refused(text):
+def test_parse_value_refuses_nonfinite_values(text):
     with pytest.raises(InvalidValueError, match=r"write|zero|finite"):
         parse_value(text)
 
 
-def test_assignments_leave_names_alone():
+def test_parse_assignments_keeps_names_unchanged():
     texts = ["kitchen/fridge_door=1", "a=b=0.1", "x:velocity=2"]
     assert parse_assignments(texts) == {"kitchen/fridge_door": 1.0, "a=b": 0.1, "x:velocity": 2.0}
 
 
 @pytest.mark.parametrize("text", ["door", "=3", "  =3", "door=", ""])
-def test_invalid_assignments_are_refused(text):
+def test_parse_assignments_refuses_invalid_texts(text):
     with pytest.raises(InvalidValueError):
         parse_assignments([text])
 
 
-def test_a_name_is_given_once():
+def test_parse_assignments_refuses_a_name_given_twice():
     with pytest.raises(DuplicateNameError, match="--set a is given twice"):
         parse_assignments(["a=1", "b=2", " a =1"])
 
 
 @pytest.mark.parametrize(("text", "value"), [("0.05", 0.05), ("5 cm", 0.05), ("2mm", 0.002), ("1/4 m", 0.25)])
-def test_lengths(text, value):
+def test_parse_length_accepts_numbers_and_units(text, value):
     assert parse_length(text) == pytest.approx(value)
 
 
 @pytest.mark.parametrize("text", ["30deg", "1rad", "pi", "3°", "", "far", "nan", "inf", "1e400", "1/0"])
-def test_invalid_lengths_are_refused(text):
+def test_parse_length_refuses_invalid_texts(text):
     with pytest.raises(InvalidValueError):
         parse_length(text)

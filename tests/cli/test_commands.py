@@ -50,19 +50,19 @@ def test_help_imports_nothing_heavy():
     assert (done.returncode, done.stderr) == (0, "[]\n")
 
 
-def test_version(run):
+def test_version_option_prints_the_version(run):
     status, out, _ = run("--version")
     assert (status, out) == (0, f"kineverse {kv.__version__}\n")
 
 
 @pytest.mark.parametrize("words", [["info"], ["fk", "kitchen"], ["view", "kitchen", "--port", "x"]])
-def test_wrong_words_are_status_2(run, words):
+def test_unknown_arguments_are_status_2(run, words):
     status, out, err = run(*words)
     assert (status, out) == (2, "")
     assert "usage: kineverse" in err
 
 
-def test_info_in_words(run):
+def test_info_prints_a_text(run):
     status, out, err = run("info", "kitchen")
     assert (status, err) == (0, "")
     assert "54 frames, 23 DoF, 46 constraints" in out
@@ -74,7 +74,7 @@ def test_info_in_words(run):
     assert "<=" in out
 
 
-def test_info_as_json_is_one_object_and_nothing_else(run):
+def test_info_as_json_is_one_object(run):
     status, out, err = run("info", "pr2", "--json")
     assert (status, err) == (0, "")
     answer = json.loads(out, parse_constant=lambda name: pytest.fail(f"{name} is not JSON"))
@@ -110,13 +110,13 @@ def test_info_lists_interlocks(run):
 
 
 @pytest.mark.parametrize("name", kv.shipped_models())
-def test_info_of_everything_that_ships(run, name):
+def test_info_of_shipped_models(run, name):
     status, out, err = run("info", name)
     assert (status, err) == (0, "")
     assert "DoF" in out
 
 
-def test_fk_in_words_and_as_json(run):
+def test_fk_as_text_and_as_json(run):
     words = ("fk", "kitchen", "kitchen/fridge_door_handle", "--set", "kitchen/fridge_door=30deg")
     status, out, err = run(*words)
     assert (status, err) == (0, "")
@@ -140,7 +140,7 @@ def test_fk_relative_to_a_frame(run):
     np.testing.assert_allclose(json.loads(out)["transform"], expected, atol=1e-12)
 
 
-def test_a_posture_beyond_limits_is_evaluated_and_said(run):
+def test_fk_beyond_limits_is_evaluated_with_a_note(run):
     status, out, err = run(
         "fk", "kitchen", "kitchen/fridge_door", "--set", "kitchen/fridge_door=9.9", "--json"
     )
@@ -162,7 +162,7 @@ def test_a_posture_beyond_limits_is_evaluated_and_said(run):
         ("sink_left_upper_drawer=10cm", ""),
     ],
 )
-def test_a_unit_of_something_else_is_said(run, assigned, remark):
+def test_a_unit_of_another_quantity_is_noted(run, assigned, remark):
     status, _, err = run("fk", "kitchen", "kitchen/fridge_door", "--set", f"kitchen/{assigned}")
     assert (status, err) == (0, f"kineverse: note: {remark}\n" if remark else "")
 
@@ -182,7 +182,7 @@ def test_a_unit_of_something_else_is_said(run, assigned, remark):
         (("view", "kitchen", "--set", "nothing"), "NAME=VALUE"),
     ],
 )
-def test_errors_are_one_line_with_the_right_names_and_status_2(run, words, hint):
+def test_errors_are_one_line_with_suggestions_and_status_2(run, words, hint):
     status, out, err = run(*words)
     assert (status, out) == (2, "")
     assert len(err.splitlines()) == 1
@@ -191,14 +191,14 @@ def test_errors_are_one_line_with_the_right_names_and_status_2(run, words, hint)
     assert "Traceback" not in err
 
 
-def test_a_file_that_is_no_model_is_one_line(run, tmp_path):
+def test_a_file_without_a_model_is_an_error_of_one_line(run, tmp_path):
     path = tmp_path / "broken.urdf"
     path.write_text("<robot name='x'><link name='a'>")
     status, out, err = run("info", path)
     assert (status, out, len(err.splitlines())) == (2, "", 1)
 
 
-def test_meshes_that_are_missing_are_counted(run, tmp_path):
+def test_missing_meshes_are_counted(run, tmp_path):
     path = tmp_path / "box.urdf"
     mesh = "<geometry><mesh filename='package://nowhere/box.stl'/></geometry>"
     path.write_text(f"<robot name='x'><link name='a'><visual>{mesh}</visual></link></robot>")
@@ -209,7 +209,7 @@ def test_meshes_that_are_missing_are_counted(run, tmp_path):
     assert json.loads(out)["not_loaded"] == ["a"]
 
 
-def test_a_closed_pipe_is_quiet():
+def test_a_closed_pipe_prints_no_error():
     done = subprocess.run(
         f"'{sys.executable}' -m kineverse info kitchen --frames --constraints | head -n 1",
         shell=True,
@@ -223,7 +223,7 @@ def test_a_closed_pipe_is_quiet():
 
 
 @pytest.mark.parametrize("words", [("info", "kitchen"), ("fk", "kitchen", "kitchen/fridge_door")])
-def test_without_a_compiler_commands_answer_the_same(run, monkeypatch, tmp_path, words):
+def test_commands_give_equal_results_without_a_compiler(run, monkeypatch, tmp_path, words):
     expected = run(*words)
     monkeypatch.delenv("CC", raising=False)
     monkeypatch.setenv("PATH", str(tmp_path))
@@ -231,7 +231,7 @@ def test_without_a_compiler_commands_answer_the_same(run, monkeypatch, tmp_path,
     assert (expected[0], expected[2]) == (0, "")
 
 
-def test_a_missing_compiler_is_said_only_when_asked(run, monkeypatch, tmp_path):
+def test_a_missing_compiler_is_reported_only_with_verbose(run, monkeypatch, tmp_path):
     monkeypatch.delenv("CC", raising=False)
     words = ("demo", "--sliders", "--headless", "--picture", tmp_path / "picture.png")
     # What was not found on one path is logged once, so there are two.
@@ -244,7 +244,7 @@ def test_a_missing_compiler_is_said_only_when_asked(run, monkeypatch, tmp_path):
     assert "No C compiler" in err
 
 
-def test_ctrl_c_is_130_and_one_empty_line(monkeypatch, run):
+def test_ctrl_c_gives_status_130_and_an_empty_line(monkeypatch, run):
     def interrupted(*_, **__):
         raise KeyboardInterrupt
 
@@ -254,7 +254,7 @@ def test_ctrl_c_is_130_and_one_empty_line(monkeypatch, run):
 
 @pytest.fixture
 def hears_ctrl_c():
-    """Have processes started here hear Ctrl-C, which they would not if this one was started with ``&``."""
+    """Restore the default handler of SIGINT, which child processes lack if this one was started with ``&``."""
     before = signal.signal(signal.SIGINT, signal.default_int_handler)
     yield
     signal.signal(signal.SIGINT, before)
@@ -286,7 +286,7 @@ def test_pages_end_with_status_0(stop, words, hears_ctrl_c):
     assert "viser" not in out + err
 
 
-def test_fk_takes_positions_and_no_speeds(run):
+def test_fk_accepts_positions_and_refuses_speeds(run):
     words = ("fk", "kitchen", "kitchen/fridge_door", "--set", "kitchen/fridge_door:velocity=1")
     status, out, err = run(*words)
     assert (status, out) == (2, "")

@@ -1,4 +1,4 @@
-"""What the commands say of bodies that touch: ``info``, ``validate --contacts``, ``view --picture --near``."""
+"""Contacts in ``info``, ``validate --contacts`` and ``view --picture --near``."""
 
 from __future__ import annotations
 
@@ -54,12 +54,12 @@ def test_info_in_json_has_the_distances_or_null(run, robot, monkeypatch):
     assert json.loads(run("info", file, "--json")[1])["touching"] is None
 
 
-def test_bodies_that_cannot_be_used_do_not_hide_the_others(run, robot):
+def test_info_lists_contacts_beside_unusable_bodies(run, robot):
     out = run("info", robot(0, 0.1, 0.75, shape=MESH))[1]
     assert "touches at the default state: l0 and l2, 0.25 m deep" in out
 
 
-def test_validate_takes_contacts_for_problems_only_if_asked(run, robot):
+def test_contacts_are_problems_only_with_the_option(run, robot):
     file = robot(0, 5, 0.75)
     assert run("validate", file)[0] == 0
     status, out, _ = run("validate", file, "--contacts")
@@ -97,14 +97,14 @@ def test_view_names_the_limits_of_a_picture(run, robot, tmp_path):
 
 
 @pytest.mark.parametrize(("radius", "said"), [("-1", "radius"), ("wide", "not a length")])
-def test_radii_that_are_none_are_refused(run, robot, tmp_path, radius, said):
+def test_view_refuses_invalid_radii(run, robot, tmp_path, radius, said):
     status, _, err = run("view", robot(0, 5), "--picture", tmp_path / "p.png", f"--near={radius}")
     assert status == 2
     assert said in err
     assert not (tmp_path / "p.png").exists()
 
 
-def test_shipped_models_stand_free():
+def test_shipped_models_have_no_penetrations():
     for name in kv.shipped_models():
         assert not any(
             pair.distance < -summary.CONTACT_DEPTH for pair in summary.find_contacts(kv.load(name))

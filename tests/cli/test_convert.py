@@ -1,4 +1,4 @@
-"""``kineverse convert``: a model from one file into another, or into standard output."""
+"""``kineverse convert``: conversion to files and to standard output."""
 
 from __future__ import annotations
 
@@ -35,7 +35,7 @@ def robot(tmp_path, monkeypatch):
     return path
 
 
-def test_a_document_is_the_model_to_the_bit(run, robot, tmp_path):
+def test_a_converted_document_equals_the_model_to_the_bit(run, robot, tmp_path):
     status, out, err = run("robot.urdf", "robot.kv.json")
     assert (status, err) == (0, "")
     size = (tmp_path / "robot.kv.json").stat().st_size
@@ -50,13 +50,13 @@ def test_a_document_is_the_model_to_the_bit(run, robot, tmp_path):
 
 @pytest.mark.parametrize("ending", [".kv.json", ".urdf"])
 @pytest.mark.parametrize("source", ["robot.urdf", "shelf_door", "articulations/revolute"])
-def test_a_converted_model_moves_alike(run, robot, source, ending):
+def test_a_converted_model_has_equal_behaviour(run, robot, source, ending):
     status, _, err = run(source, f"out{ending}")
     assert (status, err) == (0, "")
     assert main(["diff", "--values", source, f"out{ending}"]) == 0
 
 
-def test_unsupported_constraints_are_remarked(run, robot):
+def test_convert_lists_unsupported_constraints(run, robot):
     pytest.importorskip("mujoco")
     status, out, err = run("robot.urdf", "robot.xml")
     assert (status, err) == (0, "")
@@ -64,7 +64,7 @@ def test_unsupported_constraints_are_remarked(run, robot):
     assert main(["diff", "--values", "robot.urdf", "robot.xml"]) == 0
 
 
-def test_prefix(run, robot):
+def test_convert_adds_the_prefix_to_names(run, robot):
     assert run("robot.urdf", "left.kv.json", "--prefix", "left")[0] == 0
     assert list(kv.load("left.kv.json").frames) == ["left/a", "left/b"]
 
@@ -78,7 +78,7 @@ def test_json_is_one_object_and_nothing_else(run, robot):
     assert len(answer["remarks"]["reading"]) == 1
 
 
-def test_a_dash_is_standard_output(robot, tmp_path, capfdbinary):
+def test_convert_to_a_dash_writes_to_standard_output(robot, tmp_path, capfdbinary):
     kv.load("robot.urdf").save("robot.kv.json")
     assert main(["convert", "robot.urdf", "-"]) == 0
     captured = capfdbinary.readouterr()
@@ -121,7 +121,7 @@ def test_leave_out_removes_the_named_constraints_only(run, tmp_path, monkeypatch
     assert "lock" in err
 
 
-def test_curves_are_approximated_when_asked_to_and_by_how_much_is_told(run, tmp_path, monkeypatch):
+def test_convert_with_tolerance_approximates_curves_and_prints_the_error(run, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     source = "articulations/folding_door"
     status, out, err = run(source, "door.urdf")
@@ -146,7 +146,7 @@ def test_curves_are_approximated_when_asked_to_and_by_how_much_is_told(run, tmp_
 
 @pytest.mark.parametrize("ending", ["urdf", "xml"])
 @pytest.mark.parametrize("name", ["pr2", "fetch", "hsr", "kitchen", "shelf_door"])
-def test_models_that_ship_are_converted(run, tmp_path, monkeypatch, name, ending):
+def test_shipped_models_are_converted(run, tmp_path, monkeypatch, name, ending):
     if ending == "xml":
         pytest.importorskip("mujoco")
     monkeypatch.chdir(tmp_path)
@@ -186,7 +186,7 @@ def test_a_file_is_not_converted_into_itself(run, robot, tmp_path):
     assert robot.read_bytes() == before
 
 
-def test_names_of_any_script(run, robot, tmp_path):
+def test_names_in_any_script_are_kept(run, robot, tmp_path):
     (tmp_path / "机 器").mkdir()
     status, out, err = run("robot.urdf", "机 器/тело-ü.kv.json", "--prefix", "рука")
     assert (status, err) == (0, "")
@@ -199,7 +199,7 @@ def test_names_of_any_script(run, robot, tmp_path):
     [
         ("out.txt", ".urdf, .xml"),
         ("out", ".urdf, .xml"),
-        ("", "Which file"),
+        ("", "file to write is empty"),
         ("out.sdf", ".urdf, .xml"),
         ("nowhere/out.kv.json", "the folder nowhere does not exist"),
         ("robot.urdf/out.kv.json", "the folder robot.urdf does not exist"),
@@ -210,7 +210,7 @@ def test_names_of_any_script(run, robot, tmp_path):
         ("dead.kv.json", "no regular file"),
     ],
 )
-def test_places_that_cannot_be_written_to(run, robot, tmp_path, target, hint):
+def test_convert_refuses_unwritable_paths(run, robot, tmp_path, target, hint):
     for name in ("folder", "folder.kv.json"):
         (tmp_path / name).mkdir()
     os.mkfifo(tmp_path / "pipe.kv.json")
@@ -231,7 +231,7 @@ def test_an_unreadable_file_writes_nothing(run, robot, tmp_path, source):
     assert not (tmp_path / "out.kv.json").exists()
 
 
-def test_a_folder_that_may_not_be_written_to(run, robot, tmp_path, monkeypatch):
+def test_convert_to_a_read_only_folder_is_an_error(run, robot, tmp_path, monkeypatch):
     def refuse(*_, **__):
         raise PermissionError(13, "Permission denied")
 

@@ -1,4 +1,4 @@
-"""``kineverse decompose``: the meshes of models, and mesh files, as convex hulls in the cache."""
+"""``kineverse decompose``: meshes of models and mesh files as convex hulls in the cache."""
 
 from __future__ import annotations
 
@@ -44,7 +44,7 @@ def run(capfd):
 
 @pytest.fixture(autouse=True)
 def folder(tmp_path, monkeypatch):
-    """Two meshes and a robot in an empty folder, a cache of its own, and a CoACD that returns the mesh."""
+    """Create two meshes and a robot, a separate cache, and a CoACD that returns the mesh."""
     monkeypatch.chdir(tmp_path)
     monkeypatch.setenv("KINEVERSE_CACHE_DIR", str(tmp_path / "cache"))
     monkeypatch.setattr("kineverse.geometry.decomposition.accuracy.SAMPLES", 100)
@@ -57,7 +57,7 @@ def folder(tmp_path, monkeypatch):
     return tmp_path
 
 
-def test_a_model_is_decomposed_once(run):
+def test_decompose_reuses_the_cache(run):
     status, out, err = run("robot.urdf", "--jobs", 2)
     assert (status, err) == (0, "")
     assert "base: ell.stl" in out
@@ -112,7 +112,7 @@ def test_a_model_that_cannot_be_read_does_not_stop_the_others(run):
 @pytest.mark.parametrize(
     ("words", "message"),
     [
-        ((), "Which model"),
+        ((), "Name a model"),
         (("robot.urdf", "--links", "bsae"), "'base'"),
         (("cube.stl", "--links", "base"), "no link"),
         (("cube.stl", "--error", "0"), "positive length"),
@@ -133,7 +133,7 @@ def test_decompose_refuses_invalid_arguments_in_one_line(run, words, message):
     assert err.count("\n") == 1
 
 
-def test_a_model_without_meshes_is_no_error(run):
+def test_decompose_accepts_a_model_without_meshes(run):
     assert run("shelf_door") == (0, "There are no meshes.\n", "")
 
 

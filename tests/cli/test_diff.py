@@ -1,4 +1,4 @@
-"""``kineverse diff``: what two models differ in, in words, as JSON and as an exit status."""
+"""``kineverse diff``: differences of two models as text, JSON and exit status."""
 
 from __future__ import annotations
 
@@ -70,7 +70,7 @@ def test_equal_models_are_status_0(run, files, tmp_path):
     assert json.loads(run(one, two, "--json")[1])["equal"] is True
 
 
-def test_every_kind_of_difference_is_said(run, files):
+def test_every_kind_of_difference_is_printed(run, files):
     one, two = files(
         base=link("base", f'<inertial><mass value="2.5"/>{INERTIA}</inertial>'),
         upper=link("upper", '<visual><geometry><box size="1 1 1.5"/></geometry></visual>'),
@@ -120,7 +120,7 @@ def test_json_is_one_object_with_numbers(run, files):
     assert answer["frames"]["changed"][0]["distance"] == pytest.approx(0.01)
 
 
-def test_rounding_is_no_difference_unless_asked(run, files):
+def test_rounding_is_a_difference_only_with_tolerance_zero(run, files):
     one, two = files(flange=joint("flange", "upper", "tool", "fixed", '<origin xyz="0.3000000000001 0 0"/>'))
     status, out, _ = run(one, two)
     assert status == 0
@@ -166,7 +166,7 @@ def test_operations_are_compared_where_most_have_a_counterpart(run, files):
 
 
 def test_a_frame_in_another_parent_is_compared_in_the_world(run, files):
-    """Where it is in its parent says nothing when that is another one."""
+    """The pose in the parent is not comparable if the parents differ."""
     one, two = files(flange=joint("flange", "base", "tool", "fixed", '<origin xyz="0.3 0 0"/>'))
     status, out, _ = run(one, two)
     assert status == 1
@@ -183,7 +183,7 @@ def test_a_frame_in_another_parent_is_compared_in_the_world(run, files):
     assert "in the world" not in out
 
 
-def test_a_fixed_joint_is_no_difference_if_its_frames_are_there(run, tmp_path):
+def test_a_fixed_joint_with_equal_frames_is_no_difference(run, tmp_path):
     for name in ("one", "two"):
         model = kv.Model()
         origin = kv.model.Pose.from_matrix(kv.translation(1, 0, 0)())
@@ -198,7 +198,7 @@ def test_a_fixed_joint_is_no_difference_if_its_frames_are_there(run, tmp_path):
     assert run(*words, "--operations", "yes")[0] == 1
 
 
-def test_moved_operations(run, tmp_path):
+def test_moved_operations_are_differences(run, tmp_path):
     q = kv.position("q")
     for name, order in (("one", "ab"), ("two", "ba")):
         model = kv.Model()
@@ -214,7 +214,7 @@ def test_moved_operations(run, tmp_path):
     assert run(tmp_path / "one.kv.json", tmp_path / "two.kv.json", "--operations", "no")[0] == 0
 
 
-def test_a_pose_that_one_side_does_not_have(run, tmp_path):
+def test_a_pose_that_exists_on_one_side_only_is_a_difference(run, tmp_path):
     q = kv.position("q")
     for name, root in (("one", q), ("two", q - 2)):
         model = kv.Model()
@@ -235,7 +235,7 @@ def test_a_pose_that_one_side_does_not_have(run, tmp_path):
 
 @dataclass(frozen=True)
 class Crowd(kv.Operation):
-    """Adds 1 000 constraints."""
+    """Operation that adds 1 000 constraints."""
 
     upper: float
 
@@ -247,8 +247,8 @@ class Crowd(kv.Operation):
 
 
 @pytest.fixture
-def crowds(tmp_path):
-    """Two documents of 1 000 constraints each, all different."""
+def many_constraints(tmp_path):
+    """Return two documents of 1 000 constraints each, all different."""
     paths = tmp_path / "one.kv.json", tmp_path / "two.kv.json"
     for upper, path in enumerate(paths, start=1):
         model = kv.Model()
@@ -258,16 +258,16 @@ def crowds(tmp_path):
     return paths
 
 
-def test_a_thousand_differences_are_bounded(run, crowds):
-    status, out, err = run(*crowds)
+def test_a_thousand_differences_are_bounded(run, many_constraints):
+    status, out, err = run(*many_constraints)
     assert (status, err) == (1, "")
     assert len(out.splitlines()) < 40
     assert "… and 980 more (--all)" in out
     assert "1000 differences: 1000 changed" in out
-    assert len(json.loads(run(*crowds, "--json")[1])["constraints"]["changed"]) == 1_000
+    assert len(json.loads(run(*many_constraints, "--json")[1])["constraints"]["changed"]) == 1_000
 
 
-def test_all_of_them_on_request(run, files):
+def test_all_prints_all_differences(run, files):
     parts = {f"l{i}": link(f"l{i}") + joint(f"j{i}", "base", f"l{i}", "fixed") for i in range(30)}
     one, two = files(**parts)
     assert "… and 10 more (--all)" in run(one, two)[1]
@@ -276,7 +276,7 @@ def test_all_of_them_on_request(run, files):
     assert out.count("in base") == 30
 
 
-def test_names_of_any_script(run, tmp_path):
+def test_names_in_any_script_are_kept(run, tmp_path):
     for name, size in (("eins", 1), ("zwei", 2)):
         (tmp_path / f"{name}-ü.urdf").write_text(
             f'<robot name="r"><link name="тело 机"><visual><geometry><sphere radius="{size}"/></geometry></visual></link></robot>'
@@ -286,7 +286,7 @@ def test_names_of_any_script(run, tmp_path):
     assert "тело 机  visuals[0].geometry.radius 1 → 2" in out
 
 
-def test_prefix_for_both(run, files):
+def test_the_prefix_applies_to_both_models(run, files):
     one, two = files()
     assert run(one, two, "--prefix", "arm")[0] == 0
     two.write_text(two.read_text().replace("0.3 0 0", "0.4 0 0"))
@@ -294,7 +294,7 @@ def test_prefix_for_both(run, files):
 
 
 class Screen:
-    """A standard output that is a terminal."""
+    """Standard output that is a terminal."""
 
     def __init__(self, stream):
         self._stream = stream
@@ -306,7 +306,7 @@ class Screen:
         return True
 
 
-def test_colours_on_a_terminal_only(run, files, monkeypatch):
+def test_diff_is_coloured_on_a_terminal_only(run, files, monkeypatch):
     one, two = files(flange=joint("flange", "upper", "tool", "fixed", '<origin xyz="0.31 0 0"/>'))
     monkeypatch.delenv("NO_COLOR", raising=False)
     monkeypatch.setenv("TERM", "xterm")
@@ -338,7 +338,7 @@ def test_an_unreadable_file_is_status_2(run, files, tmp_path, monkeypatch, secon
 
 
 @pytest.mark.parametrize("tolerance", ["nan", "inf", "-1"])
-def test_tolerances_that_are_none(run, files, tolerance):
+def test_diff_refuses_invalid_tolerances(run, files, tolerance):
     status, out, err = run(*files(), f"--tolerance={tolerance}")
     assert (status, out) == (2, "")
     assert "from 0 on" in err
@@ -346,7 +346,7 @@ def test_tolerances_that_are_none(run, files, tolerance):
 
 
 @pytest.mark.parametrize("ending", ["urdf", "xml"])
-def test_frames_that_a_format_needs_in_between_are_no_difference(run, tmp_path, ending):
+def test_helper_frames_of_a_format_are_no_difference(run, tmp_path, ending):
     if ending == "xml":
         pytest.importorskip("mujoco")
     model, q = kv.Model(), kv.position("q")

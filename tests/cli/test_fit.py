@@ -1,4 +1,4 @@
-"""``kineverse fit``: tables of poses in, the joint they show out, in words, as JSON, as a picture, as a model."""
+"""``kineverse fit``: joints from tables of poses, as text, JSON, picture and model."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ def pose(rotation=None, position=(0.0, 0.0, 0.0)):
 
 
 def hinge(angles):
-    """A door's poses in its cupboard: half a metre wide, its own axes anyhow."""
+    """Return poses of a door of 0.5 m width in its cupboard, with an arbitrary orientation of its frame."""
     rotations = turned(np.outer(angles, AXIS))
     moved = [pose(r, POINT - r @ POINT) for r in rotations]
     return np.array(moved) @ pose(turned([0.3, 0.2, 0.1]), POINT + np.cross(AXIS, [0.5, 0, 0]))
@@ -46,7 +46,7 @@ def noisy(poses, rng, position=0.002, orientation=0.009):
 
 
 def write(path, parts, positions_only=()):
-    """A table with a part in each row."""
+    """Write a table with a part in each row."""
     lines = ["time,part,x,y,z,qx,qy,qz,qw"]
     for k in range(len(next(iter(parts.values())))):
         for name, poses in parts.items():
@@ -58,7 +58,7 @@ def write(path, parts, positions_only=()):
 
 @pytest.fixture(scope="module")
 def door(tmp_path_factory):
-    """A door in a cupboard, both before a camera that moves."""
+    """Return a recording of a door and a cupboard by a moving camera."""
     rng = np.random.default_rng(1)
     angles = np.linspace(0.0, math.radians(80), 30)
     cupboard = np.array([pose(turned(rng.normal(size=3)), rng.normal(size=3)) for _ in angles])
@@ -126,7 +126,7 @@ def test_the_document_is_the_joint(door, tmp_path, capsys):
     assert (tmp_path / "door.png").stat().st_size > 10_000
 
 
-def test_a_pose_that_does_not_fit_is_named(tmp_path, capsys):
+def test_an_outlier_is_named(tmp_path, capsys):
     rng = np.random.default_rng(7)
     seen = noisy(hinge(np.linspace(0.0, 1.2, 40)), rng)
     seen[17, :3, :3] = turned([0.0, 0.4, 0.0]) @ seen[17, :3, :3]
@@ -166,7 +166,7 @@ def test_the_picture_is_drawn(door, tmp_path, capsys, suffix):
     assert file.stat().st_size > 20_000
 
 
-def test_a_drawer_of_positions_alone(tmp_path, capsys):
+def test_a_drawer_is_identified_from_positions(tmp_path, capsys):
     pytest.importorskip("matplotlib")
     rng = np.random.default_rng(2)
     table, picture, document = (tmp_path / name for name in ("handle.log", "handle.png", "handle.kv.json"))
@@ -185,7 +185,7 @@ def test_a_drawer_of_positions_alone(tmp_path, capsys):
     np.testing.assert_allclose(ends[:, :3, 3], expected, atol=0.01)
 
 
-def test_the_hinge_of_a_handle_alone_is_where_it_is(tmp_path, capsys):
+def test_a_hinge_is_located_from_positions(tmp_path, capsys):
     rng = np.random.default_rng(3)
     table, document = tmp_path / "handle.log", tmp_path / "handle.kv.json"
     points = noisy(hinge(np.radians(np.linspace(0, 80, 30))), rng)[:, :3, 3]
@@ -200,13 +200,13 @@ def test_the_hinge_of_a_handle_alone_is_where_it_is(tmp_path, capsys):
     np.testing.assert_allclose(model.fk("door")({"door": 0.0})[:3, :3], np.eye(3), atol=1e-9)
 
 
-def test_only_the_families_asked_for_are_tried(door, capsys):
+def test_only_the_requested_families_are_tried(door, capsys):
     words = [door, "--parent", "cupboard", "--child", "door", "--families", "rigid, prismatic"]
     found = answer(words, capsys)
     assert {fit["family"] for fit in found["fits"]} == {"rigid", "prismatic"}
 
 
-def test_poses_that_do_not_tell_are_not_told(tmp_path, capsys):
+def test_fit_status_matches_the_printed_ambiguity(tmp_path, capsys):
     rng = np.random.default_rng(4)
     still = noisy(np.tile(hinge([0.0]), (3, 1, 1)), rng, 0.05, 0.3)
     words = [write(tmp_path / "still.csv", {"lid": still}), "--noise", "5cm,0.3"]
@@ -224,7 +224,7 @@ def test_fit_notes_options_without_effect(tmp_path, capsys):
     assert "columns that mean nothing here: force" in capsys.readouterr().err
 
 
-def test_thinned_recordings_are_shorter(door, capsys):
+def test_thin_reduces_the_number_of_poses(door, capsys):
     words = [door, "--parent", "cupboard", "--child", "door", "--noise", "2mm,0.5deg", "--thin", "10"]
     assert answer(words, capsys)["count"] == 10
 
@@ -259,8 +259,8 @@ def test_fit_refuses_invalid_input_in_one_line(rows, words, says, tmp_path, caps
 
 
 @pytest.mark.parametrize(("count", "told"), [(300, True), (12, False)])
-def test_turns_are_counted_by_the_times(tmp_path, capsys, count, told):
-    """A wheel of five turns, whose errors are alike for long: as many rows are judged as it takes to count."""
+def test_revolutions_are_counted_in_timed_recordings(tmp_path, capsys, count, told):
+    """The subset of a wheel with correlated errors is dense enough to count its five revolutions."""
     rng = np.random.default_rng(5)
     seen = noisy(hinge(np.linspace(0.0, 10 * math.pi, count)), rng)
     seen[:, 0, 3] += 0.006 * np.sin(np.linspace(0, 4, count))
@@ -277,8 +277,8 @@ def test_turns_are_counted_by_the_times(tmp_path, capsys, count, told):
         assert 16 <= found["judged"] < 60
 
 
-def test_a_slow_error_is_no_screw(capsys):
-    """What a hand does while it opens a microwave is off a circle for seconds, which says little however often seen."""
+def test_correlated_errors_do_not_make_a_screw(capsys):
+    """Deviations of a hand from a circle are correlated over seconds, and count by effective sample size."""
     handle = TRACKS / "microwave" / "microwave1.log"
     if not handle.exists():
         pytest.skip(f"no {handle}")

@@ -1,4 +1,4 @@
-"""``kineverse info`` of a document says which one it is."""
+"""``kineverse info`` prints the hash of a document."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from kineverse.cli import main
 
 
 @pytest.mark.parametrize("ending", ["kv.json", "kv.msgpack"])
-def test_its_hash_is_shown(ending, tmp_path, capsys):
+def test_info_prints_the_hash_of_a_document(ending, tmp_path, capsys):
     path = tmp_path / f"door.{ending}"
     model = kv.load("shelf_door")
     model.save(path)

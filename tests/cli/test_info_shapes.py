@@ -1,4 +1,4 @@
-"""``kineverse info`` says which bodies are touched as what is seen of them."""
+"""``kineverse info`` lists bodies without collision shapes."""
 
 from __future__ import annotations
 

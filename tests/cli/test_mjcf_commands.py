@@ -1,4 +1,4 @@
-"""Files of MJCF on the command line and in the viewer."""
+"""MJCF files on the command line and in the viewer."""
 
 from __future__ import annotations
 
@@ -39,7 +39,7 @@ def test_info_and_fk(door, capsys):
     assert "door in world" in capsys.readouterr().out
 
 
-def test_a_refusal_is_one_line(door, capsys):
+def test_an_unsupported_file_is_an_error_of_one_line(door, capsys):
     door.write_text(DOOR.replace("stiffness", "stiffnes"))
     assert main(["info", str(door)]) != 0
     captured = capsys.readouterr()
@@ -48,8 +48,8 @@ def test_a_refusal_is_one_line(door, capsys):
     assert "Traceback" not in captured.err
 
 
-def test_meshes_are_found_and_drawn(door):
-    """The mesh is drawn where its file's frame is: lowered by its reference, raised by its geom."""
+def test_meshes_are_drawn(door):
+    """The mesh is drawn at the frame of its file: lowered by its reference, raised by its geom."""
     shapes = kv.load(door).bodies["door"].visuals
     assert [shape.origin.matrix[2, 3] for shape in shapes] == [0.0, 1.0]
     surface = mesh_geometry(shapes[1].geometry)

@@ -1,4 +1,4 @@
-"""How commands read files: strictly or not, and below which root."""
+"""Options ``--strict`` and ``--root`` of all commands."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ def loose(tmp_path):
     return path
 
 
-def test_validate_lists_all_mistakes_and_does_not_pass(run, loose):
+def test_validate_lists_all_mistakes_and_fails(run, loose):
     status, out, err = run("validate", str(loose))
     assert (status, err) == (2, "")
     assert "not read strictly: 2 mistakes, no problems" in out
@@ -31,7 +31,7 @@ def test_validate_lists_all_mistakes_and_does_not_pass(run, loose):
 
 
 @pytest.mark.parametrize("command", [("info",), ("fk", "b"), ("convert", "out.kv.json")])
-def test_commands_read_loosely_unless_they_are_strict(run, loose, command, tmp_path, monkeypatch):
+def test_commands_tolerate_mistakes_unless_strict(run, loose, command, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     name, *rest = command
     assert run(name, str(loose), *rest)[0] == 0
@@ -48,7 +48,7 @@ def test_info_prints_remarks(run, loose):
 @pytest.mark.parametrize(
     "command", [("info",), ("fk", "b"), ("validate",), ("diff",), ("convert", "o.kv.json"), ("decompose",)]
 )
-def test_every_command_that_loads_takes_a_root(run, tmp_path, command, monkeypatch):
+def test_commands_that_load_models_have_a_root_option(run, tmp_path, command, monkeypatch):
     monkeypatch.chdir(tmp_path)
     (tmp_path / "part.xml").write_text(
         '<mujocoinclude><worldbody><body name="b"><geom size="1"/></body></worldbody></mujocoinclude>'

@@ -1,4 +1,4 @@
-"""Frames that are nowhere at some values: said by name, in one line, and never as NaN in JSON."""
+"""Frames with nonfinite poses are named in one line, and are never NaN in JSON."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ CUBE = Body(visuals=(Shape(Box((1.0, 1.0, 1.0))),))
 
 @pytest.fixture
 def garage(tmp_path):
-    """Return a door that is nowhere beyond its limit."""
+    """Return a door whose pose is not finite beyond its limit."""
     model, a = kv.Model(), kv.position("garage/door")
     with model.edit() as edit:
         edit.add_frame(
@@ -28,7 +28,7 @@ def garage(tmp_path):
 
 @pytest.fixture
 def pole(tmp_path):
-    """Return frames that are nowhere at the default state."""
+    """Return frames whose poses are not finite at the default state."""
     model, q = kv.Model(), kv.position("q")
     with model.edit() as edit:
         edit.add_frame("hook", "world", kv.translation(1 / q, 0, 0), CUBE)

@@ -10,7 +10,7 @@ from kineverse.cli.output import format_table, shorten_text, show_progress
 from kineverse.expressions.printing import format_number
 
 
-def test_columns_are_aligned():
+def test_format_table_aligns_columns():
     text = format_table(("name", "value"), [("a", "1"), ("longer", "10")], "<>")
     assert text.splitlines() == [
         "name    value",
@@ -20,7 +20,7 @@ def test_columns_are_aligned():
     ]
 
 
-def test_wide_tables_are_cut_in_the_middle_of_their_first_column():
+def test_format_table_cuts_the_first_column_in_its_middle():
     text = format_table(("name", "value"), [("kitchen/a_very_long_name_of_a_frame", "1")], "<>", width=30)
     assert all(len(line) <= 30 for line in text.splitlines())
     assert "kitchen/a" in text
@@ -28,7 +28,7 @@ def test_wide_tables_are_cut_in_the_middle_of_their_first_column():
     assert "..." in text
 
 
-def test_tables_of_nothing_have_a_head():
+def test_format_table_without_rows_has_a_head():
     assert format_table(("a",), []).splitlines() == ["a", "-"]
     assert shorten_text("short", 10) == "short"
 
@@ -36,7 +36,7 @@ def test_tables_of_nothing_have_a_head():
 @pytest.mark.parametrize(
     ("value", "text"), [(0.0, "0"), (-0.0, "0"), (math.inf, "-"), (-math.inf, "-"), (1.23456, "1.235")]
 )
-def test_figures(value, text):
+def test_format_number_rounds_to_significant_digits(value, text):
     assert format_number(value) == text
 
 

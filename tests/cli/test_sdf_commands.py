@@ -1,4 +1,4 @@
-"""Files of SDF on the command line and in the viewer."""
+"""SDF files on the command line and in the viewer."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ def test_info_and_fk(lamp, capsys):
     assert "tip in world" in capsys.readouterr().out
 
 
-def test_a_refusal_is_one_line(lamp, capsys):
+def test_an_unsupported_file_is_an_error_of_one_line(lamp, capsys):
     lamp.write_text(LAMP.replace("<parent>base", "<parent>bass"))
     assert main(["info", str(lamp)]) != 0
     captured = capsys.readouterr()

@@ -1,4 +1,4 @@
-"""What is said to somebody who mistypes, forgets a prefix or a unit, or says nothing at all."""
+"""Suggestions for mistyped names, missing prefixes, missing units and missing commands."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ def test_without_a_command_the_help_is_printed(run, words):
     assert "kineverse info kitchen" in out
 
 
-def test_the_module_is_the_same_command():
+def test_python_m_kineverse_is_the_command():
     said = subprocess.run([sys.executable, "-m", "kineverse"], capture_output=True, text=True, check=True)
     assert said.stdout.startswith("usage: kineverse ")
     assert said.stderr == ""
@@ -56,7 +56,7 @@ def test_the_module_is_the_same_command():
         ),
     ],
 )
-def test_a_line_suggests_the_intended_value(run, words, said):
+def test_an_error_suggests_the_intended_value(run, words, said):
     assert run(*words) == (2, "", f"kineverse: {said}\n")
 
 
@@ -82,7 +82,7 @@ def test_a_line_suggests_the_intended_value(run, words, said):
         ),
     ],
 )
-def test_a_forgotten_unit_is_remarked(run, assignment, said):
+def test_a_missing_unit_is_noted(run, assignment, said):
     status, out, err = run(*HANDLE, "--set", assignment)
     assert status == 0
     assert out
@@ -100,7 +100,7 @@ def test_large_values_of_continuous_joints_suggest_degrees(run):
         assert run(*words, f"pr2/r_forearm_roll_joint={value}")[2] == ""
 
 
-def test_a_picture_comes_with_the_same_remark(run, tmp_path):
+def test_view_notes_a_missing_unit(run, tmp_path):
     picture = tmp_path / "kitchen.png"
     _, _, err = run("view", "kitchen", "--set", "kitchen/fridge_door=30", "--picture", picture)
     assert "--set kitchen/fridge_door=30deg" in err

@@ -1,4 +1,4 @@
-"""``kineverse validate``: what is wrong with files, one or many, in words, as JSON and as an exit status."""
+"""``kineverse validate``: problems of files as text, JSON and exit status."""
 
 from __future__ import annotations
 
@@ -62,7 +62,7 @@ def test_shipped_models_have_no_problems(run):
     assert len(out.splitlines()) == 2 + len(kv.shipped_models())
 
 
-def test_a_good_file_in_words_and_as_json(run, good):
+def test_a_valid_file_as_text_and_as_json(run, good):
     assert run(good) == (0, f"{good}: URDF\n  2 frames, 1 DoF, 2 constraints, 0 bodies\n  no problems\n", "")
     status, out, err = run(good, "--json")
     assert (status, err) == (0, "")
@@ -82,7 +82,7 @@ def test_a_good_file_in_words_and_as_json(run, good):
     }
 
 
-def test_documents_say_their_version(run, tmp_path, good):
+def test_validate_prints_the_version_of_documents(run, tmp_path, good):
     path = tmp_path / "good.kv.json"
     kv.load(good).save(path)
     status, out, _ = run(path)
@@ -113,7 +113,7 @@ def test_validate_prints_the_contents_of_a_file(run, tmp_path, name, text, langu
     assert out.startswith(f"{tmp_path / name}: {language}\n")
 
 
-def test_operations_that_cannot_follow_are_remarks(run, tmp_path):
+def test_frozen_operations_are_remarks(run, tmp_path):
     four_bar().save(tmp_path / "loop.kv.json")
     status, out, _ = run(tmp_path / "loop.kv.json")
     assert status == 0
@@ -121,7 +121,7 @@ def test_operations_that_cannot_follow_are_remarks(run, tmp_path):
     assert "operation 'loop four_bar' is frozen" in out
 
 
-def test_remarks_are_no_problems_unless_one_is_strict(run, good):
+def test_remarks_are_problems_only_with_strict(run, good):
     good.write_text(robot(hinge(), "<my_joint/>"))
     status, out, _ = run(good)
     assert status == 0
@@ -132,7 +132,7 @@ def test_remarks_are_no_problems_unless_one_is_strict(run, good):
     assert run(good, "--strict")[0] == 1
 
 
-def test_many_remarks_are_bounded(run, good):
+def test_printed_remarks_are_limited(run, good):
     good.write_text(robot(hinge(), "\n<my_joint/>" * 100))
     _, out, _ = run(good)
     assert "… and 90 more (--all)" in out
@@ -140,7 +140,7 @@ def test_many_remarks_are_bounded(run, good):
     assert run(good, "--all")[1].count("is ignored") == 100
 
 
-def test_a_default_state_that_breaks_limits(run, good):
+def test_a_default_state_beyond_limits_is_a_problem(run, good):
     own = '<limit lower="1" upper="2" effort="1" velocity="1"/><mimic joint="k"/>'
     driver = hinge().replace('"b"', '"c"').replace('"j"', '"k"').replace('upper="2"', 'upper="0.5"')
     good.write_text(robot(hinge(own), '<link name="c"/>', driver))
@@ -149,7 +149,7 @@ def test_a_default_state_that_breaks_limits(run, good):
     assert "j/position: is broken at the default state: 0.5 is not in [1, 2]" in out
 
 
-def test_bounds_that_leave_nothing_between_them(run, tmp_path):
+def test_contradictory_bounds_are_a_problem(run, tmp_path):
     model = kv.Model()
     q, room = kv.position("q"), kv.position("room")
     with model.edit() as edit:
@@ -169,7 +169,7 @@ def test_bounds_that_leave_nothing_between_them(run, tmp_path):
         (lambda q: np.sqrt(1 - q), "states within the limits"),
     ],
 )
-def test_poses_that_are_not_finite(bend, text):
+def test_nonfinite_poses_are_a_problem(bend, text):
     model = kv.Model()
     q = kv.position("q")
     with model.edit() as edit:
@@ -181,7 +181,7 @@ def test_poses_that_are_not_finite(bend, text):
     assert text in found.text
 
 
-def test_states_that_other_constraints_forbid_are_not_looked_at():
+def test_states_forbidden_by_constraints_are_not_checked():
     model = kv.Model()
     q, r = kv.position("q"), kv.position("r")
     with model.edit() as edit:
@@ -208,7 +208,7 @@ def four_bar(crank=0.3, within=()):
     return model
 
 
-def test_loops_that_do_not_close_everywhere(tmp_path):
+def test_loops_that_do_not_close_within_limits_are_a_problem(tmp_path):
     assert [f for f in find_problems(four_bar()) if f.kind == "loop"] == []
     # A crank as long as this passes points where the rocker is out of reach; it is closed in a part only.
     limited = four_bar(crank=0.9, within=(("crank", 0.5, 0.8),))
@@ -234,14 +234,14 @@ def test_loops_that_do_not_close_everywhere(tmp_path):
         (1.0, (1.0, np.inf, 1.0), "not finite"),
     ],
 )
-def test_inertia_that_no_body_has(mass, moments, text):
+def test_impossible_inertia_is_a_problem(mass, moments, text):
     (found,) = find_problems(body(mass, moments))
     assert (found.kind, found.where) == ("inertia", "a")
     assert text in found.text
 
 
 @given(st.lists(st.tuples(*[st.floats(-2, 2)] * 3, st.floats(0.01, 3)), min_size=1, max_size=8))
-def test_the_inertia_of_any_points_is_possible(points):
+def test_inertia_of_point_masses_is_possible(points):
     tensor, mass = np.zeros((3, 3)), 0.0
     for *p, m in points:
         tensor += m * (np.dot(p, p) * np.eye(3) - np.outer(p, p))
@@ -250,7 +250,7 @@ def test_the_inertia_of_any_points_is_possible(points):
     assert list(find_inertia_errors(kv.model.Inertia(mass, (xx, xy, xz, yy, yz, zz)))) == []
 
 
-def test_meshes_that_are_missing(run, good):
+def test_missing_meshes_are_a_problem(run, good):
     mesh = '<link name="c"><visual><geometry><mesh filename="{}"/></geometry></visual></link>'
     joint = '<joint name="f" type="fixed"><parent link="a"/><child link="c"/></joint>'
     good.write_text(robot(hinge(), mesh.format("package://nowhere/a.stl"), joint))

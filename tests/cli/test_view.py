@@ -1,4 +1,4 @@
-"""``kineverse view``: the list of what can be opened, and what a page is told."""
+"""``kineverse view``: list of models, and options of the page."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ def test_a_picture_needs_a_model(run, tmp_path):
 
 @pytest.fixture
 def shown(monkeypatch):
-    """The pages that were shown: whether in degrees, and where."""
+    """Return the pages shown, with unit and address."""
     viewer = pytest.importorskip("kineverse.view.viewer")
     pytest.importorskip("viser", reason="the page needs the extra 'view'")
     pages = []
@@ -43,7 +43,7 @@ def shown(monkeypatch):
     return pages
 
 
-def test_the_page_has_the_name_that_the_file_gives_to_the_robot(run, shown, tmp_path, monkeypatch):
+def test_the_page_has_the_name_of_the_robot_in_the_file(run, shown, tmp_path, monkeypatch):
     from kineverse.view import server
 
     labels = []

@@ -1,4 +1,4 @@
-"""The estimation grid: its samples are what they claim to be, and its bound is that of the whole problem."""
+"""Estimation grid: noise of samples, Cramér-Rao bound, report."""
 
 from __future__ import annotations
 
@@ -70,7 +70,7 @@ def test_without_noise_the_child_moves_about_the_axis(cell):
 
 
 def everything_seen(cell, unknown):
-    """All twelve numbers of all observations, by all unknowns: axis, a point on it, zero pose, values, parents."""
+    """Return the measurements as a function of all unknowns: axis, point, zero pose, joint values, parents."""
     axis, point, zero = unknown[:3] / np.linalg.norm(unknown[:3]), unknown[3:6], pose(unknown[6:12])
     values = unknown[12 : 12 + cell.count]
     seen = []
@@ -105,7 +105,7 @@ def errors(seen, true):
 
 @by_cell
 def test_the_bound_is_that_of_all_unknowns_at_once(cell):
-    """The dense information matrix, in redundant unknowns: its pseudo-inverse takes no account of the gauge."""
+    """The pseudo-inverse of the dense information matrix in redundant unknowns is independent of the gauge."""
     samples = draw_samples(cell, 1, np.random.default_rng(2))
     truth = np.concatenate(
         [
@@ -133,8 +133,8 @@ def test_the_bound_is_that_of_all_unknowns_at_once(cell):
         np.testing.assert_allclose(found.point[0], sides.T @ covariance[3:6, 3:6] @ sides, rtol=1e-3)
 
 
-def test_short_motions_tell_as_much_as_joint_values_drawn_from_a_gaussian_would():
-    """The direction of a Gaussian cloud of variance s² along, with noise σ² all around, is known to σ²(s² + σ²)/(N s⁴)."""
+def test_attainable_bound_equals_that_of_gaussian_joint_values():
+    """The principal direction of N Gaussian points has the variance σ²(s² + σ²)/(N s⁴)."""
     # Only positions matter where orientations are exact; the errors of both poses add up.
     cell = Cell("prismatic", 0.05, 1e-7, 50, 0.1)
     samples = draw_samples(cell, 2, np.random.default_rng(4))
@@ -159,7 +159,7 @@ def test_the_attainable_bound_is_cramer_rao_for_small_noise(cell):
     assert (compute_attainable_bound(noisy).degrees > compute_bound(noisy).degrees).all()
 
 
-def test_more_observations_and_longer_ways_tell_more():
+def test_bound_falls_with_count_and_range():
     def degrees(count, reach):
         cell = Cell("revolute", 0.01, 3 * DEG, count, reach * DEG)
         return compute_bound(draw_samples(cell, 3, np.random.default_rng(3))).degrees.mean()
@@ -168,7 +168,7 @@ def test_more_observations_and_longer_ways_tell_more():
     assert degrees(160, 45) == pytest.approx(degrees(40, 45) / 2, rel=0.05)
 
 
-def test_a_cell_is_fitted_the_same_way_each_time():
+def test_fit_cell_is_deterministic():
     cell = Cell("revolute", 0.001, 1 * DEG, 10, 90 * DEG)
     first, again = fit_cell(cell, 3), fit_cell(cell, 3)
     # Up to rounding: once it is compiled, the estimator computes in another order.
@@ -184,7 +184,7 @@ def test_the_grid_has_18900_fits():
 
 
 def made_up(cell, ratio, right=True, count=40):
-    """A result whose errors are at so many times what can be attained, which is 1.2 times the bound."""
+    """Return a result with a given ratio of errors to the attainable bound, which is 1.2 times the other."""
     bounds = np.full(count, 2.0)
     errors = ratio * 1.2 * bounds
     turns = cell.joint == "revolute"
@@ -203,7 +203,7 @@ def made_up(cell, ratio, right=True, count=40):
     )
 
 
-def test_ratios_are_told_apart_from_chance():
+def test_ratios_are_compared_with_chance():
     hinge, slider = CELLS[0], CELLS[2]
     good = summarize_cells([made_up(hinge, 1.0), made_up(slider, 1.0)])
     assert good.attainable.direction == pytest.approx(1.0)
@@ -224,7 +224,7 @@ def test_divergences_count_large_errors_and_missing_axes():
     assert made_up(CELLS[0], 1.0).diverged == 0
 
 
-def test_the_report_says_which_bars_hold(tmp_path):
+def test_report_says_which_targets_are_met(tmp_path):
     made = report_grid([made_up(CELLS[0], 1.0), made_up(CELLS[2], 1.0)])
     holds = {row[0]: row[3] for row in made.tables[0].rows}
     assert holds["RMS of the direction over what can be attained, that below 10 deg"] == "yes"
@@ -235,7 +235,7 @@ def test_the_report_says_which_bars_hold(tmp_path):
     assert (tmp_path / "grid.png").stat().st_size > 10_000
 
 
-def test_several_processes_give_the_results_of_one():
+def test_results_are_independent_of_the_number_of_processes():
     cells = [Cell("prismatic", 0.001, 1 * DEG, n, 0.4) for n in (5, 6)]
     alone = fit_all(cells, 2, lambda items, what, unit: items, workers=1)
     together = fit_all(cells, 2, lambda items, what, unit: items, workers=2)

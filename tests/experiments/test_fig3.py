@@ -1,4 +1,4 @@
-"""Fig. 3 of the 2022 paper: the garage door's way, and its lock."""
+"""Fig. 3 of the 2022 paper: path of the garage door, and its lock."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ def fig3():
     return reproduce("fig3")
 
 
-def test_the_door_moves_as_equation_12_says(fig3):
+def test_door_paths_follow_equation_12(fig3):
     a = np.linspace(0, 2, 20)
     assert fig3.numbers["a"] == pytest.approx(a)
     angle = np.arccos(a / 2)
@@ -27,23 +27,23 @@ def test_the_door_moves_as_equation_12_says(fig3):
         np.testing.assert_allclose(fig3.numbers["paths"][name], expected, atol=1e-12)
 
 
-def test_it_is_closed_at_l_and_open_at_0(fig3):
+def test_door_is_closed_at_l_and_open_at_0(fig3):
     paths = fig3.numbers["paths"]
     np.testing.assert_allclose([paths["A"][-1], paths["B"][-1]], [[0, 0], [0, 2]], atol=1e-12)
     np.testing.assert_allclose([paths["A"][0], paths["B"][0]], [[0, 2], [2, 2]], atol=1e-12)
 
 
-def test_the_lock_of_equation_13_steps_where_it_is_closed(fig3):
+def test_lock_bound_of_equation_13_steps_at_the_closed_door(fig3):
     b = np.linspace(0, 0.6, 50)
     assert fig3.numbers["unlocked"]["a=1"] == pytest.approx(np.ones(50))
     assert fig3.numbers["unlocked"]["a=2"] == pytest.approx(np.where(b > 0.3, 1.0, 0.0))
 
 
-def test_both_forms_are_one_door(fig3):
+def test_both_forms_have_equal_paths(fig3):
     assert fig3.numbers["forms_apart"] < 1e-12
 
 
-def test_the_regular_form_has_a_slope_where_the_published_one_has_none(fig3):
+def test_regular_form_has_a_finite_slope_at_the_closed_door(fig3):
     before = np.array(fig3.numbers["before_closed"])
     # The derivative of 2 sin(arccos(a/2)) by a.
     assert fig3.numbers["slope_published"] == pytest.approx(
@@ -69,11 +69,11 @@ def test_without_matplotlib_the_extra_is_named(fig3, tmp_path, monkeypatch):
         fig3.figure.save(tmp_path / "door.png")
 
 
-def test_numbers_are_those_of_json(fig3):
+def test_numbers_are_json_data(fig3):
     assert json.loads(json.dumps(dict(fig3.numbers), allow_nan=False)) == fig3.numbers
 
 
-def test_unknown_experiments_are_named():
+def test_unknown_experiments_are_refused():
     with pytest.raises(UnknownNameError, match="Did you mean 'fig3'"):
         reproduce("fig33")
 
@@ -88,7 +88,7 @@ def test_the_command_prints_tables_and_writes_the_figure(tmp_path, monkeypatch, 
     assert (tmp_path / "fig3.png").stat().st_size > 5000
 
 
-def test_the_command_answers_with_one_object(tmp_path, monkeypatch, capsys):
+def test_reproduce_as_json_is_one_object(tmp_path, monkeypatch, capsys):
     monkeypatch.chdir(tmp_path)
     assert main(["reproduce", "fig3", "--json"]) == 0
     answer = json.loads(capsys.readouterr().out)
@@ -97,7 +97,7 @@ def test_the_command_answers_with_one_object(tmp_path, monkeypatch, capsys):
     assert not list(tmp_path.iterdir())
 
 
-def test_with_json_a_figure_is_written_where_it_is_said(tmp_path, monkeypatch, capsys):
+def test_reproduce_as_json_writes_a_requested_figure(tmp_path, monkeypatch, capsys):
     pytest.importorskip("matplotlib")
     monkeypatch.chdir(tmp_path)
     assert main(["reproduce", "fig3", "--json", "--figure", "door.svg"]) == 0
@@ -123,7 +123,7 @@ def test_without_a_figure_nothing_is_written(tmp_path, monkeypatch, capsys):
     ],
     ids=lambda value: " ".join(value) if isinstance(value, list) else "",
 )
-def test_nonsense_is_answered_in_a_line(words, says, tmp_path, monkeypatch, capsys):
+def test_invalid_arguments_are_errors_of_one_line(words, says, tmp_path, monkeypatch, capsys):
     pytest.importorskip("matplotlib")
     monkeypatch.chdir(tmp_path)
     assert main(words) == 2
@@ -142,7 +142,7 @@ def no_matplotlib(monkeypatch):
     monkeypatch.setitem(sys.modules, "matplotlib.figure", None)
 
 
-def test_without_matplotlib_there_are_tables_and_a_line(tmp_path, monkeypatch, capsys, no_matplotlib):
+def test_reproduce_without_matplotlib_prints_tables_and_a_note(tmp_path, monkeypatch, capsys, no_matplotlib):
     monkeypatch.chdir(tmp_path)
     assert main(["reproduce", "fig3"]) == 0
     out, err = capsys.readouterr()
@@ -155,7 +155,9 @@ def test_without_matplotlib_there_are_tables_and_a_line(tmp_path, monkeypatch, c
 
 
 @pytest.mark.parametrize("options", [[], ["--json"]])
-def test_a_figure_that_is_asked_for_is_refused_at_once(options, monkeypatch, capsys, no_matplotlib):
+def test_a_requested_figure_without_matplotlib_is_refused_at_once(
+    options, monkeypatch, capsys, no_matplotlib
+):
     monkeypatch.setattr("kineverse.experiments.reproduce", lambda *_: pytest.fail("computed in vain"))
     assert main(["reproduce", "fig3", "--figure", "door.svg", *options]) == 2
     out, err = capsys.readouterr()
@@ -163,7 +165,7 @@ def test_a_figure_that_is_asked_for_is_refused_at_once(options, monkeypatch, cap
     assert "[figures]" in err
 
 
-def test_a_folder_that_cannot_be_written_to_costs_the_figure_only(tmp_path, monkeypatch, capsys):
+def test_an_unwritable_figure_is_reported_after_the_tables(tmp_path, monkeypatch, capsys):
     pytest.importorskip("matplotlib")
     (tmp_path / "fig3.png").mkdir()
     monkeypatch.chdir(tmp_path)

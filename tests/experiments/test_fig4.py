@@ -1,4 +1,4 @@
-"""Fig. 4 of the papers: its noise, its order, its bounds, and what the published filter's errors are."""
+"""Fig. 4 of the papers: noise, order of groups, bounds, errors of the published filter."""
 
 from __future__ import annotations
 
@@ -51,7 +51,7 @@ def pose():
 
 
 def test_published_noise_is_along_and_about_the_frames_own_axes(pose):
-    """Directions over a quarter of the sphere correlate y and z, as 2/π says."""
+    """Directions over a quarter of the sphere give y and z the correlation 2/π."""
     noisy = add_published_noise(np.broadcast_to(pose, (40_000, 4, 4)), NOISE, np.random.default_rng(1))
     per_axis = np.eye(3) / 3
     per_axis[1, 2] = per_axis[2, 1] = 2 / (3 * math.pi)
@@ -60,7 +60,7 @@ def test_published_noise_is_along_and_about_the_frames_own_axes(pose):
         np.testing.assert_allclose(errors.mean(axis=0) / sigma, 0, atol=0.012)
 
 
-def test_directions_over_all_of_the_sphere_correlate_nothing(pose):
+def test_uniform_directions_are_uncorrelated(pose):
     many = np.broadcast_to(pose, (40_000, 4, 4))
     noisy = add_published_noise(many, NOISE, np.random.default_rng(2), "uniform")
     for errors, sigma in zip(errors_in("own", noisy, pose), (NOISE.position, NOISE.orientation), strict=True):
@@ -79,7 +79,7 @@ def test_gaussian_noise_is_in_the_observers_axes(pose):
         np.testing.assert_allclose(np.cov(errors, rowvar=False) / sigma**2, np.eye(3), atol=0.03)
 
 
-def test_all_that_moves_is_observed_and_drawers_come_first(kitchen):
+def test_all_moving_frames_are_observed_and_drawers_come_first(kitchen):
     model = kitchen.model
     assert set(kitchen.frames) == {f for f in model.frames if model.fk(f).symbols}
     assert len(kitchen.symbols) == 23
@@ -87,7 +87,7 @@ def test_all_that_moves_is_observed_and_drawers_come_first(kitchen):
     assert kitchen.turning[:8].tolist() == [False] * 7 + [True]
 
 
-def test_the_first_groups_are_a_scene_of_their_own(kitchen):
+def test_first_groups_form_an_observed_model(kitchen):
     part = kitchen.first(8)
     assert part.symbols == kitchen.symbols[:8]
     assert {s for f in part.frames for s in kitchen.model.fk(f).symbols} == set(part.symbols)
@@ -95,12 +95,12 @@ def test_the_first_groups_are_a_scene_of_their_own(kitchen):
     np.testing.assert_array_equal(part.poses(q[:, :8]), kitchen.poses(q)[:, : len(part.frames)])
 
 
-def test_a_model_in_which_nothing_moves_cannot_be_tracked():
+def test_a_model_without_moving_frames_is_refused():
     with pytest.raises(ModelError, match="Nothing moves"):
         make_observed_model(kv.Model())
 
 
-def test_the_bound_is_that_of_the_models_own_jacobians(kitchen):
+def test_cramer_rao_bound_equals_that_of_the_models_jacobians(kitchen):
     noise = PoseNoise(0.05, 0.1)
     q = kitchen.configurations(np.random.default_rng(6), 2)
     expected = np.zeros_like(q)
@@ -116,7 +116,7 @@ def test_the_bound_is_that_of_the_models_own_jacobians(kitchen):
 
 
 def test_the_published_filter_is_within_5_percent_of_the_authors_code():
-    """On their kitchen, by their noise, mean of four seeds."""
+    """Compare mean errors over four seeds, on the papers' kitchen with their noise."""
     from formats.urdf_texts import shared
 
     scene = make_observed_model(kv.load(shared("iai_kitchen", "iai_kitchen", "urdf_obj", "IAI_kitchen.urdf")))
@@ -128,27 +128,27 @@ def test_the_published_filter_is_within_5_percent_of_the_authors_code():
         assert np.mean(means) == pytest.approx(reported, rel=0.05)
 
 
-def test_consistency_is_judged_right(kitchen):
-    """Errors as large as a filter says give 1; of one that thinks it is three times better, 9."""
+def test_consistency_statistics_of_known_errors(kitchen):
+    """NEES is 1 if errors match the covariance, and 9 if deviations are a third of them."""
     rng = np.random.default_rng(7)
     truth = kitchen.configurations(rng, 400)
     bound = cramer_rao(kitchen, truth, PoseNoise(0.01, 0.02))
     q = truth + rng.normal(0, np.sqrt(bound))
-    honest = _evaluate_consistency(kitchen, truth, bound, [FilterRun(q, bound, nis=1010.0, dof=1000)])
-    assert honest.nees_inside == pytest.approx(1, abs=0.05)
-    assert honest.over_bound == pytest.approx(1, abs=0.03)
-    assert honest.rms == pytest.approx(honest.bound, rel=0.04)
-    assert honest.nis == pytest.approx(1.01)
-    assert honest.nis_band == pytest.approx((1 - 1.96 * math.sqrt(0.002), 1 + 1.96 * math.sqrt(0.002)))
+    consistent = _evaluate_consistency(kitchen, truth, bound, [FilterRun(q, bound, nis=1010.0, dof=1000)])
+    assert consistent.nees_inside == pytest.approx(1, abs=0.05)
+    assert consistent.over_bound == pytest.approx(1, abs=0.03)
+    assert consistent.rms == pytest.approx(consistent.bound, rel=0.04)
+    assert consistent.nis == pytest.approx(1.01)
+    assert consistent.nis_band == pytest.approx((1 - 1.96 * math.sqrt(0.002), 1 + 1.96 * math.sqrt(0.002)))
     lower, upper = kitchen.limits.T
     near = np.minimum(truth - lower, upper - truth) < 3 * np.sqrt(bound)
-    assert honest.states == (~near).sum() < truth.size
-    proud = _evaluate_consistency(kitchen, truth, bound, [FilterRun(q, bound / 9)])
-    assert proud.nees == pytest.approx(9 * honest.nees)
-    assert "nis" not in proud.to_json()
+    assert consistent.states == (~near).sum() < truth.size
+    overconfident = _evaluate_consistency(kitchen, truth, bound, [FilterRun(q, bound / 9)])
+    assert overconfident.nees == pytest.approx(9 * consistent.nees)
+    assert "nis" not in overconfident.as_json()
 
 
-def test_lost_runs_are_counted_and_left_out():
+def test_lost_runs_are_counted_and_excluded():
     q = np.array([[0.5], [math.nan], [0.7], [math.nan]])
     found = _coordinate_errors(FilterRun(q, np.full((4, 1), 0.01)), np.full((4, 1), 0.6), 0)
     assert (found.mean, found.max, found.nees, found.lost_percent) == pytest.approx((0.1, 0.1, 1.0, 50.0))
@@ -182,7 +182,7 @@ def report(cupboard, few):
     return reproduce("fig4", options=Options(quick=True, model=str(cupboard)))
 
 
-def test_the_report_says_all_that_was_measured(report):
+def test_report_has_all_measurements(report):
     numbers = json.loads(json.dumps(dict(report.numbers), allow_nan=False))
     assert numbers == report.numbers
     assert numbers["symbols"] == ["drawer", "door"]
@@ -201,8 +201,8 @@ def test_the_report_says_all_that_was_measured(report):
     assert len({m["mechanism"] for m in numbers["mechanisms"]}) == 3
 
 
-def test_it_comes_out_the_same_again(report, cupboard, few):
-    """But for last digits: compiled code may have been ready earlier."""
+def test_experiment_is_deterministic(report, cupboard, few):
+    """Last digits may differ, because compiled code may be ready earlier."""
     again = reproduce("fig4", options=Options(quick=True, model=str(cupboard)))
     for key in ("errors", "variants", "consistency", "mechanisms"):
         assert leaves(again.numbers[key]) == pytest.approx(leaves(report.numbers[key]), rel=1e-6)
@@ -237,7 +237,7 @@ def test_the_command_prints_tables_about_any_model(cupboard, few, capsys, monkey
         (["--data", "."], "'fig4' takes no --data. It takes --quick, --model"),
     ],
 )
-def test_nonsense_is_answered_in_a_line(words, says, capsys):
+def test_invalid_arguments_are_errors_of_one_line(words, says, capsys):
     assert main(["reproduce", "fig4", *words]) == 2
     error = capsys.readouterr().err
     assert says in error

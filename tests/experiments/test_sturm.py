@@ -1,4 +1,4 @@
-"""Recorded doors and drawers: read by their names, taken for what they are, and what is missed is drawn."""
+"""Recordings of doors and drawers: labels, classification, figure."""
 
 from __future__ import annotations
 
@@ -67,7 +67,7 @@ def test_further_columns_of_recordings_are_ignored(folder):
     np.testing.assert_allclose(door.poses[-1, :2, 0], [np.cos(59 / 40), np.sin(59 / 40)])
 
 
-def test_arcs_are_hinges_and_lines_are_drawers():
+def test_arcs_are_revolute_and_lines_prismatic():
     assert classify_recording(LabelledRecording("an arc", "revolute", arc(0.4, 1.5, 20))).is_correct
     assert classify_recording(LabelledRecording("a line", "prismatic", line(0.45, 20))).is_correct
 
@@ -89,7 +89,7 @@ def test_misclassified_recordings_are_named_and_drawn(tmp_path):
     assert (tmp_path / "missed.png").stat().st_size > 20_000
 
 
-def test_the_missed_one_is_shown_with_both_explanations():
+def test_misclassified_recording_is_drawn_with_both_families():
     figure = pytest.importorskip("matplotlib.figure").Figure(layout="constrained")
     draw_recordings(
         figure, [classify_recording(LabelledRecording("no drawer", "prismatic", arc(0.4, 1.5, 20)))]

@@ -1,7 +1,7 @@
-"""Layer 7: speed, measured beside the peers.
+"""Benchmarks of the package beside peer libraries (layer 7).
 
-:func:`run_benchmarks` yields a :class:`BenchmarkResult` for each benchmark. A benchmark measures; whether a
-build passes is decided by tests alone.
+:func:`run_benchmarks` yields a :class:`BenchmarkResult` for each benchmark. Benchmarks only measure;
+no build fails because of them.
 """
 
 from .harness import QUICK, BenchmarkSettings, DisagreementError

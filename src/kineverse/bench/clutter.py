@@ -15,37 +15,37 @@ from kineverse.spatial import rotation_x, rotation_y, rotation_z, translation
 from kineverse.symbols import position
 
 LINKS, RADIUS = 20, 0.1
-"""The links of the arm, and how near is near [m]."""
+"""Number of links of the arm, and radius of the queries [m]."""
 
 KINDS = ("hull", "box", "capsule")
-"""Shapes of the links, in turns."""
+"""Shapes of the links, in cyclic order."""
 
 LINK_LENGTH = 0.1
 CAPSULE_SIZE = 0.03, 0.06
-"""Radius of a capsule and length between its ends' centres [m]."""
+"""Radius of a capsule, and distance between the centres of its ends [m]."""
 
 BOX_SIZE = 0.06, 0.07, 0.09
-"""The edges of a link that is a box [m]."""
+"""Edges of a link that is a box [m]."""
 
-# The first boxes stay so far from the middles of the links that nothing touches, others further [m].
+# Least distances of the first boxes and of others from the middles of links, so that nothing touches [m].
 _CLEARANCE, _FAR = 0.12, 0.6
 _BOXES_NEAR_ARM = 60
-# Each joint swings by so much, in steps of a tenth of it [rad].
+# Amplitude of each joint, in steps of about a tenth of it [rad].
 _STEP_ANGLE = 0.02
 
 
 @dataclass(frozen=True, eq=False)
 class Clutter:
-    """An arm of hulls, boxes and capsules, which moves a little from step to step, among boxes that stand.
+    """Arm of hulls, boxes and capsules that moves in small steps among static boxes.
 
     Attributes
     ----------
     corners
-        (24, 3) of each link's hull; used by every third link [m].
+        Corners of each link's hull, (24, 3) [m]; used by every third link.
     sizes, poses
-        (N, 3) the edges of the boxes [m], (N, 4, 4) where they stand.
+        Edges of the boxes (N, 3) [m], and their poses (N, 4, 4).
     angles
-        (steps, 20) of the joints, one step after the other [rad].
+        Joint angles of the steps, (steps, 20) [rad].
     """
 
     corners: list[Array]
@@ -54,15 +54,15 @@ class Clutter:
     angles: Array
 
     def kind(self, link: int) -> str:
-        """Return the shape of a link, one of :data:`KINDS`."""
+        """Return the kind of shape of a link."""
         return KINDS[link % len(KINDS)]
 
     def axis(self, link: int) -> tuple[int, int, int]:
-        """Return the axis of a link's joint, which is at the end of the previous link."""
+        """Return the axis of the joint of a link, at the end of the link before."""
         return ((0, 0, 1), (0, 1, 0))[link % 2]
 
     def model(self, folder: Path) -> Model:
-        """Build the model; hulls are written to files in a folder."""
+        """Return the model of arm and boxes; hulls are written to files in a folder."""
         model = Model()
         with model.edit() as edit:
             parent = "world"
@@ -95,9 +95,10 @@ CENTRE = 0.0, 0.0, LINK_LENGTH / 2
 
 
 def make_clutter(boxes: int = _BOXES_NEAR_ARM, steps: int = 200, seed: int = 0) -> Clutter:
-    """Return an arm among boxes, the same for the same numbers.
+    """Return an arm among boxes, the same for equal arguments.
 
-    The first 60 boxes stand along the arm. Others have the density of a store room, and stay away.
+    The first 60 boxes stand along the arm. Others stand further away, with a density independent of their
+    number.
     """
     rng = np.random.default_rng(seed)
     corners = [_round_to_float32(rng.normal(size=(24, 3)) * (0.02, 0.02, 0.028)) for _ in range(LINKS)]
@@ -116,9 +117,9 @@ def make_clutter(boxes: int = _BOXES_NEAR_ARM, steps: int = 200, seed: int = 0) 
             )
             pose = (rotation_z(yaw) @ rotation_x(roll))()
             if k < _BOXES_NEAR_ARM:
-                way = random.normal(size=3)
-                way *= random.uniform(0.15, 0.28) / np.linalg.norm(way)
-                pose[:3, 3] = arm[random.integers(LINKS)] + way
+                offset = random.normal(size=3)
+                offset *= random.uniform(0.15, 0.28) / np.linalg.norm(offset)
+                pose[:3, 3] = arm[random.integers(LINKS)] + offset
             else:
                 pose[:3, 3] = arm.mean(axis=0) + random.uniform(-span, span, 3)
             if _clearance(arm, size, pose) > clear:
@@ -128,23 +129,23 @@ def make_clutter(boxes: int = _BOXES_NEAR_ARM, steps: int = 200, seed: int = 0) 
 
 
 def _link_centres(angles: Array) -> Array:
-    """Return the middles of the links at angles of the joints, (20, 3)."""
-    pose, found = np.eye(4), []
+    """Return the centres of the links at joint angles, (20, 3)."""
+    pose, centres = np.eye(4), []
     for link, angle in enumerate(angles.tolist()):
         turn = (rotation_z, rotation_y)[link % 2](angle)
         pose = pose @ translation(0, 0, LINK_LENGTH if link else 0.0)() @ turn()
-        found.append(pose[:3] @ (*CENTRE, 1.0))
-    return np.array(found)
+        centres.append(pose[:3] @ (*CENTRE, 1.0))
+    return np.array(centres)
 
 
 def _clearance(points: Array, size: Array, pose: Array) -> float:
-    """Return the least distance of points from a box [m]."""
+    """Return the least distance of points from a box."""
     inside = (points - pose[:3, 3]) @ pose[:3, :3]
     return float(np.linalg.norm(np.maximum(np.abs(inside) - size / 2, 0.0), axis=1).min())
 
 
 def _round_to_float32(numbers: Array) -> Array:
-    """Return numbers as MuJoCo keeps those of meshes."""
+    """Round numbers to single precision, like MuJoCo those of meshes."""
     return numbers.astype(np.float32).astype(np.float64)
 
 

@@ -1,4 +1,4 @@
-"""Measurements in a fresh process, where nothing else is loaded; started as a file, not imported.
+"""Measurements in a fresh process without other modules; run as a file, not imported.
 
 ``fresh_process.py FUNCTION ARGUMENT...`` prints one JSON object. Each function imports what it needs, because
 imports are part of what is measured.
@@ -25,9 +25,9 @@ def import_time(module: str) -> dict[str, Any]:
 
 
 def load_with_kineverse(file: str, frame: str, *options: str) -> dict[str, Any]:
-    """Load a file twice up to its first pose and Jacobian; return both times [s], and the values at zero.
+    """Load a file twice up to the first pose and Jacobian; return both times [s], and the values at zero.
 
-    ``load_with_kineverse FILE FRAME [wait]``; with ``wait`` it waits until the function is cached.
+    ``load_with_kineverse FILE FRAME [wait]``; ``wait`` waits until the function is cached.
     """
     import kineverse as kv
 
@@ -53,7 +53,7 @@ def load_with_mujoco(file: str, frame: str) -> dict[str, Any]:
     import mujoco
     import numpy as np
 
-    # It would leave warnings in a file in the current folder.
+    # By default MuJoCo writes warnings to a file in the current folder.
     mujoco.set_mju_user_warning(lambda warning: None)
     start = perf_counter()
     model = mujoco.MjModel.from_xml_path(file)
@@ -91,17 +91,17 @@ def load_with_pinocchio(file: str, frame: str) -> dict[str, Any]:
 
 
 def memory_of_robot(library: str, file: str, frame: str) -> dict[str, Any]:
-    """Return the memory of a loaded robot over the imports [MB], also after a pose and a Jacobian.
+    """Return the memory of a robot beyond that of the imports [MB], loaded and evaluated.
 
     ``memory_of_robot LIBRARY FILE FRAME``
     """
     module = importlib.import_module(library)
     before = _resident_memory()
-    kept = _LOADERS[library](module, file)
+    objects = _LOADERS[library](module, file)
     loaded = _resident_memory() - before
     evaluated = None
     if library == "kineverse":
-        (model,) = kept
+        (model,) = objects
         function = module.compile([model.fk(frame), model.jacobian(frame)])
         function([0.0] * len(function.inputs))
         evaluated = _resident_memory() - before
@@ -124,7 +124,7 @@ def _load_pinocchio(module: Any, file: str) -> tuple[Any, ...]:
 
 
 def _load_mujoco(module: Any, file: str) -> tuple[Any, ...]:
-    # It would leave warnings in a file in the current folder.
+    # By default MuJoCo writes warnings to a file in the current folder.
     module.set_mju_user_warning(lambda warning: None)
     model = module.MjModel.from_xml_path(file)
     return model, module.MjData(model)

@@ -1,7 +1,6 @@
 """Benchmark harness: settings, equality check, interleaved timing, installed peers, fresh processes.
 
-Times drift by a factor of two on machines that others use as well, so what counts is how contenders do beside
-each other, round by round.
+Times drift by a factor of two on shared machines. Contenders are therefore compared within each round.
 """
 
 from __future__ import annotations
@@ -37,30 +36,30 @@ def _no_progress(items: Iterable[Any], what: str, unit: str) -> Iterable[Any]:
 
 @dataclass(frozen=True, slots=True)
 class BenchmarkSettings:
-    """Amount of measurement, and the robot.
+    """Settings of benchmarks: robot, number of rounds, size of workloads.
 
     Attributes
     ----------
     robot
-        The name or file of the robot; a PR2 that is found here if None, see :func:`.workloads.find_robot`.
+        Name or file of the robot; an available PR2 if None, see :func:`.workloads.find_robot`.
     frame
-        The frame whose pose and Jacobian are computed; a gripper if None.
+        Frame of the pose and Jacobian; a gripper if None.
     rounds
-        Number of turns of each contender.
+        Number of samples of each contender.
     processes
-        The same where every turn is a fresh process.
+        Number of samples if each is taken in a fresh process.
     configurations
-        How many configurations single calls go through in one turn.
+        Number of configurations of single calls in one sample.
     steps
-        Through how many states, at most, things move among others.
+        Largest number of states in distance queries.
     rows
-        How many configurations a batch has.
+        Number of configurations of a batch.
     operations
-        How many operations and constraints the large models have.
+        Number of operations and constraints of large models.
     boxes
-        Among how many boxes, at most, an arm is moved.
+        Largest number of boxes around the arm.
     progress
-        Wraps what is worked on, like :func:`kineverse.cli.output.show_progress`.
+        Progress reporter that wraps an iterable, such as :func:`kineverse.cli.output.show_progress`.
     """
 
     robot: str | None = None
@@ -76,48 +75,48 @@ class BenchmarkSettings:
 
 
 QUICK = BenchmarkSettings(rounds=5, processes=3, steps=20, operations=1_000)
-"""Enough to see an order of magnitude."""
+"""Settings for an order of magnitude."""
 
 
 EQUALITY_TOLERANCE = 1e-9
-"""Tolerance of the comparison of poses and Jacobians [m], [rad]."""
+"""Tolerance of poses and Jacobians [m], [rad]."""
 
 
 class DisagreementError(KineverseError, ArithmeticError):
-    """Disagreement of contenders, which makes their times meaningless."""
+    """Disagreement of the results of contenders, whose times are then not comparable."""
 
 
 def check_equal(
     what: str, results: Sequence[tuple[str, Sequence[Array]]], tolerance: float = EQUALITY_TOLERANCE
 ) -> None:
-    """Compare the arrays that contenders computed with those of the first one.
+    """Compare the results of contenders with those of the first one.
 
     Parameters
     ----------
     what
         The benchmark, for the message.
     results
-        Names, each with arrays.
+        Names, each with its arrays.
     tolerance
-        How far their numbers may be apart.
+        Largest difference of numbers.
 
     Raises
     ------
     DisagreementError
-        If an array has another shape, or numbers that are further off or not finite.
+        If an array differs in shape, or in a number by more than the tolerance, or is not finite.
     """
-    (first, wanted), *others = results
-    if not all(np.isfinite(array).all() for array in wanted):
+    (first, expected), *others = results
+    if not all(np.isfinite(array).all() for array in expected):
         raise DisagreementError(f"Benchmark {what!r}: {first!r} computed what is not finite.")
     for name, found in others:
-        shapes = [np.shape(array) for array in wanted], [np.shape(array) for array in found]
+        shapes = [np.shape(array) for array in expected], [np.shape(array) for array in found]
         if shapes[0] != shapes[1]:
             raise DisagreementError(
                 f"Benchmark {what!r}: {name!r} gave arrays of shapes {shapes[1]}, {first!r} {shapes[0]}."
             )
-        for k, (ours, theirs) in enumerate(zip(wanted, found, strict=True)):
+        for k, (ours, theirs) in enumerate(zip(expected, found, strict=True)):
             error = float(np.max(np.abs(np.asarray(theirs) - ours), initial=0.0))
-            # Written so that NaN is refused as well.
+            # The negation refuses NaN as well.
             if not error <= tolerance:
                 raise DisagreementError(
                     f"Benchmark {what!r}: {name!r} and {first!r} differ by {error:.3g} in result {k}, "
@@ -127,19 +126,18 @@ def check_equal(
 
 @dataclass(frozen=True, slots=True)
 class Contender:
-    """Library or implementation that does the work.
+    """Library or implementation that is measured.
 
     Attributes
     ----------
     name
         Library and method.
     sample
-        Does the work and returns its cost, in ``unit``.
+        Does the work and returns its cost in ``unit``.
     results
-        Returns the arrays that the work gives, which must be equal to those of the others; None if there is
-        nothing to compare.
+        Returns the results of the work, which must equal those of the others; None to compare nothing.
     unit
-        ``s`` for times, or the unit of the count.
+        ``s`` for times, else the unit of the count.
     """
 
     name: str
@@ -151,16 +149,16 @@ class Contender:
 def time_calls(
     run: Callable[..., object], count: int = 1, prepare: Callable[[], Any] | None = None
 ) -> Callable[[], float]:
-    """Return a sample: the time [s] that each of ``count`` pieces of work takes in ``run``.
+    """Return a function that measures the time of ``run`` divided by ``count`` [s].
 
     Parameters
     ----------
     run
-        Does all of them.
+        Work to measure.
     count
-        Their number.
+        Number of equal parts of the work.
     prepare
-        Called before, outside of the time; ``run`` is given what it returns.
+        Called before the time is taken; its result is the argument of ``run``.
     """
 
     def sample() -> float:
@@ -175,23 +173,23 @@ def time_calls(
 def time_contenders(
     what: str, contenders: Sequence[Contender], rounds: int, progress: Progress
 ) -> dict[str, Measurement]:
-    """Check that contenders compute the same, then measure them in turns; return measurements by name.
+    """Check that contenders agree, then measure them interleaved; return measurements by name.
 
     Parameters
     ----------
     what
         The benchmark.
     contenders
-        The participants.
+        Contenders to measure.
     rounds
-        Number of turns of each contender, after one that is not counted.
+        Number of samples of each contender, after one that is not counted.
     progress
         See :class:`.harness.BenchmarkSettings`.
 
     Raises
     ------
     DisagreementError
-        If they do not compute the same.
+        If their results differ.
     """
     results = [(c.name, c.results()) for c in contenders if c.results is not None]
     if results:
@@ -200,10 +198,10 @@ def time_contenders(
     for contender in contenders:
         contender.sample()
     for number in progress(range(rounds), what, "round"):
-        # The order changes: a neighbour may leave caches warm or the processor hot.
+        # The order rotates, because the contender before may leave caches warm or the processor hot.
         first = number % len(contenders)
         for contender in (*contenders[first:], *contenders[:first]):
-            # The collector would charge all garbage to the contender that happens to run.
+            # A garbage collection would count for the contender that happens to run.
             with no_collection():
                 samples[contender.name].append(contender.sample())
     return {c.name: Measurement(c.name, c.unit, tuple(samples[c.name])) for c in contenders}
@@ -212,29 +210,29 @@ def time_contenders(
 DISTRIBUTIONS: Mapping[str, str] = MappingProxyType(
     {"pinocchio": "pin", "ripl_articulation": "ripl-articulation"}
 )
-"""Distribution of a module with another name."""
+"""Distributions of modules with another name."""
 
-IN_THE_EXTRA = ("pinocchio", "mujoco", "pybullet")
-"""The modules that the extra ``bench`` brings."""
+BENCH_EXTRA = ("pinocchio", "mujoco", "pybullet")
+"""Modules that the extra ``bench`` installs."""
 
 
 @dataclass(slots=True)
 class Contenders:
-    """Contenders of a race, and missing peers.
+    """Contenders of a benchmark, and missing peers.
 
     Attributes
     ----------
     contenders
-        The participants.
+        Contenders to measure.
     missing
-        A line for each other one.
+        A line for each missing peer.
     """
 
     contenders: list[Contender] = field(default_factory=list)
     missing: list[str] = field(default_factory=list)
 
-    def admit(self, module: str, contenders: Callable[[], Iterable[Contender]]) -> None:
-        """Add the contenders of a peer, or the line that says that it is missing."""
+    def add_peer(self, module: str, contenders: Callable[[], Iterable[Contender]]) -> None:
+        """Add the contenders of a peer, or a line on the missing peer."""
         if has_peer(module):
             self.contenders += contenders()
         else:
@@ -242,7 +240,7 @@ class Contenders:
 
 
 def has_peer(module: str) -> bool:
-    """Return whether a peer can be imported."""
+    """Return whether a peer can be imported; silence its output."""
     try:
         with _silence_stderr() if module == "pybullet" else contextlib.nullcontext():
             peer = importlib.import_module(module)
@@ -254,13 +252,13 @@ def has_peer(module: str) -> bool:
 
 
 def _ignore_warning(warning: str) -> None:
-    """Take a warning of MuJoCo, which would leave it in a file in the current folder."""
+    """Ignore a warning of MuJoCo, which by default is written to a file in the current folder."""
 
 
 def install_advice(module: str) -> str:
-    """Return the advice to install a peer."""
+    """Return a line on how to install a peer."""
     distribution = DISTRIBUTIONS.get(module, module)
-    if module in IN_THE_EXTRA:
+    if module in BENCH_EXTRA:
         called = "" if distribution == module else f" (the package {distribution!r})"
         return f"{module} is not installed: {install_command('bench')} brings it{called}"
     return f"{module} is not installed: it is the package {distribution!r}"
@@ -268,51 +266,51 @@ def install_advice(module: str) -> str:
 
 @contextlib.contextmanager
 def _silence_stderr() -> Iterator[None]:
-    """Keep what C code prints off standard error: Bullet prints a greeting at import."""
+    """Redirect standard error of C code to the null device, because Bullet prints a greeting at import."""
     sys.stderr.flush()
-    kept, nowhere = os.dup(2), os.open(os.devnull, os.O_WRONLY)
-    os.dup2(nowhere, 2)
+    stderr, null = os.dup(2), os.open(os.devnull, os.O_WRONLY)
+    os.dup2(null, 2)
     try:
         yield
     finally:
-        os.dup2(kept, 2)
-        os.close(kept)
-        os.close(nowhere)
+        os.dup2(stderr, 2)
+        os.close(stderr)
+        os.close(null)
 
 
 FRESH_PROCESS = Path(__file__).with_name("fresh_process.py")
 
 
 class ProgramError(KineverseError, RuntimeError):
-    """Failure of a measurement in a process of its own."""
+    """Failure of a measurement in a fresh process."""
 
 
 def run_program(name: str, *arguments: str, cache: str | None = None) -> dict[str, Any]:
-    """Run a function of :mod:`.fresh_process` in a process of its own; return its JSON.
+    """Run a function of :mod:`.fresh_process` in a fresh process, and return its JSON object.
 
     Parameters
     ----------
     name
-        Of the function.
+        Name of the function.
     arguments
         Its arguments.
     cache
-        Folder of the cache of compiled code; the usual one if None.
+        Folder of the cache of compiled code; the default one if None.
 
     Raises
     ------
     ProgramError
-        If it fails, with its last line.
+        If it fails, with its last line of output.
     """
     environment = dict(os.environ)
     if cache is not None:
         environment["KINEVERSE_CACHE_DIR"] = cache
-    # With -P the file's neighbours cannot be imported by accident.
+    # -P keeps the file's folder off the import path.
     command = [sys.executable, "-P", str(FRESH_PROCESS), name, *arguments]
     done = subprocess.run(command, env=environment, capture_output=True, text=True, check=False)
     try:
-        said: dict[str, Any] = json.loads(done.stdout)
+        output: dict[str, Any] = json.loads(done.stdout)
     except ValueError:
         last = (done.stderr.strip() or "it said nothing").splitlines()[-1]
         raise ProgramError(f"The program {name!r} ended with status {done.returncode}: {last}") from None
-    return said
+    return output

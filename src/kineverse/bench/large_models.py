@@ -30,7 +30,7 @@ READERS = 7
 
 _AXES = (1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0)
 _APPENDED = 100
-_ASKED = 100
+_QUERIES = 100
 
 
 @dataclass(frozen=True)
@@ -41,7 +41,7 @@ class Measured(Operation):
     value: float
 
     def apply(self, model: ReadRecorder) -> Writes:
-        """Write it."""
+        """Write the number."""
         return Writes(data={self.name: self.value})
 
 
@@ -53,12 +53,12 @@ class Doubled(Operation):
     of: str
 
     def apply(self, model: ReadRecorder) -> Writes:
-        """Read and write."""
+        """Write twice the number that is read."""
         return Writes(data={self.name: 2.0 * model.data[self.of]})
 
 
 def make_large_model(operations: int) -> Model:
-    """Return a model of chains of joints, each with a constraint; and numbers that depend on one of them."""
+    """Return a model of chains of joints with a constraint each, and of numbers that depend on one number."""
     model = Model()
     with model.edit() as edit:
         edit.apply(Measured("source", 1.0))
@@ -87,42 +87,42 @@ def _chain_joint(number: int) -> Revolute:
 
 
 def large_model_contenders(large: Model) -> Iterator[Contender]:
-    """Yield edits of a large model; where size should not matter, also those of an empty model."""
+    """Yield the edits and queries of a large model; appending is also measured on an empty model."""
     yield Contender(TO_EMPTY, time_calls(_append_operations, _APPENDED, Model))
     yield Contender(TO_LARGE, time_calls(_append_operations, _APPENDED, large.copy))
 
     values = count(2)
 
-    def replaced() -> None:
+    def replace_source() -> None:
         with large.edit() as edit:
             edit.replace("measured source", Measured("source", float(next(values))))
 
-    yield Contender(REPLACE, time_calls(replaced))
+    yield Contender(REPLACE, time_calls(replace_source))
 
     yield Contender(COPY, time_calls(lambda: large.copy() and None, len(large.history.tags)))
 
     ends = range(7, len(large.frames), 8)
-    poses = [large.fk(f"link {k}") for k in ends[:_ASKED]]
-    asked = count()
+    poses = [large.fk(f"link {k}") for k in ends[:_QUERIES]]
+    numbers = count()
 
-    def relevant() -> None:
+    def query_poses() -> None:
         for pose in poses:
             large.constraints_for(pose)
 
-    def new() -> list[Expression]:
-        number = float(next(asked))
+    def make_expressions() -> list[Expression]:
+        number = float(next(numbers))
         return [pose[0, 3] + number for pose in poses]
 
-    def relevant_new(expressions: list[Expression]) -> None:
+    def query_expressions(expressions: list[Expression]) -> None:
         for expression in expressions:
             large.constraints_for(expression)
 
-    yield Contender(RELEVANT, time_calls(relevant, len(poses)))
-    yield Contender(RELEVANT_NEW, time_calls(relevant_new, len(poses), new))
+    yield Contender(RELEVANT, time_calls(query_poses, len(poses)))
+    yield Contender(RELEVANT_NEW, time_calls(query_expressions, len(poses), make_expressions))
 
 
 def _append_operations(model: Model) -> None:
-    """Append operations, each in an edit of its own."""
+    """Append operations, each in a separate edit."""
     for k in range(_APPENDED):
         name = f"appended {k}"
         with model.edit() as edit:
@@ -130,17 +130,17 @@ def _append_operations(model: Model) -> None:
 
 
 def count_reruns(large: Model) -> int:
-    """Return the number of operations that run again when the one they read is replaced."""
-    heard: list[Diff] = []
-    listener = large.listen(heard.append)
+    """Return the number of operations that run when the one that others read is replaced."""
+    diffs: list[Diff] = []
+    listener = large.listen(diffs.append)
     with large.edit() as edit:
         edit.replace("measured source", Measured("source", -1.0))
     listener.close()
-    return heard[0].reruns
+    return diffs[0].reruns
 
 
 NODES_PER_CONSTRAINT = 9
-"""Nodes that one constraint adds to a document."""
+"""Number of nodes that one constraint adds to a document."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -150,9 +150,9 @@ class DocumentTimes:
     Attributes
     ----------
     nodes
-        How many nodes it has.
+        Number of nodes.
     written, read, packed, unpacked
-        Times [s]: from a model to text, from text to a model, and both for msgpack.
+        Times [s] to write a model as text, to read it, and of both for msgpack.
     """
 
     nodes: int
@@ -163,7 +163,7 @@ class DocumentTimes:
 
 
 def make_document_model(nodes: int) -> Model:
-    """Return a model of constraints between two coordinates each, about so many nodes as a document."""
+    """Return a model of constraints on two coordinates each, with about ``nodes`` nodes as a document."""
     model = Model()
     with model.edit() as edit, no_collection():
         for i in range(max(nodes // NODES_PER_CONSTRAINT, 1)):
@@ -173,7 +173,7 @@ def make_document_model(nodes: int) -> Model:
 
 
 def read_document(text: str) -> Model:
-    """Return the model that a document says, with all of its operations applied."""
+    """Return the model of a document, with all operations applied."""
     model = Model()
     with model.edit() as edit, no_collection():
         for tag, operation in read_operations(text):
@@ -182,7 +182,7 @@ def read_document(text: str) -> Model:
 
 
 def time_document(nodes: int) -> DocumentTimes:
-    """Measure writing and reading of a document of about so many nodes, once each."""
+    """Measure once the times of a document of about ``nodes`` nodes."""
     model = make_document_model(nodes)
     with no_collection():
         times = [perf_counter()]

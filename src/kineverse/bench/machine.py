@@ -22,13 +22,13 @@ class Machine:
     Attributes
     ----------
     tier
-        What evaluates functions here: ``interpreter``, ``c``, or ``c extension``, which calls the C directly.
+        Evaluation of functions: ``interpreter``, ``c``, or ``c extension``, which calls the C directly.
     compiler
-        What compiles them, with the vector unit and the number of cores.
+        C compiler, with the vector unit and the number of cores.
     processor, system, python
-        In their own words.
+        Names of processor, operating system and Python implementation, with versions.
     versions
-        Of this package and the ones it is measured with, by distribution; None for those that are missing.
+        Versions of this package and of peers, by distribution; None for missing ones.
     """
 
     tier: str
@@ -40,7 +40,7 @@ class Machine:
 
 
 def describe_machine() -> Machine:
-    """Return the properties of this machine."""
+    """Return the machine and software of this process."""
     return Machine(
         tier=_evaluation_tier(),
         compiler=compiler_information(),

@@ -29,12 +29,12 @@ def measure(settings: BenchmarkSettings) -> BenchmarkResult:
     """Measure batches, on one core unless the label says otherwise."""
     robot = find_robot(settings)
     configurations = robot.configurations(settings.rows)
-    points = robot.select_chain(configurations)
+    points = robot.chain_columns(configurations)
     with tempfile.TemporaryDirectory(prefix="kineverse-bench-") as folder:
-        field = Contenders(list(_ours(robot, points)))
-        field.contenders += _of_the_graph(robot, points, Path(folder), field.missing)
-        field.admit("pinocchio", lambda: [_pinocchio(robot, configurations)])
-        measured = time_contenders("batch", field.contenders, settings.rounds, settings.progress)
+        participants = Contenders(list(_ours(robot, points)))
+        participants.contenders += _casadi_graph(robot, points, Path(folder), participants.missing)
+        participants.add_peer("pinocchio", lambda: [_pinocchio(robot, configurations)])
+        measured = time_contenders("batch", participants.contenders, settings.rounds, settings.progress)
     return BenchmarkResult(
         name="batch",
         work=(
@@ -48,7 +48,7 @@ def measure(settings: BenchmarkSettings) -> BenchmarkResult:
             compare_speed(measured, ONE_CORE, NUMPY),
             compare_speed(measured, ALL_CORES, ONE_CORE),
         ),
-        missing=tuple(field.missing),
+        missing=tuple(participants.missing),
     )
 
 
@@ -72,24 +72,24 @@ def _ours(robot: BenchmarkRobot, points: Array) -> Iterator[Contender]:
     yield Contender(ALL_CORES, time_calls(run, len(points)))
 
 
-def _of_the_graph(
+def _casadi_graph(
     robot: BenchmarkRobot, points: Array, folder: Path, missing: list[str]
 ) -> Iterator[Contender]:
-    """Yield contenders that evaluate Kineverse's graph by other means."""
+    """Yield contenders that evaluate Kineverse's graph with numpy, or CasADi's map in C."""
     rows, function = len(points), make_casadi_function(robot)
-    by_numpy = NumpyGraph(function)
+    numpy_graph = NumpyGraph(function)
     outputs = _outputs(robot, rows)
     yield Contender(
         NUMPY,
-        pin_to_one_core(time_calls(lambda: by_numpy(points, outputs), rows)),
-        _results(lambda: by_numpy(points, outputs), outputs),
+        pin_to_one_core(time_calls(lambda: numpy_graph(points, outputs), rows)),
+        _results(lambda: numpy_graph(points, outputs), outputs),
     )
     if compiler_information().compiler is None:
         missing.append("casadi's map in C is missing: there is no C compiler")
         return
-    written = _outputs(robot, rows)
-    mapped = BoundMap(compile_map(function, rows, folder), points, written)
-    yield Contender(CASADI, pin_to_one_core(time_calls(mapped, rows)), _results(mapped, written))
+    map_outputs = _outputs(robot, rows)
+    mapped = BoundMap(compile_map(function, rows, folder), points, map_outputs)
+    yield Contender(CASADI, pin_to_one_core(time_calls(mapped, rows)), _results(mapped, map_outputs))
 
 
 def _pinocchio(robot: BenchmarkRobot, configurations: Array) -> Contender:
@@ -128,7 +128,7 @@ def _results(run: Callable[[], object], outputs: tuple[Array, ...]) -> Callable[
 
 
 def pin_to_one_core(sample: Callable[[], float]) -> Callable[[], float]:
-    """Return a sample that is taken on one core, where the system lets a process choose."""
+    """Return a sample that runs on one core, if the system supports affinities."""
     if not hasattr(os, "sched_setaffinity"):
         return sample
 

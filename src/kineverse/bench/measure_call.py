@@ -32,14 +32,14 @@ _TABLE = 147, 62
 
 
 def measure(settings: BenchmarkSettings) -> BenchmarkResult:
-    """Measure calls that take turns through the same configurations."""
+    """Measure interleaved calls at the same configurations."""
     robot = find_robot(settings)
     configurations = robot.configurations(settings.configurations)
-    field = Contenders(list(_ours(robot, configurations)))
-    field.admit("pinocchio", lambda: _pinocchio(robot, configurations))
-    field.admit("mujoco", lambda: [_mujoco(robot, configurations)])
-    measured = time_contenders("call", field.contenders, settings.rounds, settings.progress)
-    tables = list(_table_compiled(settings.processes))
+    participants = Contenders(list(_ours(robot, configurations)))
+    participants.add_peer("pinocchio", lambda: _pinocchio(robot, configurations))
+    participants.add_peer("mujoco", lambda: [_mujoco(robot, configurations)])
+    measured = time_contenders("call", participants.contenders, settings.rounds, settings.progress)
+    tables = list(_table_compile_times(settings.processes))
     return BenchmarkResult(
         name="call",
         work=(
@@ -57,18 +57,18 @@ def measure(settings: BenchmarkSettings) -> BenchmarkResult:
             compare_speed(measured, PLAIN, MUJOCO),
             *(bound_median(table, 2.0) for table in tables),
         ),
-        missing=tuple(field.missing),
+        missing=tuple(participants.missing),
     )
 
 
 def pose_and_jacobian(robot: BenchmarkRobot) -> CompiledFunction:
-    """Return the function that is measured, compiled as far as it goes here."""
+    """Return the compiled function of pose and Jacobian."""
     model = robot.model
     return compile([model.fk(robot.frame), model.jacobian(robot.frame)], robot.chain, wait=True)
 
 
-def _table_compiled(times: int) -> Iterator[Measurement]:
-    """Measure generation and compilation of C for a matrix of constants, without cache."""
+def _table_compile_times(times: int) -> Iterator[Measurement]:
+    """Yield the time to generate and compile C for a matrix of constants, without cache."""
     compiler = toolchain()
     if compiler is None:
         return
@@ -87,11 +87,11 @@ def _table_compiled(times: int) -> Iterator[Measurement]:
 
 def _ours(robot: BenchmarkRobot, configurations: Array) -> Iterator[Contender]:
     function = pose_and_jacobian(robot)
-    points = list(robot.select_chain(configurations))
+    points = list(robot.chain_columns(configurations))
     evaluator = function.bind()
 
-    # Inputs that change without being written in between are in evaluators of their own. More of them would
-    # not fit into the first cache, and memory would be measured.
+    # Each bound call has an evaluator whose input is written before the time is taken. More evaluators would
+    # not fit into the first-level cache, and memory access would be measured.
     evaluators = [function.bind() for _ in points[:_BOUND_AT_ONCE]]
 
     def bound() -> float:
@@ -122,9 +122,11 @@ def _ours(robot: BenchmarkRobot, configurations: Array) -> Iterator[Contender]:
         return tuple(output.copy() for output in evaluate.outputs)
 
     def results(bound: bool) -> list[Array]:
-        return _stacked(outputs(evaluators[0], point, bound) for point in points[:_CHECKED])
+        return _stack_results(outputs(evaluators[0], point, bound) for point in points[:_CHECKED])
 
-    yield Contender(PLAIN, time_calls(plain, len(points)), lambda: _stacked(map(function, points[:_CHECKED])))
+    yield Contender(
+        PLAIN, time_calls(plain, len(points)), lambda: _stack_results(map(function, points[:_CHECKED]))
+    )
     yield Contender(WRITTEN, time_calls(written, len(points)), lambda: results(False))
     yield Contender(BOUND, bound, lambda: results(True))
 
@@ -138,19 +140,19 @@ def _pinocchio(robot: BenchmarkRobot, configurations: Array) -> Iterator[Contend
     compute, aligned = pin.computeFrameJacobian, pin.ReferenceFrame.LOCAL_WORLD_ALIGNED
     reduced, whole = PinocchioRobot(robot, reduced=True), PinocchioRobot(robot)
 
-    def looked_up(peer: PinocchioRobot, rows: list[Array]) -> None:
+    def look_up_placement(peer: PinocchioRobot, rows: list[Array]) -> None:
         model, data, frame = peer.model, peer.data, peer.frame
         for row in rows:
             compute(model, data, row, frame, aligned)
             data.oMf[frame].homogeneous  # noqa: B018 - makes an array
 
-    def held(peer: PinocchioRobot, rows: list[Array]) -> None:
+    def hold_placement(peer: PinocchioRobot, rows: list[Array]) -> None:
         model, data, frame, pose = peer.model, peer.data, peer.frame, peer.pose
         for row in rows:
             compute(model, data, row, frame, aligned)
             pose.homogeneous  # noqa: B018 - makes an array
 
-    def everything(peer: PinocchioRobot, rows: list[Array]) -> None:
+    def compute_all_joints(peer: PinocchioRobot, rows: list[Array]) -> None:
         model, data, frame, pose = peer.model, peer.data, peer.frame, peer.pose
         for row in rows:
             pin.computeJointJacobians(model, data, row)
@@ -159,14 +161,14 @@ def _pinocchio(robot: BenchmarkRobot, configurations: Array) -> Iterator[Contend
             pose.homogeneous  # noqa: B018 - makes an array
 
     for name, peer, run in (
-        (REDUCED, reduced, looked_up),
-        (HELD, reduced, held),
-        (PATH, whole, held),
-        (WHOLE, whole, everything),
+        (REDUCED, reduced, look_up_placement),
+        (HELD, reduced, hold_placement),
+        (PATH, whole, hold_placement),
+        (WHOLE, whole, compute_all_joints),
     ):
         rows = peer.rows(positions)
         work, checked = partial(run, peer, rows), partial(map, peer.pose_and_jacobian, rows[:_CHECKED])
-        yield Contender(name, time_calls(work, len(rows)), lambda checked=checked: _stacked(checked()))  # type: ignore[misc]
+        yield Contender(name, time_calls(work, len(rows)), lambda checked=checked: _stack_results(checked()))  # type: ignore[misc]
 
 
 def _mujoco(robot: BenchmarkRobot, configurations: Array) -> Contender:
@@ -178,7 +180,7 @@ def _mujoco(robot: BenchmarkRobot, configurations: Array) -> Contender:
     rows = peer.rows(robot.positions(configurations))
 
     def run() -> None:
-        # The pose is left where MuJoCo writes it.
+        # The pose stays in MuJoCo's data.
         kinematics, centres, jacobian = mujoco.mj_kinematics, mujoco.mj_comPos, mujoco.mj_jacBody
         model, data, body, position = peer.model, peer.data, peer.body, peer.data.qpos
         linear, angular = peer.jacobian[:3], peer.jacobian[3:]
@@ -189,10 +191,12 @@ def _mujoco(robot: BenchmarkRobot, configurations: Array) -> Contender:
             jacobian(model, data, linear, angular, body)
 
     return Contender(
-        MUJOCO, time_calls(run, len(rows)), lambda: _stacked(map(peer.pose_and_jacobian, rows[:_CHECKED]))
+        MUJOCO,
+        time_calls(run, len(rows)),
+        lambda: _stack_results(map(peer.pose_and_jacobian, rows[:_CHECKED])),
     )
 
 
-def _stacked(results: Iterable[tuple[Array, ...]]) -> list[Array]:
+def _stack_results(results: Iterable[tuple[Array, ...]]) -> list[Array]:
     poses, jacobians = zip(*results, strict=True)
     return [np.array(poses), np.array(jacobians)]

@@ -1,4 +1,4 @@
-"""``document``: models written down and read again, a PR2 in a kitchen and up to a million nodes."""
+"""``document``: writing and reading of models, a PR2 in a kitchen and up to a million nodes."""
 
 from __future__ import annotations
 
@@ -22,19 +22,19 @@ PINOCCHIO, XML, MJB = "pinocchio, archive", "mujoco, MJCF", "mujoco, MJB"
 
 
 def measure(settings: BenchmarkSettings) -> BenchmarkResult:
-    """Measure documents of a robot in a kitchen beside the peers' formats, and their growth."""
+    """Measure documents of a robot in a kitchen beside formats of peers, and of large models."""
     robot = find_robot(settings)
     home = robot.model.copy()
     home.include("kitchen")
     text = to_json(home)
     measured = time_contenders(
-        "document", list(_of_home(robot, home, text)), settings.rounds, settings.progress
+        "document", list(_home_contenders(robot, home, text)), settings.rounds, settings.progress
     )
     size = Measurement("robot and kitchen, size", "byte", (float(len(text.encode())),))
-    field = Contenders(list(_of_robot(robot)))
-    field.admit("pinocchio", lambda: [_pinocchio(robot)])
-    field.admit("mujoco", lambda: list(_mujoco(robot)))
-    peers = time_contenders("document", field.contenders, settings.rounds, settings.progress)
+    participants = Contenders(list(_robot_contenders(robot)))
+    participants.add_peer("pinocchio", lambda: [_pinocchio(robot)])
+    participants.add_peer("mujoco", lambda: list(_mujoco(robot)))
+    peers = time_contenders("document", participants.contenders, settings.rounds, settings.progress)
     sizes = [settings.operations * factor for factor in (1, 10, 100)]
     growth = [time_document(nodes) for nodes in settings.progress(sizes, "document", "size")]
     return BenchmarkResult(
@@ -49,18 +49,18 @@ def measure(settings: BenchmarkSettings) -> BenchmarkResult:
             bound_median(measured[READ], 0.05),
             bound_median(size, 2e6),
             *(compare_speed(peers, ours, peer) for ours in (OURS, MSGPACK) for peer in (PINOCCHIO, XML, MJB)),
-            *_linear(growth[0], growth[-1]),
+            *_node_time_ratios(growth[0], growth[-1]),
         ),
-        missing=tuple(field.missing),
+        missing=tuple(participants.missing),
     )
 
 
-def _of_home(robot: BenchmarkRobot, home: Model, text: str) -> Iterator[Contender]:
+def _home_contenders(robot: BenchmarkRobot, home: Model, text: str) -> Iterator[Contender]:
     data = to_bytes(home)
 
-    def poses(made: Callable[[], Model]) -> Callable[[], list[Array]]:
+    def poses(make: Callable[[], Model]) -> Callable[[], list[Array]]:
         values = dict.fromkeys(home.fk(robot.frame).symbols, 0.1)
-        return lambda: [made().fk(robot.frame)(values)]
+        return lambda: [make().fk(robot.frame)(values)]
 
     yield Contender(WRITTEN, time_calls(partial(to_json, home)), poses(lambda: home))
     yield Contender(READ, time_calls(partial(read_document, text)), poses(lambda: read_document(text)))
@@ -68,7 +68,7 @@ def _of_home(robot: BenchmarkRobot, home: Model, text: str) -> Iterator[Contende
     yield Contender(UNPACKED, time_calls(partial(from_bytes, data)), poses(lambda: from_bytes(data)))
 
 
-def _of_robot(robot: BenchmarkRobot) -> Iterator[Contender]:
+def _robot_contenders(robot: BenchmarkRobot) -> Iterator[Contender]:
     yield Contender(OURS, time_calls(lambda: read_document(to_json(robot.model))))
     yield Contender(MSGPACK, time_calls(lambda: from_bytes(to_bytes(robot.model))))
 
@@ -103,20 +103,20 @@ def _mujoco(robot: BenchmarkRobot) -> Iterator[Contender]:
 
 def _times(growth: list[DocumentTimes]) -> Iterator[Measurement]:
     for g in growth:
-        for what, time in _ways(g).items():
+        for what, time in _times_by_label(g).items():
             yield Measurement(f"{g.nodes:,} nodes, {what}", "s", (time,))
 
 
-def _linear(small: DocumentTimes, large: DocumentTimes) -> Iterator[Comparison]:
-    """Yield the ratio of the times per node of a large and a small model."""
+def _node_time_ratios(small: DocumentTimes, large: DocumentTimes) -> Iterator[Comparison]:
+    """Yield the ratios of the time for a node in the large model to that in the small one."""
     ratio = large.nodes / small.nodes
-    before = _ways(small)
-    for what, time in _ways(large).items():
+    before = _times_by_label(small)
+    for what, time in _times_by_label(large).items():
         name = f"{what}, a node of {large.nodes:,} beside one of {small.nodes:,}"
         yield Comparison(name, time / ratio / before[what], "x", Bar(3, at_least=False))
 
 
-def _ways(growth: DocumentTimes) -> dict[str, float]:
+def _times_by_label(growth: DocumentTimes) -> dict[str, float]:
     return {
         "written": growth.written,
         "read": growth.read,

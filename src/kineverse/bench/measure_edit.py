@@ -1,4 +1,4 @@
-"""``edit``: changes of a large model, and of one joint of a robot until its next pose."""
+"""``edit``: edits of a large model, and of one joint of a robot up to its next pose."""
 
 from __future__ import annotations
 
@@ -46,21 +46,23 @@ def replace_joint(robot: BenchmarkRobot) -> Contender:
     model = robot.model.copy()
     tag, joint = _middle_joint(robot)
     origin = joint.origin
-    assert isinstance(origin, Pose)  # descriptions have no others
+    assert isinstance(origin, Pose)  # as in all robot descriptions
     values = dict.fromkeys(robot.chain, _CONFIGURATION_RANGE)
     shifts = count(1)
 
-    def at(shift: float) -> Array:
+    def edited_pose(shift: float) -> Array:
         with model.edit() as edit:
             edit.replace(tag, replace(joint, origin=_shift_origin(origin, shift)))
         return np.asarray(model.fk(robot.frame)(values))
 
-    # Every time by another shift: a model that is what it was before would be done at once.
-    return Contender(JOINT, time_calls(lambda: at(_SHIFT * next(shifts))), lambda: [at(_SHIFT)])
+    # Each shift differs from the last, because an edit that changes nothing takes no time.
+    return Contender(
+        JOINT, time_calls(lambda: edited_pose(_SHIFT * next(shifts))), lambda: [edited_pose(_SHIFT)]
+    )
 
 
 def _middle_joint(robot: BenchmarkRobot) -> tuple[str, Joint]:
-    """Return tag and operation of the middle one of the joints that move the frame."""
+    """Return tag and operation of the middle joint of the chain."""
     name = robot.chain[len(robot.chain) // 2].path
     for tag in robot.model.history.tags:
         operation = robot.model.history.entry(tag).operation
@@ -80,7 +82,7 @@ def _sampled_configurations(robot: BenchmarkRobot) -> dict[str, Array]:
 
 
 def reread_file(robot: BenchmarkRobot, folder: Path) -> Contender:
-    """Return the contender that reads a file with the joint moved, as models in pinocchio are immutable."""
+    """Return the contender that reads a file with the joint moved, as pinocchio models are immutable."""
     import pinocchio as pin
 
     from .peers.pinocchio import PinocchioRobot
@@ -89,14 +91,14 @@ def reread_file(robot: BenchmarkRobot, folder: Path) -> Contender:
     file.write_text(_edited_text(robot), encoding="utf-8")
     edited = replace(robot, file=file)
 
-    def at() -> Array:
+    def edited_pose() -> Array:
         peer = PinocchioRobot(edited)
         (row,) = peer.rows(_sampled_configurations(robot))
         pin.framesForwardKinematics(peer.model, peer.data, row)
         pose: Array = peer.pose.homogeneous
         return pose
 
-    return Contender(PINOCCHIO, time_calls(at), lambda: [at()])
+    return Contender(PINOCCHIO, time_calls(edited_pose), lambda: [edited_pose()])
 
 
 def recompile_specification(robot: BenchmarkRobot) -> Contender:
@@ -113,7 +115,7 @@ def recompile_specification(robot: BenchmarkRobot) -> Contender:
     start = np.array(place)
     shifts = count(1)
 
-    def at(shift: float) -> Array:
+    def edited_pose(shift: float) -> Array:
         place[:] = start + np.array([shift, 0.0, 0.0])
         peer.model = specification.compile()
         peer.data = mujoco.MjData(peer.model)
@@ -121,7 +123,9 @@ def recompile_specification(robot: BenchmarkRobot) -> Contender:
         mujoco.mj_kinematics(peer.model, peer.data)
         return peer.pose(peer.body)
 
-    return Contender(MUJOCO, time_calls(lambda: at(_SHIFT * next(shifts))), lambda: [at(_SHIFT)])
+    return Contender(
+        MUJOCO, time_calls(lambda: edited_pose(_SHIFT * next(shifts))), lambda: [edited_pose(_SHIFT)]
+    )
 
 
 def _edited_text(robot: BenchmarkRobot) -> str:
@@ -146,10 +150,10 @@ def measure(settings: BenchmarkSettings) -> BenchmarkResult:
     )
     runs = Measurement("operations run by that", "operations", (float(count_reruns(large)),))
     with tempfile.TemporaryDirectory(prefix="kineverse-bench-") as folder:
-        field = Contenders([replace_joint(robot)])
-        field.admit("pinocchio", lambda: [reread_file(robot, Path(folder))])
-        field.admit("mujoco", lambda: [recompile_specification(robot)])
-        edited = time_contenders("edit", field.contenders, settings.rounds, settings.progress)
+        participants = Contenders([replace_joint(robot)])
+        participants.add_peer("pinocchio", lambda: [reread_file(robot, Path(folder))])
+        participants.add_peer("mujoco", lambda: [recompile_specification(robot)])
+        edited = time_contenders("edit", participants.contenders, settings.rounds, settings.progress)
     ratio = compare_speed(measured, TO_LARGE, TO_EMPTY)
     return BenchmarkResult(
         name="edit",
@@ -167,5 +171,5 @@ def measure(settings: BenchmarkSettings) -> BenchmarkResult:
             compare_speed(edited, JOINT, PINOCCHIO),
             compare_speed(edited, JOINT, MUJOCO),
         ),
-        missing=tuple(field.missing),
+        missing=tuple(participants.missing),
     )

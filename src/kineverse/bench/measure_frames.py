@@ -1,4 +1,4 @@
-"""``frames``: the poses of all frames at one configuration."""
+"""``frames``: poses of all frames at one configuration."""
 
 from __future__ import annotations
 
@@ -19,14 +19,14 @@ _CHECKED = 10
 
 
 def measure(settings: BenchmarkSettings) -> BenchmarkResult:
-    """Measure all frames at once."""
+    """Measure the poses of all frames."""
     robot = find_robot(settings)
     frames = list(robot.model.frames)
     configurations = robot.configurations(settings.configurations)
-    field = Contenders([_ours(robot, frames, configurations)])
-    field.admit("pinocchio", lambda: [_pinocchio(robot, frames, configurations)])
-    field.admit("mujoco", lambda: [_mujoco(robot, frames, configurations)])
-    measured = time_contenders("frames", field.contenders, settings.rounds, settings.progress)
+    participants = Contenders([_ours(robot, frames, configurations)])
+    participants.add_peer("pinocchio", lambda: [_pinocchio(robot, frames, configurations)])
+    participants.add_peer("mujoco", lambda: [_mujoco(robot, frames, configurations)])
+    measured = time_contenders("frames", participants.contenders, settings.rounds, settings.progress)
     return BenchmarkResult(
         name="frames",
         work=(
@@ -38,7 +38,7 @@ def measure(settings: BenchmarkSettings) -> BenchmarkResult:
             compare_speed(measured, KINEVERSE, PINOCCHIO, 2.5),
             compare_speed(measured, KINEVERSE, MUJOCO),
         ),
-        missing=tuple(field.missing),
+        missing=tuple(participants.missing),
     )
 
 
@@ -52,11 +52,11 @@ def _ours(robot: BenchmarkRobot, frames: Sequence[str], configurations: Array) -
             evaluator(point)
 
     def results() -> list[Array]:
-        found = []
+        poses = []
         for point in points[:_CHECKED]:
             evaluator(point)
-            found.append(np.array(evaluator.outputs))
-        return found
+            poses.append(np.array(evaluator.outputs))
+        return poses
 
     return Contender(KINEVERSE, time_calls(run, len(points)), results)
 
@@ -72,16 +72,16 @@ def _pinocchio(robot: BenchmarkRobot, frames: Sequence[str], configurations: Arr
     numbers = [model.getFrameId(frame, pin.FrameType.BODY) for frame in frames]
 
     def run() -> None:
-        place = pin.framesForwardKinematics
+        forward = pin.framesForwardKinematics
         for row in rows:
-            place(model, data, row)
+            forward(model, data, row)
 
     def results() -> list[Array]:
-        found = []
+        poses = []
         for row in rows[:_CHECKED]:
             pin.framesForwardKinematics(model, data, row)
-            found.append(np.array([data.oMf[k].homogeneous for k in numbers]))
-        return found
+            poses.append(np.array([data.oMf[k].homogeneous for k in numbers]))
+        return poses
 
     return Contender(PINOCCHIO, time_calls(run, len(rows)), results)
 
@@ -98,17 +98,17 @@ def _mujoco(robot: BenchmarkRobot, frames: Sequence[str], configurations: Array)
     numbers = [max(mujoco.mj_name2id(model, mujoco.mjtObj.mjOBJ_BODY, frame), 0) for frame in frames]
 
     def run() -> None:
-        place, position = mujoco.mj_kinematics, data.qpos
+        forward, position = mujoco.mj_kinematics, data.qpos
         for row in rows:
             position[:] = row
-            place(model, data)
+            forward(model, data)
 
     def results() -> list[Array]:
-        found = []
+        poses = []
         for row in rows[:_CHECKED]:
             data.qpos[:] = row
             mujoco.mj_kinematics(model, data)
-            found.append(np.array([peer.pose(k) for k in numbers]))
-        return found
+            poses.append(np.array([peer.pose(k) for k in numbers]))
+        return poses
 
     return Contender(MUJOCO, time_calls(run, len(rows)), results)

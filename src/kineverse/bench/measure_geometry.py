@@ -1,4 +1,4 @@
-"""``geometry``: pairs within a radius, with distances, points and normals, from step to step of a motion."""
+"""``geometry``: pairs within a radius with distances, points and normals, along a motion."""
 
 from __future__ import annotations
 
@@ -34,32 +34,31 @@ SEARCH, PAIRS, BULLET = "mujoco, mj_collision", "mujoco, mj_geomDistance and num
 UPDATE, QUERY = "update", "query"
 
 _EXACT, _CURVED, _MARGINS = 1e-6, 1e-4, 3e-3
-"""Tolerances of distances [m]: of polytopes and capsules; of whatever a robot has; of Bullet with
-its margins."""
+"""Tolerances of distances [m]: polytopes and capsules; all shapes of a robot; Bullet, which adds margins."""
 
 _NEAR, _WHOLE = 0.06, " without rules, within .06 m"
-"""A radius [m] at which the robot's own links, many of which always overlap, are most of what is found."""
+"""Radius [m] of the query without rules, whose results are mostly pairs of the robot's own links."""
 
 _CHECKED = 20
 
 
 @dataclass(frozen=True)
 class SearchEntry:
-    """Search for near objects, and its tolerance [m]."""
+    """Proximity search, and the tolerance of its distances [m]."""
 
     name: str
-    finder: ProximitySearch
+    search: ProximitySearch
     accuracy: float
 
 
 def measure(settings: BenchmarkSettings) -> BenchmarkResult:
-    """Measure an arm among boxes, among more boxes with as many near, and a robot in a kitchen."""
+    """Measure an arm among boxes, among more boxes with as many near ones, and a robot in a kitchen."""
     collision_library.prepare(wait=True)
     steps = min(settings.configurations, settings.steps)
     sizes = [settings.boxes // part for part in (30, 10, 3, 1)]
-    field = Contenders()
+    participants = Contenders()
     with tempfile.TemporaryDirectory(prefix="kineverse-bench-") as folder:
-        arm = list(_among_boxes(field, Path(folder), steps))
+        arm = list(_among_boxes(participants, Path(folder), steps))
         robot = make_kitchen_robot(steps)
         rooms = list(_around_robot(robot))
         angles = make_clutter(steps=steps).angles
@@ -77,9 +76,9 @@ def measure(settings: BenchmarkSettings) -> BenchmarkResult:
             )
             for boxes in sizes
         ]
-        field.contenders += [*_timed(arm, angles), *_timed(many, angles), *_timed(rooms, robot.values)]
-        field.contenders += _timed(everything, robot.values)
-        measured = time_contenders("geometry", field.contenders, settings.rounds, settings.progress)
+        participants.contenders += [*_timed(arm, angles), *_timed(many, angles), *_timed(rooms, robot.values)]
+        participants.contenders += _timed(everything, robot.values)
+        measured = time_contenders("geometry", participants.contenders, settings.rounds, settings.progress)
     peers = (SEARCH, PAIRS, BULLET, COAL)
     room = {name: f"{robot.name}: {name}, {QUERY}" for name in (OURS, SEARCH, BULLET, COAL)}
     whole = f"{robot.name}: {OURS}{_WHOLE}, {QUERY}"
@@ -102,23 +101,23 @@ def measure(settings: BenchmarkSettings) -> BenchmarkResult:
             compare_speed(measured, whole, f"{robot.name}: {COAL}{_WHOLE}, {QUERY}", 1.0),
             _growth(measured, sizes),
         ),
-        missing=tuple(field.missing),
+        missing=tuple(participants.missing),
     )
 
 
 def check_distances(entries: Sequence[SearchEntry], rows: Array) -> None:
     """Compare the results of all searches at some states with those of the first.
 
-    A pair that is found by one and not by another counts as being at the radius for the other, so that only
-    those may be missing that are next to it. Depths in penetration are not compared: they count as touching.
+    If a search misses a pair of another, its distance counts as the radius, so that only pairs near the
+    radius may be missing. Penetration depths are not compared; they count as contact.
 
     Raises
     ------
     DisagreementError
-        If distances differ by more than the accuracy of either.
+        If distances differ by more than the tolerance of the search.
     """
     for row in rows[:: max(len(rows) // _CHECKED, 1)]:
-        found = [_distances(entry.finder, row) for entry in entries]
+        found = [_distances(entry.search, row) for entry in entries]
         pairs = sorted({pair for each in found for pair in each})
         table = [np.array([each.get(pair, RADIUS) for pair in pairs]) for each in found]
         for entry, distances in zip(entries[1:], table[1:], strict=True):
@@ -126,17 +125,17 @@ def check_distances(entries: Sequence[SearchEntry], rows: Array) -> None:
             check_equal("geometry", names, entry.accuracy)
 
 
-def _distances(finder: ProximitySearch, row: Array) -> dict[tuple[str, str], float]:
-    finder.update(row)
-    finder.find()
+def _distances(search: ProximitySearch, row: Array) -> dict[tuple[str, str], float]:
+    search.update(row)
+    search.query()
     least: dict[tuple[str, str], float] = {}
-    for a, b, distance in finder.distances():
+    for a, b, distance in search.distances():
         pair = min(a, b), max(a, b)
         least[pair] = min(least.get(pair, RADIUS), max(distance, 0.0))
     return least
 
 
-def _among_boxes(field: Contenders, folder: Path, steps: int) -> Iterator[SearchEntry]:
+def _among_boxes(participants: Contenders, folder: Path, steps: int) -> Iterator[SearchEntry]:
     arm = make_clutter(steps=steps)
     yield SearchEntry(OURS, KineverseSearch(_scene(folder, 60, steps)), _EXACT)
     yield SearchEntry(COAL, CoalSearch(_scene(folder, 60, steps)), _EXACT)
@@ -144,17 +143,17 @@ def _among_boxes(field: Contenders, folder: Path, steps: int) -> Iterator[Search
         yield SearchEntry(SEARCH, MujocoSearch(arm), _EXACT)
         yield SearchEntry(PAIRS, MujocoPairSearch(arm), _EXACT)
     else:
-        field.admit("mujoco", list)
+        participants.add_peer("mujoco", list)
     if has_peer("pybullet"):
         from .peers.bullet import BulletSearch
 
         yield SearchEntry(BULLET, BulletSearch(arm), _MARGINS)
     else:
-        field.missing.append(install_advice("pybullet"))
+        participants.missing.append(install_advice("pybullet"))
 
 
 def _around_robot(robot: KitchenRobot) -> Iterator[SearchEntry]:
-    """Yield the searches that support a moving robot; :func:`_among_boxes` lists the others as missing."""
+    """Yield the searches that support a moving robot; :func:`_among_boxes` lists missing peers."""
     yield SearchEntry(f"{robot.name}: {OURS}", KineverseSearch(robot.scene()), _CURVED)
     yield SearchEntry(f"{robot.name}: {COAL}", CoalSearch(robot.scene()), _CURVED)
     if has_peer("mujoco"):
@@ -172,26 +171,26 @@ def _scene(folder: Path, boxes: int, steps: int) -> Scene:
 
 
 def _timed(entries: Iterable[SearchEntry], rows: Array) -> Iterator[Contender]:
-    """Yield two contenders for each: both go through all states, and each counts its part of the time."""
+    """Yield two contenders for each search, one for the time of updates and one for that of queries."""
     for entry in entries:
-        yield Contender(f"{entry.name}, {UPDATE}", _sample(entry.finder, rows, whole=False))
-        yield Contender(f"{entry.name}, {QUERY}", _sample(entry.finder, rows, whole=True))
+        yield Contender(f"{entry.name}, {UPDATE}", _sample(entry.search, rows, queries=False))
+        yield Contender(f"{entry.name}, {QUERY}", _sample(entry.search, rows, queries=True))
 
 
-def _sample(finder: ProximitySearch, rows: Array, whole: bool) -> Callable[[], float]:
+def _sample(search: ProximitySearch, rows: Array, queries: bool) -> Callable[[], float]:
     states = list(rows)
 
     def sample() -> float:
-        update, find = finder.update, finder.find
-        updating = asking = 0.0
+        update, query = search.update, search.query
+        update_time = query_time = 0.0
         for state in states:
             start = perf_counter()
             update(state)
-            there = perf_counter()
-            find()
-            asking += perf_counter() - there
-            updating += there - start
-        return (asking if whole else updating) / len(states)
+            updated = perf_counter()
+            query()
+            query_time += perf_counter() - updated
+            update_time += updated - start
+        return (query_time if queries else update_time) / len(states)
 
     return sample
 

@@ -1,4 +1,4 @@
-"""``identification``: the joint between two parts, from twenty noisy poses of both, and from one more."""
+"""``identification``: the joint between two parts from twenty noisy poses of both, and from one more."""
 
 from __future__ import annotations
 
@@ -17,8 +17,6 @@ from .harness import (
     BenchmarkSettings,
     Contender,
     Contenders,
-    has_peer,
-    install_advice,
     time_calls,
     time_contenders,
 )
@@ -36,16 +34,13 @@ _RANGE = math.pi / 2
 
 
 def measure(settings: BenchmarkSettings) -> BenchmarkResult:
-    """Measure the identification of a hinge that was seen over a right angle."""
+    """Measure the identification of a hinge observed over a right angle."""
     solver.prepare(wait=True)
     parents, children = _recording()
-    field = Contenders([*_ours(parents, children)])
+    participants = Contenders([*_ours(parents, children)])
     for module, peer in (("scipy", _scipy), ("ripl_articulation", _ripl)):
-        if has_peer(module):
-            field.contenders.append(peer(parents, children))
-        else:
-            field.missing.append(install_advice(module))
-    measured = time_contenders("identification", field.contenders, settings.rounds, settings.progress)
+        participants.add_peer(module, lambda peer=peer: [peer(parents, children)])  # type: ignore[misc]
+    measured = time_contenders("identification", participants.contenders, settings.rounds, settings.progress)
     return BenchmarkResult(
         name="identification",
         work=(
@@ -54,12 +49,12 @@ def measure(settings: BenchmarkSettings) -> BenchmarkResult:
         ),
         measurements=tuple(measured.values()),
         comparisons=(bound_median(measured[ALL], 5e-3), bound_median(measured[ONE], 1e-3)),
-        missing=tuple(field.missing),
+        missing=tuple(participants.missing),
     )
 
 
 def _recording() -> tuple[Array, Array]:
-    """Return poses of parent and child as they were seen, one more than are used at once."""
+    """Return noisy poses of parent and child, one more than the batch uses."""
     random = np.random.default_rng(0)
     count = _COUNT + 1
     angles = random.uniform(-_RANGE / 2, _RANGE / 2, count)
@@ -82,29 +77,29 @@ def _ours(parents: Array, children: Array) -> Iterator[Contender]:
     yield Contender(ALL, time_calls(lambda: identify(a, b, noise=noise)))
     yield Contender(HINGE, time_calls(lambda: identify(a, b, noise=noise, families=["revolute"])))
 
-    def known() -> Identifier:
+    def make_identifier() -> Identifier:
         identifier = Identifier(noise=noise)
         for parent, child in zip(a, b, strict=True):
             identifier.add(parent, child)
         assert identifier.result
         return identifier
 
-    def one_more(identifier: Identifier) -> None:
+    def add_pose(identifier: Identifier) -> None:
         identifier.add(parents[_COUNT], children[_COUNT])
         assert identifier.result
 
-    yield Contender(ONE, time_calls(one_more, prepare=known))
+    yield Contender(ONE, time_calls(add_pose, prepare=make_identifier))
 
 
 def _scipy(parents: Array, children: Array) -> Contender:
-    """Return a fit by scipy: unknown frames on both sides of the hinge, angles, and true poses."""
+    """Return the fit with scipy; unknowns are the frames on both sides, the angles and the true poses."""
     optimize: Any = importlib.import_module("scipy.optimize")
     a, b = parents[:_COUNT], children[:_COUNT]
     scale = np.array([1.0 / _POSITION] * 3 + [1.0 / _ORIENTATION] * 3)
     start = identify(a, b, noise=pose_covariance(_POSITION, _ORIENTATION), families=["revolute"]).best
 
-    def apart(seen: Array, true: Array) -> Array:
-        weighted: Array = pose_difference(seen, true) * scale
+    def weighted_difference(measured: Array, true: Array) -> Array:
+        weighted: Array = pose_difference(measured, true) * scale
         return weighted
 
     def errors(unknown: Array) -> Array:
@@ -113,8 +108,8 @@ def _scipy(parents: Array, children: Array) -> Contender:
         turns = exp_so3(unknown[12 : 12 + _COUNT, None] * (0.0, 0.0, 1.0))
         moved = unknown[12 + _COUNT :].reshape(_COUNT, 6)
         true = retract(a, moved)
-        there = true @ left @ transform(turns, np.zeros((_COUNT, 3))) @ right
-        return np.concatenate([apart(a, true), apart(b, there)]).ravel()
+        child = true @ left @ transform(turns, np.zeros((_COUNT, 3))) @ right
+        return np.concatenate([weighted_difference(a, true), weighted_difference(b, child)]).ravel()
 
     left, right = start.frame, inverse(start.frame) @ start.parameters["reference"]
     sides = [np.concatenate([log_so3(side[:3, :3]), side[:3, 3]]) for side in (left, right)]
@@ -125,6 +120,6 @@ def _scipy(parents: Array, children: Array) -> Contender:
 def _ripl(parents: Array, children: Array) -> Contender:
     peer: Any = importlib.import_module("ripl_articulation")
     a, b = parents[:_COUNT], children[:_COUNT]
-    # It takes the parts to coincide at joint value 0.
+    # It assumes that the parts coincide at joint value 0.
     aligned = b @ inverse(inverse(a[0]) @ b[0])
     return Contender(RIPL, time_calls(lambda: peer.solve_articulation_from_poses(a, aligned)))

@@ -1,4 +1,4 @@
-"""``import``: importing the library in a fresh process, and the packages that takes."""
+"""``import``: import time in a fresh process, and number of required packages."""
 
 from __future__ import annotations
 
@@ -23,10 +23,10 @@ CORE, MOST_PACKAGES = "kineverse-articulation", 14
 
 def measure(settings: BenchmarkSettings) -> BenchmarkResult:
     """Measure imports, and count packages."""
-    field = Contenders([_import("kineverse")])
+    participants = Contenders([_import("kineverse")])
     for peer in PEERS:
-        field.admit(peer, lambda peer=peer: [_import(peer)])  # type: ignore[misc]
-    measured = time_contenders("import", field.contenders, settings.processes, settings.progress)
+        participants.add_peer(peer, lambda peer=peer: [_import(peer)])  # type: ignore[misc]
+    measured = time_contenders("import", participants.contenders, settings.processes, settings.progress)
     comparisons = [bound_median(measured[KINEVERSE], 0.5)]
     comparisons += [compare_speed(measured, KINEVERSE, f"import {peer}") for peer in PEERS]
     packages = []
@@ -35,13 +35,13 @@ def measure(settings: BenchmarkSettings) -> BenchmarkResult:
         bar = Bar(MOST_PACKAGES, at_least=False)
         comparisons.append(Comparison(packages[0].name, packages[0].median, "packages", bar))
     else:
-        field.missing.append(install_advice("packaging"))
+        participants.missing.append(install_advice("packaging"))
     return BenchmarkResult(
         name="import",
         work="the import, in a fresh process; and the packages that pip installs for it, itself included",
         measurements=(*measured.values(), *packages),
         comparisons=tuple(comparisons),
-        missing=tuple(field.missing),
+        missing=tuple(participants.missing),
     )
 
 
@@ -69,18 +69,18 @@ def find_requirements(distribution: str) -> set[str]:
     from packaging.requirements import Requirement
     from packaging.utils import canonicalize_name
 
-    found: set[str] = set()
-    waiting = [Requirement(distribution)]
-    while waiting:
-        wanted = waiting.pop()
-        name = canonicalize_name(wanted.name)
-        if name in found:
+    names: set[str] = set()
+    pending = [Requirement(distribution)]
+    while pending:
+        required = pending.pop()
+        name = canonicalize_name(required.name)
+        if name in names:
             continue
-        found.add(name)
-        extras = wanted.extras or {""}
+        names.add(name)
+        extras = required.extras or {""}
         for text in metadata.requires(name) or ():
             requirement = Requirement(text)
             marker = requirement.marker
             if marker is None or any(marker.evaluate({"extra": extra}) for extra in extras):
-                waiting.append(requirement)
-    return found
+                pending.append(requirement)
+    return names

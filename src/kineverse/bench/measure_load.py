@@ -1,4 +1,4 @@
-"""``load``: a robot's file to its first pose and Jacobian, in a fresh process, after the import."""
+"""``load``: time from a robot file to the first pose and Jacobian, in a fresh process after the import."""
 
 from __future__ import annotations
 
@@ -21,13 +21,15 @@ PINOCCHIO, MUJOCO = "pinocchio", "mujoco"
 
 
 def measure(settings: BenchmarkSettings) -> BenchmarkResult:
-    """Measure loading, every time in a new process."""
+    """Measure loading, each time in a fresh process."""
     robot = find_robot(settings)
     with tempfile.TemporaryDirectory(prefix="kineverse-bench-") as folder:
-        field = Contenders(list(_ours(robot, Path(folder))))
-        field.admit("pinocchio", lambda: [_peer(robot, PINOCCHIO, str(robot.file))])
-        field.admit("mujoco", lambda: [_peer(robot, MUJOCO, _for_mujoco(robot, Path(folder)))])
-        measured = time_contenders("load", field.contenders, settings.processes, settings.progress)
+        participants = Contenders(list(_ours(robot, Path(folder))))
+        participants.add_peer("pinocchio", lambda: [_peer(robot, PINOCCHIO, str(robot.file))])
+        participants.add_peer(
+            "mujoco", lambda: [_peer(robot, MUJOCO, write_mujoco_file(robot, Path(folder)))]
+        )
+        measured = time_contenders("load", participants.contenders, settings.processes, settings.progress)
     return BenchmarkResult(
         name="load",
         work=f"{robot} to pose and Jacobian of {robot.frame}, in a fresh process, after the import",
@@ -38,7 +40,7 @@ def measure(settings: BenchmarkSettings) -> BenchmarkResult:
             bound_median(measured[AGAIN], 0.005),
             *(compare_speed(measured, ours, peer) for ours in (COLD, CACHED) for peer in (PINOCCHIO, MUJOCO)),
         ),
-        missing=tuple(field.missing),
+        missing=tuple(participants.missing),
     )
 
 
@@ -69,7 +71,8 @@ def _peer(robot: BenchmarkRobot, name: str, file: str) -> Contender:
     return Contender(name, lambda: float(load()["first"]), _results(robot, load))
 
 
-def _for_mujoco(robot: BenchmarkRobot, folder: Path) -> str:
+def write_mujoco_file(robot: BenchmarkRobot, folder: Path) -> str:
+    """Write the robot's file for MuJoCo to a folder, and return its path."""
     from .peers.mujoco_kinematics import make_robot_mjcf
 
     file = folder / "for_mujoco.urdf"
@@ -78,11 +81,11 @@ def _for_mujoco(robot: BenchmarkRobot, folder: Path) -> str:
 
 
 def _results(robot: BenchmarkRobot, load: Callable[[], dict[str, Any]]) -> Callable[[], Sequence[Array]]:
-    """Return a function for pose and Jacobian, with columns in the order of the chain."""
+    """Return a function that gives pose and Jacobian, with columns in the order of the chain."""
 
     def results() -> list[Array]:
-        said = load()
-        columns = [said["columns"][symbol.path] for symbol in robot.chain]
-        return [np.array(said["pose"]), np.array(columns).T]
+        output = load()
+        columns = [output["columns"][symbol.path] for symbol in robot.chain]
+        return [np.array(output["pose"]), np.array(columns).T]
 
     return results

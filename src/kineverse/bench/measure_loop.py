@@ -1,4 +1,4 @@
-"""``loop``: a four-bar linkage, whose coupler and rocker follow the crank."""
+"""``loop``: forward kinematics of a four-bar linkage with the crank as its coordinate."""
 
 from __future__ import annotations
 
@@ -28,10 +28,10 @@ _CHECKED = 50
 
 
 def measure(settings: BenchmarkSettings) -> BenchmarkResult:
-    """Measure the coupler's pose and Jacobian all around the crank."""
+    """Measure the position and Jacobian of the coupler's end over full turns of the crank."""
     angles = np.random.default_rng(0).uniform(-np.pi, np.pi, settings.configurations)
-    field = Contenders([*_ours(angles), _rootfinder(angles)])
-    measured = time_contenders("loop", field.contenders, settings.rounds, settings.progress)
+    participants = Contenders([*_ours(angles), _rootfinder(angles)])
+    measured = time_contenders("loop", participants.contenders, settings.rounds, settings.progress)
     return BenchmarkResult(
         name="loop",
         work=(
@@ -44,12 +44,12 @@ def measure(settings: BenchmarkSettings) -> BenchmarkResult:
             bound_median(measured[PLAIN], 5e-6),
             compare_speed(measured, BOUND, ROOTFINDER),
         ),
-        missing=tuple(field.missing),
+        missing=tuple(participants.missing),
     )
 
 
 def make_four_bar() -> Model:
-    """Return crank and coupler, and the rocker that they are closed with."""
+    """Return a four-bar linkage: crank and coupler, closed with the rocker."""
     model = Model()
     with model.edit() as edit:
         for name, parent, x in (
@@ -93,7 +93,7 @@ def _ours(angles: Array) -> Iterator[Contender]:
 
 
 def _rootfinder(angles: Array) -> Contender:
-    """Return CasADi's own way, started beside the solution: what a user of it would write."""
+    """Return CasADi's rootfinder, started near the solution."""
     crank, x = ca.SX.sym("crank"), ca.SX.sym("x", 2)
     end = _link_transform(crank, _CRANK) + _link_transform(x[0], _COUPLER)
     gap = end - _link_transform(x[1], _ROCKER) - ca.vertcat(_GROUND, 0)
@@ -110,7 +110,7 @@ def _rootfinder(angles: Array) -> Contender:
     buffer.set_res(0, out.data)
     buffer.set_res(1, derivative.data)
 
-    def evaluate(angle: float, near: Array, kept: Any = buffer) -> None:
+    def evaluate(angle: float, near: Array, reference: Any = buffer) -> None:
         guess[:] = near
         given[0] = angle
         run()
@@ -134,13 +134,13 @@ def _link_transform(angle: ca.SX, length: float) -> ca.SX:
 
 
 def _closing_angles(crank: float) -> Array:
-    """Return approximate angles at which coupler and rocker meet, from the intersection of two circles."""
+    """Return angles of coupler and rocker near those that close the loop, by intersecting two circles."""
     pin = _CRANK * np.array([np.cos(crank), np.sin(crank)])
-    way = np.array([_GROUND, 0.0]) - pin
-    distance = np.linalg.norm(way)
+    offset = np.array([_GROUND, 0.0]) - pin
+    distance = np.linalg.norm(offset)
     along = (_COUPLER**2 - _ROCKER**2 + distance**2) / (2 * distance)
     across = np.sqrt(_COUPLER**2 - along**2)
-    end = pin + (along * way + across * np.array([-way[1], way[0]])) / distance
+    end = pin + (along * offset + across * np.array([-offset[1], offset[0]])) / distance
     to_end, from_ground = end - pin, end - np.array([_GROUND, 0.0])
     angles = np.array(
         [np.arctan2(to_end[1], to_end[0]), np.arctan2(from_ground[1], from_ground[0])], dtype=np.float64

@@ -1,4 +1,4 @@
-"""``memory``: memory of a loaded robot in a fresh process, without that of the imports."""
+"""``memory``: memory of a loaded robot in a fresh process, beyond that of the imports."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from pathlib import Path
 from kineverse.errors import KineverseError
 
 from .harness import BenchmarkSettings, Contender, Contenders, run_program, time_contenders
-from .measure_load import _for_mujoco
+from .measure_load import write_mujoco_file
 from .result import BenchmarkResult, bound_median
 from .workloads import BenchmarkRobot, find_robot
 
@@ -18,27 +18,29 @@ LOADED, EVALUATED = "kineverse, loaded", "kineverse, pose and Jacobian compiled"
 
 
 def measure(settings: BenchmarkSettings) -> BenchmarkResult:
-    """Measure memory, every time in a new process.
+    """Measure memory, each time in a fresh process.
 
     Raises
     ------
     KineverseError
-        Where the system does not say how much memory a process has.
+        If the system does not report the memory of a process.
     """
     if not os.path.exists("/proc/self/statm"):
-        raise KineverseError("Benchmark 'memory' needs Linux, where processes are told how much they use.")
+        raise KineverseError("Benchmark 'memory' needs Linux, which reports the memory of a process.")
     robot = find_robot(settings)
     with tempfile.TemporaryDirectory(prefix="kineverse-bench-") as folder:
-        field = Contenders(list(_ours(robot)))
-        field.admit("pinocchio", lambda: [_peer("pinocchio", str(robot.file), robot)])
-        field.admit("mujoco", lambda: [_peer("mujoco", _for_mujoco(robot, Path(folder)), robot)])
-        measured = time_contenders("memory", field.contenders, settings.processes, settings.progress)
+        participants = Contenders(list(_ours(robot)))
+        participants.add_peer("pinocchio", lambda: [_peer("pinocchio", str(robot.file), robot)])
+        participants.add_peer(
+            "mujoco", lambda: [_peer("mujoco", write_mujoco_file(robot, Path(folder)), robot)]
+        )
+        measured = time_contenders("memory", participants.contenders, settings.processes, settings.progress)
     return BenchmarkResult(
         name="memory",
         work=f"{robot}, in a fresh process, over what the imports take",
         measurements=tuple(measured.values()),
         comparisons=(bound_median(measured[LOADED], 60.0), bound_median(measured[EVALUATED], 60.0)),
-        missing=tuple(field.missing),
+        missing=tuple(participants.missing),
     )
 
 

@@ -1,4 +1,4 @@
-"""``tracking``: the shipped kitchen's 23 coordinates from the noisy poses of all that moves in it."""
+"""``tracking``: the 23 coordinates of the shipped kitchen from noisy poses of all moving frames."""
 
 from __future__ import annotations
 
@@ -22,10 +22,10 @@ GAIN, INFORMATION = "numpy, textbook gain", "numpy, information form"
 
 POSITION, ORIENTATION = 0.01, math.radians(1.0)
 LONGEST = 1e-4
-"""Time allowed for an update [s]; the papers' took 4 ms."""
+"""Target time of an update [s]; the papers report 4 ms."""
 
 _UPDATES = 25
-# So many are compared, and done with the textbook gain, each of which takes as long as a hundred of ours.
+# Number of updates compared, and done with the textbook gain, which takes a hundred times as long.
 _CHECKED = 3
 
 
@@ -35,10 +35,10 @@ def measure(settings: BenchmarkSettings) -> BenchmarkResult:
     frames = [name for name in model.frames if model.speeds_of(name)]
     readings = _readings(model, frames, min(_UPDATES, settings.configurations))
     covariance = pose_covariance(POSITION, ORIENTATION)
-    field = Contenders(
+    participants = Contenders(
         [*_ours(model, frames, covariance, readings), *_theirs(model, frames, covariance, readings)]
     )
-    measured = time_contenders("tracking", field.contenders, settings.rounds, settings.progress)
+    measured = time_contenders("tracking", participants.contenders, settings.rounds, settings.progress)
     return BenchmarkResult(
         name="tracking",
         work=(
@@ -57,7 +57,7 @@ def measure(settings: BenchmarkSettings) -> BenchmarkResult:
 
 
 def _readings(model: Model, frames: list[str], count: int) -> list[Array]:
-    """Return noisy poses of a kitchen whose doors are far from their limits, which thus have no effect."""
+    """Return noisy poses of a kitchen whose coordinates are so far from limits that these have no effect."""
     rng = np.random.default_rng(0)
     symbols = model.degrees_of_freedom
     low, high = np.array([model.limits(s) for s in symbols]).T

@@ -1,4 +1,4 @@
-"""The benchmarks by name."""
+"""Benchmarks by name."""
 
 from __future__ import annotations
 
@@ -50,26 +50,26 @@ def select_benchmarks(names: Sequence[str]) -> list[str]:
 def run_benchmarks(
     names: Sequence[str] = (), settings: BenchmarkSettings | None = None
 ) -> Iterator[BenchmarkResult]:
-    """Run benchmarks, and yield each result when it is there.
+    """Run benchmarks, and yield each result.
 
-    One that needs an extra which is not installed has nothing but a line about that.
+    The result of a benchmark whose extra is not installed has only a line that names it.
 
     Parameters
     ----------
     names
-        Which; all of them if empty.
+        Names of benchmarks; all if empty.
     settings
-        How much is measured, and on which robot.
+        Settings; the defaults if None.
 
     Raises
     ------
     UnknownNameError
         If there is no such benchmark, before any is run.
     DisagreementError
-        If the contenders do not compute the same.
+        If the results of contenders differ.
     """
     for name in select_benchmarks(names):
-        # A benchmark is imported when it is run, as it brings its peers.
+        # Imported here, because a benchmark imports its peers.
         module = importlib.import_module(f"{__package__}.measure_{name}")
         try:
             result: BenchmarkResult = module.measure(settings or BenchmarkSettings())

@@ -17,11 +17,11 @@ class Measurement:
     Attributes
     ----------
     name
-        Whose it is.
+        Contender.
     unit
-        ``s`` for times, or what is counted.
+        ``s`` for times, else the unit of the count.
     samples
-        A number for each round; a single one for what does not vary.
+        A number for each round; a single one if it does not vary.
     """
 
     name: str
@@ -30,12 +30,12 @@ class Measurement:
 
     @property
     def median(self) -> float:
-        """Median time."""
+        """Median of the samples."""
         return statistics.median(self.samples)
 
     @property
     def best(self) -> float:
-        """Best time, without disturbance."""
+        """Least of the samples."""
         return min(self.samples)
 
 
@@ -56,20 +56,20 @@ class Bar:
 
 @dataclass(frozen=True, slots=True)
 class Comparison:
-    """A figure made of measurements, and the bar it is held to.
+    """Figure computed from measurements, and its target.
 
     Attributes
     ----------
     name
-        What it says.
+        Description.
     value
         The figure; None if a peer is missing.
     unit
         ``x`` for ratios, else as in measurements.
     bar
-        What it is to reach, in the same unit; None if it is for information.
+        Target in the same unit; None if there is none.
     ours, theirs
-        Where it is a ratio of speeds: whose they are; empty where it is something else.
+        Contenders of a ratio of speeds; empty for other figures.
     """
 
     name: str
@@ -81,7 +81,7 @@ class Comparison:
 
     @property
     def status(self) -> Status:
-        """True if the target is reached."""
+        """Status of the figure: target met or missed, peer missing, or no target."""
         if self.value is None:
             return "missing"
         if self.bar is None:
@@ -100,11 +100,11 @@ class BenchmarkResult:
     work
         Description of the work.
     measurements
-        Results of the contenders.
+        Measurements of all contenders.
     comparisons
-        Ratios of measurements.
+        Figures computed from them.
     missing
-        Missing peers, each with the advice to install it.
+        A line for each missing peer, with advice.
     """
 
     name: str
@@ -117,19 +117,19 @@ class BenchmarkResult:
 def compare_speed(
     measured: Mapping[str, Measurement], ours: str, theirs: str, at_least: float | None = None
 ) -> Comparison:
-    """Return the speed relative to a peer.
+    """Return the speed of a contender relative to a peer.
 
-    It is the median, over the rounds, of the ratio within a round, as a machine that slows down for a while
-    does so for both.
+    It is the median over the rounds of the ratio within a round, because a temporary slowdown of the machine
+    affects both.
 
     Parameters
     ----------
     measured
-        The measurements by name.
+        Measurements by name.
     ours, theirs
         Names of two of them; the second may be missing.
     at_least
-        The bar.
+        Target of the ratio.
     """
     bar = None if at_least is None else Bar(at_least, at_least=True)
     name = f"{ours}, beside {theirs}"
@@ -141,5 +141,5 @@ def compare_speed(
 
 
 def bound_median(measurement: Measurement, limit: float) -> Comparison:
-    """Return the median of a measurement, held to a limit in its own unit."""
+    """Return the median of a measurement, with an upper limit in its unit as the target."""
     return Comparison(measurement.name, measurement.median, measurement.unit, Bar(limit, at_least=False))

@@ -1,4 +1,4 @@
-"""Robots to measure: a PR2 with one frame of interest, and a PR2 in a kitchen."""
+"""Robots of the benchmarks: a PR2 with one frame of interest, and a PR2 in a kitchen."""
 
 from __future__ import annotations
 
@@ -32,16 +32,16 @@ _ONE_COORDINATE = ("fixed", "revolute", "continuous", "prismatic")
 
 @dataclass(frozen=True)
 class BenchmarkRobot:
-    """A robot from a URDF file, with one frame of interest.
+    """Robot of a URDF file, with one frame of interest.
 
     Attributes
     ----------
     file
         File that all libraries read.
     model
-        What Kineverse makes of it, without prefix.
+        Model of the file in Kineverse, without prefix.
     frame
-        Whose pose and Jacobian are computed, in the robot's root.
+        Frame of the pose and Jacobian, which are relative to the robot's root.
     """
 
     file: Path
@@ -50,17 +50,17 @@ class BenchmarkRobot:
 
     @cached_property
     def coordinates(self) -> tuple[Symbol, ...]:
-        """All coordinates, the columns of :meth:`configurations`."""
+        """Coordinates, in the order of the columns of :meth:`configurations`."""
         return self.model.symbols
 
     @cached_property
     def chain(self) -> tuple[Symbol, ...]:
-        """The coordinates that move the frame; also the columns of its Jacobian."""
+        """Coordinates that move the frame, in the order of the columns of its Jacobian."""
         return self.model.fk(self.frame).symbols
 
     @cached_property
     def mimics(self) -> dict[str, tuple[str, float, float]]:
-        """Mimic joints: their driver, multiplier and offset, read from the file itself."""
+        """Leader, multiplier and offset of mimic joints by name, read from the file."""
         joints = ElementTree.parse(self.file).iterfind("joint")
         return {
             joint.get("name", ""): (
@@ -73,16 +73,16 @@ class BenchmarkRobot:
         }
 
     def configurations(self, count: int) -> Array:
-        """Return configurations [rad], [m] in [-1, 1], shape (count, coordinates); always the same ones."""
+        """Return configurations [rad], [m] in [-1, 1], shape (count, coordinates), from a fixed seed."""
         return np.random.default_rng(0).uniform(-1.0, 1.0, (count, len(self.coordinates)))
 
-    def select_chain(self, configurations: Array) -> Array:
+    def chain_columns(self, configurations: Array) -> Array:
         """Return the columns of the coordinates that move the frame."""
         columns = [self.coordinates.index(symbol) for symbol in self.chain]
         return np.ascontiguousarray(configurations[:, columns])
 
     def positions(self, configurations: Array) -> dict[str, Array]:
-        """Return the positions of all joints by name, those that follow others included."""
+        """Return the positions of all joints by name, mimic joints included."""
         columns = zip(self.coordinates, configurations.T, strict=True)
         known = {symbol.path: np.array(column) for symbol, column in columns}
 
@@ -104,15 +104,15 @@ class BenchmarkRobot:
 
 
 def find_robot(settings: BenchmarkSettings) -> BenchmarkRobot:
-    """Return the robot that is wanted, else the first PR2 that is found.
+    """Return the requested robot, else the first PR2 that is found.
 
     Raises
     ------
     UnknownNameError
         If there is no such robot, or no such frame on it.
     InvalidValueError
-        If peers have joints of other coordinates than Kineverse, so that comparing would take a translation:
-        planar and floating ones, and those that follow others on the way to the frame.
+        If a joint has other coordinates in peers than in Kineverse: planar and floating joints, and mimic
+        joints that move the frame.
     """
     file = _robot_file(settings.robot)
     if file.suffix != ".urdf":
@@ -142,8 +142,8 @@ def _robot_file(name: str | None) -> Path:
 def _default_frame(model: Model) -> str:
     if GRIPPER in model.frames:
         return GRIPPER
-    led = [frame for frame in model.frames if _mimic_joint(model, frame) is None]
-    return max(led, key=lambda frame: (len(model.speeds_of(frame)), frame))
+    frames = [frame for frame in model.frames if _mimic_joint(model, frame) is None]
+    return max(frames, key=lambda frame: (len(model.speeds_of(frame)), frame))
 
 
 def _check_chain(robot: BenchmarkRobot) -> None:
@@ -159,7 +159,7 @@ def _check_chain(robot: BenchmarkRobot) -> None:
 
 
 def _mimic_joint(model: Model, frame: str) -> str | None:
-    """Return a joint that moves the frame and follows another joint, if there is one."""
+    """Return a mimic joint that moves the frame; None if there is none."""
     above = {a.child: (name, a) for name, a in model.articulations.items()}
     while frame != WORLD:
         if frame in above:
@@ -171,7 +171,7 @@ def _mimic_joint(model: Model, frame: str) -> str | None:
 
 
 def strip_shapes(file: str | os.PathLike[str]) -> str:
-    """Return a URDF file without shapes, so that no library looks for meshes.
+    """Return the text of a URDF file without shapes, so that no library opens meshes.
 
     Raises
     ------
@@ -191,24 +191,25 @@ def strip_shapes(file: str | os.PathLike[str]) -> str:
 
 
 KITCHENS = {"iai_kitchen/urdf_obj/kitchen.urdf": (0.3, 1.5), "kitchen": (0.2, 0.8)}
-"""The kitchen with meshes from the model path, else the one that ships; and where the robot stands in it [m]:
-before the counters, so that much is near and hardly anything is hit."""
+"""Kitchen with meshes from the model path, else the shipped one, with the robot's position [m].
+
+The robot stands close to the counters, so that many bodies are near and few are in contact."""
 
 _WALK_STEP, _WALK_RANGE = 0.003, 0.3
 
 
 @dataclass(frozen=True)
 class KitchenRobot:
-    """A robot in a kitchen.
+    """Robot in a kitchen.
 
     Attributes
     ----------
     name
-        What they are.
+        Names of both.
     model
-        Both, below the prefixes ``robot`` and ``kitchen``.
+        Model of both, with the prefixes ``robot`` and ``kitchen``.
     values
-        (steps, n) values of ``scene().inputs`` [m], [rad]: a walk of all joints of the robot.
+        Values of ``scene().inputs``, (steps, n) [m], [rad]: a random walk of all joints of the robot.
     """
 
     name: str
@@ -216,16 +217,16 @@ class KitchenRobot:
     values: Array
 
     def scene(self) -> Scene:
-        """Return a scene in which robot and kitchen are looked at, but neither with itself."""
+        """Return a scene that checks pairs of a robot's and a kitchen's body only."""
         return _make_scene(self.model)
 
     def whole_scene(self) -> Scene:
-        """Return a scene without rules, so that overlapping links of the robot are checked too."""
+        """Return a scene without rules, which also checks pairs within the robot and within the kitchen."""
         return Scene(self.model)
 
 
 def make_kitchen_robot(steps: int) -> KitchenRobot:
-    """Return the first PR2 and the first kitchen that are found here, with their meshes as hulls."""
+    """Return the first PR2 and kitchen that are found, with hulls for meshes."""
     robot, kitchen = _first_found(PR2), _first_found(tuple(KITCHENS))
     model = Model()
     with model.edit() as edit:

@@ -51,13 +51,13 @@ def parse_assignments(texts: Iterable[str]) -> dict[str, float]:
     Raises
     ------
     InvalidValueError
-        If a text is no assignment, or the value no finite number.
+        If a text is not an assignment, or the value is not a finite number.
     DuplicateNameError
-        If there are two values for a name.
+        If a name has two values.
     """
     values: dict[str, float] = {}
     for text in texts:
-        # A value has no equals sign in it; a name may.
+        # A name may contain an equals sign, a value does not.
         name, equals, value = text.rpartition("=")
         if not equals or not name.strip():
             raise InvalidValueError(f"--set {text!r}: write NAME=VALUE, such as kitchen/fridge_door=0.3")
@@ -73,7 +73,7 @@ def has_unit(text: str) -> bool:
 
 
 def unit_kind(text: str) -> str | None:
-    """Return ``rad`` or ``m``, whichever a value is measured in; None if it does not say."""
+    """Return the base unit of a value, ``rad`` or ``m``; None if the text has no unit."""
     match = _VALUE_PATTERN.fullmatch(text.rpartition("=")[2].strip())
     if match is None or not (match["unit"] or match["pi"]):
         return None
@@ -86,7 +86,7 @@ def parse_length(text: str) -> float:
     Raises
     ------
     InvalidValueError
-        If it is none, not finite, or an angle.
+        If the text is not a length, or not finite.
     """
     match = _VALUE_PATTERN.fullmatch(text.strip())
     if match is None or match["unit"] not in LENGTHS or match["pi"]:
@@ -100,7 +100,7 @@ def parse_value(text: str) -> float:
     Raises
     ------
     InvalidValueError
-        If it is none, or not finite.
+        If the text is not a value, or not finite.
     """
     match = _VALUE_PATTERN.fullmatch(text.strip())
     if match is None or not (match["number"] or match["pi"]) or (match["times"] and not match["number"]):
@@ -119,26 +119,26 @@ def parse_value(text: str) -> float:
 
 
 def add_model_options(
-    parser: argparse.ArgumentParser, strict: str = "refuse what is otherwise read with a remark"
+    parser: argparse.ArgumentParser, strict: str = "refuse a file that is otherwise read with remarks"
 ) -> None:
-    """Declare ``--root``, ``--loops`` and ``--strict``, which means ``strict``."""
+    """Declare ``--root``, ``--loops`` and ``--strict``, the last with the help text ``strict``."""
     parser.add_argument(
         "--root",
         metavar="FOLDER",
-        help="the folder below which it may open files, meshes and included ones (its package or repository)",
+        help="folder that meshes and included files must lie in (the package or repository of the file)",
     )
     parser.add_argument(
         "--loops",
         choices=("solve", "constraint", "refuse"),
         default="solve",
-        help="what becomes of closed loops: solved where that can be done (the default), all kept as "
-        "equality constraints, or refused where one cannot be solved",
+        help="treatment of closed loops: solve those that can be solved (the default), keep all as equality "
+        "constraints, or refuse a model with a loop that cannot be solved",
     )
     parser.add_argument("--strict", action="store_true", help=strict)
 
 
 def load_model(arguments: argparse.Namespace, source: str, prefix: str | None = None) -> kv.Model:
-    """Load a model as the options say.
+    """Load a model with the options of the command line.
 
     Raises
     ------
@@ -155,35 +155,36 @@ ALTERNATIVE_UNITS = {"rad": ("deg",), "m": ("cm", "mm")}
 
 
 def find_limit_notes(model: kv.Model, values: Mapping[str, float], texts: Iterable[str]) -> list[str]:
-    """Return a line for everything that is violated, and for angles of more than a turn that have no unit.
+    """Return a line for each violated limit or constraint, and for each angle above 2π without a unit.
 
     Parameters
     ----------
     model
         The model.
     values
-        Of all its symbols, by name [rad], [m].
+        Values of all symbols of the model, by name [rad], [m].
     texts
-        What was given as ``--set``.
+        Arguments of ``--set``.
     """
     import kineverse as kv
     from kineverse.view.sliders import infer_units
 
     given = {text.rpartition("=")[0].strip(): text for text in texts}
     kinds = infer_units(model, values, given) if given else {}
-    said, lines = set(), []
+    reported, lines = set(), []
     for name, text in given.items():
         lower, upper = map(float, model.limits(model.symbol(name)))
         kind, value = kinds[name], values[name]
         if unit_kind(text) not in (None, kind) and kind:
-            sort, wrong = "an angle" if kind == "rad" else "a length", text.rpartition("=")[2].strip()
+            quantity, number = "an angle" if kind == "rad" else "a length", text.rpartition("=")[2].strip()
             lines.append(
-                f"{name} is {sort}, and {wrong} is none: it is taken for {format_number(value, 6)} {kind}"
+                f"{name} is {quantity}, and {number} is none: "
+                f"it is taken for {format_number(value, 6)} {kind}"
             )
         turns = kind == "rad" and abs(value) > math.tau and not has_unit(text)
         if lower <= value <= upper and not turns:
             continue
-        said.add(name)
+        reported.add(name)
         what = f"{name} = {format_number(value, 6)} {kind}".rstrip()
         if lower <= value <= upper:
             what += f" is {format_number(value / math.tau, 3)} turns"
@@ -191,8 +192,8 @@ def find_limit_notes(model: kv.Model, values: Mapping[str, float], texts: Iterab
             what += f" is beyond its limits [{format_number(lower)}, {format_number(upper)}]"
         lines.append(what + _suggest_unit(text, kind, lower, upper))
     for violation in model.violations(kv.State(values)):
-        about = [str(symbol) for symbol in model.constraints[violation.name].expression.symbols]
-        if len(about) == 1 and about[0] in said:
+        names = [str(symbol) for symbol in model.constraints[violation.name].expression.symbols]
+        if len(names) == 1 and names[0] in reported:
             continue
         lines.append(
             f"{violation.name} is violated: {format_number(violation.value)} is not in "
@@ -208,7 +209,7 @@ def print_notes(lines: Iterable[str]) -> None:
 
 
 def _suggest_unit(text: str, kind: str, lower: float, upper: float) -> str:
-    """Suggest a smaller unit in which the same number is within the limits."""
+    """Return advice to write the number in a smaller unit, if that value is within the limits."""
     if has_unit(text):
         return ""
     name, _, number = text.rpartition("=")

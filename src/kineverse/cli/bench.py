@@ -1,4 +1,4 @@
-"""``kineverse bench``: benchmarks on this machine."""
+"""``kineverse bench``: speed of this installation beside other libraries."""
 
 from __future__ import annotations
 
@@ -18,9 +18,9 @@ if TYPE_CHECKING:
 
 HELP = """measure the speed of this installation, beside its peers where they are installed
 
-Everything is measured unless names are given. Everybody takes turns on the same work and has to compute the
-same. Printed are times, and how many times as fast Kineverse is as each peer: compare these ratios, as times
-drift. Peers that are not installed are named at the end.
+All benchmarks run unless names are given. All libraries do the same work in turns and must compute equal
+results. Times are printed, and how many times as fast Kineverse is as each peer. Compare these ratios, since
+times drift. Peers that are not installed are listed at the end.
 
 examples:
   kineverse bench
@@ -32,14 +32,14 @@ examples:
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Declare the options."""
-    parser.add_argument("names", metavar="NAME", nargs="*", help="what to measure, see --list")
-    parser.add_argument("--list", action="store_true", help="say what each benchmark measures, and end")
-    parser.add_argument("--quick", action="store_true", help="few rounds: an order of magnitude")
+    parser.add_argument("names", metavar="NAME", nargs="*", help="names of benchmarks, see --list")
+    parser.add_argument("--list", action="store_true", help="list the benchmarks and exit")
+    parser.add_argument("--quick", action="store_true", help="few rounds, for an order of magnitude")
     parser.add_argument(
-        "--targets", action="store_true", help="also what the developers aim at, met or missed"
+        "--targets", action="store_true", help="also print the targets of the developers, met or missed"
     )
-    parser.add_argument("--robot", metavar="MODEL", help="a URDF file, or a name; a PR2 if left out")
-    parser.add_argument("--frame", metavar="FRAME", help="whose pose and Jacobian; a gripper if left out")
+    parser.add_argument("--robot", metavar="MODEL", help="path of a URDF file, or name of a model (a PR2)")
+    parser.add_argument("--frame", metavar="FRAME", help="frame of the pose and Jacobian (a gripper)")
     parser.add_argument("--json", action="store_true", help="one JSON object on standard output")
 
 
@@ -48,7 +48,7 @@ def run(arguments: argparse.Namespace) -> int:
     from kineverse import bench
 
     if arguments.list:
-        print(_print_benchmarks(bench.BENCHMARKS.items(), arguments.json))
+        print(_format_benchmarks(bench.BENCHMARKS.items(), arguments.json))
         return 0
     names = bench.select_benchmarks(arguments.names)
     settings = replace(
@@ -81,7 +81,7 @@ Times drift on a machine that others use, ratios hardly."""
 
 
 def benchmark_to_json(result: BenchmarkResult) -> dict[str, Any]:
-    """Return a result as JSON has it: times in s; ``value`` is null where a peer is missing."""
+    """Return a result as JSON data, times in s; ``value`` is null where a peer is missing."""
     return {
         "name": result.name,
         "work": result.work,
@@ -110,9 +110,9 @@ def format_benchmark(result: BenchmarkResult, targets: bool = False) -> str:
     Parameters
     ----------
     result
-        What was measured.
+        Result of the benchmark.
     targets
-        Whether to say what the developers aim at.
+        True to print the targets of the developers as well.
     """
     measured = [
         (m.name, format_quantity(m.median, m.unit), format_quantity(m.best, m.unit))
@@ -127,18 +127,18 @@ def format_benchmark(result: BenchmarkResult, targets: bool = False) -> str:
     lengths = [(_format_speedup(c), c.name) for c in known if c.unit == "x" and not c.theirs]
     if lengths:
         parts.append(format_table(("times as long", ""), lengths, "><"))
-    aimed = [
+    with_bars = [
         (c.name, _value_or_none(c), _format_target(c), c.status)
         for c in result.comparisons
         if c.bar is not None
     ]
-    if targets and aimed:
-        parts.append(format_table(("target", "", "bar", ""), aimed, "<>><"))
+    if targets and with_bars:
+        parts.append(format_table(("target", "", "bar", ""), with_bars, "<>><"))
     return "\n\n".join(parts)
 
 
 def format_quantity(value: float, unit: str) -> str:
-    """Return a number with its unit, times in the one that suits them."""
+    """Return a number with its unit; times are scaled to s, ms, µs or ns."""
     if unit == "x":
         return f"{format_number(value, 3)} x"
     if unit != "s":
@@ -165,7 +165,7 @@ def _format_target(comparison: Comparison) -> str:
     return f"{'>=' if bar.at_least else '<='} {format_quantity(bar.limit, comparison.unit)}"
 
 
-def _print_benchmarks(benchmarks: Iterable[tuple[str, str]], as_object: bool) -> str:
+def _format_benchmarks(benchmarks: Iterable[tuple[str, str]], as_object: bool) -> str:
     if as_object:
         return json.dumps(dict(benchmarks), indent=2)
     return format_table(("benchmark", "what it measures"), benchmarks)

@@ -1,4 +1,4 @@
-"""``kineverse convert``: a model from one file into another."""
+"""``kineverse convert``: conversion of a model file to another format."""
 
 from __future__ import annotations
 
@@ -17,20 +17,20 @@ if TYPE_CHECKING:
     import kineverse as kv
     from kineverse.model.registry import SaveResult
 
-HELP = """write a model to a file, in the format that its name ends in
+HELP = """write a model to a file, in the format of its suffix
 
-IN is whatever can be opened. OUT is a document (.kv.json), which says all of a model, URDF (.urdf) or MJCF
-(.xml). A motion that the format cannot say is refused by name, and nothing is written; with --tolerance,
-motions by curves are approximated, and by how much frames are off at most is certain, and printed.
-Constraints that it cannot say, as locks and how wheels tie speeds, are left out, and named on standard
-error; --strict refuses these, too, and --leave-out names those that may be missing nevertheless. OUT is read
-again before it is there. It is written whole or not at all, and replaces a file only with --force. If OUT is
-a dash, a document goes to standard output.
+IN is any model that can be loaded. OUT is a document (.kv.json), which holds the whole model, URDF (.urdf)
+or MJCF (.xml). A motion that the format cannot represent is refused by name, and nothing is written; with
+--tolerance, such motions are approximated, and a guaranteed bound on the errors of frames is printed.
+Constraints that the format cannot represent, such as locks and couplings of wheel speeds, are left out and
+listed on standard error; --strict refuses these, too, and --leave-out names exceptions. The new file is read
+back before it becomes OUT. It is written whole or not at all, and replaces a file only with --force. If OUT
+is a dash, a document goes to standard output.
 
-Meshes keep their files, by paths that are right from where OUT is. Those that MuJoCo cannot read are
-converted, into a folder beside OUT; those that are not there are left out of MJCF.
+Mesh files are not copied; OUT refers to them by paths that are valid from its folder. Meshes that MuJoCo
+cannot read are converted, into a folder beside OUT; missing ones are left out of MJCF.
 
-To see whether the result moves as it should: kineverse diff IN OUT --values
+To check that OUT moves like IN: kineverse diff IN OUT --values
 
 examples:
   kineverse convert robot.sdf robot.urdf
@@ -49,33 +49,34 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Declare the options."""
     parser.add_argument("source", metavar="IN", help="name of a shipped model, or path of a file")
     parser.add_argument("target", metavar="OUT", help="path of the file to write; - for standard output")
-    parser.add_argument("--prefix", metavar="NAME", help="put in front of all names, with a slash")
-    parser.add_argument("--force", action="store_true", help="replace OUT if it is there")
+    parser.add_argument("--prefix", metavar="NAME", help="prefix of all names, followed by a slash")
+    parser.add_argument("--force", action="store_true", help="replace OUT if it exists")
     add_model_options(
-        parser, "refuse what is otherwise read or left out with a remark, such as constraints OUT cannot say"
+        parser,
+        "refuse what is otherwise left out with a remark, such as constraints that OUT cannot represent",
     )
     parser.add_argument(
         "--leave-out",
         metavar="NAME",
         action="append",
         default=[],
-        help="a constraint, or an articulation, that OUT need not say; may be given several times",
+        help="constraint or articulation that OUT may leave out; may be given several times",
     )
     parser.add_argument(
         "--tolerance",
         metavar="X",
         type=float,
-        help="how far any frame of OUT may be off [m], [rad]; without it nothing is approximated",
+        help="largest error of any frame of OUT [m], [rad]; without it nothing is approximated",
     )
     parser.add_argument("--all", action="store_true", help=f"print more than {SHOWN} remarks")
-    parser.add_argument("--json", action="store_true", help="what was done, as one JSON object")
+    parser.add_argument("--json", action="store_true", help="report as one JSON object")
 
 
 def run(arguments: argparse.Namespace) -> int:
-    """Read, write, and report the written file."""
+    """Read the model, write it, and print a report."""
     to_stdout = arguments.target == STDOUT
     if not to_stdout:
-        # Before the model is loaded: a name that cannot be written to should not take seconds to be found.
+        # Checked before the model is loaded, so that a wrong name fails at once.
         check_writable(arguments.target, arguments.source, arguments.force)
     else:
         given = {
@@ -84,7 +85,7 @@ def run(arguments: argparse.Namespace) -> int:
             "--tolerance": arguments.tolerance is not None,
             "--strict": arguments.strict,
         }
-        option = next((name for name, there in given.items() if there), None)
+        option = next((name for name, is_given in given.items() if is_given), None)
         if option is not None:
             raise InvalidValueError(
                 f"{option} and - exclude each other: the output is a document, which says all."
@@ -106,7 +107,7 @@ def run(arguments: argparse.Namespace) -> int:
     if arguments.json:
         print(json.dumps(_as_json(arguments, model, size, left_out, saved), allow_nan=False))
     else:
-        lines = _print_report(arguments, model, size, left_out, saved)
+        lines = _format_report(arguments, model, size, left_out, saved)
         print("\n".join(lines), file=sys.stderr if to_stdout else sys.stdout)
     return 0
 
@@ -126,23 +127,23 @@ def _save_model(model: kv.Model, arguments: argparse.Namespace) -> SaveResult:
 
 
 def check_writable(target: str, source: str, force: bool = False) -> None:
-    """Check that a file can be written, as far as possible before the model is loaded.
+    """Check that a file can be written, before the model is loaded.
 
     Raises
     ------
     FormatError
-        If the name has no ending that is written, its folder does not exist, or it is none of a file.
+        If no format of that suffix is written, the folder does not exist, or the path is not a regular file.
     DuplicateNameError
-        If it is the source itself, or another file that may not be replaced.
+        If the target is the source, or another file and ``force`` is False.
     UnknownNameError
-        If a file is there, and the source is not.
+        If the target exists and the source does not.
     """
     from kineverse.formats.locate import locate_model
     from kineverse.model.registry import writable_suffixes
 
     endings = writable_suffixes()
     if not target:
-        raise FormatError("Which file is to be written? Its name is empty.")
+        raise FormatError("The name of the file to write is empty.")
     path = Path(target).expanduser()
     if path.is_dir():
         inside = path / f"{_source_stem(source)}{endings[0]}"
@@ -169,7 +170,7 @@ def _source_stem(source: str) -> str:
 
 
 def _print_document(model: kv.Model) -> int:
-    """Write a document to standard output; return its size [byte]."""
+    """Write a document to standard output, and return its size [byte]."""
     from kineverse.formats.document import to_json
 
     content = to_json(model).encode()
@@ -178,7 +179,7 @@ def _print_document(model: kv.Model) -> int:
     return len(content)
 
 
-def _print_report(
+def _format_report(
     arguments: argparse.Namespace, model: kv.Model, size: int, left_out: list[str], saved: SaveResult
 ) -> list[str]:
     from kineverse.cli.format_values import format_contents
@@ -197,7 +198,7 @@ def _print_report(
 
 
 def _omission_notes(arguments: argparse.Namespace, saved: SaveResult) -> list[str]:
-    """Format the omissions of the file, for standard error."""
+    """Return a line for each thing that the file leaves out, below a heading."""
     from kineverse.cli.format_values import format_count
 
     count = format_count(len(saved.left_out), "thing")
@@ -207,7 +208,7 @@ def _omission_notes(arguments: argparse.Namespace, saved: SaveResult) -> list[st
 
 
 def _approximation_errors(saved: SaveResult) -> str:
-    """Format the largest approximation errors, with their frames."""
+    """Return the largest errors of approximated frames, with their names."""
     from kineverse.cli.format_values import format_count, format_pose_difference
 
     errors = saved.errors

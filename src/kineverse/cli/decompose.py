@@ -12,7 +12,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from kineverse.cli.arguments import add_model_options, load_model, parse_length
-from kineverse.cli.output import colorize, format_table, show_activity, show_progress
+from kineverse.cli.output import colorize, format_table, join_lines, show_activity, show_progress
 from kineverse.errors import InvalidValueError, KineverseError, UnknownNameError, suggest
 from kineverse.expressions.printing import format_number
 from kineverse.model.body import Mesh
@@ -20,14 +20,14 @@ from kineverse.model.body import Mesh
 if TYPE_CHECKING:
     from kineverse.geometry.decomposition import CacheEntry, Decomposition, DecompositionOutcome
 
-HELP = """decompose meshes into convex hulls, once, for fast distances with a depth
+HELP = """decompose meshes into convex hulls, for fast distances with penetration depth
 
-Of a model, the meshes of its collision shapes are decomposed, or of bodies without them, those that are seen.
-The hulls are kept in the user's cache by the content of the mesh and the settings; what is there is not made
-again. Each mesh takes seconds to minutes; after Ctrl-C, what is done is kept.
+Of a model, the meshes of collision shapes are decomposed; of bodies without collision shapes, the visual
+meshes. The hulls are stored in the user's cache by the content of the mesh and the settings; cached meshes
+are not decomposed again. Each mesh takes seconds to minutes; after Ctrl-C, finished meshes stay cached.
 
-"excess" is how far the hulls stand out from the mesh, "uncovered" how far the mesh stands out from the hulls:
-the largest among some thousand sampled points, so that the true ones may be a little larger.
+"excess" is the largest distance of the hulls from the mesh, "uncovered" that of the mesh from the hulls. Both
+are taken over some thousand sampled points, so that the true values may be a little larger.
 
 The exit status is 0 if all went well, 1 if a mesh could not be decomposed, 2 if a model could not be read.
 
@@ -45,14 +45,14 @@ WRONG_MESH, WRONG_MODEL = 1, 2
 
 @dataclass
 class MeshTask:
-    """A mesh, and the links it belongs to, of which model; a mesh file has none."""
+    """Mesh to decompose, with the links that it belongs to; a mesh file has none."""
 
     mesh: Mesh
     links: list[str] = field(default_factory=list)
 
     @property
     def name(self) -> str:
-        """Label in a table: its first links, and the name of the file."""
+        """Label in a table: the first link, the number of others, and the name of the file."""
         file = Path(self.mesh.uri).name
         if not self.links:
             return file
@@ -67,63 +67,63 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     )
     add_model_options(parser)
     parser.add_argument("--links", metavar="LINK", nargs="+", help="only the meshes of these links")
-    parser.add_argument("--max-hulls", metavar="N", type=int, help="at most so many hulls of each mesh (32)")
+    parser.add_argument("--max-hulls", metavar="N", type=int, help="largest number of hulls of a mesh (32)")
     parser.add_argument(
         "--error",
         metavar="M",
-        help="how far hulls may stand out: 0.002, 2mm (2%% of the mesh's longest edge)",
+        help="largest distance of hulls from the mesh: 0.002, 2mm (2%% of the mesh's longest edge)",
     )
-    parser.add_argument("--jobs", metavar="N", type=int, help="so many at a time (one for each core)")
-    parser.add_argument("--timeout", metavar="S", type=float, help="the most that a mesh may take [s] (600)")
     parser.add_argument(
-        "--memory", metavar="GIB", type=float, help="the most memory that it may take [GiB] (4)"
+        "--jobs", metavar="N", type=int, help="meshes decomposed in parallel (one for each core)"
     )
-    parser.add_argument("--force", action="store_true", help="make them anew though they are in the cache")
-    parser.add_argument("--list", action="store_true", help="say what is in the cache, and end")
-    parser.add_argument("--clear", action="store_true", help="empty the cache, and end")
+    parser.add_argument("--timeout", metavar="S", type=float, help="time limit of a mesh [s] (600)")
+    parser.add_argument("--memory", metavar="GIB", type=float, help="memory limit of a mesh [GiB] (4)")
+    parser.add_argument("--force", action="store_true", help="decompose cached meshes again")
+    parser.add_argument("--list", action="store_true", help="list the cache and exit")
+    parser.add_argument("--clear", action="store_true", help="empty the cache and exit")
     parser.add_argument("--json", action="store_true", help="everything, as one JSON object")
 
 
 def run(arguments: argparse.Namespace) -> int:
-    """Decompose, print, and return the worst status."""
+    """Decompose the meshes, print the results, and return the worst status."""
     if arguments.list or arguments.clear:
         return _manage_cache(arguments)
     if not arguments.names:
-        raise UnknownNameError("Which model, or mesh? See kineverse decompose --help.")
+        raise UnknownNameError("Name a model or a mesh file; see kineverse decompose --help.")
     from kineverse.geometry.decomposition import decompose_all
 
     settings, limits, jobs = _settings(arguments)
     tasks, unread = _tasks(arguments)
     order = {task.mesh: k for k, task in enumerate(tasks)}
     outcomes = decompose_all([task.mesh for task in tasks], settings, limits, arguments.force, jobs)
-    found = sorted(
+    results = sorted(
         show_progress(outcomes, "decomposing", "mesh", len(tasks)), key=lambda outcome: order[outcome.mesh]
     )
-    status = WRONG_MODEL if unread else WRONG_MESH if any(o.error for o in found) else 0
+    status = WRONG_MODEL if unread else WRONG_MESH if any(o.error for o in results) else 0
     if arguments.json:
-        meshes = [_outcome_to_json(task, outcome) for task, outcome in zip(tasks, found, strict=True)]
+        meshes = [_outcome_to_json(task, outcome) for task, outcome in zip(tasks, results, strict=True)]
         answer = {"status": status, "meshes": meshes, "not_read": unread}
         print(json.dumps(answer, allow_nan=False))
     else:
-        print("\n\n".join(_print_results(tasks, found, unread)))
+        print("\n\n".join(_format_results(tasks, results, unread)))
     return status
 
 
 def _settings(arguments: argparse.Namespace) -> tuple[Any, Any, int]:
     from kineverse.geometry.decomposition import DecompositionSettings, ResourceLimits
 
-    asked: dict[str, Any] = {}
+    options: dict[str, Any] = {}
     if arguments.error is not None:
-        asked["error"] = parse_length(arguments.error)
+        options["error"] = parse_length(arguments.error)
     if arguments.max_hulls is not None:
-        asked["max_hulls"] = arguments.max_hulls
+        options["max_hulls"] = arguments.max_hulls
     limits: dict[str, Any] = {}
     if arguments.timeout is not None:
         limits["seconds"] = _positive(arguments.timeout, "--timeout")
     if arguments.memory is not None:
         limits["memory"] = int(_positive(arguments.memory, "--memory") * 2**30)
     jobs = (os.cpu_count() or 1) if arguments.jobs is None else int(_positive(arguments.jobs, "--jobs"))
-    return DecompositionSettings(**asked), ResourceLimits(**limits), jobs
+    return DecompositionSettings(**options), ResourceLimits(**limits), jobs
 
 
 def _positive(value: float, option: str) -> float:
@@ -133,7 +133,7 @@ def _positive(value: float, option: str) -> float:
 
 
 def _tasks(arguments: argparse.Namespace) -> tuple[list[MeshTask], dict[str, str]]:
-    """Return each mesh once, and why models could not be read, by their names."""
+    """Return a task for each distinct mesh, and by name the reasons of models that cannot be read."""
     tasks: dict[Mesh, MeshTask] = {}
     unread: dict[str, str] = {}
     with_meshes: set[str] = set()
@@ -144,9 +144,9 @@ def _tasks(arguments: argparse.Namespace) -> tuple[list[MeshTask], dict[str, str
             tasks.setdefault(mesh, MeshTask(mesh))
             continue
         try:
-            meshes = _meshes_of(name, arguments)
+            meshes = _model_meshes(name, arguments)
         except (KineverseError, OSError) as error:
-            unread[name] = " ".join(str(error).split())
+            unread[name] = join_lines(error)
             continue
         for link, mesh in meshes:
             with_meshes.add(link)
@@ -154,7 +154,7 @@ def _tasks(arguments: argparse.Namespace) -> tuple[list[MeshTask], dict[str, str
                 task = tasks.setdefault(mesh, MeshTask(mesh))
                 task.links += [] if link in task.links else [link]
     if not unread:
-        # Otherwise the link may well be of the model that cannot be read.
+        # Otherwise the link may belong to a model that cannot be read.
         for link in links or ():
             if link not in with_meshes:
                 raise UnknownNameError(
@@ -163,8 +163,8 @@ def _tasks(arguments: argparse.Namespace) -> tuple[list[MeshTask], dict[str, str
     return list(tasks.values()), unread
 
 
-def _meshes_of(name: str, arguments: argparse.Namespace) -> list[tuple[str, Mesh]]:
-
+def _model_meshes(name: str, arguments: argparse.Namespace) -> list[tuple[str, Mesh]]:
+    """Return the meshes to decompose of a model, each with its link."""
     with show_activity(f"reading {name}"):
         model = load_model(arguments, name)
     return [
@@ -175,22 +175,22 @@ def _meshes_of(name: str, arguments: argparse.Namespace) -> list[tuple[str, Mesh
     ]
 
 
-def _print_results(
-    tasks: Sequence[MeshTask], found: Sequence[DecompositionOutcome], unread: dict[str, str]
+def _format_results(
+    tasks: Sequence[MeshTask], outcomes: Sequence[DecompositionOutcome], unread: dict[str, str]
 ) -> list[str]:
     rows, remarks, errors = [], [], []
-    for task, outcome in zip(tasks, found, strict=True):
-        made = outcome.decomposition
-        if made is None:
-            errors.append(f"  {task.name}: {' '.join(str(outcome.error).split())}")
+    for task, outcome in zip(tasks, outcomes, strict=True):
+        decomposition = outcome.decomposition
+        if decomposition is None:
+            errors.append(f"  {task.name}: {join_lines(outcome.error)}")
             continue
-        time_ = "cached" if outcome.cached else f"{made.seconds:.1f} s"
-        rows.append((task.name, *_format_row(made), time_))
-        remarks += [f"  {task.name}: {remark}" for remark in made.remarks]
+        time_ = "cached" if outcome.cached else f"{decomposition.seconds:.1f} s"
+        rows.append((task.name, *_format_row(decomposition), time_))
+        remarks += [f"  {task.name}: {remark}" for remark in decomposition.remarks]
     sections = [_table(("mesh", *HEAD, "time"), rows)] if rows else []
     sections += ["\n".join(["remarks", *remarks])] if remarks else []
     sections += ["\n".join([colorize("not decomposed", "!"), *errors])] if errors else []
-    unread_lines = [f"  {name}: {why}" for name, why in unread.items()]
+    unread_lines = [f"  {name}: {reason}" for name, reason in unread.items()]
     sections += ["\n".join([colorize("cannot be read", "!"), *unread_lines])] if unread else []
     return sections or ["There are no meshes."]
 
@@ -198,42 +198,41 @@ def _print_results(
 HEAD = ("hulls", "mesh [l]", "hulls [l]", "one hull [l]", "error [mm]", "excess [mm]", "uncovered [mm]")
 
 
-def _format_row(made: Decomposition) -> tuple[str, ...]:
-    a = made.accuracy
+def _format_row(decomposition: Decomposition) -> tuple[str, ...]:
+    a = decomposition.accuracy
     volumes = [
         "open" if v is None else format_number(1e3 * v) for v in (a.mesh_volume, a.volume, a.hull_volume)
     ]
-    lengths = [format_number(1e3 * length, 3) for length in (made.error, a.excess, a.uncovered)]
-    return (str(len(made.hulls)), *volumes, *lengths)
+    lengths = [format_number(1e3 * length, 3) for length in (decomposition.error, a.excess, a.uncovered)]
+    return (str(len(decomposition.hulls)), *volumes, *lengths)
 
 
 def _table(head: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
     return format_table(head, rows, "<" + ">" * (len(head) - 1))
 
 
-def _decomposition_to_json(made: Decomposition) -> dict[str, Any]:
+def _decomposition_to_json(decomposition: Decomposition) -> dict[str, Any]:
     return {
-        "file": made.name,
-        "hulls": len(made.hulls),
-        "corners": sum(len(hull) for hull in made.hulls),
-        "error": made.error,
-        "max_hulls": made.max_hulls,
-        **asdict(made.accuracy),
-        "seconds": made.seconds,
-        "remarks": list(made.remarks),
+        "file": decomposition.name,
+        "hulls": len(decomposition.hulls),
+        "corners": sum(len(hull) for hull in decomposition.hulls),
+        "error": decomposition.error,
+        "max_hulls": decomposition.max_hulls,
+        **asdict(decomposition.accuracy),
+        "seconds": decomposition.seconds,
+        "remarks": list(decomposition.remarks),
     }
 
 
 def _outcome_to_json(task: MeshTask, outcome: DecompositionOutcome) -> dict[str, Any]:
-    made = outcome.decomposition
-    facts = {"file": task.mesh.uri} if made is None else _decomposition_to_json(made)
-    error = None if outcome.error is None else " ".join(str(outcome.error).split())
+    decomposition = outcome.decomposition
+    facts = {"file": task.mesh.uri} if decomposition is None else _decomposition_to_json(decomposition)
     return {
         **facts,
         "links": task.links,
         "scale": list(task.mesh.scale),
         "cached": outcome.cached,
-        "failure": error,
+        "failure": None if outcome.error is None else join_lines(outcome.error),
     }
 
 
@@ -244,24 +243,27 @@ def _manage_cache(arguments: argparse.Namespace) -> int:
         raise InvalidValueError("--list and --clear are about the whole cache, and one at a time.")
     if arguments.clear:
         count = clear()
-        told = json.dumps({"removed": count}) if arguments.json else f"{count} removed from {folder()}"
-        print(told)
+        print(json.dumps({"removed": count}) if arguments.json else f"{count} removed from {folder()}")
         return 0
-    kept = list_entries()
+    cached = list_entries()
     if arguments.json:
         entries = [
-            {**_decomposition_to_json(k.decomposition), "made": k.decomposition.made, "bytes": k.bytes}
-            for k in kept
+            {
+                **_decomposition_to_json(entry.decomposition),
+                "made": entry.decomposition.made,
+                "bytes": entry.bytes,
+            }
+            for entry in cached
         ]
         print(json.dumps({"folder": str(folder()), "decompositions": entries}, allow_nan=False))
-    elif kept:
-        print(_table(("mesh", *HEAD, "made"), [_cache_row(k) for k in kept]))
+    elif cached:
+        print(_table(("mesh", *HEAD, "made"), [_cache_row(entry) for entry in cached]))
     else:
         print(f"There are no decompositions in {folder()}.")
     return 0
 
 
-def _cache_row(kept: CacheEntry) -> tuple[str, ...]:
-    made = kept.decomposition
-    when = time.strftime("%Y-%m-%d %H:%M", time.localtime(made.made))
-    return (Path(made.name).name, *_format_row(made), when)
+def _cache_row(entry: CacheEntry) -> tuple[str, ...]:
+    decomposition = entry.decomposition
+    when = time.strftime("%Y-%m-%d %H:%M", time.localtime(decomposition.made))
+    return (Path(decomposition.name).name, *_format_row(decomposition), when)

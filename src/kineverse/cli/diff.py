@@ -10,17 +10,17 @@ from kineverse.cli.arguments import add_model_options, load_model
 from kineverse.cli.output import colorize, show_activity
 from kineverse.errors import InvalidValueError
 
-HELP = """print what two models differ in: operations, frames, constraints, bodies
+HELP = """print the differences of two models: operations, frames, constraints, bodies
 
-Models are compared name by name, whatever formats they come from. Numbers and formulas that agree within the
-tolerance at sampled states count as equal. Operations are compared where most have a counterpart of the same
-tag. Meshes are compared by what they are called, not by what is in the files.
+Models are compared name by name, whatever their formats. Numbers and formulas that agree within the tolerance
+at sampled states count as equal. Operations are compared if most of them have a counterpart with the same
+tag. Meshes are compared by name, not by the content of the files.
 
-With --values, what the models do is compared instead of how they are made: where their frames are in the
-world at sampled states, and the limits of their degrees of freedom. Frames that a format needs in between,
-and that carry nothing, are told and not counted.
+With --values, behaviour is compared instead of structure: the poses of all frames in the world at sampled
+states, and the limits of the degrees of freedom. Helper frames without bodies, which some formats need, are
+listed but not counted.
 
-  +  only in B      -  only in A      ~  changed      >  comes at another place
+  +  only in B      -  only in A      ~  changed      >  at another position
 
 The exit status is 0 if they are equal, 1 if they differ, and 2 if a model cannot be read.
 
@@ -39,18 +39,18 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Declare the options."""
     for name, what in (("A", "model before"), ("B", "model after")):
         parser.add_argument(
-            name.lower(), metavar=name, help=f"{what}: name of a shipped one, or path of a file"
+            name.lower(), metavar=name, help=f"{what}: name of a shipped model, or path of a file"
         )
-    parser.add_argument("--prefix", metavar="NAME", help="put in front of all names of both, with a slash")
+    parser.add_argument("--prefix", metavar="NAME", help="prefix of all names of both, followed by a slash")
     add_model_options(parser)
     parser.add_argument(
         "--tolerance",
         metavar="X",
         type=float,
         default=1e-9,
-        help="up to this, numbers are equal (1e-9): [m], [rad], relative above 1; 0: as written, to the bit",
+        help="largest difference of equal numbers (1e-9): [m], [rad], relative above 1; 0: equal to the bit",
     )
-    parser.add_argument("--values", action="store_true", help="compare what the models do at sampled states")
+    parser.add_argument("--values", action="store_true", help="compare poses at sampled states, and limits")
     parser.add_argument(
         "--operations",
         choices=("auto", "yes", "no"),
@@ -62,7 +62,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def run(arguments: argparse.Namespace) -> int:
-    """Load both, compare, print."""
+    """Load both models, compare them, and print the differences."""
     if not (math.isfinite(arguments.tolerance) and arguments.tolerance >= 0.0):
         raise InvalidValueError(f"--tolerance is a number from 0 on, not {arguments.tolerance}.")
 
@@ -84,7 +84,7 @@ def run(arguments: argparse.Namespace) -> int:
             report = ModelComparisonReport(
                 ModelComparison(before, after, arguments.tolerance, arguments.operations)
             )
-    equal = report.found.equal
+    equal = report.comparison.equal
     if arguments.json:
         answer = {
             "before": arguments.a,
@@ -96,6 +96,6 @@ def run(arguments: argparse.Namespace) -> int:
     else:
         sides = (("-", arguments.a, before), ("+", arguments.b, after))
         head = [colorize(f"{sign * 3} {name}  {format_contents(model)}", sign) for sign, name, model in sides]
-        told = report.blocks(None if arguments.all else SHOWN)
-        print("\n\n".join("\n".join(block) for block in ([] if equal else head, *told) if block))
+        blocks = report.blocks(None if arguments.all else SHOWN)
+        print("\n\n".join("\n".join(block) for block in ([] if equal else head, *blocks) if block))
     return EQUAL if equal else DIFFERENT

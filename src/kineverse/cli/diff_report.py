@@ -29,30 +29,32 @@ _WIDEST = 44
 class ModelComparisonReport:
     """Printable differences of two models, by value."""
 
-    found: ModelComparison
+    comparison: ModelComparison
 
     def blocks(self, most: int | None) -> list[list[str]]:
-        """Return the paragraphs of the report, with at most so many differences each."""
-        result = [_operation_lines(self.found, most)] if any(self.found.operations.values()) else []
+        """Return the paragraphs of the report, with at most ``most`` differences each."""
+        result = [_operation_lines(self.comparison, most)] if any(self.comparison.operations.values()) else []
         for kind in ORDER:
-            differences = self.found.by_kind(kind)
+            differences = self.comparison.by_kind(kind)
             if differences:
                 result.append([colorize(kind, "bold"), *_difference_lines(differences, most)])
-        result.append(_totals(self.found))
+        result.append(_totals(self.comparison))
         return result
 
     def as_json(self) -> dict[str, Any]:
-        """Return all of it as JSON has it: by operation, and by kind of data."""
-        operations = {WORDS[sign]: list(tags) for sign, tags in self.found.operations.items()}
+        """Return the report as JSON data, by operation and by kind of data."""
+        operations = {WORDS[sign]: list(tags) for sign, tags in self.comparison.operations.items()}
         return {
-            "operations": operations if self.found.operations_compared else None,
-            **{kind: _kind_to_json(self.found.by_kind(kind)) for kind in ORDER},
-            "alike": self.found.alike,
+            "operations": operations if self.comparison.operations_compared else None,
+            **{kind: _kind_to_json(self.comparison.by_kind(kind)) for kind in ORDER},
+            "alike": self.comparison.alike,
         }
 
 
-def _operation_lines(found: ModelComparison, most: int | None) -> list[str]:
-    lines = [f"  {colorize(sign, sign)} {tag}" for sign, tags in found.operations.items() for tag in tags]
+def _operation_lines(comparison: ModelComparison, most: int | None) -> list[str]:
+    lines = [
+        f"  {colorize(sign, sign)} {tag}" for sign, tags in comparison.operations.items() for tag in tags
+    ]
     return [colorize("operations", "bold"), *truncate_lines(lines, most)]
 
 
@@ -72,24 +74,26 @@ def _difference_texts(difference: ValueDifference) -> list[str]:
     change = difference.change
     if change.before is not None and change.after is not None:
         return [text for delta in difference.parts for text in format_delta(delta)]
-    there = change.after if change.before is None else change.before
-    return [format_value(there[1] if change.kind == RATES else there)]
+    value = change.after if change.before is None else change.before
+    return [format_value(value[1] if change.kind == RATES else value)]
 
 
-def _totals(found: ModelComparison) -> list[str]:
-    """Return the sum, and what was not counted."""
-    within = f"within {found.tolerance:g}" if found.tolerance else "to the bit"
+def _totals(comparison: ModelComparison) -> list[str]:
+    """Return the number of differences, with a note on those that are not counted."""
+    within = f"within {comparison.tolerance:g}" if comparison.tolerance else "to the bit"
     notes = []
-    if found.alike:
-        notes.append(f"{format_count(len(found.alike), 'value')} written or rounded in another way")
-    if not found.operations_compared:
+    if comparison.alike:
+        notes.append(f"{format_count(len(comparison.alike), 'value')} written or rounded in another way")
+    if not comparison.operations_compared:
         notes.append("operations not compared")
-    said = f" ({', '.join(notes)})" if notes else ""
-    if found.equal:
-        return [f"equal {within}: {format_contents(found.after)}{said}"]
-    counts = ", ".join(f"{count} {word}" for word, count in found.counts.items() if count)
-    lines = [f"{format_count(len(found.differences), 'difference')}: {counts or 'in operations only'}{said}"]
-    if not set(found.before.frames) & set(found.after.frames) and found.before.frames and found.after.frames:
+    note = f" ({', '.join(notes)})" if notes else ""
+    if comparison.equal:
+        return [f"equal {within}: {format_contents(comparison.after)}{note}"]
+    counts = ", ".join(f"{count} {word}" for word, count in comparison.counts.items() if count)
+    count = format_count(len(comparison.differences), "difference")
+    lines = [f"{count}: {counts or 'in operations only'}{note}"]
+    before, after = comparison.before.frames, comparison.after.frames
+    if before and after and not set(before) & set(after):
         lines.append("They have no frame in common; --prefix NAME puts the same name in front of both.")
     return lines
 
@@ -120,12 +124,15 @@ def _delta_to_json(delta: Delta) -> dict[str, Any]:
 class BehaviourComparisonReport:
     """Printable differences of two models, by behaviour."""
 
-    found: BehaviourComparison
+    comparison: BehaviourComparison
 
     def blocks(self, most: int | None) -> list[list[str]]:
-        """Return the paragraphs of the report, with at most so many lines each."""
+        """Return the paragraphs of the report, with at most ``most`` lines each."""
         result = []
-        for title, sides in (("frames", self.found.frames), ("degrees of freedom", self.found.freedoms)):
+        for title, sides in (
+            ("frames", self.comparison.frames),
+            ("degrees of freedom", self.comparison.freedoms),
+        ):
             lines = [
                 f"  {colorize(sign, sign)} {name}"
                 for sign, side in (("-", "removed"), ("+", "added"))
@@ -133,72 +140,72 @@ class BehaviourComparisonReport:
             ]
             if lines:
                 result.append([colorize(title, "bold"), *truncate_lines(lines, most)])
-        if self.found.apart:
-            width = max(len(a.frame) for a in self.found.apart)
+        if self.comparison.apart:
+            width = max(len(a.frame) for a in self.comparison.apart)
             lines = [
                 f"  {colorize('~', '~')} {a.frame:<{width}}  {format_pose_difference(a.distance, a.angle)}"
-                for a in self.found.apart
+                for a in self.comparison.apart
             ]
-            title = f"{colorize('poses', 'bold')}, at worst in {self.found.states} states"
+            title = f"{colorize('poses', 'bold')}, at worst in {self.comparison.states} states"
             result.append([title, *truncate_lines(lines, most)])
-        if self.found.ranges:
-            width = max(len(r.name) for r in self.found.ranges)
+        if self.comparison.ranges:
+            width = max(len(r.name) for r in self.comparison.ranges)
             lines = [
                 f"  {colorize('~', '~')} {r.name:<{width}}  "
                 f"{format_interval(*r.before)} → {format_interval(*r.after)}"
-                for r in self.found.ranges
+                for r in self.comparison.ranges
             ]
             result.append([colorize("limits", "bold"), *truncate_lines(lines, most)])
-        if self.found.helpers:
-            names = ", ".join(self.found.helpers[:most])
-            more = "" if most is None or len(self.found.helpers) <= most else ", ..."
+        if self.comparison.helpers:
+            names = ", ".join(self.comparison.helpers[:most])
+            more = "" if most is None or len(self.comparison.helpers) <= most else ", ..."
             result.append([f"not counted, in between and without bodies: {names}{more}"])
-        if not self.found.apart:
-            common = format_count(len(self.found.frames["common"]), "frame")
-            agree = f"{common} at the same places in {self.found.states} states"
+        if not self.comparison.apart:
+            common = format_count(len(self.comparison.frames["common"]), "frame")
+            agree = f"{common} at the same places in {self.comparison.states} states"
             result.append(
                 [
-                    f"{agree}, to within {format_pose_difference(*self.found.largest)}"
-                    if any(self.found.largest)
+                    f"{agree}, to within {format_pose_difference(*self.comparison.largest)}"
+                    if any(self.comparison.largest)
                     else agree
                 ]
             )
         return result
 
     def as_json(self) -> dict[str, Any]:
-        """Return all of it as JSON has it; a pose that is nowhere on one side is null apart."""
+        """Return the report as JSON data; a distance is null if the pose exists on one side only."""
         return {
-            "states": self.found.states,
+            "states": self.comparison.states,
             "largest": {
-                "distance": _finite_or_none(self.found.largest[0]),
-                "angle": _finite_or_none(self.found.largest[1]),
+                "distance": _finite_or_none(self.comparison.largest[0]),
+                "angle": _finite_or_none(self.comparison.largest[1]),
             },
             "frames": {
-                "removed": self.found.frames["removed"],
-                "added": self.found.frames["added"],
-                "helpers": self.found.helpers,
+                "removed": self.comparison.frames["removed"],
+                "added": self.comparison.frames["added"],
+                "helpers": self.comparison.helpers,
                 "changed": [
                     {
                         "name": a.frame,
                         "distance": _finite_or_none(a.distance),
                         "angle": _finite_or_none(a.angle),
                     }
-                    for a in self.found.apart
+                    for a in self.comparison.apart
                 ],
             },
             "dof": {
-                "removed": self.found.freedoms["removed"],
-                "added": self.found.freedoms["added"],
-                "changed": [_limits_to_json(r) for r in self.found.ranges],
+                "removed": self.comparison.freedoms["removed"],
+                "added": self.comparison.freedoms["added"],
+                "changed": [_limits_to_json(r) for r in self.comparison.ranges],
             },
         }
 
 
-def _limits_to_json(found: LimitDifference) -> dict[str, Any]:
+def _limits_to_json(difference: LimitDifference) -> dict[str, Any]:
     return {
-        "name": found.name,
-        "before": [_finite_or_none(bound) for bound in found.before],
-        "after": [_finite_or_none(bound) for bound in found.after],
+        "name": difference.name,
+        "before": [_finite_or_none(bound) for bound in difference.before],
+        "after": [_finite_or_none(bound) for bound in difference.after],
     }
 
 

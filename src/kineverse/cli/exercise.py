@@ -14,18 +14,28 @@ from kineverse.view.poses import FramePoses, complete
 from kineverse.view.sliders import Ranges, choose_slider_range, infer_units
 
 SAMPLES_PER_RANGE = 65
-"""Places at which each range is looked at, the limits included."""
+"""Number of samples of each range, limits included."""
 
 CHECKED_PER_RANGE = 5
-"""At how many of them the constraints are evaluated, the limits included."""
+"""Number of these samples at which constraints are evaluated, limits included."""
 
 
 @dataclass(frozen=True, slots=True)
 class ExerciseResult:
     """Result of an exercise.
 
-    ``poses`` of frames were computed, ``rate`` of them a second; ``violations`` is the number of constraints
-    violated inside the ranges; ``problems`` are those in words, and poses that are none.
+    Attributes
+    ----------
+    freedoms
+        Number of degrees of freedom.
+    poses
+        Number of frame poses computed.
+    rate
+        Frame poses per second.
+    violations
+        Number of constraints violated inside the ranges.
+    problems
+        Texts for these constraints, and for frames whose poses are not finite and rigid.
     """
 
     freedoms: int
@@ -36,10 +46,10 @@ class ExerciseResult:
 
 
 def exercise_model(model: ModelView) -> ExerciseResult:
-    """Move each degree of freedom of a model from limit to limit, the others at their default.
+    """Move each degree of freedom of a model from limit to limit, with the others at their defaults.
 
-    Poses that are not finite and rigid, and constraints that are violated although every coordinate is inside
-    its own limits, are problems of the model.
+    Problems are poses that are not finite and rigid, and constraints that are violated although each
+    coordinate is within its limits.
     """
     values = complete(model)
     poses, ranges = FramePoses(model), Ranges(model)
@@ -49,7 +59,7 @@ def exercise_model(model: ModelView) -> ExerciseResult:
     count, seconds, violated, problems = 0, 0.0, set(), []
     for name in show_progress(ranges.names, "driving", "DoF"):
         path = np.linspace(*choose_slider_range(limits[name], values[name], unit[name]), SAMPLES_PER_RANGE)
-        # Rounding must not carry the last sample over the limit.
+        # Rounding must not move the last sample beyond the limit.
         path = np.clip(path, *limits[name])
         if name in poses.inputs:
             rows = np.tile(base, (SAMPLES_PER_RANGE, 1))

@@ -8,6 +8,7 @@ from dataclasses import dataclass, field
 
 import kineverse as kv
 from kineverse.cli.format_values import format_contents, format_count
+from kineverse.cli.output import join_lines
 from kineverse.cli.summary import find_penetrations
 from kineverse.errors import KineverseError
 from kineverse.formats.document import OpaqueOperation
@@ -31,21 +32,21 @@ class ValidationResult:
     Attributes
     ----------
     name
-        What it was asked for by.
+        Name or path as given.
     format
-        What it is, as far as that is known.
+        Format of the file; empty if unknown.
     model
-        What is in it; None if it cannot be read, and then ``error`` says why.
+        Loaded model; None if the file cannot be read, for the reason in ``error``.
     facts
-        What a document says about itself: its ``version``, and ``sha256``, the hash of its content.
+        Header of a document: its ``version``, and ``sha256``, the hash of its content.
     remarks
-        What its reader left out, or took another way.
+        Reader warnings: content left out or interpreted.
     faults
-        What a strict reader refuses.
+        Mistakes that a strict reader refuses.
     problems
-        What is wrong with the model.
+        Problems of the model.
     strict
-        Whether remarks are problems, too.
+        True if remarks count as problems.
     """
 
     name: str
@@ -60,14 +61,14 @@ class ValidationResult:
 
     @property
     def status(self) -> int:
-        """The exit status for this file."""
+        """Exit status for this file."""
         if self.model is None or self.faults:
             return UNREADABLE
         return INVALID if self.problems or (self.strict and self.remarks) else VALID
 
     @property
     def kind(self) -> str:
-        """The format, with the facts; of a hash only so much as people compare."""
+        """Format and header; of a hash the first 12 digits."""
         return ", ".join([self.format, *(f"{name} {str(fact)[:12]}" for name, fact in self.facts.items())])
 
     @property
@@ -82,33 +83,33 @@ class ValidationResult:
         """Reason on one line if the file cannot be read."""
         if isinstance(self.error, OSError) and self.error.strerror:
             return self.error.strerror
-        return " ".join(str(self.error).split())
+        return join_lines(self.error)
 
 
 def validate_file(
     name: str,
     meshes: bool = True,
     strict: bool = False,
-    touch: bool = False,
+    contacts: bool = False,
     root: str | None = None,
     loops: LoopTreatment = "solve",
 ) -> ValidationResult:
-    """Validate a file; its faults are listed in the result and not raised.
+    """Validate a file; mistakes in it are returned, not raised.
 
     Parameters
     ----------
     name
-        The name of a model or the path of a file.
+        Name of a shipped model, or path of a file.
     meshes
-        Whether to look for the files of meshes.
+        True to check that mesh files exist.
     strict
-        Whether remarks are problems, too.
-    touch
-        Whether to look for bodies that penetrate each other at the default state.
+        True if remarks count as problems.
+    contacts
+        True to search for bodies that penetrate each other at the default state.
     root
-        The folder below which the file may open others; by default its package or repository.
+        Folder that meshes and included files must lie in; by default the file's package or repository.
     loops
-        What becomes of closed loops, see :func:`kineverse.load`.
+        Treatment of closed loops, see :func:`kineverse.load`.
     """
     language = ""
     with collect_warnings() as remarks:
@@ -117,18 +118,18 @@ def validate_file(
             language = detect_format(source)
             model = kv.load(name, root=root, loops=loops)
             facts = _document_header(source)
-            problems = (*find_problems(model, meshes), *(find_penetrations(model) if touch else ()))
+            problems = (*find_problems(model, meshes), *(find_penetrations(model) if contacts else ()))
         except (KineverseError, OSError) as error:
             return ValidationResult(name, language, error=error, remarks=remarks, strict=strict)
     faults = [remark for remark in remarks if isinstance(remark, Fault)]
-    noted = [remark for remark in remarks if not isinstance(remark, Fault)]
+    others = [remark for remark in remarks if not isinstance(remark, Fault)]
     return ValidationResult(
-        name, language, model, None, facts, [*noted, *_frozen_operations(model)], faults, problems, strict
+        name, language, model, None, facts, [*others, *_frozen_operations(model)], faults, problems, strict
     )
 
 
 def _frozen_operations(model: kv.Model) -> list[str]:
-    """List the operations of a document that cannot follow changes of the values they read, with reasons."""
+    """Return a line for each operation that does not follow changes of what it reads, with the reason."""
     operations = {tag: model.history.operation(tag) for tag in model.history.tags}
     return [
         f"operation {tag!r} is frozen: {operation.frozen}"
@@ -138,7 +139,7 @@ def _frozen_operations(model: kv.Model) -> list[str]:
 
 
 def detect_format(source: Source) -> str:
-    """Return in which language a model is written; empty if its name does not say."""
+    """Return the format of a model; empty if its suffix is unknown."""
     if source.scene:
         return "scene of the gallery"
     if source.path.name.endswith(".xml"):
@@ -148,7 +149,7 @@ def detect_format(source: Source) -> str:
 
 
 def _document_header(source: Source) -> dict[str, int | str]:
-    """Return the version of a document, and its hash if it has one; its reader has checked both."""
+    """Return the version of a document, and its hash if it has one; the reader has checked both."""
     if source.scene or not source.path.name.endswith(".kv.json"):
         return {}
     head = json.loads(read_file(source.path))

@@ -1,4 +1,4 @@
-"""``kineverse fit``: identification of the joint between two parts from recorded poses."""
+"""``kineverse fit``: identification of the joint between two parts from their recorded poses."""
 
 from __future__ import annotations
 
@@ -18,21 +18,21 @@ if TYPE_CHECKING:
     from kineverse.estimation.recordings import RecordedPair
 
 
-HELP = """learn how a part moves from a table of its poses
+HELP = """identify the joint of a part from a table of its poses
 
 The table is text, with a head that names its columns: time, part, x, y, z and qx, qy, qz, qw (or roll,
 pitch, yaw, or rx, ry, rz, a rotation vector), in m, rad and s unless a unit follows as in "x [mm]". There is
 a part in each row, or all parts are in one row, and then columns are called door.x. Without a head, 3 columns
 are positions and 7 are poses.
 
-Errors of observations are taken for independent of each other. Those of a camera at 30 Hz are not; where
-what is left of neighbours is alike, so many are judged as tell something of their own, evenly over the
-recording. --thin N takes another number of them.
+Errors of observations are assumed to be independent. Those of a camera at 30 Hz are not. If the residuals of
+neighbours are correlated, families are compared by a subset of the poses, evenly over the recording, as large
+as the effective sample size. --thin N sets another size.
 
 Joints of all kinds are tried: rigid, prismatic, revolute, screw, cylindrical, spherical, planar, free. Each
-gets the probability with which it explains what was seen.
+gets its probability, given the observations.
 
-The exit status is 0 if one of them stands out, 1 if it cannot be told, 2 if the table cannot be read.
+The exit status is 0 if the joint is determined, 1 if it is ambiguous, 2 if the table cannot be read.
 
 examples:
   kineverse fit poses.csv --parent cupboard --child door
@@ -43,7 +43,7 @@ examples:
 AMBIGUOUS = 1
 
 MAX_ROTATION_STEP = 2.0
-"""Turns are counted where it turns by no more than this from one pose to the next [rad]."""
+"""Largest rotation between successive poses for which revolutions are counted reliably [rad]."""
 
 
 @dataclass(frozen=True)
@@ -53,10 +53,10 @@ class ObservationNoise:
     Attributes
     ----------
     position, orientation
-        Standard deviations of each coordinate [m] and about each axis [rad]; no orientation where only
-        positions were seen.
+        Standard deviations of each coordinate [m] and about each axis [rad]; orientation is None if only
+        positions are observed.
     given
-        Whether they were given, rather than estimated.
+        True if they were given, False if estimated.
     """
 
     position: float
@@ -71,11 +71,11 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "--parent",
         metavar="NAME",
         default="world",
-        help="the part in which it moves (world, which stands still)",
+        help="part relative to which the child moves (world)",
     )
-    parser.add_argument("--child", metavar="NAME", help="the part that moves, if there are several")
+    parser.add_argument("--child", metavar="NAME", help="part that moves; needed if there are several")
     parser.add_argument(
-        "--columns", metavar="NAMES", help="what the columns are: x,y,z,-,qx,... (- for none)"
+        "--columns", metavar="NAMES", help="names of the columns: x,y,z,-,qx,... (- to ignore one)"
     )
     parser.add_argument(
         "--noise",
@@ -86,18 +86,16 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "--thin",
         metavar="N",
         type=int,
-        help="take so many of the poses, evenly (as many as tell something of their own)",
+        help="number of poses to use, evenly spaced (the effective sample size)",
     )
-    parser.add_argument("--families", metavar="NAMES", help="only these joints: prismatic,revolute")
-    parser.add_argument(
-        "--picture", metavar="FILE", help="draw what was seen and what was found (.png, .svg)"
-    )
+    parser.add_argument("--families", metavar="NAMES", help="joint families to try: prismatic,revolute (all)")
+    parser.add_argument("--picture", metavar="FILE", help="draw the observations and the joint (.png, .svg)")
     parser.add_argument("--document", metavar="FILE", help="write the joint as a model (.kv.json)")
     parser.add_argument("--json", action="store_true", help="everything, as one JSON object")
 
 
 def run(arguments: argparse.Namespace) -> int:
-    """Read the table, learn the joint, and say, draw and write it."""
+    """Read the table, identify the joint, and print, draw and save it."""
     from kineverse.cli.fit_output import fit_to_json, format_fit
     from kineverse.estimation.recordings import read_recording
 
@@ -136,7 +134,7 @@ def parse_noise(text: str) -> tuple[float, float | None]:
     Raises
     ------
     InvalidValueError
-        If it is something else.
+        If the text is not of this form.
     """
     first, comma, second = text.partition(",")
     try:
@@ -159,13 +157,13 @@ class LearnedJoint:
     Attributes
     ----------
     found
-        All families with their probabilities.
+        All families, with their probabilities.
     noise
-        How far observations are off.
+        Noise of the observations.
     judged
-        How many of the poses families were weighed by.
+        Number of poses that the families were compared by.
     fit
-        The best one, with all poses: those that are wrong altogether are outlying.
+        Fit of the most probable family to all poses, outliers marked.
     """
 
     found: IdentificationResult
@@ -177,7 +175,7 @@ class LearnedJoint:
 def fit_joint(
     pair: RecordedPair, stated: tuple[float, float | None] | None, families: str | None, thins: bool
 ) -> LearnedJoint:
-    """Identify the joint between two parts; with ``thins``, from an independent subset of the poses.
+    """Identify a joint; if ``thins``, from as many poses as the effective sample size.
 
     Raises
     ------
@@ -196,9 +194,9 @@ def fit_joint(
     judged = spaced_indices(len(pair.lines), count)
     found, noise = identify_joint(pair.select(judged), stated, families)
     covariance = make_covariance(noise.position, noise.orientation)
-    seen = check_observations(pair.parent_poses, pair.child_poses, covariance, covariance)
+    observations = check_observations(pair.parent_poses, pair.child_poses, covariance, covariance)
     fit = complete_fit(
-        found.best, seen, judged, outliers=Outliers(), stated=noise.given, sequential=pair.is_timed
+        found.best, observations, judged, outliers=Outliers(), stated=noise.given, sequential=pair.is_timed
     )
     return LearnedJoint(found, noise, count, fit)
 
@@ -206,12 +204,12 @@ def fit_joint(
 def identify_joint(
     pair: RecordedPair, stated: tuple[float, float | None] | None, families: str | None
 ) -> tuple[IdentificationResult, ObservationNoise]:
-    """Identify the joint between two parts, and return it with the noise of the observations.
+    """Identify a joint from all poses, and return it with the noise of the observations.
 
     Raises
     ------
     InvalidValueError
-        If a noise of positions alone is stated for poses, or there is nothing to learn from the poses.
+        If the noise of orientations is missing, or the poses do not allow an identification.
     UnknownNameError
         For a family that does not exist.
     """
@@ -230,43 +228,43 @@ def identify_joint(
         outliers=True,
         sequential=pair.is_timed,
     )
-    position, orientation = stated or (found.noise_scale * one for one in UNKNOWN_NOISE)
+    position, orientation = stated or (found.noise_scale * deviation for deviation in UNKNOWN_NOISE)
     return found, ObservationNoise(
         position, orientation if pair.has_orientation else None, stated is not None
     )
 
 
 def make_covariance(position: float, orientation: float | None) -> Array:
-    """Return the covariance of poses; where only positions are seen, the other half is not looked at."""
+    """Return the covariance of poses (6, 6); for positions alone its orientation block is unused."""
     from kineverse.estimation import pose_covariance
 
     return pose_covariance(position, orientation or 1.0)
 
 
 def count_independent(found: IdentificationResult, pair: RecordedPair) -> int:
-    """Return the effective sample size of the poses, from the residuals of the most probable joint."""
+    """Return the effective sample size of the poses, by the residuals of the most probable joint."""
     from kineverse.estimation.recordings import effective_sample_size, spaced_indices
 
     count = len(pair.lines)
-    # What is free leaves nothing.
+    # The free family has no residuals.
     fit = next((fit for fit in found if fit.family != "free"), None)
     if fit is None:
         return count
-    # As many more as are wrong and tell nothing.
-    right = len(fit.inliers)
-    judged = min(count, round(effective_sample_size(fit.residuals[fit.inliers]) * count / right))
-    # And enough to count turns.
+    # Outliers carry no information: the share of inliers in the subset is that in the recording.
+    inliers = len(fit.inliers)
+    size = min(count, round(effective_sample_size(fit.residuals[fit.inliers]) * count / inliers))
+    # The subset must be dense enough to count revolutions.
     while (
         pair.is_timed
-        and judged < count
-        and fit.select(spaced_indices(count, judged)).largest_turn > MAX_ROTATION_STEP
+        and size < count
+        and fit.select(spaced_indices(count, size)).largest_turn > MAX_ROTATION_STEP
     ):
-        judged += 1
-    return judged
+        size += 1
+    return size
 
 
 def write_results(arguments: argparse.Namespace, pair: RecordedPair, learned: LearnedJoint) -> dict[str, Any]:
-    """Write the requested files, and return their paths."""
+    """Write the requested picture and document, and return their paths."""
     fit = learned.fit
     if arguments.picture:
         from kineverse.experiments.plots import SIZE, draw_fit

@@ -28,25 +28,25 @@ if TYPE_CHECKING:
     from kineverse.estimation.recordings import RecordedPair
 
 _LEAST_PROBABILITY = 1e-4
-"""Less probable families are counted, not listed."""
+"""Less probable families are named without numbers."""
 
 _MOST_LISTED = 10
-"""Of more poses that do not fit only the first are listed."""
+"""Number of outliers listed."""
 
 
 def format_fit(source: str, pair: RecordedPair, learned: LearnedJoint) -> str:
-    """Format the identified joint, its probability and its alternatives."""
+    """Return the joint as text, with its uncertainty and the alternatives."""
     found, best, count = learned.found, learned.fit, len(pair.child_poses)
-    said = f"{best.family}, {_format_percent(best.probability)}"
+    verdict = f"{best.family}, {_format_percent(best.probability)}"
     if found.is_ambiguous:
-        said = f"{found}\nThe most probable one: {said}"
+        verdict = f"{found}\nThe most probable one: {verdict}"
     what = "poses" if pair.child_poses.ndim == 3 else "positions"
     lines = [
         f"{pair.child} in {pair.parent}: {count} {what} ({source})",
         *_format_subset(learned.judged, count),
         f"noise: {_format_noise(learned.noise)}",
         "",
-        said,
+        verdict,
         *(f"  {name:10}{value}" for name, value in _format_parameters(best)),
         *_format_outliers(best.outliers, count, what),
         *_revolution_warning(best, pair),
@@ -57,7 +57,7 @@ def format_fit(source: str, pair: RecordedPair, learned: LearnedJoint) -> str:
 
 
 def fit_to_json(pair: RecordedPair, learned: LearnedJoint) -> dict[str, Any]:
-    """Return everything that was found, as plain values."""
+    """Return the identified joints as JSON data."""
     found, noise = learned.found, learned.noise
     return {
         "parent": pair.parent,
@@ -89,7 +89,7 @@ def _format_noise(noise: ObservationNoise) -> str:
 
 
 def _format_parameters(fit: Fit) -> list[tuple[str, str]]:
-    """Return the parameters of a joint in words, with standard deviations."""
+    """Return the names and texts of the parameters of a joint, with standard deviations."""
     parts = []
     for name in ("axis", "normal"):
         if name in fit.parameters:
@@ -108,14 +108,14 @@ def _format_parameters(fit: Fit) -> list[tuple[str, str]]:
         scale, unit = (math.degrees(1.0), "deg") if turns else (1e3, "mm")
         ends = f"{format_number(scale * low)} … {format_number(scale * high)} {unit}"
         parts.append(("seen", f"{ends}   ± {format_number(scale * spread, 2)} {unit} at each end"))
-    left = f"{format_number(1e3 * fit.rms[0], 3)} mm"
+    rms = f"{format_number(1e3 * fit.rms[0], 3)} mm"
     if fit.residuals.shape[1] > 3:
-        left += f", {format_number(math.degrees(fit.rms[1]), 3)} deg"
-    return [*parts, ("left over", f"{left} rms")]
+        rms += f", {format_number(math.degrees(fit.rms[1]), 3)} deg"
+    return [*parts, ("left over", f"{rms} rms")]
 
 
 def _format_outliers(outliers: Sequence[int], count: int, what: str) -> list[str]:
-    """Format the indices of the outliers, from 0."""
+    """Return a line with the indices of outliers, from 0; none if there are no outliers."""
     if not outliers:
         return []
     numbers = ", ".join(map(str, outliers[:_MOST_LISTED]))
@@ -125,7 +125,7 @@ def _format_outliers(outliers: Sequence[int], count: int, what: str) -> list[str
 
 
 def _revolution_warning(fit: Fit, pair: RecordedPair) -> list[str]:
-    """Return that turns may have been counted wrongly."""
+    """Return a warning if revolutions may be miscounted."""
     from kineverse.cli.fit import MAX_ROTATION_STEP
 
     if not pair.is_timed or fit.largest_turn < MAX_ROTATION_STEP:
@@ -135,14 +135,14 @@ def _revolution_warning(fit: Fit, pair: RecordedPair) -> list[str]:
 
 
 def joint_ranges(fit: Fit) -> list[tuple[float, float, float, bool]]:
-    """Return of each joint value the least and the largest seen, their deviation, and if it is an angle."""
-    found = []
+    """Return for each joint value its range, the standard deviation of the ends, and if it is an angle."""
+    ranges = []
     for k, component in enumerate(fit.motion.parametrisation.joints):
         values, deviations = fit.joint_values[fit.inliers, k], fit.deviations[fit.inliers, k]
         ends = [int(np.argmin(values)), int(np.argmax(values))]
         spread = float(deviations[ends].max())
-        found.append((float(values[ends[0]]), float(values[ends[1]]), spread, component >= 3))
-    return found
+        ranges.append((float(values[ends[0]]), float(values[ends[1]]), spread, component >= 3))
+    return ranges
 
 
 def _format_ranking(found: IdentificationResult) -> list[str]:
@@ -188,7 +188,7 @@ def _fit_to_json(fit: Fit) -> dict[str, Any]:
 
 
 def _standard_deviation(fit: Fit, *coordinates: str) -> float:
-    """Return the root of the sum of variances of those coordinates that there are."""
+    """Return the root of the summed variances of coordinates; those that the fit lacks are skipped."""
     return math.hypot(*(fit.deviation(name) for name in coordinates if name in fit.coordinates))
 
 
@@ -197,43 +197,43 @@ def _format_vector(fit: Fit, name: str) -> str:
 
 
 def _format_percent(probability: float) -> str:
-    """Return a probability in percent, and no 100 where something else is possible."""
+    """Return a probability in percent; below 1 it is at most 99.99 %."""
     percent = 100.0 * probability
     return f"{min(percent, 99.99):.4g} %" if probability < 1.0 else "100 %"
 
 
 MOST_DOTS = 60
-"""At most so many of the poses that were seen are in the model."""
+"""Largest number of observed poses drawn in the model."""
 
 
 def make_joint_model(pair: RecordedPair, fit: Fit) -> Model:
-    """Return a model with the joint and, to be looked at, its axis, the part on it, and where it was seen.
+    """Return a model with the joint, and shapes of its axis, the child and the observed positions.
 
-    Where only positions were seen, the part's axes are those of its parent at joint value 0.
+    If only positions are observed, the child's axes are those of its parent at joint value 0.
 
     Raises
     ------
     InvalidValueError
-        For a part that moves freely: there is no joint.
+        If only positions are observed and the part moves freely, as then there is no joint.
     """
     if fit.family == "free" and fit.motion.rows == 3:
         raise InvalidValueError(
             f"'{pair.child}' moves freely: there is no joint to write. Without --document."
         )
     model = Model()
-    seen = pair.relative[:, :3, 3] if pair.relative.ndim == 3 else pair.relative
-    size = max(float(np.ptp(seen, axis=0).max()), 0.01)
+    positions = pair.relative[:, :3, 3] if pair.relative.ndim == 3 else pair.relative
+    size = max(float(np.ptp(positions, axis=0).max()), 0.01)
     with model.edit() as edit:
         if pair.parent != WORLD:
             edit.add_frame(pair.parent, WORLD, translation(0, 0, 0))
         edit.apply(make_joint_operation(fit, pair.parent, pair.child), tag=pair.child)
-        edit.apply(SetBody(pair.parent, Body(_parent_shapes(fit, seen, size))))
-        edit.apply(SetBody(pair.child, Body(_child_shapes(fit, seen, size))))
+        edit.apply(SetBody(pair.parent, Body(_parent_shapes(fit, positions, size))))
+        edit.apply(SetBody(pair.child, Body(_child_shapes(fit, size))))
     return model
 
 
 def make_joint_operation(fit: Fit, parent: str, child: str) -> Operation:
-    """Return the joint as an operation, also where only positions were seen, see :func:`make_joint_model`."""
+    """Return the joint as an operation; for positions alone see :func:`make_joint_model`."""
     if fit.motion.rows == 6:
         return fit.operation(name=child, parent=parent, child=child)
     right = fit.motion.right.copy()
@@ -242,35 +242,35 @@ def make_joint_operation(fit: Fit, parent: str, child: str) -> Operation:
     return joint_operation(replace(fit.motion, right=right), limits, child, parent, child)
 
 
-def _parent_shapes(fit: Fit, seen: Array, size: float) -> shapes.Shapes:
-    """Return the axis, and dots where the part was seen, in the parent's frame."""
-    chosen = np.unique(np.linspace(0, len(seen) - 1, MOST_DOTS).round().astype(int))
-    made: shapes.Shapes = ()
-    for point in seen[chosen]:
-        made += shapes.sphere(0.008 * size, point, shapes.ORANGE)
+def _parent_shapes(fit: Fit, positions: Array, size: float) -> shapes.Shapes:
+    """Return the axis, and dots at observed positions, in the parent's frame."""
+    indices = np.unique(np.linspace(0, len(positions) - 1, MOST_DOTS).round().astype(int))
+    parts: shapes.Shapes = ()
+    for point in positions[indices]:
+        parts += shapes.sphere(0.008 * size, point, shapes.ORANGE)
     if "axis" in fit.parameters:
         axis = np.asarray(fit.parameters["axis"])
-        middle = _closest_point_on_axis(fit, seen.mean(axis=0))
-        made += shapes.rod(middle - 0.5 * size * axis, middle + 0.5 * size * axis, 0.012 * size, shapes.RED)
-    return made
+        middle = _closest_point_on_axis(fit, positions.mean(axis=0))
+        parts += shapes.rod(middle - 0.5 * size * axis, middle + 0.5 * size * axis, 0.012 * size, shapes.RED)
+    return parts
 
 
-def _child_shapes(fit: Fit, seen: Array, size: float) -> shapes.Shapes:
-    """Return the part, and an arm to the axis if it turns about one, in the part's frame."""
-    made = shapes.box(np.full(3, 0.06 * size), color=shapes.BLUE)
+def _child_shapes(fit: Fit, size: float) -> shapes.Shapes:
+    """Return a box for the child, and a rod from it to its axis if there is one, in the child's frame."""
+    parts = shapes.box(np.full(3, 0.06 * size), color=shapes.BLUE)
     if "point" in fit.parameters:
         reference = np.asarray(fit.parameters["reference"])
         rotation = reference[:3, :3] if fit.motion.rows == 6 else np.eye(3)
         arm = rotation.T @ (_closest_point_on_axis(fit, reference[:3, 3]) - reference[:3, 3])
         if np.linalg.norm(arm) > 0.01 * size:
-            made += shapes.rod(np.zeros(3), arm, 0.012 * size, shapes.BLUE)
-    return made
+            parts += shapes.rod(np.zeros(3), arm, 0.012 * size, shapes.BLUE)
+    return parts
 
 
-def _closest_point_on_axis(fit: Fit, place: Array) -> Array:
-    """Return the point on the axis nearest to a place; the place itself for what has no point."""
+def _closest_point_on_axis(fit: Fit, position: Array) -> Array:
+    """Return the point of the axis closest to a position; the position itself if there is no axis."""
     if "point" not in fit.parameters:
-        return place
+        return position
     axis, point = np.asarray(fit.parameters["axis"]), np.asarray(fit.parameters["point"])
-    foot: Array = point + (axis @ (place - point)) * axis
+    foot: Array = point + (axis @ (position - point)) * axis
     return foot

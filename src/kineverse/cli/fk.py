@@ -1,10 +1,9 @@
-"""``kineverse fk``: where a frame is."""
+"""``kineverse fk``: pose of a frame."""
 
 from __future__ import annotations
 
 import argparse
 import json
-from typing import TYPE_CHECKING
 
 from kineverse.cli.arguments import (
     add_model_options,
@@ -18,12 +17,9 @@ from kineverse.errors import InvalidValueError
 from kineverse.expressions.printing import format_number
 from kineverse.lie import to_quaternion
 
-if TYPE_CHECKING:
-    pass
+HELP = """print the pose of a frame at given positions
 
-HELP = """print where a frame is, for given positions
-
-Positions that are not set have their default: 0, or the nearest value within the limits.
+Positions that are not set have their defaults: 0, or the nearest value within the limits.
 
 examples:
   kineverse fk kitchen kitchen/fridge_door_handle
@@ -35,15 +31,15 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Declare the options."""
     parser.add_argument("model", metavar="MODEL", help="name of a shipped model, or path of a file")
     parser.add_argument("frame", metavar="FRAME", help="name of a frame, such as kitchen/fridge_door")
-    parser.add_argument("--relative-to", metavar="FRAME", default="world", help="in whose axes (world)")
+    parser.add_argument("--relative-to", metavar="FRAME", default="world", help="reference frame (world)")
     add_set_option(parser)
     add_model_options(parser)
     parser.add_argument("--json", action="store_true", help="one JSON object on standard output")
 
 
 def run(arguments: argparse.Namespace) -> int:
-    """Evaluate and print."""
-    # Before the model is loaded: a typing error should not take seconds to be found.
+    """Evaluate the pose and print it."""
+    # Parsed before the model is loaded, so that a typing error is reported at once.
     assigned = parse_assignments(arguments.assignments)
 
     import numpy as np

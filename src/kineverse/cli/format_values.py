@@ -19,18 +19,18 @@ from kineverse.model.model_view import ModelView
 from kineverse.view.poses import roll_pitch_yaw
 
 LONGEST = 60
-_NOTHING = 1e-9
+_NEGLIGIBLE = 1e-9
 """Threshold below which a distance is printed as zero beside a larger one [m], [rad]."""
 
 
 def format_contents(model: ModelView) -> str:
-    """Format the numbers of frames, degrees of freedom and constraints of a model."""
+    """Return the numbers of frames, degrees of freedom and constraints of a model."""
     counts = (model.frames, "frame"), (model.degrees_of_freedom, "DoF"), (model.constraints, "constraint")
-    return ", ".join(format_count(len(some), noun) for some, noun in counts)
+    return ", ".join(format_count(len(items), noun) for items, noun in counts)
 
 
 def format_count(count: int, noun: str) -> str:
-    """Return a count of things."""
+    """Return a number with its noun, in the plural unless it is 1."""
     if count != 1 and noun != "DoF":
         noun = f"{noun[:-1]}ies" if noun.endswith("dy") else f"{noun}s"
     return f"{count} {noun}"
@@ -72,7 +72,7 @@ def format_value(given: Any) -> str:
 
 
 def value_to_json(given: Any) -> Any:
-    """Return a value as JSON can say it: numbers, lists of them, transforms as matrices; else as text."""
+    """Return a value as JSON data: numbers, lists of them, transforms as matrices; others as text."""
     if isinstance(given, Expression) and given.is_constant and not given.shape:
         given = float(given)
     if given is None or isinstance(given, bool | str | int):
@@ -101,7 +101,7 @@ def _format_body(body: Body) -> str:
 
 
 def format_delta(delta: Delta) -> list[str]:
-    """Format the difference of one part of a value, in one line or several."""
+    """Return the lines that describe the difference of one part of a value."""
     if delta.what == "place":
         return [f"in the world {_format_transform_delta(delta)}"]
     if delta.what == "transform":
@@ -110,12 +110,12 @@ def format_delta(delta: Delta) -> list[str]:
     if isinstance(delta.before, Pose) and isinstance(delta.after, Pose):
         return [f"{name}{_format_transform_delta(delta)}"]
     if delta.before is None or delta.after is None:
-        there, what = (delta.after, "added") if delta.before is None else (delta.before, "removed")
-        return [f"{name}{what}: {format_value(there)}"]
+        value, change = (delta.after, "added") if delta.before is None else (delta.before, "removed")
+        return [f"{name}{change}: {format_value(value)}"]
     if delta.distance == 0.0 and delta.angle == 0.0:
         return [f"{name}is written in another way"]
     before, after = format_value(delta.before), format_value(delta.after)
-    if before == after:  # in six digits, or in as much of a formula as is shown
+    if before == after:  # equal in the printed digits, or in the printed part of a formula
         off = format_number(delta.distance, 2)
         return [
             f"{name}{before}, off by {off}" if math.isfinite(delta.distance) else f"{name}{before}, otherwise"
@@ -124,21 +124,21 @@ def format_delta(delta: Delta) -> list[str]:
 
 
 def _format_transform_delta(delta: Delta) -> str:
-    """Format the distance of two transforms, at the default state and elsewhere."""
-    here, worst = delta.at_default, (delta.distance, delta.angle)
+    """Return the distance and angle between two transforms, at the default state and elsewhere."""
+    default, worst = delta.at_default, (delta.distance, delta.angle)
     if max(worst) == 0.0:
         return "is written in another way"
     if not all(map(math.isfinite, worst)):
         return format_pose_difference(*worst)
-    if max(here) < _NOTHING < max(worst):
+    if max(default) < _NEGLIGIBLE < max(worst):
         return f"up to {format_pose_difference(*worst)} apart, but not at the default state"
-    text = f"{format_pose_difference(*here)} apart"
-    further = any(w > 1.001 * h and w - h > _NOTHING for w, h in zip(worst, here, strict=True))
+    text = f"{format_pose_difference(*default)} apart"
+    further = any(w > 1.001 * d and w - d > _NEGLIGIBLE for w, d in zip(worst, default, strict=True))
     return f"{text}, up to {format_pose_difference(*worst)} elsewhere" if further else text
 
 
 def format_pose_difference(metres: float, radians: float) -> str:
-    """Return a distance [m] and an angle [rad] in millimetres and degrees, without those that are zero."""
+    """Return a distance [m] and an angle [rad] in millimetres and degrees; zeros are left out."""
     if not (math.isfinite(metres) and math.isfinite(radians)):
         return "somewhere on one side only"
     parts = [f"{format_number(1000.0 * metres, 3)} mm"] if metres else []
@@ -153,7 +153,7 @@ def format_interval(lower: float, upper: float) -> str:
 
 
 def _transform_values(delta: Delta) -> Iterator[str]:
-    """Yield origin and angles of transforms, those that differ in what is printed."""
+    """Yield origins and angles of transforms whose printed values differ."""
     if isinstance(delta.before, Pose) and isinstance(delta.after, Pose):
         sides = [
             (_format_row(p.rows[3::4]), _format_row(roll_pitch_yaw(p.matrix)))

@@ -15,13 +15,13 @@ if TYPE_CHECKING:
     from kineverse.cli.summary import ModelSummary
     from kineverse.geometry import DistanceResult
 
-HELP = """print what a model consists of: frames, degrees of freedom, constraints, size
+HELP = """print the contents of a model: frames, degrees of freedom, constraints, size
 
 examples:
   kineverse info kitchen
   kineverse info my_robot.urdf --frames
   kineverse info pr2 --json
-  kineverse info articulations        the list of those in the gallery"""
+  kineverse info articulations        list of the gallery"""
 
 
 SHOWN = 10
@@ -38,7 +38,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def run(arguments: argparse.Namespace) -> int:
-    """Load, count and print."""
+    """Load the model, summarise it, and print the summary."""
     if is_gallery_list(arguments.model):
         return print_articulations(arguments.json)
 
@@ -51,10 +51,12 @@ def run(arguments: argparse.Namespace) -> int:
     if arguments.json:
         print(json.dumps({**summary_to_json(summary), "remarks": remarks}, allow_nan=False))
         return 0
-    found = format_sections(summary, arguments.frames, arguments.constraints)
+    sections = format_sections(summary, arguments.frames, arguments.constraints)
     if remarks:
-        found.append("\n".join(["remarks", *truncate_lines([f"  {text}" for text in remarks], SHOWN, "  ")]))
-    print("\n\n".join(found))
+        sections.append(
+            "\n".join(["remarks", *truncate_lines([f"  {text}" for text in remarks], SHOWN, "  ")])
+        )
+    print("\n\n".join(sections))
     return 0
 
 
@@ -81,7 +83,7 @@ def format_sections(summary: ModelSummary, frames: bool = False, constraints: bo
         lines.append(_format_contacts(summary.contacts))
     if summary.sha256:
         lines.append(f"  document, sha256 {summary.sha256}")
-    found = ["\n".join(lines)]
+    sections = ["\n".join(lines)]
     if summary.freedoms:
         rows = [
             (
@@ -94,26 +96,26 @@ def format_sections(summary: ModelSummary, frames: bool = False, constraints: bo
             )
             for f in summary.freedoms
         ]
-        found.append(format_table(("DoF", "unit", "lower", "upper", "default", "speed"), rows, "<<>>>>"))
+        sections.append(format_table(("DoF", "unit", "lower", "upper", "default", "speed"), rows, "<<>>>>"))
     if summary.interlocks:
-        found.append("\n".join(["interlocks", *(f"  {interlock}" for interlock in summary.interlocks)]))
-    said = {name for interlock in summary.interlocks for name in interlock.constraints}
-    shown = [c for c in summary.constraints if constraints or not (c.simple or c.name in said)]
+        sections.append("\n".join(["interlocks", *(f"  {interlock}" for interlock in summary.interlocks)]))
+    locking = {name for interlock in summary.interlocks for name in interlock.constraints}
+    shown = [c for c in summary.constraints if constraints or not (c.simple or c.name in locking)]
     if shown:
         title = "constraint" if constraints else "other constraints"
-        found.append(format_table((title, ""), [(c.name, c.text) for c in shown]))
+        sections.append(format_table((title, ""), [(c.name, c.text) for c in shown]))
     if frames:
-        found.append("frames\n" + "\n".join(_format_tree(summary.frames)))
+        sections.append("frames\n" + "\n".join(_format_tree(summary.frames)))
     hidden = [] if frames else ["--frames"]
     if not constraints and len(shown) < len(summary.constraints):
         hidden.append("--constraints")
     if hidden:
-        found.append(f"More with {' and '.join(hidden)}.")
-    return found
+        sections.append(f"More with {' and '.join(hidden)}.")
+    return sections
 
 
 def summary_to_json(summary: ModelSummary) -> dict[str, Any]:
-    """Convert the summary to JSON; an absent limit is null."""
+    """Return the summary as JSON data; missing limits are null."""
 
     def finite(value: float) -> float | None:
         return value if abs(value) < float("inf") else None
@@ -155,7 +157,7 @@ def summary_to_json(summary: ModelSummary) -> dict[str, Any]:
 
 
 def _format_contacts(pairs: Sequence[DistanceResult]) -> str:
-    """Format the number of touching pairs and the deepest pair."""
+    """Return the number of pairs in contact, and the deepest one."""
     from kineverse.cli.summary import CONTACT_DEPTH
 
     pair, depth = pairs[0], -pairs[0].distance
@@ -168,7 +170,7 @@ def _format_contacts(pairs: Sequence[DistanceResult]) -> str:
 
 
 def _format_tree(frames: dict[str, str]) -> list[str]:
-    """Return the frames, each below its parent and two spaces to the right of it."""
+    """Return the frames in depth-first order, each indented by two spaces more than its parent."""
     children: dict[str, list[str]] = {}
     for name, parent in frames.items():
         children.setdefault(parent, []).append(name)
@@ -181,7 +183,7 @@ def _format_tree(frames: dict[str, str]) -> list[str]:
 
 
 def is_gallery_list(model: str) -> bool:
-    """Return whether it is the list that a user wants instead of a model."""
+    """Return whether a name stands for the list of articulations."""
     from kineverse.formats.locate import GALLERY
 
     return model.rstrip("/") == GALLERY

@@ -1,4 +1,4 @@
-"""From the words on the command line to an exit status."""
+"""Entry point of the command line: parser, errors, exit status."""
 
 from __future__ import annotations
 
@@ -12,6 +12,7 @@ from typing import TextIO
 
 from kineverse._version import __version__
 from kineverse.cli import bench, convert, decompose, demo, diff, fit, fk, info, reproduce, validate, view
+from kineverse.cli.output import join_lines
 from kineverse.errors import KineverseError, UnknownNameError, suggest
 
 COMMANDS = {
@@ -22,20 +23,20 @@ COMMANDS = {
 ERROR, INTERRUPTED, PIPE_CLOSED = 2, 130, 141
 """Exit statuses: the request failed; Ctrl-C; the output pipe was closed (128 and the signal's number)."""
 
-# Meshes that are missing are counted by the commands, and without a compiler they answer the same.
+# The commands report missing meshes themselves; a missing compiler does not change their results.
 QUIET = ("kineverse.view.meshes", "kineverse.compile.toolchain")
 
 EXAMPLES = """\
 A MODEL is the name of a shipped model (kitchen, pr2, articulations/screw ...) or the path of a file.
 
 examples:
-  kineverse info kitchen                              what it consists of
+  kineverse info kitchen                              its frames, degrees of freedom, constraints
   kineverse fk kitchen kitchen/fridge_door_handle --set kitchen/fridge_door=30deg
   kineverse view kitchen                              move it in the browser
   kineverse convert kitchen kitchen.kv.json           write it in another format
-  kineverse diff kitchen kitchen.kv.json              what two models differ in
+  kineverse diff kitchen kitchen.kv.json              differences of two models
   kineverse fit poses.csv --child door                learn a joint from recorded poses
-  kineverse demo --headless                           track a simulated kitchen; numbers and a picture
+  kineverse demo --headless                           a picture of kitchen and robot
 """
 
 
@@ -45,13 +46,13 @@ def main(argv: Sequence[str] | None = None) -> int:
     Parameters
     ----------
     argv
-        The arguments, without the name of the program; those of the process if None. Without any, the help is
-        printed.
+        Arguments without the name of the program; those of the process if None. If there are none, the help
+        is printed.
 
     Returns
     -------
-    0 if all went well; 2 if what was asked for cannot be done, with one line on standard error that says why;
-    130 after Ctrl-C; 141 if the output pipe was closed.
+    0 on success; 2 if the request cannot be fulfilled, with the reason in one line on standard error; 130
+    after Ctrl-C; 141 if the output pipe was closed.
     """
     words = sys.argv[1:] if argv is None else list(argv)
     if not set(words) - {"-v", "--verbose"}:
@@ -59,7 +60,7 @@ def main(argv: Sequence[str] | None = None) -> int:
         return 0
     try:
         arguments = _parse_arguments(words)
-    except SystemExit as stop:  # argparse ends the process itself; a function returns.
+    except SystemExit as stop:  # argparse would end the process.
         return stop.code if isinstance(stop.code, int) else ERROR
     except UnknownNameError as error:
         print(f"kineverse: {format_error(error)}", file=sys.stderr)
@@ -84,12 +85,12 @@ def make_parser() -> argparse.ArgumentParser:
     """Return the parser of the whole command line."""
     top = argparse.ArgumentParser(
         prog="kineverse",
-        description="Articulation models: look at them, move them, ask them.",
+        description="View, move and query articulation models.",
         epilog=EXAMPLES,
         formatter_class=argparse.RawDescriptionHelpFormatter,
     )
     top.add_argument("--version", action="version", version=f"kineverse {__version__}")
-    top.add_argument("-v", "--verbose", action="store_true", help="say more on standard error")
+    top.add_argument("-v", "--verbose", action="store_true", help="print more messages on standard error")
     commands = top.add_subparsers(title="commands", metavar="COMMAND", required=True)
     for name, command in COMMANDS.items():
         summary, _, description = command.HELP.partition("\n")
@@ -105,12 +106,12 @@ def make_parser() -> argparse.ArgumentParser:
 
 
 def _parse_arguments(words: Sequence[str]) -> argparse.Namespace:
-    """Return the arguments that words are.
+    """Parse the arguments of the command line.
 
     Raises
     ------
     SystemExit
-        If they are wrong for their command, which has been said, or were asking for help.
+        After printing a usage error, or help.
     UnknownNameError
         For a command or an option that does not exist, with similar ones.
     """
@@ -131,7 +132,7 @@ def _parse_arguments(words: Sequence[str]) -> argparse.Namespace:
 
 
 def _suggest_command(name: str) -> str:
-    """Suggest similar names for an unknown command."""
+    """Return advice on a command that does not exist."""
     from kineverse.formats.locate import shipped_models
 
     if name in shipped_models() or os.path.exists(name):
@@ -140,16 +141,16 @@ def _suggest_command(name: str) -> str:
 
 
 def format_error(error: BaseException) -> str:
-    """Format an error on one line."""
+    """Return the message of an error on one line."""
     if isinstance(error, OSError) and error.strerror:
         where = f"{error.filename}: " if error.filename else ""
         return f"{where}{error.strerror}"
-    return " ".join(str(error).split()) or type(error).__name__
+    return join_lines(error) or type(error).__name__
 
 
 @contextmanager
 def _log_warnings_to(stream: TextIO, verbose: bool) -> Iterator[None]:
-    """Print log records of the library, one a line; some of them only with ``--verbose``."""
+    """Print warnings of the library on a stream; those of :data:`QUIET` loggers only if verbose."""
     handler = logging.StreamHandler(stream)
     handler.setFormatter(logging.Formatter("kineverse: %(message)s"))
     log, quiet = logging.getLogger("kineverse"), [logging.getLogger(name) for name in QUIET]
@@ -167,10 +168,10 @@ def _log_warnings_to(stream: TextIO, verbose: bool) -> Iterator[None]:
 
 
 def _discard_stdout() -> None:
-    """Discard the remaining output, so that the interpreter does not complain at its end."""
+    """Redirect standard output to the null device, so that the interpreter can flush it at exit."""
     try:
-        nowhere = os.open(os.devnull, os.O_WRONLY)
-        os.dup2(nowhere, sys.stdout.fileno())
-        os.close(nowhere)
+        null = os.open(os.devnull, os.O_WRONLY)
+        os.dup2(null, sys.stdout.fileno())
+        os.close(null)
     except (OSError, ValueError):
-        pass  # A stdout that is no file, as under a test, has nothing to flush to.
+        pass  # Under a test, standard output may not be a file.

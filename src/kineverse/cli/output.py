@@ -15,7 +15,7 @@ _CODES = {"+": "32", "-": "31", "~": "33", ">": "36", "!": "31", "bold": "1"}
 def colorize(text: str, style: str) -> str:
     """Return a text in the colour of a sign (``+``, ``-``, ``~``, ``>``, ``!``), or ``bold``.
 
-    Plain if standard output is no terminal, or the environment has ``NO_COLOR``.
+    The text stays plain if standard output is not a terminal, or the environment has ``NO_COLOR``.
     """
     if not text or not sys.stdout.isatty() or os.environ.get("NO_COLOR") or os.environ.get("TERM") == "dumb":
         return text
@@ -23,7 +23,7 @@ def colorize(text: str, style: str) -> str:
 
 
 def truncate_lines(lines: Sequence[str], most: int | None, indent: str = "  ") -> list[str]:
-    """Return the first ``most`` lines and the number of the rest; all lines if ``most`` is None."""
+    """Return the first ``most`` lines and the number of others; all lines if ``most`` is None."""
     if most is None or len(lines) <= most:
         return list(lines)
     return [*lines[:most], f"{indent}… and {len(lines) - most} more (--all)"]
@@ -40,21 +40,21 @@ def format_table(
     Parameters
     ----------
     head
-        The titles of the columns.
+        Titles of the columns.
     rows
-        The cells.
+        Cells.
     align
-        A ``<`` or ``>`` for each column; left if missing.
+        ``<`` or ``>`` for each column; ``<`` if missing.
     width
-        The width of the screen; the terminal's if None. If the table is wider, its first column is cut in the
-        middle, where names of frames differ least. In a pipe nothing is ever cut.
+        Width of the screen; the terminal's if None. If the table is wider, its first column is cut in the
+        middle, where names of frames differ least. In a pipe nothing is cut.
     """
     cells = [list(head), *(list(row) for row in rows)]
     sides: list[str] = [align[k] if k < len(align) else "<" for k in range(len(head))]
     widths = [max(len(row[k]) for row in cells) for k in range(len(head))]
-    room = (terminal_width() if width is None else width) - sum(widths[1:]) - 2 * (len(head) - 1)
-    if widths and widths[0] > room:
-        widths[0] = max(room, 12)
+    available = (terminal_width() if width is None else width) - sum(widths[1:]) - 2 * (len(head) - 1)
+    if widths and widths[0] > available:
+        widths[0] = max(available, 12)
     lines = []
     for row in cells:
         row[0] = shorten_text(row[0], widths[0])
@@ -62,6 +62,11 @@ def format_table(
         lines.append("  ".join(texts).rstrip())
     lines.insert(1, "  ".join("-" * w for w in widths))
     return "\n".join(lines)
+
+
+def join_lines(message: object) -> str:
+    """Return a message, such as an exception, on one line."""
+    return " ".join(str(message).split())
 
 
 def shorten_text(text: str, width: int) -> str:
@@ -73,9 +78,7 @@ def shorten_text(text: str, width: int) -> str:
 
 
 def terminal_width() -> int:
-    """Return the columns of the terminal; practically no limit where the output is not read on one."""
-    import sys
-
+    """Return the columns of the terminal; 10 000 if standard output is not a terminal."""
     return shutil.get_terminal_size().columns if sys.stdout.isatty() else 10_000
 
 
@@ -90,13 +93,13 @@ def show_progress(
     Parameters
     ----------
     items
-        What is worked on.
+        Items to yield.
     what
-        What is being done, in front of the bar.
+        Activity, printed in front of the bar.
     unit
-        What is counted.
+        Unit of the items.
     total
-        How many items there are, if they cannot say so themselves.
+        Number of items, if they have no length.
     """
     if not sys.stderr.isatty():
         yield from items
@@ -110,7 +113,7 @@ def show_progress(
 
 @contextmanager
 def show_activity(what: str) -> Iterator[None]:
-    """Show an activity on standard error while it lasts, if that is a terminal."""
+    """Print an activity on standard error while it lasts, if that is a terminal."""
     if not sys.stderr.isatty():
         yield
         return

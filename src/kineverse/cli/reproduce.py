@@ -1,4 +1,4 @@
-"""``kineverse reproduce``: the papers' experiments, made again."""
+"""``kineverse reproduce``: the papers' experiments."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from kineverse.expressions.printing import format_number
 if TYPE_CHECKING:
     from kineverse.experiments import Report, ReportTable
 
-HELP = """make an experiment of the papers again: a table here, a figure in a file
+HELP = """reproduce an experiment of the papers, with tables and a figure
 
 examples:
   kineverse reproduce --list
@@ -27,14 +27,14 @@ examples:
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Declare the options."""
-    parser.add_argument("name", metavar="NAME", nargs="?", help="which experiment, see --list")
-    parser.add_argument("--list", action="store_true", help="say what each experiment is about, and end")
-    parser.add_argument("--quick", action="store_true", help="a part of it, in seconds")
-    parser.add_argument("--data", metavar="FOLDER", type=Path, help="where the recordings are that it needs")
-    parser.add_argument("--model", metavar="MODEL", help="the model that it is about, a name or path")
+    parser.add_argument("name", metavar="NAME", nargs="?", help="name of an experiment, see --list")
+    parser.add_argument("--list", action="store_true", help="list the experiments and exit")
+    parser.add_argument("--quick", action="store_true", help="reduced experiment, in seconds")
+    parser.add_argument("--data", metavar="FOLDER", type=Path, help="folder of the recordings that it needs")
+    parser.add_argument("--model", metavar="MODEL", help="name or path of its model")
     figure = parser.add_mutually_exclusive_group()
     figure.add_argument(
-        "--figure", metavar="FILE", type=Path, help="where the figure goes (NAME.png; with --json: nowhere)"
+        "--figure", metavar="FILE", type=Path, help="file of the figure (NAME.png; with --json: none)"
     )
     figure.add_argument("--no-figure", action="store_true", help="draw nothing")
     parser.add_argument("--json", action="store_true", help="one JSON object on standard output")
@@ -54,10 +54,10 @@ def run(arguments: argparse.Namespace) -> int:
         )
         return 0
     if arguments.name is None:
-        raise UnknownNameError(f"Which experiment? There are: {', '.join(EXPERIMENTS)}.")
+        raise UnknownNameError(f"Name an experiment. There are: {', '.join(EXPERIMENTS)}.")
     options = Options(quick=arguments.quick, data=arguments.data, model=arguments.model)
     if arguments.figure is not None:
-        check_drawing()  # before minutes are spent on numbers
+        check_drawing()  # before minutes of computation
     report = reproduce(arguments.name, show_progress, options)
     if arguments.json:
         if arguments.figure is not None:
@@ -76,13 +76,13 @@ def run(arguments: argparse.Namespace) -> int:
     return 0
 
 
-def _save_figure(report: Report, asked: Path | None) -> None:
-    """Write the figure; without ``--figure``, only if matplotlib is installed."""
-    path = asked or Path(f"{report.name}.png")
+def _save_figure(report: Report, requested: Path | None) -> None:
+    """Write the figure; if no path is requested, only if the drawing library is installed."""
+    path = requested or Path(f"{report.name}.png")
     try:
         report.figure.save(path)
     except MissingDependencyError as error:
-        if asked:
+        if requested:
             raise
         print(f"\nThere is no figure. {error}")
     else:
@@ -94,6 +94,6 @@ def format_report(report: Report) -> str:
     return "\n\n".join([report.title, *map(_format_report_table, report.tables)])
 
 
-def _format_report_table(part: ReportTable) -> str:
-    rows = [[cell if isinstance(cell, str) else format_number(cell) for cell in row] for row in part.rows]
-    return f"{part.title}\n{format_table(part.head, rows, '>' * len(part.head))}"
+def _format_report_table(table: ReportTable) -> str:
+    rows = [[cell if isinstance(cell, str) else format_number(cell) for cell in row] for row in table.rows]
+    return f"{table.title}\n{format_table(table.head, rows, '>' * len(table.head))}"

@@ -29,21 +29,21 @@ CONTACT_DEPTH = 1e-5
 
 
 def find_contacts(model: ModelView) -> Sequence[DistanceResult] | None:
-    """Return the touching or penetrating pairs at the default state, deepest first; else None.
+    """Return the touching or penetrating pairs at the default state, deepest first.
 
-    Shapes that cannot be used are left out. The result is None without the extra ``geometry``, or where
-    the default state has no poses.
+    Unusable shapes are left out. The result is None if the extra ``geometry`` is not installed, or poses at
+    the default state are not finite.
     """
     if not is_installed():
         return None
     try:
         return _touching_pairs(model)
-    except KineverseError:  # What is not finite there is reported for itself.
+    except KineverseError:  # Poses that are not finite are reported separately.
         return None
 
 
 def find_penetrations(model: ModelView) -> Iterator[ModelProblem]:
-    """Yield the pairs of bodies that are in each other at the default state.
+    """Yield the pairs of bodies that penetrate each other at the default state.
 
     Raises
     ------
@@ -65,7 +65,7 @@ def _touching_pairs(model: ModelView) -> Sequence[DistanceResult]:
 
 @dataclass(frozen=True, slots=True)
 class DofSummary:
-    """A degree of freedom: its limits and default [unit], and the limit of its speed [unit/s]."""
+    """Degree of freedom: limits and default value [unit], and largest speed [unit/s]."""
 
     name: str
     unit: str
@@ -77,7 +77,7 @@ class DofSummary:
 
 @dataclass(frozen=True, slots=True)
 class ConstraintSummary:
-    """A constraint as text; ``simple`` if it bounds a single symbol by numbers."""
+    """Constraint as text; ``simple`` is True if it bounds a single symbol by numbers."""
 
     name: str
     text: str
@@ -89,12 +89,32 @@ class ConstraintSummary:
 class ModelSummary:
     """Contents of a model, for printing and JSON.
 
-    ``frames`` are the parents by name; ``low``, ``high`` and ``extent`` the box around all shapes at the
-    default state [m]; ``mass`` that of all bodies [kg]; ``problems`` what could not be loaded; ``unplaced``
-    the frames whose pose there is not finite, which the box leaves out; ``interlocks`` what locks what;
-    ``touched_as_seen`` the bodies without collision shapes, for which distances are to hulls of what is seen;
-    ``find_contacts`` the pairs that touch at the default state, deepest first, None if not known;
-    ``sha256`` the hash of the content if the model is from a document, else empty.
+    Attributes
+    ----------
+    name
+        Name or path of the model, as given.
+    frames
+        Parents of the frames, by name.
+    freedoms, constraints
+        Degrees of freedom and constraints.
+    low, high, extent
+        Bounding box of all shapes at the default state [m].
+    mass
+        Mass of all bodies [kg].
+    shapes
+        Number of visual shapes.
+    problems
+        Frames of shapes that cannot be loaded.
+    unplaced
+        Frames whose poses at the default state are not finite; the box leaves them out.
+    interlocks
+        Interlocks between coordinates.
+    touched_as_seen
+        Bodies without collision shapes; distances to them are to hulls of their visual shapes.
+    contacts
+        Pairs that touch at the default state, deepest first; None if unknown.
+    sha256
+        Hash of the content if the model is a document, else empty.
     """
 
     name: str
@@ -115,19 +135,19 @@ class ModelSummary:
 
 
 def summarize_model(name: str, model: ModelView) -> ModelSummary:
-    """Return the summary of a model; reads its meshes for the size."""
+    """Return the summary of a model; meshes are read for their size."""
     values = complete(model)
     poses = FramePoses(model)
-    places = poses.evaluate(values)
-    unplaced = poses.unplaced(places)
-    at = dict(zip(poses.names, places, strict=True))
+    matrices = poses.evaluate(values)
+    unplaced = poses.unplaced(matrices)
+    pose_of = dict(zip(poses.names, matrices, strict=True))
     for frame in unplaced:
-        del at[frame]
-    shown = collect_drawables(model)
-    loaded = [part for part in shown if not part.placeholder and part.frame in at]
-    corners = TriangleSoup.from_drawables(loaded, at).corners.reshape(-1, 3)
+        del pose_of[frame]
+    drawables = collect_drawables(model)
+    loaded = [part for part in drawables if not part.placeholder and part.frame in pose_of]
+    corners = TriangleSoup.from_drawables(loaded, pose_of).corners.reshape(-1, 3)
     if not len(corners):
-        corners = np.array([pose[:3, 3] for pose in at.values()])
+        corners = np.array([pose[:3, 3] for pose in pose_of.values()])
     low, high = corners.min(axis=0), corners.max(axis=0)
     free = model.degrees_of_freedom
     unit = infer_units(model, values, [str(symbol) for symbol in free])
@@ -141,8 +161,8 @@ def summarize_model(name: str, model: ModelView) -> ModelSummary:
         high=high.tolist(),
         extent=(high - low).tolist(),
         mass=float(sum(masses)),
-        shapes=len(shown),
-        problems=sorted(part.frame for part in shown if part.problem),
+        shapes=len(drawables),
+        problems=sorted(part.frame for part in drawables if part.problem),
         unplaced=unplaced,
         interlocks=interlocks(model),
         touched_as_seen=bodies_with_visual_collision(model),

@@ -1,4 +1,4 @@
-"""``kineverse validate``: faults of files."""
+"""``kineverse validate``: strict validation of model files."""
 
 from __future__ import annotations
 
@@ -13,17 +13,17 @@ from kineverse.cli.output import colorize, format_table, show_progress, truncate
 if TYPE_CHECKING:
     from kineverse.cli.file_validation import ValidationResult
 
-HELP = """read files strictly, and say what is wrong with them
+HELP = """read files strictly, and list their mistakes and problems
 
-Mistakes that kv.load reads past with a remark are listed, all of them, and the file counts as one that cannot
-be read. A file that can be read is looked at for limits that are broken at the default state, poses that are
-not finite and loops that do not close there or within the limits, bodies with an impossible inertia, and
-meshes whose files are missing. With --contacts bodies that are in each other at the default state are
-problems as well, unless they are joined; many a good model has some. Remarks are what the reader left out, or
-took in a way that may not have been meant.
+All mistakes that kv.load tolerates with a remark are listed, and a file with mistakes counts as unreadable. A
+file that can be read is checked for limits that are violated at the default state, poses that are not finite
+there, loops that do not close there or within the limits, bodies with an impossible inertia, and missing mesh
+files. With --contacts, bodies that penetrate each other at the default state are problems as well, unless a
+joint connects them; many valid models have some. Remarks name content that the reader left out, or
+interpreted in one of several ways.
 
-The exit status is 0 if nothing is wrong, 1 if something is, and 2 if a file cannot be read, or not strictly;
-of several files, the worst.
+The exit status is 0 without problems, 1 with problems, and 2 if a file cannot be read, or has mistakes; of
+several files, the worst.
 
 examples:
   kineverse validate robot.urdf
@@ -48,7 +48,7 @@ TITLES = {
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Declare the options."""
     parser.add_argument("files", metavar="FILE", nargs="+", help="path of a file, or name of a shipped model")
-    parser.add_argument("--no-meshes", action="store_true", help="do not look for the files of meshes")
+    parser.add_argument("--no-meshes", action="store_true", help="do not check that mesh files exist")
     parser.add_argument(
         "--contacts", action="store_true", help="bodies that penetrate each other are problems (needs coal)"
     )
@@ -60,33 +60,38 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def run(arguments: argparse.Namespace) -> int:
-    """Examine, print, and return the worst status."""
+    """Validate the files, print the results, and return the worst status."""
     from kineverse.cli.file_validation import validate_file
     from kineverse.geometry.shapes import import_coal
 
     files = show_progress(arguments.files, "validating", "file")
     if arguments.contacts:
         import_coal()
-    meshes, strict, touch = not arguments.no_meshes, arguments.strict, arguments.contacts
-    found = [validate_file(file, meshes, strict, touch, arguments.root, arguments.loops) for file in files]
-    status = max(examination.status for examination in found)
-    most = None if arguments.all else SHOWN if len(found) == 1 else SHOWN_OF_SEVERAL
+    meshes, strict, contacts = not arguments.no_meshes, arguments.strict, arguments.contacts
+    results = [
+        validate_file(file, meshes, strict, contacts, arguments.root, arguments.loops) for file in files
+    ]
+    status = max(result.status for result in results)
+    most = None if arguments.all else SHOWN if len(results) == 1 else SHOWN_OF_SEVERAL
     if arguments.json:
         print(
-            json.dumps({"status": status, "files": [validation_to_json(e) for e in found]}, allow_nan=False)
+            json.dumps(
+                {"status": status, "files": [validation_to_json(result) for result in results]},
+                allow_nan=False,
+            )
         )
-    elif len(found) > 1:
-        told = [format_validation(e, most) for e in found if e.status]
-        print("\n\n".join([_format_results(found), *("\n".join(lines) for lines in told)]))
-    elif found[0].error is not None:
-        raise found[0].error
+    elif len(results) > 1:
+        details = [format_validation(result, most) for result in results if result.status]
+        print("\n\n".join([_format_results(results), *("\n".join(lines) for lines in details)]))
+    elif results[0].error is not None:
+        raise results[0].error
     else:
-        print("\n".join(format_validation(found[0], most)))
+        print("\n".join(format_validation(results[0], most)))
     return status
 
 
 def format_validation(found: ValidationResult, most: int | None) -> list[str]:
-    """Format the validation of one file, with at most ``most`` remarks and problems of a kind."""
+    """Return the lines of one file, with at most ``most`` remarks, and problems of a kind."""
     if found.error is not None:
         return [found.name, f"  {colorize('cannot be read', '!')}: {found.reason}"]
     lines = [f"{found.name}: {found.kind}", f"  {found.contents}", f"  {_format_verdict(found)}"]
@@ -108,11 +113,11 @@ def _format_verdict(found: ValidationResult) -> str:
     text = f"{problems or 'no'} problem{'' if problems == 1 else 's'}"
     if found.faults:
         text = f"not read strictly: {format_count(len(found.faults), 'mistake')}, {text}"
-    noted = f", {remarks} remark{'' if remarks == 1 else 's'}" if remarks else ""
-    return f"{colorize(text, '!' if found.status else '+')}{noted}"
+    remark_text = f", {remarks} remark{'' if remarks == 1 else 's'}" if remarks else ""
+    return f"{colorize(text, '!' if found.status else '+')}{remark_text}"
 
 
-def _format_results(found: list[ValidationResult]) -> str:
+def _format_results(results: list[ValidationResult]) -> str:
     rows = [
         (e.name, e.format, "", "", "", "", "cannot be read")
         if e.model is None
@@ -125,7 +130,7 @@ def _format_results(found: list[ValidationResult]) -> str:
             str(len(e.remarks)),
             str(len(e.problems) + len(e.faults)),
         )
-        for e in found
+        for e in results
     ]
     return format_table(
         ("file", "format", "frames", "DoF", "constraints", "remarks", "problems"), rows, "<<>>>>>"
@@ -133,7 +138,7 @@ def _format_results(found: list[ValidationResult]) -> str:
 
 
 def validation_to_json(found: ValidationResult) -> dict[str, Any]:
-    """Return everything about one file as JSON has it."""
+    """Return the result of one file as JSON data."""
     model = found.model
     counts = None
     if model is not None:

@@ -27,16 +27,16 @@ if TYPE_CHECKING:
 
 HELP = """show a model in the browser, with a slider for everything that moves
 
-The page is served to this computer only, until Ctrl-C; with --host to others, who need the address with its
-token. With --picture there is no page: a picture of the
-state is written. That needs neither a browser nor anything beyond the core, but for meshes and --near.
+The page is served to this computer only, until Ctrl-C; with --host also to others, who need the address with
+its token. With --picture, a picture of the state is written instead. This needs no browser, and no extra
+except for meshes and --near.
 
 examples:
   kineverse view kitchen
   kineverse view articulations/folding_door      any articulation of the library
-  kineverse view                                 the list of all that can be named
+  kineverse view                                 list of all models and articulations
   kineverse view my_robot.urdf --set elbow=45deg --port 8090
-  kineverse view kitchen --near 5cm              which bodies are how near to each other
+  kineverse view kitchen --near 5cm              bodies within 5 cm of each other
   kineverse view articulations/ratchet --near 0.1 --collisions --picture ratchet.png"""
 
 
@@ -46,17 +46,19 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "model",
         metavar="MODEL",
         nargs="?",
-        help="name of a shipped model, or path of a file; none for a list",
+        help="name of a shipped model, or path of a file; without it, a list is printed",
     )
     add_set_option(parser)
     parser.add_argument(
         "--near",
         metavar="RADIUS",
-        help="show which bodies are within 0.1 (or 5cm) of each other, green to red, with arrows in contact",
+        help="show pairs of bodies within a distance (0.1, 5cm), green to red, with arrows at contacts",
     )
     parser.add_argument("--collisions", action="store_true", help="show the collision shapes")
     parser.add_argument(
-        "--decomposed", action="store_true", help="both with meshes as the hulls of kineverse decompose"
+        "--decomposed",
+        action="store_true",
+        help="for both, use the hulls of kineverse decompose",
     )
     parser.add_argument("--degrees", action="store_true", help="show angles in degrees")
     parser.add_argument("--picture", metavar="PATH", help="write a picture (.png) instead of opening a page")
@@ -70,13 +72,13 @@ def add_page_options(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--host",
         metavar="ADDRESS",
-        help="let others look: listen on this address of the computer (0.0.0.0: all)",
+        help="serve other computers: listen on this address (0.0.0.0: all)",
     )
     parser.add_argument("--no-browser", action="store_true", help="only print the address")
 
 
 def page_options(arguments: argparse.Namespace) -> dict[str, Any]:
-    """Return the options of a page as keyword arguments."""
+    """Return the page options as keyword arguments of a page."""
     return {"port": arguments.port, **({"host": arguments.host} if arguments.host else {})}
 
 
@@ -128,12 +130,12 @@ def run(arguments: argparse.Namespace) -> int:
 def _write_picture(
     arguments: argparse.Namespace, model: kv.Model, state: dict[str, float], near: float | None
 ) -> int:
-    """Write a picture of the state, and report missing meshes."""
+    """Write a picture of the state, and print what it cannot show."""
     from kineverse.geometry.exclusions import find_unusable_shapes, label_unusable_shapes
     from kineverse.view import meshes, save_picture
 
-    shown = {"collisions": arguments.collisions, "near": near, "decomposed": arguments.decomposed}
-    save_picture(arguments.picture, model, state, **shown)
+    options = {"collisions": arguments.collisions, "near": near, "decomposed": arguments.decomposed}
+    save_picture(arguments.picture, model, state, **options)
     problems = [
         f"{m.uri}: {meshes.load_mesh(m).problem}"
         for m in meshes.list_visual_meshes(model)
@@ -155,7 +157,7 @@ class _Page(Protocol):
 
 
 def print_address(page: _Page, browser: bool) -> None:
-    """Print the address of a page and open it, if there is a screen to open it on."""
+    """Print the address of a page, and open it if there is a display."""
     print(f"{page.address}   (Ctrl-C ends)", flush=True)
     if browser:
         from kineverse.view.show import open_page
@@ -164,7 +166,7 @@ def print_address(page: _Page, browser: bool) -> None:
 
 
 def print_mesh_problems(problems: list[str]) -> None:
-    """Say on standard error, in one line, that meshes are missing."""
+    """Print a line on standard error if meshes are missing."""
     if problems:
         more = f" and {len(problems) - 1} more" if len(problems) > 1 else ""
         print(f"kineverse: shown as placeholders: {problems[0]}{more}", file=sys.stderr)
@@ -172,7 +174,7 @@ def print_mesh_problems(problems: list[str]) -> None:
 
 @contextmanager
 def handle_interrupts() -> Iterator[None]:
-    """Take Ctrl-C as the way to leave that it is, and SIGTERM, by which programs are stopped, as the same."""
+    """Leave the context on Ctrl-C or SIGTERM, without an exception."""
 
     def interrupt(*_: object) -> None:
         raise KeyboardInterrupt

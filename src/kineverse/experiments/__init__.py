@@ -1,4 +1,4 @@
-"""The papers' experiments, made again: each measures, says beside it what the papers report, and draws."""
+"""Experiments of the papers: measurements beside the published values, with figures."""
 
 from .registry import EXPERIMENTS, Options, reproduce
 from .report import Figure, Report, ReportTable

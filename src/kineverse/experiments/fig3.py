@@ -1,8 +1,8 @@
 """``fig3``: the garage door and its lock (2022 paper, IV-A, Fig. 3).
 
-The paper's coordinate is the position a of an edge, a in [0, l], l closed and 0 open; its door's angle
-arccos(a/l) has an infinite slope where the door is closed. The regular form has the angle as its coordinate.
-Beside the paper's two plots stands how fast the door's upper edge moves with either coordinate.
+The paper's coordinate is the position a of an edge in [0, l], where a = l is closed and a = 0 is open. The
+angle arccos(a/l) of the door has an infinite slope at a = l. The regular form uses the angle.
+The third plot compares the speeds of the upper edge per unit of either coordinate.
 """
 
 from __future__ import annotations
@@ -31,7 +31,7 @@ OPTIONS = ()
 
 LENGTH = 2.0
 PARTS = {"A": 0.0, "25 %": 0.25, "50 %": 0.5, "75 %": 0.75, "B": 1.0}
-"""Points along the door by name, the lower edge A first."""
+"""Points along the door by name, from the lower edge A to the upper edge B, as fractions of its length."""
 
 _OPENINGS = np.linspace(0.0, LENGTH, 20)
 _HANDLE = np.linspace(0.0, 0.6, 50)
@@ -41,16 +41,16 @@ _BEFORE_CLOSED = tuple(10.0**-k for k in range(1, 9))
 
 @dataclass(frozen=True)
 class GarageDoorCurves:
-    """Data of both plots, and the slopes.
+    """Curves of the three plots.
 
     Attributes
     ----------
     paths
-        The points in x and z by name, (20, 2) each [m].
+        Paths of points in x and z by name, (20, 2) each [m].
     unlocked
-        The upper bound of the speed by the position of the door, (50,) each.
+        Upper bound of the speed by the position of the door, (50,) each.
     published, regular
-        How far the upper edge moves per metre of a, and per radian of the angle, along the way.
+        Speed of the upper edge per unit of a [m/m], and of the angle [m/rad], (200,) each.
     """
 
     paths: dict[str, Array]
@@ -60,14 +60,14 @@ class GarageDoorCurves:
 
 
 def run(progress: Progress, options: Options) -> Report:
-    """Evaluate the door and its lock where the paper does."""
+    """Evaluate the door and its lock at the positions of the paper."""
     published, regular = _make_door("published"), _make_door("regular")
     paths = {
         name: _edge_path(published, part, _OPENINGS)
         for name, part in progress(PARTS.items(), "fig3", "point")
     }
     angles = np.arccos(_OPENINGS / LENGTH)
-    apart = max(
+    difference = max(
         float(np.abs(_edge_path(regular, part, angles) - paths[n]).max()) for n, part in PARTS.items()
     )
     inputs = [published.symbol("garage/door"), published.symbol("garage/bolt")]
@@ -116,7 +116,7 @@ def run(progress: Progress, options: Options) -> Report:
             "length": LENGTH,
             "a": _OPENINGS.tolist(),
             "paths": {name: path.tolist() for name, path in paths.items()},
-            "forms_apart": apart,
+            "forms_apart": difference,
             "b": _HANDLE.tolist(),
             "unlocked": {f"a={a:g}": u.tolist() for a, u in unlocked.items()},
             "before_closed": list(_BEFORE_CLOSED),
@@ -137,30 +137,30 @@ def _make_door(form: str) -> Model:
 
 
 def _edge_path(model: Model, part: float, coordinates: Array) -> Array:
-    """Return a point of the door in x and z at coordinates, (N, 2)."""
-    place = (model.fk("garage/door") @ point(0, 0, part * LENGTH))[[0, 2]]
-    found: Array = compile(place, [model.symbol("garage/door")]).batch(coordinates[:, None])
-    return found
+    """Return the path of a point of the door in x and z at coordinates, (N, 2)."""
+    position = (model.fk("garage/door") @ point(0, 0, part * LENGTH))[[0, 2]]
+    path: Array = compile(position, [model.symbol("garage/door")]).batch(coordinates[:, None])
+    return path
 
 
 def _slopes(model: Model, coordinates: Array) -> Array:
     """Return the length of the derivative of the upper edge's position by the coordinate."""
     q = model.symbol("garage/door")
-    place = model.fk("garage/upper_edge")[:3, 3]
-    derivative = compile(place.jacobian([q]), [q]).batch(coordinates[:, None])
+    position = model.fk("garage/upper_edge")[:3, 3]
+    derivative = compile(position.jacobian([q]), [q]).batch(coordinates[:, None])
     slopes: Array = np.linalg.norm(derivative.reshape(len(coordinates), 3), axis=1)
     return slopes
 
 
 def _draw(canvas: Canvas, measured: GarageDoorCurves) -> None:
-    way, lock, slope = canvas.subplots(1, 3)
+    door, lock, slope = canvas.subplots(1, 3)
     for i in range(len(_OPENINGS)):
         ends = np.array([measured.paths[name][i] for name in ("A", "B")])
-        way.plot(*ends.T, color="0.85", linewidth=1, zorder=1)
+        door.plot(*ends.T, color="0.85", linewidth=1, zorder=1)
     for name, path in measured.paths.items():
-        way.plot(*path.T, marker="o", markersize=3, label=name)
-    way.set(title="the door, a = 0 … 2 m", xlabel="x [m]", ylabel="z [m]", aspect="equal")
-    way.legend(title="along the door")
+        door.plot(*path.T, marker="o", markersize=3, label=name)
+    door.set(title="the door, a = 0 … 2 m", xlabel="x [m]", ylabel="z [m]", aspect="equal")
+    door.legend(title="along the door")
     for (a, bound), style in zip(measured.unlocked.items(), ("--", "-"), strict=True):
         lock.plot(_HANDLE, bound, style, label=f"a = {a:g} m")
     lock.axvline(0.3, color="0.8", zorder=0)

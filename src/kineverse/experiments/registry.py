@@ -21,29 +21,29 @@ class Options:
     Attributes
     ----------
     quick
-        A part of it, in seconds.
+        True for a reduced experiment, in seconds.
     data
-        The folder of the recordings that it is about.
+        Folder of recordings; None for the default.
     model
-        The model that it is about, a name or path.
+        Name or path of the model; None for the default.
     """
 
     quick: bool = False
     data: Path | None = None
     model: str | None = None
 
-    def check(self, name: str, taken: Sequence[str]) -> None:
-        """Look whether an experiment takes what was given.
+    def check(self, name: str, supported: Sequence[str]) -> None:
+        """Check that an experiment supports the options that are set.
 
         Raises
         ------
         InvalidValueError
-            If not, with what it takes.
+            If one is not supported, with those that are.
         """
         given = [field.name for field in fields(self) if getattr(self, field.name) != field.default]
         for option in given:
-            if option not in taken:
-                takes = ", ".join(f"--{known}" for known in taken) or "none"
+            if option not in supported:
+                takes = ", ".join(f"--{known}" for known in supported) or "none"
                 raise InvalidValueError(f"The experiment '{name}' takes no --{option}. It takes {takes}.")
 
 
@@ -57,7 +57,7 @@ EXPERIMENTS: Mapping[str, str] = MappingProxyType(
         "estimation-grid": "hinges and sliders learned from noisy poses, against the Cramér-Rao bound",
     }
 )
-"""Names of experiments: the modules of this package, with a dash for an underscore."""
+"""Descriptions of experiments by name; the names are modules of this package, with dashes for underscores."""
 
 
 def reproduce(name: str, progress: Progress | None = None, options: Options | None = None) -> Report:
@@ -68,16 +68,16 @@ def reproduce(name: str, progress: Progress | None = None, options: Options | No
     name
         One of :data:`EXPERIMENTS`.
     progress
-        Wraps what is worked on, like :func:`kineverse.cli.output.show_progress`; None for silence.
+        Progress reporter, such as :func:`kineverse.cli.output.show_progress`; None for none.
     options
-        How it is made; None for the defaults.
+        Options; the defaults if None.
 
     Raises
     ------
     UnknownNameError
         If there is no such experiment, with similar names.
     InvalidValueError
-        If it does not take an option.
+        If it does not support an option.
     """
     if name not in EXPERIMENTS:
         raise UnknownNameError(

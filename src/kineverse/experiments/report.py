@@ -17,16 +17,16 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class ReportTable:
-    """Rows of cells, numbers or texts.
+    """Table of a report.
 
     Attributes
     ----------
     title
-        What they are about.
+        Title of the table.
     head
-        The titles of the columns, with units.
+        Titles of the columns, with units.
     rows
-        The cells.
+        Rows of cells, numbers or texts.
     """
 
     title: str
@@ -36,12 +36,12 @@ class ReportTable:
 
 @dataclass(frozen=True)
 class Figure:
-    """A picture that is drawn when it is wanted.
+    """Picture that is drawn on demand.
 
     Attributes
     ----------
     draw
-        Draws on an empty canvas of matplotlib.
+        Function that draws on an empty matplotlib figure.
     size
         Width and height [inch].
     """
@@ -50,16 +50,16 @@ class Figure:
     size: tuple[float, float]
 
     def save(self, path: Path) -> None:
-        """Write the picture to a file; its suffix says how.
+        """Write the picture to a file, in the format of its suffix.
 
         Raises
         ------
         MissingDependencyError
-            Without matplotlib.
+            If matplotlib is not installed.
         FormatError
-            If the file cannot be written, or in no format of that suffix.
+            If the file cannot be written, or its suffix is unknown.
         """
-        # Without pyplot: it would look for a screen, and keep the figure.
+        # Not with pyplot, which would search for a display and keep a reference to the figure.
         canvas = _matplotlib("matplotlib.figure").Figure(figsize=self.size, layout="constrained")
         self.draw(canvas)
         try:
@@ -75,13 +75,13 @@ class Report:
     Attributes
     ----------
     name, title
-        Its name, and what it is about.
+        Name and title of the experiment.
     tables
-        For people.
+        Tables to print.
     numbers
-        For programs: plain values, lists and mappings of these, as JSON has them.
+        Results as JSON data.
     figure
-        The picture.
+        Picture of the results.
     """
 
     name: str
@@ -92,12 +92,12 @@ class Report:
 
 
 def check_drawing() -> None:
-    """Look whether figures can be drawn here.
+    """Check that figures can be drawn.
 
     Raises
     ------
     MissingDependencyError
-        Without matplotlib.
+        If matplotlib is not installed.
     """
     _matplotlib("matplotlib.figure")
 

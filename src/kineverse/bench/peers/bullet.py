@@ -1,4 +1,4 @@
-"""Pairs within a distance, as Bullet finds them."""
+"""Pairs within a distance in Bullet."""
 
 from __future__ import annotations
 
@@ -11,47 +11,47 @@ from kineverse.lie import Array, to_quaternion
 from .clutter_search import PairDistances
 
 _LINKS_PER_BODY = 100
-"""Number of boxes in one body: Bullet bounds the number of links."""
+"""Number of boxes in one body, as Bullet limits the number of links."""
 
 
 class BulletSearch:
-    """Bullet: getClosestPoints of the arm and of one body that has all boxes as links."""
+    """Search with Bullet's getClosestPoints of the arm and bodies with the boxes as links."""
 
-    def __init__(self, crowd: Clutter) -> None:
+    def __init__(self, clutter: Clutter) -> None:
         import pybullet
 
         self._bullet: Any = pybullet
         self._client = pybullet.connect(pybullet.DIRECT)
-        shapes = [_create_link_shape(pybullet, crowd, link, self._client) for link in range(LINKS)]
+        shapes = [_create_link_shape(pybullet, clutter, link, self._client) for link in range(LINKS)]
         links = [[0.0, 0.0, LINK_LENGTH if link else 0.0] for link in range(LINKS)]
-        axes = [list(crowd.axis(link)) for link in range(LINKS)]
+        axes = [list(clutter.axis(link)) for link in range(LINKS)]
         self._arm = _create_body(pybullet, shapes, links, None, axes, self._client)
         boxes = [
             pybullet.createCollisionShape(
                 pybullet.GEOM_BOX, halfExtents=(size / 2).tolist(), physicsClientId=self._client
             )
-            for size in crowd.sizes
+            for size in clutter.sizes
         ]
-        self._bodies = create_static_bodies(pybullet, boxes, crowd.poses, self._client)
+        self._bodies = create_static_bodies(pybullet, boxes, clutter.poses, self._client)
         self._joints = list(range(LINKS))
-        self.found: list[Any] = []
+        self.results: list[Any] = []
 
     def update(self, angles: Array) -> None:
-        """Set the joint angles [rad]."""
+        """Set the joint angles."""
         rows = angles[:, None].tolist()
         self._bullet.resetJointStatesMultiDof(
             self._arm, self._joints, targetValues=rows, physicsClientId=self._client
         )
 
-    def find(self) -> object:
-        """Find the pairs within the radius."""
-        ask, arm, client = self._bullet.getClosestPoints, self._arm, self._client
-        self.found = [ask(arm, body, RADIUS, physicsClientId=client) for body in self._bodies]
-        return self.found
+    def query(self) -> object:
+        """Search for pairs within the radius."""
+        closest_points, arm, client = self._bullet.getClosestPoints, self._arm, self._client
+        self.results = [closest_points(arm, body, RADIUS, physicsClientId=client) for body in self._bodies]
+        return self.results
 
     def distances(self) -> PairDistances:
-        """Return the pairs of the last search."""
-        for contact in itertools.chain(*self.found):
+        """Return the pairs of the last search, with distances [m]."""
+        for contact in itertools.chain(*self.results):
             yield f"link{contact[3]}", f"box{self._bodies[contact[2]] + contact[4]}", contact[8]
 
     def __del__(self) -> None:
@@ -59,11 +59,11 @@ class BulletSearch:
 
 
 def create_static_bodies(pybullet: Any, shapes: list[int], poses: Array, client: int) -> dict[int, int]:
-    """Make bodies of shapes that stand at poses, (N, 3, 4) or larger, each shape a link.
+    """Create static bodies of shapes at poses, (N, 3, 4) or larger, each shape a link.
 
     Returns
     -------
-    By the number of the body, which shape its first link is.
+    Index of the shape of the first link, by body.
     """
     bodies = {}
     for first in range(0, len(shapes), _LINKS_PER_BODY):
@@ -73,8 +73,8 @@ def create_static_bodies(pybullet: Any, shapes: list[int], poses: Array, client:
     return bodies
 
 
-def _create_link_shape(pybullet: Any, crowd: Clutter, link: int, client: int) -> int:
-    kind = crowd.kind(link)
+def _create_link_shape(pybullet: Any, clutter: Clutter, link: int, client: int) -> int:
+    kind = clutter.kind(link)
     at = {"collisionFramePosition": list(CENTRE), "physicsClientId": client}
     if kind == "box":
         half = [edge / 2 for edge in BOX_SIZE]
@@ -82,7 +82,9 @@ def _create_link_shape(pybullet: Any, crowd: Clutter, link: int, client: int) ->
     if kind == "capsule":
         radius, length = CAPSULE_SIZE
         return int(pybullet.createCollisionShape(pybullet.GEOM_CAPSULE, radius=radius, height=length, **at))
-    return int(pybullet.createCollisionShape(pybullet.GEOM_MESH, vertices=crowd.corners[link].tolist(), **at))
+    return int(
+        pybullet.createCollisionShape(pybullet.GEOM_MESH, vertices=clutter.corners[link].tolist(), **at)
+    )
 
 
 def _create_body(
@@ -93,7 +95,7 @@ def _create_body(
     axes: list[list[int]] | None,
     client: int,
 ) -> int:
-    """Make a chain of links that turn about axes, or links that stand if there are none."""
+    """Create a chain of revolute links, or static links if there are no axes."""
     count, nothing, upright = len(shapes), [0.0, 0.0, 0.0], [0.0, 0.0, 0.0, 1.0]
     fixed, turning = pybullet.JOINT_FIXED, pybullet.JOINT_REVOLUTE
     return int(
@@ -116,5 +118,5 @@ def _create_body(
 
 def xyzw_quaternions(poses: Array) -> list[list[float]]:
     """Return (x, y, z, w) of (N, 3, 4) or larger poses."""
-    found: list[list[float]] = to_quaternion(poses[:, :3, :3]).tolist()
-    return found
+    quaternions: list[list[float]] = to_quaternion(poses[:, :3, :3]).tolist()
+    return quaternions

@@ -1,4 +1,4 @@
-"""CasADi graph of the robot over many points: its own map in C, and numpy operation by operation."""
+"""CasADi graph of the robot at many points, as CasADi's map in C and as numpy operations."""
 
 from __future__ import annotations
 
@@ -17,11 +17,11 @@ from kineverse.errors import CompileError
 from kineverse.lie import Array
 
 COMPILER_FLAGS = ("-O3", "-march=native", "-fPIC", "-shared")
-"""Choice of a user of CasADi. The C of the map is faster than a map over the C of the function."""
+"""Flags for the C code of a map, which is faster than a map over the C code of the function."""
 
 
 def make_casadi_function(robot: BenchmarkRobot) -> Any:
-    """Return pose and Jacobian of the robot's frame as a function of CasADi's, common parts shared.
+    """Return pose and Jacobian of the robot's frame as a CasADi function with common subexpressions shared.
 
     CasADi stores columns first, numpy rows first, so the outputs are transposed.
     """
@@ -53,20 +53,20 @@ def compile_map(function: Any, rows: int, folder: Path) -> Any:
 
 
 class BoundMap:
-    """A map with the memory it reads and writes.
+    """CasADi map bound to its input and output memory.
 
     Parameters
     ----------
     function
-        A map.
+        CasADi map.
     points
-        Its input, a row for each point.
+        Input, a row for each point.
     outputs
-        What it writes.
+        Output arrays.
     """
 
     def __init__(self, function: Any, points: Array, outputs: tuple[Array, ...]) -> None:
-        self._kept = function, points, outputs
+        self._references = function, points, outputs
         self._buffer, self._run = function.buffer()
         self._buffer.set_arg(0, points.reshape(-1).data)
         for k, output in enumerate(outputs):
@@ -78,7 +78,7 @@ class BoundMap:
 
 
 CHUNK_SIZE = 1024
-"""So many points that the columns of a graph stay in the cache, and numpy's overhead is small."""
+"""Number of points of a chunk: columns stay in the cache, and numpy's overhead is small."""
 
 NUMPY_OPERATIONS: Mapping[int, Callable[..., Any]] = MappingProxyType(
     {
@@ -96,21 +96,21 @@ NUMPY_OPERATIONS: Mapping[int, Callable[..., Any]] = MappingProxyType(
         ca.OP_ASSIGN: lambda x, out: np.copyto(out, x),
     }
 )
-"""Data of the kinematics of joints with one coordinate."""
+"""Numpy functions of CasADi's operations, as far as joints with one coordinate need them."""
 
 
 class NumpyGraph:
-    """A function of CasADi's, of one vector, that numpy evaluates at many points.
+    """CasADi function of one vector, evaluated with numpy at many points.
 
     Parameters
     ----------
     function
-        With scalar instructions only, as those of ``SX`` are.
+        Function with scalar instructions only, such as one of ``SX``.
 
     Raises
     ------
     CompileError
-        If it contains operations that are not among :data:`NUMPY_OPERATIONS`.
+        If it contains an operation that is not in :data:`NUMPY_OPERATIONS`.
     """
 
     def __init__(self, function: Any) -> None:

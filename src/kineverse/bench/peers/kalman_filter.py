@@ -12,21 +12,21 @@ from kineverse.model.model import Model
 
 Form: TypeAlias = Literal["gain", "information"]
 
-# The same as a tracker's: a step of so many standard deviations is the last.
+# Step in standard deviations that ends the iteration, as in the tracker.
 CONVERGED = 1e-5
 
 
 class NumpyFilter:
-    """An iterated extended Kalman filter over the poses of frames, all coordinates in one state.
+    """Iterated extended Kalman filter of all coordinates from poses of frames.
 
     Parameters
     ----------
     model, frames
-        What is seen; its poses and Jacobians are compiled as one function.
+        Model and observed frames, whose poses and Jacobians are compiled as one function.
     covariance
-        Of each pose, 6×6.
+        Covariance of each pose, (6, 6).
     mean, variances
-        Of the coordinates at the start.
+        Initial means and variances of the coordinates.
     form
         ``"gain"``: K = P Hᵀ (H P Hᵀ + R)⁻¹, as in textbooks (Bell and Cathey, IEEE Trans. Automatic Control
         38, 1993). ``"information"``: Λ + Hᵀ R⁻¹ H, a system as large as the state.
@@ -53,19 +53,19 @@ class NumpyFilter:
         self.start = mean, np.diag(variances)
 
     def run(self, readings: list[Array]) -> list[tuple[Array, Array]]:
-        """Return mean and covariance after each reading (m, 4, 4), from the start on."""
+        """Return mean and covariance after each reading (m, 4, 4), from the initial state."""
         mean, covariance = self.start
-        found = []
-        for seen in readings:
-            mean, covariance = self._update(mean, covariance, seen)
-            found.append((mean, covariance))
-        return found
+        estimates = []
+        for poses in readings:
+            mean, covariance = self._update(mean, covariance, poses)
+            estimates.append((mean, covariance))
+        return estimates
 
-    def _update(self, prior: Array, P: Array, seen: Array) -> tuple[Array, Array]:
+    def _update(self, prior: Array, P: Array, poses: Array) -> tuple[Array, Array]:
         x = prior
         information = np.linalg.inv(P) if self._form == "information" else P
         while True:
-            error, H = self._linear(x, seen)
+            error, H = self._linearise(x, poses)
             if self._form == "gain":
                 K = P @ H.T @ np.linalg.inv(H @ P @ H.T + self._covariance)
                 after = prior + K @ (error - H @ (prior - x))
@@ -82,10 +82,10 @@ class NumpyFilter:
             if moved @ moved < CONVERGED**2:
                 return x, covariance
 
-    def _linear(self, x: Array, seen: Array) -> tuple[Array, Array]:
-        """Return errors (6 m,) and derivatives (6 m, n) of the predicted poses at x."""
-        said, jacobian = self._evaluate(x)
-        turned = seen[:, :3, :3] @ said[:, :3, :3].transpose(0, 2, 1)
+    def _linearise(self, x: Array, poses: Array) -> tuple[Array, Array]:
+        """Return the innovations (6 m,) and the measurement Jacobian (6 m, n) at x."""
+        predicted, jacobian = self._evaluate(x)
+        turned = poses[:, :3, :3] @ predicted[:, :3, :3].transpose(0, 2, 1)
         sine = (
             np.stack(
                 [
@@ -104,5 +104,5 @@ class NumpyFilter:
         factor = (1 - angle / 2 / np.tan(angle / 2)) / angle**2
         back = np.eye(3) + k / 2 + factor[:, None, None] * (k @ k)
         H = np.concatenate([jacobian[:, :3], back @ jacobian[:, 3:]], axis=1)
-        error = np.concatenate([seen[:, :3, 3] - said[:, :3, 3], vector], axis=1)
+        error = np.concatenate([poses[:, :3, 3] - predicted[:, :3, 3], vector], axis=1)
         return error.reshape(-1), H.reshape(-1, H.shape[2])

@@ -13,21 +13,21 @@ from kineverse.lie import Array, transform
 
 
 class MujocoRobot:
-    """A robot in MuJoCo, with all of its links and without its shapes.
+    """Robot in MuJoCo, with all links and without shapes.
 
     Parameters
     ----------
     robot
-        Whose file is read.
+        Robot whose file is read.
 
     Attributes
     ----------
     model, data
-        MuJoCo's.
+        Model and data of MuJoCo.
     body
-        The number of the frame.
+        Index of the frame's body.
     jacobian
-        Where :meth:`pose_and_jacobian` has the Jacobian of all joints written, shape (6, nv).
+        Output array of :meth:`pose_and_jacobian`, the Jacobian of all joints, (6, nv).
     """
 
     def __init__(self, robot: BenchmarkRobot) -> None:
@@ -51,14 +51,14 @@ class MujocoRobot:
         return self.pose(self.body), self.jacobian[:, self.columns]
 
     def pose(self, body: int) -> Array:
-        """Return the pose of a body, shape (4, 4)."""
+        """Return the pose of a body, (4, 4)."""
         return transform(self.data.xmat[body].reshape(3, 3), self.data.xpos[body])
 
 
 def make_robot_mjcf(robot: BenchmarkRobot) -> str:
-    """Return the robot's file as MuJoCo takes it.
+    """Return the robot's file with options for MuJoCo.
 
-    It wants meshes that exist, merges links that do not move, and refuses moving ones without inertia.
+    By default MuJoCo requires mesh files, merges fixed links, and refuses moving links without inertia.
     """
     root = ElementTree.fromstring(strip_shapes(robot.file))
     options = {"fusestatic": "false", "balanceinertia": "true", "boundmass": "1e-6", "boundinertia": "1e-9"}

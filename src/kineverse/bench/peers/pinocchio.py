@@ -12,24 +12,23 @@ from kineverse.lie import Array
 
 
 class PinocchioRobot:
-    """A robot in pinocchio.
+    """Robot in pinocchio.
 
     Parameters
     ----------
     robot
-        Whose file is read.
+        Robot whose file is read.
     reduced
-        Whether only the joints that move the robot's frame are kept, which is several times as fast.
+        True to keep only the joints that move the robot's frame, which is several times as fast.
 
     Attributes
     ----------
     model, data
-        Pinocchio's.
+        Model and data of pinocchio.
     frame
-        The number of the frame.
+        Index of the frame.
     pose
-        The frame's placement inside of ``data``. To look it up there for every call would take longer than
-        the kinematics.
+        Placement of the frame within ``data``. A lookup in each call would take longer than the kinematics.
     """
 
     def __init__(self, robot: BenchmarkRobot, reduced: bool = False) -> None:
@@ -45,7 +44,7 @@ class PinocchioRobot:
         self.columns: list[int] = [model.joints[model.getJointId(name)].idx_v for name in moving]
 
     def rows(self, positions: dict[str, Array]) -> list[Array]:
-        """Return configurations in pinocchio's coordinates, where a continuous joint has cosine and sine."""
+        """Return configurations in pinocchio's coordinates; a continuous joint has cosine and sine."""
         columns: list[Array] = []
         for name, joint in list(zip(self.model.names, self.model.joints, strict=True))[1:]:
             angle = positions[name]

@@ -1,4 +1,4 @@
-"""Pairs within a distance of a robot in a room: MuJoCo, Bullet."""
+"""Pairs within a distance of a robot and a room: MuJoCo, Bullet."""
 
 from __future__ import annotations
 
@@ -18,16 +18,16 @@ from .clutter_search import UNIT_BOX_CORNERS, MujocoSearch, PairDistances, forma
 
 
 class RobotSurroundings:
-    """The pieces of a scene: those of a robot, and those of the room, which stand.
+    """Collision objects of a scene, divided into those of a robot and the static ones of a room.
 
     Parameters
     ----------
     scene
-        A scene.
+        Scene of both.
     values
-        Of its inputs, at which the room stands.
+        Values of the scene's inputs, for the poses of the room.
     robot
-        What the names of the robot's bodies begin with.
+        Prefix of the names of the robot's bodies.
     """
 
     def __init__(self, scene: Scene, values: Array, robot: str) -> None:
@@ -39,21 +39,21 @@ class RobotSurroundings:
         self.others = [k for k, name in enumerate(self.names) if not name.startswith(robot)]
 
     def update(self, values: Array) -> Array:
-        """Move the robot, and return the (N, 3, 4) poses of its pieces."""
+        """Move the robot, and return the poses of its objects, (N, 3, 4)."""
         self._scene.update(values)
         return self.poses(self.robot)
 
-    def poses(self, pieces: list[int]) -> Array:
-        """Return (N, 3, 4) poses of some pieces."""
-        return self._world.table.poses[pieces]
+    def poses(self, objects: list[int]) -> Array:
+        """Return the poses of objects, (N, 3, 4)."""
+        return self._world.table.poses[objects]
 
-    def solid(self, piece: int) -> Solid:
-        """Return the solid of a collision object."""
-        return self._world.solid(piece)
+    def solid(self, index: int) -> Solid:
+        """Return the solid of an object."""
+        return self._world.solid(index)
 
 
 class MujocoRobotSearch(MujocoSearch):
-    """MuJoCo's own search, in which each piece of the robot is a free body; see :class:`.MujocoSearch`."""
+    """Search with MuJoCo, each object of the robot a free body; see :class:`.MujocoSearch`."""
 
     def __init__(self, room: RobotSurroundings) -> None:
         self._room = room
@@ -73,14 +73,14 @@ class MujocoRobotSearch(MujocoSearch):
         self.names = [room.names[int(name)] for name in self.names]
 
     def update(self, angles: Array) -> None:
-        """Set the joint angles [rad]."""
+        """Set the state of the robot."""
         poses = self._room.update(angles)
         self.data.qpos.reshape(-1, 7)[:] = np.hstack([poses[:, :, 3], to_wxyz(poses)])
         self._mujoco.mj_kinematics(self.model, self.data)
 
 
 def _mjcf_geom(number: int, solid: Solid) -> tuple[str, str]:
-    """Return the asset and the attributes of a piece in MJCF."""
+    """Return the asset and the geom attributes of an object in MJCF."""
     shape, name = solid.surface, f'name="{number}"'
     if isinstance(shape, Sphere):
         return "", f'{name} type="sphere" size="{shape.radius!r}"'
@@ -103,7 +103,7 @@ def _solid_corners(solid: Solid) -> Array:
 
 
 class BulletRobotSearch:
-    """Bullet: getClosestPoints of each piece of the robot and of bodies that have all others as links."""
+    """Search with Bullet's getClosestPoints of each object of the robot and bodies of the others."""
 
     def __init__(self, room: RobotSurroundings) -> None:
         import pybullet
@@ -117,30 +117,30 @@ class BulletRobotSearch:
             pybullet.createMultiBody(1.0, self._shape(room.solid(k)), physicsClientId=client): k
             for k in room.robot
         }
-        self.found: list[tuple[int, int, Any]] = []
+        self.results: list[tuple[int, int, Any]] = []
 
     def update(self, angles: Array) -> None:
-        """Set the joint angles [rad]."""
+        """Set the state of the robot."""
         poses, place = self._room.update(angles), self._bullet.resetBasePositionAndOrientation
         for body, at, turn in zip(self._robot, poses[:, :, 3].tolist(), xyzw_quaternions(poses), strict=True):
             place(body, at, turn, physicsClientId=self._client)
 
-    def find(self) -> object:
-        """Find the pairs within the radius."""
-        ask, client = self._bullet.getClosestPoints, self._client
-        self.found = [
-            (piece, first, ask(one, other, RADIUS, physicsClientId=client))
-            for one, piece in self._robot.items()
+    def query(self) -> object:
+        """Search for pairs within the radius."""
+        closest_points, client = self._bullet.getClosestPoints, self._client
+        self.results = [
+            (index, first, closest_points(body, other, RADIUS, physicsClientId=client))
+            for body, index in self._robot.items()
             for other, first in self._bodies.items()
         ]
-        return self.found
+        return self.results
 
     def distances(self) -> PairDistances:
-        """Return the pairs of the last search."""
+        """Return the pairs of the last search, with distances [m]."""
         names, others = self._room.names, self._room.others
-        for piece, first, contacts in self.found:
+        for index, first, contacts in self.results:
             for contact in contacts:
-                yield names[piece], names[others[first + contact[4]]], contact[8]
+                yield names[index], names[others[first + contact[4]]], contact[8]
 
     def _shape(self, solid: Solid) -> int:
         bullet, shape = self._bullet, solid.surface

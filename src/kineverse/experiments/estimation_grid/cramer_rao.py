@@ -60,18 +60,18 @@ def compute_bound(samples: JointSamples) -> Bound:
     """Return the Cramér-Rao bound of samples."""
     cell = samples.cell
     shared = 8 if cell.joint == "prismatic" else 10
-    weighed = _derivatives(samples, shared, range(shared + UNKNOWNS_PER_OBSERVATION))
+    weighted = _derivatives(samples, shared, range(shared + UNKNOWNS_PER_OBSERVATION))
     # The joint's zero is a gauge freedom, so the first joint value may be known without loss.
-    weighed[:, 0, :, -1] = 0.0
-    of_shared, of_own = weighed[..., :shared], weighed[..., shared:]
-    information = _transpose(of_shared) @ of_shared
-    mixed = _transpose(of_own) @ of_shared
-    own = _transpose(of_own) @ of_own
+    weighted[:, 0, :, -1] = 0.0
+    by_shared, by_own = weighted[..., :shared], weighted[..., shared:]
+    information = _transpose(by_shared) @ by_shared
+    mixed = _transpose(by_own) @ by_shared
+    own = _transpose(by_own) @ by_own
     own[:, 0, -1, -1] = 1.0
-    left = (information - _transpose(mixed) @ np.linalg.solve(own, mixed)).sum(axis=1)
-    covariance = np.linalg.inv(left)
-    nowhere = np.full((len(covariance), 2, 2), math.nan)
-    return Bound(covariance[:, :2, :2], covariance[:, 2:4, 2:4] if cell.joint == "revolute" else nowhere)
+    reduced = (information - _transpose(mixed) @ np.linalg.solve(own, mixed)).sum(axis=1)
+    covariance = np.linalg.inv(reduced)
+    undefined = np.full((len(covariance), 2, 2), math.nan)
+    return Bound(covariance[:, :2, :2], covariance[:, 2:4, 2:4] if cell.joint == "revolute" else undefined)
 
 
 def compute_attainable_bound(samples: JointSamples) -> Bound:
@@ -81,8 +81,8 @@ def compute_attainable_bound(samples: JointSamples) -> Bound:
     variance = np.linalg.inv(_transpose(own) @ own)[..., -1, -1]
     values = samples.joint_values
     middle, spread = values.mean(axis=1, keepdims=True), values.var(axis=1, keepdims=True)
-    left = np.sqrt(spread / (spread + variance))
-    return compute_bound(replace(samples, joint_values=middle + left * (values - middle)))
+    contraction = np.sqrt(spread / (spread + variance))
+    return compute_bound(replace(samples, joint_values=middle + contraction * (values - middle)))
 
 
 def orthonormal_complement(axis: Array) -> Array:
@@ -95,16 +95,16 @@ def orthonormal_complement(axis: Array) -> Array:
 
 def _derivatives(samples: JointSamples, shared: int, unknowns: Sequence[int]) -> Array:
     """Return the derivatives of the measurements by some unknowns, in standard deviations, (S, N, 12, n)."""
-    found = np.stack([_difference(samples, shared, k) for k in unknowns], axis=-1)
-    weighed: Array = found / _deviations(samples.cell)[:, None]
-    return weighed
+    derivatives = np.stack([_difference(samples, shared, k) for k in unknowns], axis=-1)
+    weighted: Array = derivatives / _deviations(samples.cell)[:, None]
+    return weighted
 
 
 def _difference(samples: JointSamples, shared: int, k: int) -> Array:
     """Return the derivatives of the measurements by the unknown k, (S, N, 12)."""
-    there, back = (_observation_errors(samples, shared, k, sign * STEP) for sign in (1.0, -1.0))
-    found: Array = (there - back) / (2.0 * STEP)
-    return found
+    forward, backward = (_observation_errors(samples, shared, k, sign * STEP) for sign in (1.0, -1.0))
+    derivative: Array = (forward - backward) / (2.0 * STEP)
+    return derivative
 
 
 def _observation_errors(samples: JointSamples, shared: int, k: int, step: float) -> Array:

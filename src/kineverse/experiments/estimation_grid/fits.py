@@ -153,7 +153,7 @@ def _seed(cell: Cell) -> list[int]:
 
 
 def _end_with_parent() -> None:
-    """End this worker process when its parent is gone, because no signal tells it."""
+    """End this worker process when its parent ends, because it receives no signal."""
     parent = multiprocessing.parent_process()
     assert parent is not None  # this runs in a worker process
 

@@ -15,7 +15,7 @@ from kineverse.lie import Array
 Flags = npt.NDArray[np.bool_]
 
 NEAR, TELLING = 10.0, 5.0
-"""Bounds [deg] below which errors are compared with the bound, and below which families have to be right."""
+"""Bounds [deg] below which errors are compared with the bound, and below which families must be correct."""
 
 MOST_OVER, LEAST_RIGHT = 1.1, 0.99
 """Largest ratio of errors to a bound, and least share of right families."""

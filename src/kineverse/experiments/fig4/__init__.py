@@ -1,8 +1,8 @@
 """``fig4``: tracking a kitchen from poses of its parts (2020 paper, IV-A; 2022 paper, IV-B, Fig. 4).
 
-The papers' filter and :class:`kineverse.estimation.Tracker` see the same observations. Beside what the papers
-plot stands what their noise cannot show: whether a filter is as good as the Cramér-Rao bound allows, and
-whether its covariance is true.
+The papers' filter and :class:`kineverse.estimation.Tracker` get the same observations. In addition to the
+papers' plots, errors are compared with the Cramér-Rao bound and with the covariance of each filter, under
+Gaussian noise.
 """
 
 from __future__ import annotations
@@ -21,13 +21,13 @@ from .timing import time_updates, time_updates_by_size
 OPTIONS = ("quick", "model")
 
 TIMED = 40
-"""So many configurations are timed, one by one."""
+"""Number of configurations that are timed."""
 
 
 def run(progress: Progress, options: Options) -> Report:
     """Track the model with both filters, by the papers' protocol and beyond it.
 
-    With ``quick`` one seed instead of four, and a tenth of the configurations.
+    The option ``quick`` reduces four seeds to one, and the configurations to a tenth.
     """
     model = options.model or "kitchen"
     scene = make_observed_model(load(model))

@@ -24,12 +24,12 @@ from .protocol import (
 )
 
 FILTERS = ("published", "proper")
-"""The papers' own, and :class:`kineverse.estimation.Tracker`."""
+"""Names of the papers' filter and of :class:`kineverse.estimation.Tracker`."""
 
 REPORTED_MEAN = (0.0067, 0.0137, 0.0201, 0.0256)
-"""Mean errors of the authors' filter run again with ten gradient steps, mean of four seeds."""
+"""Mean errors of the authors' code with ten gradient steps, mean of four seeds, by level of noise."""
 REPORTED_MAX = (0.065, 0.115, 0.156, 0.247)
-"""The largest errors of one of these runs."""
+"""Largest errors of one of these runs, by level of noise."""
 
 
 @dataclass(frozen=True)
@@ -39,11 +39,11 @@ class Errors:
     Attributes
     ----------
     noise
-        The level.
+        Level of noise.
     by_filter
-        By filter, (seeds, C, n): for each seed and configuration those of all coordinates [m] or [rad].
+        Errors of all coordinates by filter, (seeds, C, n) [m] or [rad].
     nees
-        By filter, the mean over all states of (q̂ - q)²/σ²; 1 is right.
+        Mean of (q̂ - q)²/σ² over all states by filter; 1 for a consistent filter.
     """
 
     noise: PoseNoise
@@ -51,7 +51,7 @@ class Errors:
     nees: dict[str, float]
 
     def summary(self, filter_name: str, coordinates: Any = slice(None)) -> dict[str, Any]:
-        """Return mean, standard deviation and maximum over all, and means and maxima by seed."""
+        """Return mean, standard deviation and maximum of errors, and means and maxima by seed."""
         errors = self.by_filter[filter_name][:, :, coordinates]
         return {
             "mean": float(errors.mean()),
@@ -62,13 +62,13 @@ class Errors:
         }
 
     def rms(self, filter_name: str, coordinates: Any) -> float:
-        """Return the root of the mean square of some coordinates' errors."""
+        """Return the root mean square error of some coordinates."""
         return float(np.sqrt((self.by_filter[filter_name][:, :, coordinates] ** 2).mean()))
 
 
 @dataclass(frozen=True)
 class Variant:
-    """The published filter with something about it or about the noise changed."""
+    """Variant of the published filter or of the noise."""
 
     name: str
     steps: int = 10
@@ -88,19 +88,19 @@ VARIANTS = (
 def measure_errors(
     scene: ObservedModel, seeds: Sequence[int], configurations: int, progress: Progress
 ) -> tuple[Errors, ...]:
-    """Return the errors of both filters on the same observations, at the papers' levels."""
+    """Return the errors of both filters for equal observations, at the papers' levels of noise."""
     jobs = [(noise, seed) for noise in LEVELS for seed in seeds]
-    found: dict[PoseNoise, dict[str, list[tuple[Array, Array]]]] = {
-        n: {w: [] for w in FILTERS} for n in LEVELS
+    errors: dict[PoseNoise, dict[str, list[tuple[Array, Array]]]] = {
+        level: {filter_name: [] for filter_name in FILTERS} for level in LEVELS
     }
     for noise, seed in progress(jobs, "fig4: errors", "run"):
-        truth, seen, training = simulate_observations(scene, noise, seed, configurations)
+        truth, observations, training = simulate_observations(scene, noise, seed, configurations)
         for filter_name, run in (
-            ("published", run_published(scene, seen, training)),
-            ("proper", run_proper(scene, seen, noise.on_axes)),
+            ("published", run_published(scene, observations, training)),
+            ("proper", run_proper(scene, observations, noise.on_axes)),
         ):
             error = np.abs(run.q - truth)
-            found[noise][filter_name].append((error, error**2 / run.variance))
+            errors[noise][filter_name].append((error, error**2 / run.variance))
     return tuple(
         Errors(
             noise,
@@ -110,28 +110,28 @@ def measure_errors(
                 for filter_name, runs in by_filter.items()
             },
         )
-        for noise, by_filter in found.items()
+        for noise, by_filter in errors.items()
     )
 
 
 def measure_variants(
     scene: ObservedModel, seeds: Sequence[int], configurations: int, progress: Progress
 ) -> dict[str, list[float]]:
-    """Return the mean error of each variant at the papers' levels."""
-    found = {}
+    """Return the mean error of each variant at the papers' levels of noise."""
+    mean_errors = {}
     for variant in progress(VARIANTS, "fig4: variants", "variant"):
         means = []
         for noise in LEVELS:
             errors = []
             for seed in seeds:
-                truth, seen, training = simulate_observations(
+                truth, observations, training = simulate_observations(
                     scene, noise, seed, configurations, variant.directions
                 )
-                run = run_published(scene, seen, training, variant.steps, variant.spread)
+                run = run_published(scene, observations, training, variant.steps, variant.spread)
                 errors.append(np.abs(run.q - truth).mean())
             means.append(float(np.mean(errors)))
-        found[variant.name] = means
-    return found
+        mean_errors[variant.name] = means
+    return mean_errors
 
 
 def simulate_observations(
@@ -141,11 +141,11 @@ def simulate_observations(
     configurations: int,
     directions: Directions = "published",
 ) -> tuple[Array, Array, Array]:
-    """Return the truth (C, n), what is seen of it (25, C, m, 4, 4), and what R is learnt from (400, …)."""
+    """Return true states (C, n), observations (25, C, m, 4, 4), and others to learn R (400, m, 4, 4)."""
     rng = np.random.default_rng([seed, LEVELS.index(noise)])
-    still = scene.poses(scene.configurations(rng, 1))
-    training = add_published_noise(np.repeat(still, TRAINING, axis=0), noise, rng, directions)
+    static_poses = scene.poses(scene.configurations(rng, 1))
+    training = add_published_noise(np.repeat(static_poses, TRAINING, axis=0), noise, rng, directions)
     truth = scene.configurations(rng, configurations)
-    true = scene.poses(truth)
-    seen = [add_published_noise(true, noise, rng, directions) for _ in range(OBSERVATIONS)]
-    return truth, np.stack(seen), training
+    true_poses = scene.poses(truth)
+    observations = [add_published_noise(true_poses, noise, rng, directions) for _ in range(OBSERVATIONS)]
+    return truth, np.stack(observations), training

@@ -1,9 +1,9 @@
-"""Consistency of a filter (NEES, NIS), and its error beside the Cramér-Rao bound.
+"""Consistency of a filter (NEES, NIS), and its error relative to the Cramér-Rao bound.
 
-The noise is Gaussian on each axis here, so that there is a bound: of all unbiased estimators from K poses of
-m frames none has a smaller covariance than the inverse of K Σ Jᵀ W J (Cramér and Rao), with the frames'
-Jacobians J at the truth and the inverse covariance W of a pose. J comes from differences of poses: nothing
-that a filter uses is in it.
+The noise is Gaussian on each axis. No unbiased estimator from K poses of m frames then has a smaller
+covariance than the inverse of K Σ Jᵀ W J (Cramér-Rao bound), with the Jacobians J of the frames at the true
+state and the inverse covariance W of a pose. J is computed from differences of poses, independently of the
+filters.
 """
 
 from __future__ import annotations
@@ -36,7 +36,7 @@ LEVELS = (
     PoseNoise(0.10, math.radians(10.0)),
 )
 INTERIOR_DEVIATIONS = 3.0
-"""A truth is inside when it is so many of the bound's standard deviations away from its limits."""
+"""Least distance of an interior state from its limits, in standard deviations of the bound."""
 
 _STEP = 1e-5
 
@@ -48,16 +48,16 @@ class FilterConsistency:
     Attributes
     ----------
     nees_inside, nees
-        The mean over all states of (q̂ - q)²/σ², of truths inside the limits and of all; 1 is right.
+        Mean of (q̂ - q)²/σ² over interior states and over all states; 1 for a consistent filter.
     nis, nis_band
-        Innovation squared over its degrees of freedom, and where it lies 95 times in 100 if the filter is
-        right; NaN if it was not counted.
+        Normalised innovation squared over its degrees of freedom, and its 95 % interval for a consistent
+        filter; NaN if not computed.
     over_bound
-        The root of the mean of (q̂ - q)² over the bound, over truths inside the limits.
+        Root mean square of (q̂ - q) over the bound, over interior states.
     rms, bound
-        By ``"shifting"`` [m] and ``"turning"`` [rad] coordinates: the root mean square error and bound.
+        Root mean square error and bound of ``"shifting"`` [m] and ``"turning"`` [rad] coordinates.
     states
-        How many states are inside.
+        Number of interior states.
     """
 
     nees_inside: float
@@ -69,9 +69,9 @@ class FilterConsistency:
     bound: dict[str, float]
     states: int
 
-    def to_json(self) -> dict[str, Any]:
-        """Convert to JSON; null where nothing was counted."""
-        found: dict[str, Any] = {
+    def as_json(self) -> dict[str, Any]:
+        """Return the statistics as JSON data."""
+        numbers: dict[str, Any] = {
             "nees_inside": self.nees_inside,
             "nees_all": self.nees,
             "rmse_over_cramer_rao": self.over_bound,
@@ -80,39 +80,42 @@ class FilterConsistency:
             "states_inside": self.states,
         }
         if not math.isnan(self.nis):
-            found |= {"nis": self.nis, "nis_band": list(self.nis_band)}
-        return found
+            numbers |= {"nis": self.nis, "nis_band": list(self.nis_band)}
+        return numbers
 
 
 def measure_consistency(
     scene: ObservedModel, seeds: Sequence[int], configurations: int, progress: Progress
 ) -> dict[PoseNoise, dict[str, FilterConsistency]]:
-    """Return the consistency of both filters at each noise level."""
-    found = {}
+    """Return the statistics of both filters at each level of noise."""
+    statistics = {}
     for noise in progress(LEVELS, "fig4: consistency", "level"):
         truths, runs = [], []
         for seed in seeds:
             rng = np.random.default_rng([seed, LEVELS.index(noise), 1])
-            still = np.repeat(scene.poses(scene.configurations(rng, 1)), TRAINING, axis=0)
+            static_poses = np.repeat(scene.poses(scene.configurations(rng, 1)), TRAINING, axis=0)
             truth = scene.configurations(rng, configurations)
-            true = scene.poses(truth)
-            seen = np.stack([add_gaussian_noise(true, noise, rng) for _ in range(OBSERVATIONS)])
+            true_poses = scene.poses(truth)
+            observations = np.stack([add_gaussian_noise(true_poses, noise, rng) for _ in range(OBSERVATIONS)])
             truths.append(truth)
-            training = add_gaussian_noise(still, noise, rng)
+            training = add_gaussian_noise(static_poses, noise, rng)
             runs.append(
-                {"published": run_published(scene, seen, training), "proper": run_proper(scene, seen, noise)}
+                {
+                    "published": run_published(scene, observations, training),
+                    "proper": run_proper(scene, observations, noise),
+                }
             )
         truth = np.concatenate(truths)
         bound = cramer_rao(scene, truth, noise)
-        found[noise] = {
+        statistics[noise] = {
             filter_name: _evaluate_consistency(scene, truth, bound, [run[filter_name] for run in runs])
             for filter_name in runs[0]
         }
-    return found
+    return statistics
 
 
 def cramer_rao(scene: ObservedModel, q: Array, noise: PoseNoise, observations: int = OBSERVATIONS) -> Array:
-    """Return the least variance of each coordinate at configurations (C, n), (C, n)."""
+    """Return the Cramér-Rao bound of the variance of each coordinate at configurations (C, n), (C, n)."""
     information = np.zeros((*q.shape, q.shape[1]))
     jacobian = np.stack([_derivative(scene, q, i) for i in range(q.shape[1])], axis=-1)
     for rows, sigma in ((slice(0, 3), noise.position), (slice(3, 6), noise.orientation)):
@@ -131,8 +134,8 @@ def _derivative(scene: ObservedModel, q: Array, i: int) -> Array:
     turned = after[..., :3, :3] @ np.swapaxes(before[..., :3, :3], -1, -2)
     rotation = np.stack([turned[..., a, b] - turned[..., b, a] for a, b in ((2, 1), (0, 2), (1, 0))], axis=-1)
     shifted = after[..., :3, 3] - before[..., :3, 3]
-    found: Array = np.concatenate([shifted, rotation / 2], axis=-1) / (2 * _STEP)
-    return found
+    twists: Array = np.concatenate([shifted, rotation / 2], axis=-1) / (2 * _STEP)
+    return twists
 
 
 def _evaluate_consistency(
@@ -144,7 +147,7 @@ def _evaluate_consistency(
     inside = np.minimum(truth - lower, upper - truth) >= INTERIOR_DEVIATIONS * np.sqrt(bound)
     kinds = {"shifting": inside & ~scene.turning, "turning": inside & scene.turning}
     dof = sum(run.dof for run in runs)
-    # χ² of so many degrees of freedom is as good as Gaussian.
+    # χ² with many degrees of freedom is approximately Gaussian.
     margin = 1.96 * math.sqrt(2 / dof) if dof else math.nan
     return FilterConsistency(
         nees_inside=float(nees[inside].mean()),
@@ -158,5 +161,5 @@ def _evaluate_consistency(
     )
 
 
-def _root_mean(squares: Array, where: npt.NDArray[np.bool_]) -> float:
-    return float(np.sqrt(squares[where].mean()))
+def _root_mean(squares: Array, mask: npt.NDArray[np.bool_]) -> float:
+    return float(np.sqrt(squares[mask].mean()))

@@ -1,4 +1,4 @@
-"""Both filters on mechanisms that have no joint type: a folding door, and a garage door in both forms."""
+"""Tracking of mechanisms other than joints: a folding door, and a garage door in both forms."""
 
 from __future__ import annotations
 
@@ -36,7 +36,7 @@ MECHANISMS: dict[str, tuple[Operation, str]] = {
         "garage/door",
     ),
 }
-"""The operation, and the coordinate that is looked at."""
+"""Operation and evaluated coordinate of each mechanism."""
 
 
 @dataclass(frozen=True)
@@ -46,11 +46,11 @@ class CoordinateErrors:
     Attributes
     ----------
     mean, max
-        Of |q̂ - q| [rad] or [m], over the configurations that were not lost; NaN if all were.
+        Mean and maximum of |q̂ - q| [rad] or [m] over the configurations not lost; NaN if all are lost.
     nees
-        The mean of (q̂ - q)²/σ² over these; 1 is right.
+        Mean of (q̂ - q)²/σ² over these; 1 for a consistent filter.
     lost_percent
-        The share of configurations in which the filter stepped to where the model has no value.
+        Share of configurations in which the filter left the domain of the model [%].
     """
 
     mean: float
@@ -69,7 +69,7 @@ class MechanismErrors:
 
 
 def measure_mechanisms(configurations: int, progress: Progress) -> list[MechanismErrors]:
-    """Return the errors of both filters for each mechanism at each noise level."""
+    """Return the errors of both filters for each mechanism at each level of noise."""
     jobs = [(name, noise) for name in MECHANISMS for noise in LEVELS]
     return [
         _track_mechanism(name, noise, configurations)
@@ -85,13 +85,15 @@ def _track_mechanism(name: str, noise: PoseNoise, configurations: int) -> Mechan
     scene = make_observed_model(model)
     column = [str(s) for s in scene.symbols].index(coordinate)
     rng = np.random.default_rng([list(MECHANISMS).index(name), LEVELS.index(noise)])
-    still = np.repeat(scene.poses(scene.configurations(rng, 1)), TRAINING, axis=0)
+    static_poses = np.repeat(scene.poses(scene.configurations(rng, 1)), TRAINING, axis=0)
     truth = scene.configurations(rng, configurations)
-    true = scene.poses(truth)
-    seen = np.stack([add_gaussian_noise(true, noise, rng) for _ in range(OBSERVATIONS)])
+    true_poses = scene.poses(truth)
+    observations = np.stack([add_gaussian_noise(true_poses, noise, rng) for _ in range(OBSERVATIONS)])
     runs = {
-        "published": _run_published_one_by_one(scene, seen, add_gaussian_noise(still, noise, rng)),
-        "proper": run_proper(scene, seen, noise),
+        "published": _run_published_sequentially(
+            scene, observations, add_gaussian_noise(static_poses, noise, rng)
+        ),
+        "proper": run_proper(scene, observations, noise),
     }
     return MechanismErrors(
         name,
@@ -101,25 +103,25 @@ def _track_mechanism(name: str, noise: PoseNoise, configurations: int) -> Mechan
 
 
 def _coordinate_errors(run: FilterRun, truth: Array, column: int) -> CoordinateErrors:
-    kept = np.isfinite(run.q[:, column])
-    lost = 100.0 * float((~kept).sum()) / len(kept)
-    if not kept.any():
+    finite = np.isfinite(run.q[:, column])
+    lost = 100.0 * float((~finite).sum()) / len(finite)
+    if not finite.any():
         return CoordinateErrors(np.nan, np.nan, np.nan, lost)
-    error = np.abs(run.q - truth)[kept, column]
-    nees = error**2 / run.variance[kept, column]
+    error = np.abs(run.q - truth)[finite, column]
+    nees = error**2 / run.variance[finite, column]
     return CoordinateErrors(float(error.mean()), float(error.max()), float(nees.mean()), lost)
 
 
-def _run_published_one_by_one(scene: ObservedModel, seen: Array, training: Array) -> FilterRun:
-    """Run the papers' filter on one configuration after the other, as a step of one may lead nowhere."""
+def _run_published_sequentially(scene: ObservedModel, observations: Array, training: Array) -> FilterRun:
+    """Run the papers' filter on each configuration separately, as a step may leave the model's domain."""
     published = PaperEkf(scene.model, scene.frames)
     published.learn_noise(training)
-    q = np.full((seen.shape[1], len(scene.symbols)), np.nan)
+    q = np.full((observations.shape[1], len(scene.symbols)), np.nan)
     variance = q.copy()
-    for c in range(seen.shape[1]):
+    for c in range(observations.shape[1]):
         published.reset()
         try:
-            for poses in seen[:, c]:
+            for poses in observations[:, c]:
                 published.predict(DT)
                 published.update(poses)
         except InvalidValueError:

@@ -22,23 +22,24 @@ from kineverse.symbols import Symbol
 Generator: TypeAlias = np.random.Generator
 
 DT = 0.05
-"""Between two observations [s]."""
+"""Time between two observations [s]."""
 OBSERVATIONS = 25
 CONFIGURATIONS = 300
 TRAINING = 400
-"""From so many noisy observations of one configuration comes the papers' R."""
+"""Number of noisy observations of one configuration from which the papers' filter estimates R."""
 SHIFTING_FIRST = 7
-"""In the papers' order so many drawers come before the first door."""
+"""Number of drawers before the first door in the papers' order."""
 
 
 @dataclass(frozen=True)
 class PoseNoise:
-    """The noise of a pose, its position and its orientation.
+    """Noise of a pose.
 
     Attributes
     ----------
     position, orientation
-        Standard deviations [m], [rad]: along and about a random direction, or on each of the three axes.
+        Standard deviations of position [m] and orientation [rad], along and about a random direction, or on
+        each of the three axes.
     """
 
     position: float
@@ -46,7 +47,7 @@ class PoseNoise:
 
     @property
     def on_axes(self) -> PoseNoise:
-        """Factor from noise along a random direction to noise on each of the three axes."""
+        """Noise on each of the three axes that equals this noise along a random direction."""
         return PoseNoise(self.position / math.sqrt(3), self.orientation / math.sqrt(3))
 
     def __str__(self) -> str:
@@ -54,23 +55,23 @@ class PoseNoise:
 
 
 LEVELS = tuple(PoseNoise(0.05 * k, math.radians(7.5 * k)) for k in (1, 2, 3, 4))
-"""The papers' four levels."""
+"""Levels of noise of the papers."""
 
 
 @dataclass(frozen=True)
 class ObservedModel:
-    """A model of which every frame that moves is observed, in the order in which degrees of freedom join.
+    """Model with all moving frames observed, in groups that share coordinates.
 
     Attributes
     ----------
     model
-        The model.
+        Model.
     frames
-        The m frames, group by group.
+        Observed frames, m, group by group.
     sizes
-        How many frames and how many coordinates the first group has, the first two, and so on.
+        Cumulative numbers of frames and coordinates over the groups.
     symbols
-        The n coordinates, group by group.
+        Coordinates, n, group by group.
     limits
         Lower and upper limits, (n, 2).
     """
@@ -83,7 +84,7 @@ class ObservedModel:
 
     @cached_property
     def turning(self) -> npt.NDArray[np.bool_]:
-        """Coordinates that turn a frame: their errors are angles, those of the others lengths."""
+        """Mask of the coordinates that rotate a frame, (n,); only their errors are angles."""
         return np.array([any(_is_rotation(self.model, f, s) for f in self.frames) for s in self.symbols])
 
     @cached_property
@@ -108,15 +109,15 @@ class ObservedModel:
 
 
 def make_observed_model(model: ModelView) -> ObservedModel:
-    """Return the frames of a model that the papers observe: every frame that moves.
+    """Return a model with all moving frames observed, as in the papers.
 
-    Groups of frames that share coordinates come in the model's order, but the first seven only shift, as in
-    the papers, whose time per update jumps at the eighth.
+    Groups of frames that share coordinates are in the model's order, except that up to seven groups without
+    rotation come first, as in the papers, whose time per update jumps at the eighth group.
 
     Raises
     ------
     ModelError
-        If nothing moves.
+        If no frame moves.
     """
     frames = [frame for frame in model.frames if model.fk(frame).symbols]
     if not frames:
@@ -128,8 +129,9 @@ def make_observed_model(model: ModelView) -> ObservedModel:
     first = shifting[:SHIFTING_FIRST]
     ordered = [*first, *(group for group in groups if group not in first)]
     counts = np.cumsum([(len(names), len(symbols)) for symbols, names in ordered], axis=0)
-    found = PaperEkf(model, [name for _, names in ordered for name in names])
-    return ObservedModel(model, found.frames, tuple(map(tuple, counts.tolist())), found.symbols, found.limits)
+    published = PaperEkf(model, [name for _, names in ordered for name in names])
+    sizes = tuple(map(tuple, counts.tolist()))
+    return ObservedModel(model, published.frames, sizes, published.symbols, published.limits)
 
 
 def _observed_frames(model: ModelView, frames: list[str], symbols: tuple[Symbol, ...]) -> list[str]:
@@ -148,8 +150,8 @@ def add_published_noise(
 ) -> Array:
     """Return poses with the papers' noise: T · translation(a d) · rotation(b about e).
 
-    a and b are N(0, σ), d and e random directions. So each of three axes has a variance of σ²/3, and the
-    errors are in the frame's own axes.
+    a and b are N(0, σ), d and e random directions. Each of the three axes has the variance σ²/3. The errors
+    are in the axes of the frame.
 
     Parameters
     ----------
@@ -158,10 +160,10 @@ def add_published_noise(
     noise
         σ of a and b.
     rng
-        Where the numbers come from.
+        Random generator.
     directions
-        ``"published"`` draws d and e like the authors' code, over a quarter of the sphere: with signs that is
-        half of it, on which y and z have a correlation of 2/π. ``"uniform"`` draws over all of it.
+        ``"published"`` draws d and e like the authors' code over a quarter of the sphere. With the signs of a
+        and b that is half of it, and y and z have a correlation of 2/π. ``"uniform"`` draws over the sphere.
     """
     lead = poses.shape[:-2]
     shift = _directions(rng, lead, directions) * rng.normal(0, noise.position, (*lead, 1))
@@ -170,7 +172,7 @@ def add_published_noise(
 
 
 def add_gaussian_noise(poses: Array, noise: PoseNoise, rng: Generator) -> Array:
-    """Return poses (p + δp, Exp(δθ) R), all six N(0, σ): see :mod:`kineverse.estimation.noise`."""
+    """Return poses (p + δp, Exp(δθ) R) with errors N(0, σ), see :mod:`kineverse.estimation.noise`."""
     lead = poses.shape[:-2]
     moved = rng.normal(0, noise.position, (*lead, 3))
     turned = rng.normal(0, noise.orientation, (*lead, 3))
@@ -192,10 +194,10 @@ class FilterRun:
     Attributes
     ----------
     q, variance
-        The estimates and what the filter thinks their variances are, (C, n).
+        Estimates, and their variances according to the filter, (C, n).
     nis, dof
-        Normalised innovation squared and its degrees of freedom, sums of all updates but the first of each
-        configuration, whose prior is no distribution of truths; 0 if not counted.
+        Sums of the normalised innovation squared and of its degrees of freedom over all updates except the
+        first of each configuration, whose prior is not the distribution of true states; 0 if not computed.
     """
 
     q: Array
@@ -205,41 +207,41 @@ class FilterRun:
 
 
 def run_published(
-    scene: ObservedModel, seen: Array, training: Array, steps: int = STEPS, spread: float = SPREAD
+    scene: ObservedModel, observations: Array, training: Array, steps: int = STEPS, spread: float = SPREAD
 ) -> FilterRun:
-    """Run the papers' filter on observations (25, C, m, 4, 4), all configurations side by side.
+    """Run the papers' filter on observations (25, C, m, 4, 4), with all configurations in parallel.
 
     Parameters
     ----------
     scene
-        What is tracked.
-    seen, training
-        The observations, and those of which R is learnt (400, m, 4, 4).
+        Observed model.
+    observations, training
+        Observations, and those from which R is learnt, (400, m, 4, 4).
     steps, spread
         See :class:`~kineverse.experiments.fig4.paper_ekf.PaperEkf`.
     """
-    filters = PaperEkf(scene.model, scene.frames, steps, spread, copies=seen.shape[1])
+    filters = PaperEkf(scene.model, scene.frames, steps, spread, copies=observations.shape[1])
     filters.learn_noise(training)
-    for poses in seen:
+    for poses in observations:
         filters.predict(DT)
         filters.update(poses)
     return FilterRun(filters.q, np.diagonal(filters.covariance, axis1=-2, axis2=-1))
 
 
 def make_tracker(scene: ObservedModel, noise: PoseNoise) -> Tracker:
-    """Return the proper filter for a scene with noise of that much on each axis."""
+    """Return the tracker of a scene, for noise on each axis."""
     covariance = pose_covariance(noise.position, noise.orientation)
     return Tracker(scene.model, [ObservedPose(frame, covariance=covariance) for frame in scene.frames])
 
 
-def run_proper(scene: ObservedModel, seen: Array, noise: PoseNoise) -> FilterRun:
-    """Run the proper filter on observations (25, C, m, 4, 4) with noise of that much on each axis."""
-    unused = make_tracker(scene, noise)
+def run_proper(scene: ObservedModel, observations: Array, noise: PoseNoise) -> FilterRun:
+    """Run the tracker on observations (25, C, m, 4, 4) with noise on each axis."""
+    initial = make_tracker(scene, noise)
     q, variance, nis, dof = [], [], 0.0, 0
-    for c in range(seen.shape[1]):
-        # Making a tracker looks at the whole model; a copy begins where that one did.
-        tracker = copy(unused)
-        for k, poses in enumerate(seen[:, c]):
+    for c in range(observations.shape[1]):
+        # A copy of the initial tracker is cheaper than a new one, which analyses the whole model.
+        tracker = copy(initial)
+        for k, poses in enumerate(observations[:, c]):
             tracker.predict(DT)
             estimate = tracker.update_poses(poses)
             if k > 0:

@@ -28,9 +28,9 @@ class Fig4Results:
     Attributes
     ----------
     model, scene
-        What was tracked.
+        Name of the model, and the model with its observed frames.
     seeds, configurations
-        How often, and how many configurations each time.
+        Seeds, and number of configurations of each.
     errors, variants, consistency, mechanisms
         See :mod:`.accuracy`, :mod:`.consistency`, :mod:`.mechanisms`.
     by_size, by_noise
@@ -49,7 +49,7 @@ class Fig4Results:
     mechanisms: list[MechanismErrors]
 
     def numbers(self) -> dict[str, Any]:
-        """Return all of it as JSON has it: by filter, with null for what has no value."""
+        """Return the results as JSON data, by filter, with null for NaN."""
         return {
             "model": self.model,
             "degrees_of_freedom": len(self.scene.symbols),
@@ -90,7 +90,7 @@ class Fig4Results:
             "consistency": [
                 {
                     **_noise_to_json(noise),
-                    **{key: c.to_json() for key, c in by_filter.items()},
+                    **{filter_name: c.as_json() for filter_name, c in by_filter.items()},
                 }
                 for noise, by_filter in self.consistency.items()
             ],
@@ -123,11 +123,11 @@ def _without_nan(values: Mapping[str, float]) -> dict[str, float | None]:
 FILTER_NAMES = {"published": "papers' filter", "proper": "Tracker"}
 
 _KINDS = (("shifting", 1e3), ("turning", 180 / math.pi))
-"""Kinds of coordinates, and what makes [mm] and [deg] of [m] and [rad]."""
+"""Kinds of coordinates, with the factors from [m] to [mm] and from [rad] to [deg]."""
 
 
 def make_tables(results: Fig4Results) -> tuple[ReportTable, ...]:
-    """Return all tables, what the papers report first."""
+    """Return all tables, first the one of published values."""
     return (
         _table_of_reported(results),
         _table_by_noise(results),
@@ -270,16 +270,16 @@ def _consistency_row(found: FilterConsistency) -> tuple[str, ...]:
 
 def _table_of_mechanisms(results: Fig4Results) -> ReportTable:
     rows = []
-    for followed in results.mechanisms:
+    for mechanism in results.mechanisms:
         for filter_name in FILTERS:
-            found = followed.by_filter[filter_name]
+            found = mechanism.by_filter[filter_name]
             values = (
                 _format_fixed(found.mean),
                 _format_fixed(found.max),
                 f"{found.nees:.2f}",
                 f"{found.lost_percent:.0f}",
             )
-            rows.append((followed.mechanism, str(followed.noise), FILTER_NAMES[filter_name], *values))
+            rows.append((mechanism.mechanism, str(mechanism.noise), FILTER_NAMES[filter_name], *values))
     return ReportTable(
         "Mechanisms that are no joints: |q̂ - q| [rad], [m]; lost: a step to where the model has no value",
         ("mechanism", "noise", "filter", "mean", "max", "NEES", "lost [%]"),
@@ -301,12 +301,12 @@ _COLORS = {"published": "tab:orange", "proper": "tab:blue"}
 
 
 def draw_results(canvas: Canvas, results: Fig4Results) -> None:
-    """Draw on an empty canvas."""
-    (noise, size), (time, honest) = canvas.subplots(2, 2)
+    """Draw the results on an empty figure."""
+    (noise, size), (time, consistency) = canvas.subplots(2, 2)
     _plot_errors_by_noise(noise, results)
     _plot_errors_by_size(size, results)
     _plot_times(time, results)
-    _plot_consistency(honest, results)
+    _plot_consistency(consistency, results)
 
 
 def _plot_errors_by_noise(axes: Any, results: Fig4Results) -> None:

@@ -21,14 +21,14 @@ from .protocol import DT, LEVELS, ObservedModel, PoseNoise, make_tracker
 Step: TypeAlias = Callable[[Array], None]
 
 REPORTED = 4.0
-"""Time reported by the papers for all 23 degrees of freedom [ms]."""
+"""Upper bound of the times in the papers, with 23 degrees of freedom [ms]."""
 
 
 @dataclass(frozen=True)
 class Duration:
-    """Mean, standard deviation and median [ms], and how many updates that is.
+    """Mean, standard deviation and median of times [ms], and number of updates.
 
-    Mean and deviation are what the papers plot; the median knows least of what else the machine does.
+    The papers plot mean and deviation. The median depends least on other load of the machine.
     """
 
     mean: float
@@ -40,23 +40,23 @@ class Duration:
 def time_updates_by_size(
     scene: ObservedModel, configurations: int, progress: Progress
 ) -> list[tuple[int, dict[str, Duration]]]:
-    """Return degrees of freedom and times of the first group, of the first two, and so on."""
-    found = []
+    """Return degrees of freedom and times for the first group, the first two groups, and so on."""
+    times = []
     for groups in progress(range(1, len(scene.sizes) + 1), "fig4: time", "size"):
         part = scene.first(groups)
-        found.append((len(part.symbols), time_updates(part, LEVELS[-1], configurations)))
-    return found
+        times.append((len(part.symbols), time_updates(part, LEVELS[-1], configurations)))
+    return times
 
 
 def time_updates(scene: ObservedModel, noise: PoseNoise, configurations: int) -> dict[str, Duration]:
-    """Return the durations of both filters for the updates after the first."""
-    _, seen, training = simulate_observations(scene, noise, 0, configurations)
+    """Return the times of both filters for all updates except the first."""
+    _, observations, training = simulate_observations(scene, noise, 0, configurations)
     published = PaperEkf(scene.model, scene.frames)
     published.learn_noise(training)
     published.function.wait()
-    unused = make_tracker(scene, noise.on_axes)
+    initial = make_tracker(scene, noise.on_axes)
 
-    def publish() -> Step:
+    def start_published() -> Step:
         published.reset()
 
         def step(poses: Array) -> None:
@@ -65,8 +65,8 @@ def time_updates(scene: ObservedModel, noise: PoseNoise, configurations: int) ->
 
         return step
 
-    def proper() -> Step:
-        tracker = copy(unused)
+    def start_tracker() -> Step:
+        tracker = copy(initial)
 
         def step(poses: Array) -> None:
             tracker.predict(DT)
@@ -74,22 +74,27 @@ def time_updates(scene: ObservedModel, noise: PoseNoise, configurations: int) ->
 
         return step
 
-    return {"published": _time_steps(publish, seen), "proper": _time_steps(proper, seen)}
+    return {
+        "published": _time_steps(start_published, observations),
+        "proper": _time_steps(start_tracker, observations),
+    }
 
 
-def _time_steps(begin: Callable[[], Step], seen: Array) -> Duration:
-    """Time steps on observations (K, C, m, 4, 4); each configuration's first is not counted."""
-    _run_step(begin(), seen[:, 0])  # warms caches up
+def _time_steps(start: Callable[[], Step], observations: Array) -> Duration:
+    """Time steps on observations (K, C, m, 4, 4); the first of each configuration is not counted."""
+    _run_step(start(), observations[:, 0])  # fills caches
     with no_collection():
-        times = [t for c in range(seen.shape[1]) for t in _run_step(begin(), seen[:, c])]
-    found = 1e3 * np.array(times)
-    return Duration(float(found.mean()), float(found.std()), float(np.median(found)), len(found))
+        times = [t for c in range(observations.shape[1]) for t in _run_step(start(), observations[:, c])]
+    milliseconds = 1e3 * np.array(times)
+    return Duration(
+        float(milliseconds.mean()), float(milliseconds.std()), float(np.median(milliseconds)), len(times)
+    )
 
 
-def _run_step(step: Step, seen: Array) -> list[float]:
-    step(seen[0])
+def _run_step(step: Step, observations: Array) -> list[float]:
+    step(observations[0])
     times = []
-    for poses in seen[1:]:
+    for poses in observations[1:]:
         before = perf_counter()
         step(poses)
         times.append(perf_counter() - before)

@@ -201,34 +201,37 @@ def axis_distance(fit: Fit) -> float:
 
 def format_travel(fit: Fit) -> str:
     """Format the range of the joint values."""
-    ways = np.ptp(fit.joint_values, axis=0) if fit.joint_values.size else []
+    ranges = np.ptp(fit.joint_values, axis=0) if fit.joint_values.size else []
     turns = fit.family in ("revolute", "screw")
-    return " ".join(f"{math.degrees(way):.0f} deg" if turns else f"{way:.2f} m" for way in ways) or "-"
+    return (
+        " ".join(f"{math.degrees(travel):.0f} deg" if turns else f"{travel:.2f} m" for travel in ranges)
+        or "-"
+    )
 
 
 def _recording_row(item: Classification) -> tuple[float | str, ...]:
     best, recording = item.result.best, item.recording
-    around = axis_distance(best)
+    radius = axis_distance(best)
     return (
         recording.name,
         float(len(recording.poses)),
         LABEL_NAMES[recording.label],
         item.predicted,
         best.probability,
-        around if math.isfinite(around) else "-",
+        radius if math.isfinite(radius) else "-",
         format_travel(best),
         1e3 * best.rms[0],
         ("yes" if item.is_correct else "NO") + (", cannot tell" if item.result.is_ambiguous else ""),
     )
 
 
-def _format_families(found: IdentificationResult) -> str:
-    return ", ".join(f"{fit.family} {fit.probability:.2g}" for fit in found.fits)
+def _format_families(result: IdentificationResult) -> str:
+    return ", ".join(f"{fit.family} {fit.probability:.2g}" for fit in result.fits)
 
 
 def _numbers(item: Classification) -> dict[str, Any]:
     best, recording = item.result.best, item.recording
-    around = axis_distance(best)
+    radius = axis_distance(best)
     return {
         "name": recording.name,
         "count": len(recording.poses),
@@ -237,7 +240,7 @@ def _numbers(item: Classification) -> dict[str, Any]:
         "right": item.is_correct,
         "told": not item.result.is_ambiguous,
         "probabilities": {fit.family: fit.probability for fit in item.result.fits},
-        "radius": around if math.isfinite(around) else None,
+        "radius": radius if math.isfinite(radius) else None,
         "ranges": best.range.tolist(),
         "rms": list(best.rms),
     }
