@@ -1,12 +1,12 @@
 """C text of joint ranges, sliding points and mirrored joint values."""
 
 JOINT_RANGES = r"""
-/* What observations say alone, and how wide the motion is, as Alone and Widths in widths.py. */
+/* Observations alone, and the width of the motion: PerObservation and JointRanges in range_prior.py. */
 typedef struct {
   double *values, *covariances, log_likelihood, deviations[6], mean[6], log_density;
 } Apart;
 
-/* As alone in widths.py, for errors whose covariances are larger by a factor. */
+/* As solve_per_observation in range_prior.py, for errors whose covariances are larger by a factor. */
 static void alone(const Problem *p, const Answer *a, double factor, Apart *apart) {
   int m = (int)p->rows, n = (int)p->joints;
   double log_likelihood = 0.0, *values = apart->values, *covariances = apart->covariances;
@@ -115,7 +115,7 @@ FAST double widened(const double *covariance, int n, const double *deviations, d
   return invert(total, n, inverse);
 }
 
-/* As widths in widths.py. */
+/* As fit_joint_ranges in range_prior.py. */
 static void widths(const Problem *p, Apart *apart, double *memory) {
   int n = (int)p->joints;
   const double *values = apart->values, *covariances = apart->covariances;
@@ -180,7 +180,7 @@ static void place_all(const Problem *p, Answer *a) {
   at(p, p->count, &a->head->motion, a->values, a->poses, a->by_parameters, a->by_joints);
 }
 
-/* As slid in sliding.py: motion, values and derivatives are changed in their place. */
+/* As optimise_sliding_point in ambiguities.py: motion, values and derivatives are changed in their place. */
 static void slide(const Problem *p, Answer *a, double *memory) {
   int joints = (int)p->joints, slides = (int)p->slides, n = joints + slides;
   Motion *m = &a->head->motion;
@@ -310,8 +310,8 @@ static void errors_at(const Problem *p, const Motion *m, int64_t k, const double
   }
 }
 
-/* As singly in mirrored.py, for one observation: joint value and orientation are moved to the most probable
-   ones; returns the logarithm of the density. */
+/* As evaluate_each_observation in ambiguities.py, for one: joint value and orientation become the likeliest
+   ones. Returns the logarithm of the density. */
 static double single(const Problem *p, const Motion *m, int64_t k, const double *lower, double volume,
                      double *value, double *orientation) {
   int n = 3 + (int)p->rows;
@@ -372,7 +372,7 @@ static double other_value(const Problem *p, const Motion *m, double value) {
   return other - TAU * rint((other - p->belief.mean[0]) / TAU);
 }
 
-/* As straightened in mirrored.py. */
+/* As choose_mirrored_values in ambiguities.py. */
 static void exchange(Problem *p, Answer *a, double *memory) {
   if (!p->mirrored) return;
   Answer trial;

@@ -243,7 +243,7 @@ static void keep(const Problem *p, const Observation *o, double *pose, double *b
   for (int j = 0; j < 4; j++) pose[12 + j] = j == 3;
 }
 
-/* As at in groups.py. */
+/* As GroupMotion.linearise in families.py. */
 EXPORT void at(const Problem *p, int64_t count, const Motion *m, const double *values, double *poses,
                double *by_parameters, double *by_joints) {
   Observation o;

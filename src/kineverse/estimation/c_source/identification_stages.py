@@ -77,7 +77,7 @@ static double of_lever(const double *lever, int64_t count, double scale) {
   return log_density;
 }
 
-/* As GroupMotion.beforehand and .prior: the density, and the precision is added to the information. */
+/* As GroupMotion.log_prior and .prior: the density, and the precision is added to the information. */
 static double beforehand(const Problem *p, const Motion *m, const double *mean, double *information) {
   int joints = (int)p->joints, size = (int)size_of(p), rights = (int)p->rights;
   int n = size + joints + (int)p->slides, columns = rights + joints;
@@ -106,7 +106,7 @@ static double beforehand(const Problem *p, const Motion *m, const double *mean, 
   return log_density;
 }
 
-/* As evidence in evidence.py, for errors whose variances are larger by a factor. */
+/* As laplace_evidence in evidence.py, for errors whose variances are larger by a factor. */
 static double evidence(const Problem *p, const Answer *a, double factor, const Apart *apart, double *values,
                        double *covariances, double *information) {
   int n = (int)(size_of(p) + p->joints + p->slides);
@@ -123,7 +123,7 @@ static double log_evidence(const Problem *p, const Answer *a, const Apart *apart
   return evidence(p, a, 1.0, apart, memory, memory + p->count * p->joints, information);
 }
 
-/* As overrated in evidence.py. */
+/* As evidence_excess in evidence.py. */
 static double overrated(const Problem *p, const Answer *a, const Apart *apart) {
   if (a->head->converged > 0.0 || !(a->head->marginal > 0.0)) return 0.0;
   int n = (int)p->joints;
@@ -161,7 +161,7 @@ static double *begin_stage(Problem *p, double *memory, double *answer, Answer *a
   return memory + NOISE * p->count;
 }
 
-/* As _settled in refining.py; leaves what observations say alone in the end, and returns free memory. */
+/* As _iterate_ranges in maximum_likelihood.py; leaves what observations say alone; returns free memory. */
 static double *widen_until_settled(Problem *p, Answer *a, Apart *apart, double *memory) {
   int n = (int)p->joints, believed = a->head->marginal > 0.0;
   double before[6], *rest = memory;
@@ -185,7 +185,7 @@ static double *widen_until_settled(Problem *p, Answer *a, Apart *apart, double *
   }
 }
 
-/* As refined in refining.py; leaves and returns the same. */
+/* As maximise_marginal_likelihood in maximum_likelihood.py; leaves and returns the same. */
 static double *refine_from(Problem *p, Answer *a, Apart *apart, double *noise, double *memory) {
   int narrowing = p->softer && !(a->head->marginal > 0.0);
   Answer other;
@@ -210,7 +210,7 @@ static double *refine_from(Problem *p, Answer *a, Apart *apart, double *noise, d
   return rest;
 }
 
-/* As solve in solving.py. */
+/* As levenberg_marquardt in optimise.py. */
 EXPORT void solve(const Problem *problem, double *memory, double *answer) {
   Problem p = *problem;
   Answer a;
@@ -218,7 +218,7 @@ EXPORT void solve(const Problem *problem, double *memory, double *answer) {
   go_on(&p, &a, memory);
 }
 
-/* As likeliest in refining.py, from several starts. */
+/* As maximum_likelihood in maximum_likelihood.py, from several starts. */
 EXPORT void likeliest(const Problem *problem, int64_t starts, const Motion *motions, const double *values,
                       double *memory, double *answer) {
   Problem p = *problem;
@@ -238,7 +238,7 @@ EXPORT void likeliest(const Problem *problem, int64_t starts, const Motion *moti
   judge(&p, &a, &apart, memory);
 }
 
-/* As refined in refining.py. */
+/* As maximise_marginal_likelihood in maximum_likelihood.py. */
 EXPORT void refine(const Problem *problem, double *memory, double *answer) {
   Problem p = *problem;
   Answer a;
@@ -249,7 +249,7 @@ EXPORT void refine(const Problem *problem, double *memory, double *answer) {
   judge(&p, &a, &apart, memory);
 }
 
-/* As continued in refining.py. */
+/* As continue_from in maximum_likelihood.py. */
 EXPORT void carry_on(const Problem *problem, double *memory, double *answer) {
   Problem p = *problem;
   Answer a;
@@ -262,7 +262,7 @@ EXPORT void carry_on(const Problem *problem, double *memory, double *answer) {
   judge(&p, &a, &apart, memory);
 }
 
-/* As evidence in evidence.py, for errors that are larger by several factors; the rest is for the last. */
+/* As laplace_evidence in evidence.py, for errors larger by several factors; the rest is for the last. */
 EXPORT void rate(const Problem *problem, int64_t scales, const double *scale, double *memory,
                  double *answer, double *logs, double *values, double *covariances, double *information) {
   Answer a;
