@@ -94,14 +94,13 @@ __all__ = [
     "where",
 ]
 
-# Packages that are imported at first use.
+_LAZY = ("estimation", "geometry", "reasoning")
+
+# Entries are texts: the packages are imported at first use.
 model.registry.register_collection(
     "articulations", model.registry.ModelCollection("kineverse.gallery:names", "kineverse.gallery:operations")
 )
 model.registry.register_service("read_mesh", "kineverse.geometry.mesh_files:read_mesh")
-
-
-_LAZY = ("estimation", "geometry", "reasoning")
 
 
 def __getattr__(name: str) -> object:

@@ -10,6 +10,7 @@ import numpy.typing as npt
 import kineverse as kv
 from kineverse.errors import UnknownNameError, duplicate_value_error, suggest
 from kineverse.lie import to_quaternion, to_rpy
+from kineverse.model.frame import WORLD
 from kineverse.model.model_view import ModelView
 from kineverse.state import State, StateLike
 from kineverse.symbols import parse_symbol_name
@@ -33,9 +34,6 @@ def roll_pitch_yaw(matrix: npt.ArrayLike) -> Floats:
     return angles
 
 
-WORLD_FRAME = "world"
-
-
 class FramePoses:
     """Poses of frames in the world, as a compiled function of the values of symbols.
 
@@ -57,11 +55,11 @@ class FramePoses:
     """
 
     def __init__(self, model: ModelView, names: Iterable[str] | None = None) -> None:
-        everything = (WORLD_FRAME, *(name for name in model.frames if name != WORLD_FRAME))
+        everything = (WORLD, *(name for name in model.frames if name != WORLD))
         self.names = everything if names is None else tuple(names)
         self._index = {name: k for k, name in enumerate(self.names)}
         # The world does not move, and a function without outputs cannot be compiled.
-        self.moving = tuple(name for name in self.names if name != WORLD_FRAME)
+        self.moving = tuple(name for name in self.names if name != WORLD)
         self._function = kv.compile([model.fk(name) for name in self.moving]) if self.moving else None
         self.inputs = tuple(map(str, self._function.inputs)) if self._function else ()
 

@@ -42,16 +42,13 @@ _SETTLED = 0.03
 _LEAST_DENSITY, _MOST_DENSITY = 1e-4, 10.0
 # A ridge whose deviation from a line and log density ratio to a Gaussian stay below this is straight.
 _RIDGE_CURVATURE = 0.05
+_RANK = 1e-6
+# Measurements that deviate from linearity by less, in deviations of the noise, are linear.
+_LINEAR = 0.02
 
 
-class RidgeCovariance:
-    """Posterior covariance of groups with unobservable directions.
-
-    Parameters
-    ----------
-    layout, residuals, process_model, reader, group_bounds, unobservable
-        Components of the tracker.
-    """
+class _CovarianceComputation:
+    """Components of the tracker from which covariances of groups are computed."""
 
     def __init__(
         self,
@@ -64,6 +61,10 @@ class RidgeCovariance:
     ) -> None:
         self._layout, self._residuals, self._process_model = layout, residuals, process_model
         self._reader, self._group_bounds, self._unobservable = reader, group_bounds, unobservable
+
+
+class RidgeCovariance(_CovarianceComputation):
+    """Posterior covariance of groups with unobservable directions."""
 
     def compute(self, number: int, belief: InformationState) -> Array:
         """Return the second moment of the posterior of a group about its estimate (t, t).
@@ -235,31 +236,8 @@ class _ManifoldPoint:
         return math.exp(min(log, math.log(_MOST_DENSITY)))
 
 
-_RANK = 1e-6
-# Measurements that deviate from linearity by less, in deviations of the noise, are linear.
-_LINEAR = 0.02
-
-
-class CovarianceInflation:
-    """Inflation of beliefs by the curvature of the posterior.
-
-    Parameters
-    ----------
-    layout, residuals, process_model, reader, group_bounds, unobservable
-        Components of the tracker.
-    """
-
-    def __init__(
-        self,
-        layout: Layout,
-        residuals: Residuals,
-        process_model: ProcessModel,
-        reader: MeasurementReader,
-        group_bounds: Sequence[GroupBounds],
-        unobservable: UnobservableDirections,
-    ) -> None:
-        self._layout, self._residuals, self._process_model = layout, residuals, process_model
-        self._reader, self._group_bounds, self._unobservable = reader, group_bounds, unobservable
+class CovarianceInflation(_CovarianceComputation):
+    """Inflation of beliefs by the curvature of the posterior."""
 
     def inflate(self, number: int, belief: InformationState) -> None:
         """Inflate the covariance of a group by the curvature of its posterior, and drop its static record."""
