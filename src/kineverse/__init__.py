@@ -35,7 +35,7 @@ from .state import State, StateLike
 from .symbols import Symbol, parameter, position, velocity
 
 if TYPE_CHECKING:
-    from . import estimation, geometry, reasoning
+    from . import control, estimation, geometry, reasoning
     from .view.show import show
 
 __all__ = [
@@ -62,6 +62,7 @@ __all__ = [
     "axis_angle",
     "clip",
     "compile",
+    "control",
     "errors",
     "estimation",
     "expressions",
@@ -94,7 +95,7 @@ __all__ = [
     "where",
 ]
 
-_LAZY = ("estimation", "geometry", "reasoning")
+_LAZY = ("control", "estimation", "geometry", "reasoning")
 
 # Entries are texts: the packages are imported at first use.
 model.registry.register_collection(
