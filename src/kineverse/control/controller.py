@@ -1,0 +1,340 @@
+"""QP velocity controller: one compiled function and one quadratic program a step."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterable, Mapping, Sequence
+from time import perf_counter
+
+import numpy as np
+import numpy.typing as npt
+
+from kineverse.compile import compile  # noqa: A004
+from kineverse.errors import InfeasibleError, InvalidValueError, NotFiniteError, ShapeError, UnknownNameError
+from kineverse.expressions.expression import Expression, ExpressionLike, as_expression
+from kineverse.geometry.dependence import FrameDependence
+from kineverse.lie import Array
+from kineverse.model.model_view import ModelView
+from kineverse.model.speed_limits import raw_min
+from kineverse.state import State, StateLike, as_state
+from kineverse.symbols import Symbol, parameter
+
+from .command import Command, StepTimes
+from .formulation import Formulation, find_speeds
+from .infeasibility import Conflict, find_irreducible_conflict, find_least_violation
+from .quadratic_program import make_solver
+from .tasks import Goal, Task
+from .velocity_program import Costs, VelocityProgram
+
+_DT = "control/dt"
+_LEAST_SHARE = 0.01
+"""Smallest default weight of a speed, so that damping stays positive."""
+
+
+class Controller:
+    """Velocity controller that serves tasks within the constraints of a model.
+
+    A step evaluates one compiled function of the state and solves one quadratic program; see
+    :mod:`.velocity_program` for the equations. The program starts in CasADi's interpreter and continues in C
+    once that is compiled. Without contradictory tasks a step is feasible at every state: outside of its limits
+    a coordinate is led back. The controller is about the version of the model at construction.
+
+    Parameters
+    ----------
+    model
+        The model of everything that the tasks are about: robot, objects, or both.
+    tasks
+        Goals, holds and keeps.
+    dt
+        Time between two steps [s].
+    still
+        Coordinates or speeds that stay still, as symbols or names.
+    weights
+        Factor on damping and smoothness by coordinate or speed, as symbol or name. The default is the share
+        of the bodies that a speed moves, so that fingers are preferred to bases.
+    smooth, jerk
+        Weights of the first and second differences of commands.
+    posture
+        Weight of the pull to the middle of limits while goals are not reached; 0 for none.
+    acceleration
+        Limits on accelerations [m/s²], [rad/s²], a number or a mapping by coordinate or speed. They and those
+        of the model are limits around the last command, and give way where nothing else is possible.
+    solver
+        ``"daqp"``, ``"proxsuite"`` or ``"osqp"``.
+
+    Attributes
+    ----------
+    model
+        The model.
+    tasks
+        The tasks.
+    speeds
+        The speeds of commands, found from the tasks and the constraints that they meet.
+    inputs
+        The symbols whose values a step needs.
+
+    Raises
+    ------
+    InvalidValueError, UnknownNameError, DuplicateNameError
+        As :class:`.Formulation`; also for a time step that is not positive.
+    MissingDependencyError
+        If the solver is not installed.
+    """
+
+    def __init__(
+        self,
+        model: ModelView,
+        tasks: Iterable[Task],
+        *,
+        dt: float,
+        still: Iterable[Symbol | str] = (),
+        weights: Mapping[Symbol | str, ExpressionLike] | None = None,
+        smooth: float = 1e-2,
+        jerk: float = 0.0,
+        posture: float = 1e-3,
+        acceleration: float | Mapping[Symbol | str, float] | None = None,
+        solver: str = "daqp",
+    ) -> None:
+        for name, value in (("smooth", smooth), ("jerk", jerk), ("posture", posture)):
+            if not (isinstance(value, int | float) and 0 <= value < math.inf):
+                raise InvalidValueError(f"{name}= is a weight of at least 0, not {value!r}.")
+        if not (isinstance(dt, int | float) and 0 < dt < math.inf):
+            raise InvalidValueError(f"dt= is a positive time in seconds, not {dt!r}.")
+        self.model = model
+        self.dt = float(dt)
+        step = parameter(_DT, self.dt)
+        self._formulation = formulation = Formulation(model, tasks, dt=step, still=still)
+        self.tasks = formulation.tasks
+        self.speeds = formulation.speeds
+        stated, chosen = _accelerations(model, self.speeds, acceleration)
+        self._program = VelocityProgram(
+            formulation,
+            Costs(smooth=smooth, jerk=jerk, posture=posture),
+            joint_weights=_joint_weights(model, self.speeds, weights),
+            posture=_middles(formulation) if posture else {},
+            accelerations=stated | chosen,
+            hard_accelerations=bool(stated) and not formulation.holds,
+            contacts=0,
+            dt=step,
+        )
+        self.inputs = self._program.inputs
+        self._solver_name = solver
+        self._solver = make_solver(solver, self._program.columns, self._program.rows, soft=None)
+        self._relaxed = self._solver
+        if self._program.soft.any():
+            self._relaxed = make_solver(
+                solver, self._program.columns, self._program.rows, soft=self._program.soft
+            )
+        self._evaluate = self._program.function.bind()
+        n, first = len(self.speeds), len(self.inputs)
+        self._values = self._evaluate.input[:first]
+        self._evaluate.input[first] = self.dt
+        self._last = self._evaluate.input[first + 1 : first + 1 + n]
+        self._before = self._evaluate.input[first + 1 + n :]
+        equalities = self._program.equalities
+        self._row_names = tuple(
+            tuple(name for name in names if name not in equalities) for names in self._program.names
+        )
+
+    @property
+    def tier(self) -> str:
+        """Present kind of evaluation: ``"interpreter"``, or ``"c"`` once that is compiled."""
+        return self._program.function.tier
+
+    def wait(self, timeout: float | None = None) -> bool:
+        """Wait until the program is compiled, at most for a time [s], and return whether it is."""
+        return self._program.function.wait(timeout)
+
+    def reset(self, speeds: StateLike | None = None) -> None:
+        """Forget the last commands: the next step starts from given speeds, by default from rest."""
+        known = as_state(speeds or {}, self.speeds)
+        self._last[:] = [known.given(s) or 0.0 for s in self.speeds]
+        if len(self._before):
+            self._before[:] = self._last
+
+    def step(self, state: StateLike | npt.ArrayLike) -> Command:
+        """Return the command for one time step at a state.
+
+        Parameters
+        ----------
+        state
+            A state; a mapping by symbol or name; or the values of :attr:`inputs` as a vector, which is the
+            fastest. Parameters without a value have their own.
+
+        Raises
+        ------
+        InfeasibleError
+            If hard rows contradict each other, with an irreducible set of them and the least-violating command.
+        NotFiniteError
+            If the program or its solution has a NaN, with the tasks or constraints where it arises.
+        UnknownNameError, ShapeError, InvalidValueError
+            For a state that lacks a value, or has another length, or a NaN.
+        """
+        start = perf_counter()
+        self._read(state)
+        read = perf_counter()
+        self._evaluate()
+        H, f, A, lower, upper, residuals, check = self._evaluate.outputs
+        if not math.isfinite(check[()]):
+            raise self._not_finite()
+        evaluated = perf_counter()
+        found = self._solver.solve(H, f, A, lower, upper)
+        if found.status != "solved" and self._relaxed is not self._solver:
+            found = self._relaxed.solve(H, f, A, lower, upper)
+        solved = perf_counter()
+        times = StepTimes(read - start, evaluated - read, solved - evaluated, solved - start)
+        if found.status != "solved":
+            raise self._infeasible(times)
+        return self._command(found.x, found.multipliers, found.iterations, residuals, times)
+
+    def _command(
+        self, x: Array, multipliers: Array, iterations: int, residuals: Array, times: StepTimes
+    ) -> Command:
+        """Return the command of a solution, and remember it as the last one."""
+        n = len(self.speeds)
+        if len(self._before):
+            self._before[:] = self._last
+        self._last[:] = x[:n]
+        values = x.tolist()
+        return Command(
+            dict(zip(self.speeds, values, strict=False)),
+            dict(zip(self._program.residuals, residuals.tolist(), strict=True)),
+            values[n] if len(values) > n else 1.0,
+            times,
+            iterations,
+            multipliers.copy(),
+            self._row_names,
+        )
+
+    def _read(self, state: StateLike | npt.ArrayLike) -> None:
+        """Write the values of the inputs at a state."""
+        if isinstance(state, Mapping):
+            if not isinstance(state, State):
+                state = as_state(state, (*self.model.symbols, *self.model.speeds, *self.inputs))
+            given = state.given
+            for k, symbol in enumerate(self.inputs):
+                value = given(symbol)
+                if value is None:
+                    value = symbol.value
+                    if value is None:
+                        raise UnknownNameError(
+                            f"The state has no value for '{symbol}', which the controller needs. "
+                            "model.default_state() has one for everything."
+                        )
+                self._values[k] = value
+            return
+        vector = np.asarray(state, dtype=float)
+        if vector.shape != self._values.shape:
+            raise ShapeError(
+                f"The vector of a state has the {len(self.inputs)} values of controller.inputs, not the shape "
+                f"{vector.shape}."
+            )
+        self._values[:] = vector
+
+    def _not_finite(self) -> NotFiniteError:
+        """Return the error that names the tasks and constraints with values that are not finite."""
+        values = self._evaluate.input
+        wrong = [str(s) for s, v in zip(self.inputs, values, strict=False) if not math.isfinite(v)]
+        if wrong:
+            return NotFiniteError(f"The state has no finite value for {', '.join(map(repr, wrong[:6]))}.")
+        parts = self._formulation.parts
+        symbols = self._program.function.inputs
+        found = compile(list(parts.values()), symbols, tier="interpreter")(values)
+        names = [name for name, part in zip(parts, found, strict=True) if not np.isfinite(part).all()]
+        where = ", ".join(map(repr, names[:6])) or "the sum of the terms, which is too large"
+        return NotFiniteError(
+            f"A value or derivative is not finite at this state, in {where}: the state is a singularity of "
+            "the expression, such as the end of a range where a speed becomes infinite. No command was made.",
+            names,
+        )
+
+    def _infeasible(self, times: StepTimes) -> InfeasibleError:
+        """Return the error with an irreducible conflict and the least-violating command."""
+        _, _, A, lower, upper, residuals, _ = self._evaluate.outputs
+        names, n = self._program.names, len(self.speeds)
+        sides = find_irreducible_conflict(A, lower, upper)
+        grouped: dict[str, Conflict] = {}
+        for k, side in sides:
+            for name in names[k]:
+                bounds = (lower[k], math.inf) if side < 0 else (-math.inf, upper[k])
+                if name in grouped:
+                    bounds = (max(bounds[0], grouped[name].lower), min(bounds[1], grouped[name].upper))
+                grouped[name] = Conflict(name, self._operations(name), *map(float, bounds))
+        hard = np.zeros(len(lower), dtype=bool)
+        hard[:n] = True
+        least = find_least_violation(A, lower, upper, hard)
+        command = self._command(least, np.zeros(len(lower)), 0, residuals, times)
+        listed = "; ".join(map(str, grouped.values()))
+        return InfeasibleError(
+            f"No command satisfies all hard rows. These contradict each other: {listed}. "
+            "error.command is the least-violating one.",
+            tuple(grouped.values()),
+            command,
+        )
+
+    def _operations(self, name: str) -> tuple[str, ...]:
+        history = getattr(self.model, "history", None)
+        return () if history is None else tuple(history.writers(f"constraints/{name}"))
+
+    def __repr__(self) -> str:
+        return (
+            f"<Controller: {len(self.tasks)} tasks, {len(self.speeds)} speeds, "
+            f"{self._program.rows} rows, dt {self.dt:g} s>"
+        )
+
+
+def _joint_weights(
+    model: ModelView, speeds: Sequence[Symbol], weights: Mapping[Symbol | str, ExpressionLike] | None
+) -> dict[Symbol, Expression]:
+    """Return the factor on damping and smoothness of each speed."""
+    found = {}
+    for speed in speeds:
+        moved = FrameDependence(model, [speed])
+        found[speed] = sum(moved.moves(body) for body in model.bodies)
+    most = max(found.values(), default=1) or 1
+    factors = {s: as_expression(max(count / most, _LEAST_SHARE)) for s, count in found.items()}
+    for key, weight in (weights or {}).items():
+        chosen = find_speeds(model, (key,), "weights")
+        unused = [s for s in chosen if s not in factors]
+        if unused:
+            raise InvalidValueError(f"weights=: no task moves '{key}', so it has no weight.")
+        for speed in chosen:
+            factors[speed] = as_expression(weight)
+    return factors
+
+
+def _middles(formulation: Formulation) -> dict[Symbol, float]:
+    """Return the middle of the limits by speed, for coordinates that no goal is about directly."""
+    model = formulation.model
+    asked = {task.expression for task in formulation.tasks if isinstance(task, Goal)}
+    found = {}
+    for speed in formulation.speeds:
+        coordinate = speed.position
+        if coordinate in asked or coordinate in model.rates or coordinate not in model.degrees_of_freedom:
+            continue
+        lower, upper = model.limits(coordinate)
+        if math.isfinite(lower) and math.isfinite(upper):
+            found[speed] = (lower + upper) / 2
+    return found
+
+
+def _accelerations(
+    model: ModelView, speeds: Sequence[Symbol], chosen: float | Mapping[Symbol | str, float] | None
+) -> tuple[dict[Symbol, ExpressionLike], dict[Symbol, ExpressionLike]]:
+    """Return the limits on accelerations that the model states, and those that were chosen."""
+    stated: dict[Symbol, ExpressionLike] = {}
+    for constraint in model.constraints.values():
+        symbol = constraint.expression
+        if isinstance(symbol, Symbol) and symbol.order == 2 and symbol.integral() in speeds:
+            stated[symbol.integral()] = raw_min(-constraint.lower, constraint.upper)
+    if chosen is None:
+        return stated, {}
+    if isinstance(chosen, Mapping):
+        given = {s: a for key, a in chosen.items() for s in find_speeds(model, (key,), "acceleration")}
+    else:
+        given = dict.fromkeys(speeds, chosen)
+    for speed, limit in given.items():
+        if not (isinstance(limit, int | float) and 0 < limit < math.inf):
+            raise InvalidValueError(f"The acceleration of '{speed.position}' is a positive limit, not {limit!r}.")
+    both = {s: raw_min(as_expression(stated[s]), as_expression(a)) if s in stated else a for s, a in given.items()}
+    return stated, both
