@@ -7,26 +7,26 @@ from __future__ import annotations
 
 import math
 import os
-from collections.abc import Collection, Iterable, Sequence
+from collections.abc import Collection, Iterable, Mapping, Sequence
 from html import escape
 from typing import Any
 
 import numpy as np
 
 from kineverse._checks import check_flag
-from kineverse.errors import InvalidValueError, UnknownNameError, suggest
-from kineverse.expressions.expression import Expression
+from kineverse.errors import DuplicateNameError, InvalidValueError, UnknownNameError, suggest
+from kineverse.expressions.expression import Expression, ExpressionLike
 from kineverse.state import State, StateLike, as_state, check_meant
 from kineverse.symbols import Symbol, parse_symbol_name
 
 from . import registry
-from .constraint import Constraint
+from .constraint import Constraint, ConstraintLike, as_constraint
 from .integration import integrate
 from .operation import ARTICULATIONS, CONSTRAINTS
 from .projection import TOLERANCE, EqualityConstraints, project
 from .registry import SaveResult
 from .symbolic_view import SymbolicView
-from .velocity_rows import VelocityRows, velocity_rows
+from .velocity_rows import Recovery, VelocityRows, velocity_rows
 from .violations import Checks, Violations, find_violations
 
 
@@ -246,24 +246,75 @@ class ModelView(SymbolicView):
 
     def velocity_rows(
         self,
-        dt: float,
+        dt: ExpressionLike,
         subject: Expression | str | Iterable[Symbol | Expression | str] | None = None,
         *,
         speeds: Sequence[Symbol] | None = None,
-        gain: float | None = None,
+        gain: ExpressionLike | None = None,
+        recovery: Recovery = "required",
+        extra: Mapping[str, ConstraintLike] | None = None,
     ) -> VelocityRows:
         """Return linear rows in the speeds that enforce constraints over a step of ``dt`` seconds.
 
         With a subject, these are the constraints relevant for it and the speed limits of all coordinates that
         they involve; without one, all constraints. See :meth:`constraints_for` and
-        :mod:`kineverse.model.velocity_rows`.
+        :mod:`kineverse.model.velocity_rows`, for ``gain`` and ``recovery`` as well.
+
+        Parameters
+        ----------
+        dt
+            Control period [s], a number or an expression.
+        subject
+            One or several expressions, symbols, or names of frames, which stand for their poses.
+        speeds
+            Columns; by default the speeds of the constraints, sorted. All other speeds are assumed to be 0.
+        gain
+            Gain [1/s] in (0, 1/dt], a number or an expression; 1/dt by default.
+        recovery
+            ``"required"`` or ``"allowed"`` outside of bounds.
+        extra
+            Further constraints by name, as (lower, expression, upper), which the model does not have. They
+            are rows whatever the subject is, with the constraints relevant for their expressions.
+
+        Raises
+        ------
+        DuplicateNameError
+            For an extra constraint with the name of a constraint of the model.
+        InvalidValueError
+            For a step, gain or recovery that is not possible, or an extra constraint that is none.
         """
         with self._lock:
             every = dict(self.constraints)
-            constraints = every if subject is None else self.constraints_for(subject)
+            added = self._extra_constraints({} if extra is None else extra)
+            if subject is None:
+                constraints = every
+            else:
+                constraints = self.constraints_for(subject)
+                for constraint in added.values():
+                    constraints |= self.constraints_for(constraint.expression)
             return velocity_rows(
-                constraints, dt, rates=self.rates, speeds=speeds, gain=gain, speed_limits=every
+                {**constraints, **added},
+                dt,
+                rates=self.rates,
+                speeds=speeds,
+                gain=gain,
+                speed_limits=every,
+                recovery=recovery,
             )
+
+    def _extra_constraints(self, extra: Mapping[str, ConstraintLike]) -> dict[str, Constraint]:
+        """Return further constraints by name, coordinates carried by their rates."""
+        for name in extra:
+            if name in self._head[CONSTRAINTS]:
+                raise DuplicateNameError(
+                    f"The model has a constraint {name!r} already; give the extra one another name."
+                )
+        checked = {name: as_constraint(value) for name, value in extra.items()}
+        carry = self.rates.carry
+        return {
+            name: Constraint(carry(c.lower), carry(c.expression), carry(c.upper))
+            for name, c in checked.items()
+        }
 
     def integrate(self, state: StateLike, speeds: StateLike, dt: float, *, clip: bool = False) -> State:
         """Return the state after ``dt`` seconds at constant speeds; see :mod:`kineverse.model.integration`.

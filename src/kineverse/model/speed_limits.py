@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Collection, Mapping
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass
 from typing import TypeAlias
 
@@ -67,12 +67,25 @@ INFINITE = as_expression(math.inf)
 
 @dataclass(frozen=True)
 class SpeedRow:
-    """Row ``lower <= Σ weight·speed <= upper``, with the name of its constraint."""
+    """Row ``lower <= Σ weight·speed <= upper`` of a constraint.
+
+    Attributes
+    ----------
+    name
+        Name of the constraint.
+    weights
+        Coefficients by speed.
+    lower, upper
+        Bounds, scalars.
+    violation
+        Signed excess of a position constraint: positive above its upper bound, negative below its lower one.
+    """
 
     name: str
     weights: Weights
     lower: Expression
     upper: Expression
+    violation: Expression = ZERO
 
 
 @dataclass(frozen=True)
@@ -219,6 +232,26 @@ def clamp_below(value: Expression, least: Expression) -> Expression:
 def clamp_above(value: Expression, most: Expression) -> Expression:
     """Return the minimum, or NaN if the value is NaN."""
     return _replace_where(value, binary(ca.OP_LT, most, value), most)
+
+
+def raw_merge(values: Sequence[Expression], sign: int) -> Expression:
+    """Return the least value (sign 1) or the greatest (sign -1), without a gradient; NaN if any is NaN."""
+    numbers = [v for v in values if not v.symbols]
+    end = sign * min((sign * float(v) for v in numbers), default=math.inf)
+    others = [v for v in values if v.symbols]
+    if not others:
+        return as_expression(end)
+    result, *others = others
+    for other in others:
+        least = clamp_above(result, other) if sign > 0 else clamp_below(result, other)
+        ordered = binary(
+            ca.OP_OR, binary(ca.OP_LE, result, other), binary(ca.OP_LT, other, result)
+        )  # neither holds for NaN
+        result = least + binary(ca.OP_IF_ELSE_ZERO, unary(ca.OP_NOT, ordered), other)
+    if math.isinf(end):
+        return result
+    bound = as_expression(end)
+    return clamp_above(result, bound) if sign > 0 else clamp_below(result, bound)
 
 
 def _replace_where(value: Expression, beyond: Expression, end: Expression) -> Expression:
