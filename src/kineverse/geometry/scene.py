@@ -22,9 +22,9 @@ from .dependence import FrameDependence
 from .distance_expressions import DistanceParameters, PairDistance, distance_expression, distance_parameters
 from .mesh_files import Floats
 from .objects import Exclusion
-from .proximity_query import (
+from .prepared_query import (
     PairFlags,
-    ProximityQuery,
+    PreparedQuery,
     flag_between,
     flag_matching,
     flag_relatively_moving,
@@ -79,7 +79,7 @@ class Scene:
         self.model = model
         self._world = CollisionWorld(model, rules, triangles, decomposed, leave_out)
         self._parameters: dict[tuple[str, str], DistanceParameters] = {}
-        self._queries: dict[tuple[Any, ...], ProximityQuery] = {}
+        self._queries: dict[tuple[Any, ...], PreparedQuery] = {}
 
     @property
     def collision_world(self) -> CollisionWorld:
@@ -176,7 +176,7 @@ class Scene:
         moving: Symbol | str | Iterable[Symbol | str] | None = None,
         rules: Iterable[Rule] = (),
         per_shape: bool = False,
-    ) -> ProximityQuery:
+    ) -> PreparedQuery:
         """Return a prepared query: the near pairs among selected pairs of bodies, for loops.
 
         Each call of it, after :meth:`update`, returns what :meth:`pairs_within` does for these pairs. The
@@ -213,7 +213,7 @@ class Scene:
             wanted *= flag_between(*(flag_matching(bodies, each) for each in names))
             return wanted if symbols is None else wanted * flag_relatively_moving(self.model, bodies, symbols)
 
-        query = ProximityQuery(self._world, choose, radius, per_shape)
+        query = PreparedQuery(self._world, choose, radius, per_shape)
         _ = query.pairs  # raises for unknown names
         return query
 
@@ -337,12 +337,12 @@ class Scene:
 
         return self._query_pairs(("moved by", *moving), choose)(radius)
 
-    def _query_pairs(self, key: tuple[Any, ...], choose: Callable[[], PairFlags]) -> ProximityQuery:
+    def _query_pairs(self, key: tuple[Any, ...], choose: Callable[[], PairFlags]) -> PreparedQuery:
         """Return the query about the checked pairs that are chosen, made once for a key."""
         if key not in self._queries:
             if len(self._queries) >= _MAX_QUERIES:
                 self._queries.clear()
-            self._queries[key] = ProximityQuery(
+            self._queries[key] = PreparedQuery(
                 self._world, lambda: self._world.table.allowed * choose(), math.inf
             )
         return self._queries[key]

@@ -73,7 +73,7 @@ def test_arrays_of_indices_name_bodies_and_shapes(model):
         (f"link{k}", "box1") for k in range(5)
     }
     assert watch.pairs.dtype == np.int32
-    assert repr(watch) == "<ProximityQuery: 5 pairs of bodies, within 0.1 m>"
+    assert repr(watch) == "<PreparedQuery: 5 pairs of bodies, within 0.1 m>"
 
 
 def test_per_shape_returns_every_pair_of_shapes(either_search):

@@ -1,4 +1,4 @@
-"""Proximity queries about selected pairs of bodies, prepared once for many states."""
+"""Queries about selected pairs of bodies, prepared once for many states."""
 
 from __future__ import annotations
 
@@ -25,8 +25,8 @@ PairFlags: TypeAlias = npt.NDArray[np.bool_] | Flags
 """Flags (B, B) of pairs of bodies, symmetric."""
 
 
-class ProximityQuery:
-    """Prepared query for the near pairs among some pairs of bodies, created by :meth:`.Scene.watch`.
+class PreparedQuery:
+    """Query for the near pairs among some pairs of bodies, created by :meth:`.Scene.watch`.
 
     A call returns the pairs within the radius at the scene's present state, nearest first. The pairs are
     selected again only after an edit of the model.
@@ -77,7 +77,7 @@ class ProximityQuery:
 
     def __repr__(self) -> str:
         what = "pairs of bodies, each pair of shapes" if self.per_shape else "pairs of bodies"
-        return f"<ProximityQuery: {len(self.pairs)} {what}, within {self.radius:g} m>"
+        return f"<PreparedQuery: {len(self.pairs)} {what}, within {self.radius:g} m>"
 
 
 def flag_between(ones: PairFlags, others: PairFlags) -> npt.NDArray[np.bool_]:
