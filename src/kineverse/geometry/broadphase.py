@@ -207,6 +207,25 @@ class ObjectTable:
         return distances
 
 
+class PairSelection:
+    """Selected pairs of bodies of a table, for a search among these only.
+
+    Parameters
+    ----------
+    table
+        The table, all of whose objects have solids.
+    bodies
+        (B, B) 1 for selected pairs, symmetric; 0 on the diagonal.
+    """
+
+    def __init__(self, table: ObjectTable, bodies: Flags) -> None:
+        self.bodies = np.ascontiguousarray(bodies)
+        involved = np.asarray(self.bodies.any(axis=1), dtype=np.uint8)
+        self._objects = np.ascontiguousarray(involved[table.body])
+        self.addresses = self.bodies.ctypes.data, self._objects.ctypes.data
+        """Addresses of the flags of the pairs, and of those of the objects that are in any pair."""
+
+
 LEAF_SIZE = 4
 """Number of objects in a leaf of the static tree."""
 
@@ -317,9 +336,12 @@ def find_near_pairs(table: ObjectTable, reach: float, allowed: Flags | None = No
     return np.stack([ones[keep], others[keep]], axis=1), lows[keep]
 
 
-def rank_pairs(table: ObjectTable, pairs: Indices, distances: Floats, radius: float) -> npt.NDArray[np.int64]:
+def rank_pairs(
+    table: ObjectTable, pairs: Indices, distances: Floats, radius: float, per_shape: bool = False
+) -> npt.NDArray[np.int64]:
     """Return the pairs that are the nearest of their bodies, by index, within a radius [m], nearest first.
 
+    If ``per_shape``, all pairs within the radius are returned.
     Ties are broken by the indices of the bodies and then of the objects.
 
     Parameters
@@ -331,6 +353,8 @@ def rank_pairs(table: ObjectTable, pairs: Indices, distances: Floats, radius: fl
     low, high = owners.min(axis=1, initial=len(table.allowed)), owners.max(axis=1, initial=0)
     order = np.lexsort((pairs[:, 1], pairs[:, 0], high, low, distances))
     order = order[: np.searchsorted(distances[order], radius, side="right")]
+    if per_shape:
+        return np.asarray(order)
     bodies = low[order].astype(np.int64) * len(table.allowed) + high[order]
     leading = np.unique(bodies, return_index=True)[1]
     return np.asarray(order[np.sort(leading)])

@@ -248,10 +248,11 @@ static Found *sorted(Found *found, Found *spare, int64_t n) {
   return found;
 }
 
-/* Writes the indices of the pairs that are the nearest of their bodies within a radius, nearest first;
-   `order` has room for all. Returns their number, -1 without memory. */
+/* Writes the indices of the pairs within a radius, nearest first, of each pair of bodies the nearest, or
+   `all`; `order` has room for all. Returns their number, -1 without memory. */
 EXPORT int64_t rank(
-    const Table *t, const int32_t *pairs, int64_t n, const double *distances, double radius, int64_t *order) {
+    const Table *t, const int32_t *pairs, int64_t n, const double *distances, double radius, int64_t all,
+    int64_t *order) {
   int64_t count = 0, kept = 0, slots = 2;
   while (slots < 2 * n) slots *= 2;
   Found *memory = malloc((2 * n + 1) * sizeof(Found)), *found = memory;
@@ -272,7 +273,7 @@ EXPORT int64_t rank(
     const int64_t bodies = found[k].bodies + 1;
     uint64_t slot = (uint64_t)bodies * 0x9E3779B97F4A7C15u >> 20 & (slots - 1);
     while (known[slot] && known[slot] != bodies) slot = (slot + 1) & (slots - 1);
-    if (!known[slot]) order[kept++] = found[k].at;
+    if (all || !known[slot]) order[kept++] = found[k].at;
     known[slot] = bodies;
   }
   free(memory);
@@ -305,16 +306,16 @@ EXPORT void gather(
    measured pairs, and writes the number `kept`: -1 if some pairs are left to coal, or the buffers are too
    short. */
 EXPORT int64_t search(
-    Table *t, double reach, double radius, int64_t room, int32_t *pairs, double *lows, double *distances,
-    double *witnesses, int64_t *order, int64_t *kept, int32_t *pieces, int32_t *bodies, double *distance,
-    double *witness) {
+    Table *t, double reach, double radius, int64_t all, int64_t room, int32_t *pairs, double *lows,
+    double *distances, double *witnesses, int64_t *order, int64_t *kept, int32_t *pieces, int32_t *bodies,
+    double *distance, double *witness) {
   const int64_t found = near(t, reach, pairs, lows, room);
   *kept = -1;
   if (found > room) return found;
   measure(t, pairs, found, radius, distances, witnesses);
   for (int64_t k = 0; k < found; k++)
     if (isnan(distances[k])) return found;
-  *kept = rank(t, pairs, found, distances, radius, order);
+  *kept = rank(t, pairs, found, distances, radius, all, order);
   if (*kept > 0) gather(t, pairs, distances, witnesses, order, *kept, pieces, bodies, distance, witness);
   return found;
 }

@@ -102,7 +102,12 @@ def check_frame_names(what: str, names: Iterable[str], model: ModelView) -> None
 
 def allowed_pairs(model: ModelView, bodies: Sequence[str], rules: Sequence[Rule]) -> Flags:
     """Return (B, B) flags, 1 for pairs that are checked."""
-    table = 1 - adjacent_pairs(model, bodies)
+    return apply_rules(1 - adjacent_pairs(model, bodies), bodies, rules)
+
+
+def apply_rules(flags: Flags, bodies: Sequence[str], rules: Sequence[Rule]) -> Flags:
+    """Return (B, B) flags of checked pairs, changed by rules."""
+    table = flags.copy()
     index = {name: k for k, name in enumerate(bodies)}
     matches: dict[str, list[int]] = {}
     for rule in rules:

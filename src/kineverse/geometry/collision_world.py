@@ -55,6 +55,8 @@ class CollisionWorld:
         Names of the bodies that have objects, in the order of the model.
     members
         Indices of the objects of each body, in the order of :attr:`bodies`.
+    shape_numbers
+        (M,) index of the shape of each object among the shapes of its body.
     table, narrowphase
         Tables of the broad phase, and the narrow phase by coal.
     """
@@ -83,6 +85,7 @@ class CollisionWorld:
         self.objects: list[CollisionObject] = []
         self.bodies: tuple[str, ...] = ()
         self.members: list[list[int]] = []
+        self.shape_numbers: Indices = np.zeros(0, dtype=np.int32)
         self._solids: list[Solid | None] = []
         self._all_loaded = False
         self.table = ObjectTable(0, np.zeros(0, dtype=np.int32), np.zeros((0, 0), dtype=np.uint8))
@@ -120,6 +123,7 @@ class CollisionWorld:
         number = {name: k for k, name in enumerate(self.bodies)}
         body = np.array([number[item.body] for item in self.objects], dtype=np.int32)
         self.members = [[] for _ in self.bodies]
+        self.shape_numbers = np.array([item.number for item in self.objects], dtype=np.int32)
         for k, owner in enumerate(body.tolist()):
             self.members[owner].append(k)
         self.table = table = ObjectTable(len(moving), body, allowed_pairs(self.model, self.bodies, rules))
@@ -258,14 +262,24 @@ class CollisionWorld:
         return distances, witnesses
 
     def measure_remaining(
-        self, pairs: Indices, lows: Floats, limit: float, distances: Floats, witnesses: Floats
+        self,
+        pairs: Indices,
+        lows: Floats,
+        limit: float,
+        distances: Floats,
+        witnesses: Floats,
+        per_shape: bool = False,
     ) -> None:
-        """Measure by coal the pairs whose distance is NaN, see :meth:`measure`."""
+        """Measure by coal the pairs whose distance is NaN, see :meth:`measure`.
+
+        If ``per_shape``, all of them are measured, also beside a nearer pair of the same bodies.
+        """
         owners = self.table.body[pairs]
         keys = owners.min(axis=1).astype(np.int64) * len(self.bodies) + owners.max(axis=1)
         unsolved = np.flatnonzero(np.isnan(distances))
         # Most bodies have one object; then no other pair of the same bodies can be nearer.
-        nearest = _NearestByBodies(keys, distances) if len(np.unique(keys)) < len(keys) else None
+        several = not per_shape and len(np.unique(keys)) < len(keys)
+        nearest = _NearestByBodies(keys, distances) if several else None
         for k in unsolved[np.argsort(lows[unsolved], kind="stable")].tolist():
             if nearest is not None and nearest.has_nearer(k, lows[k]):
                 distances[k] = math.inf
