@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 
+from kineverse.geometry.results import DistanceResult
 from kineverse.lie import Array
 from kineverse.symbols import Symbol
 
@@ -39,6 +40,8 @@ class Command:
         Durations of the parts of the step.
     iterations
         Iterations of the solver.
+    contacts
+        Near pairs of bodies, nearest first; the first of them have rows.
     """
 
     speeds: Mapping[Symbol, float]
@@ -48,10 +51,19 @@ class Command:
     iterations: int
     multipliers: Array = field(repr=False)
     row_names: tuple[tuple[str, ...], ...] = field(repr=False)
+    contacts: Sequence[DistanceResult] = field(repr=False)
 
     @property
     def active(self) -> tuple[str, ...]:
         """Names of the constraints that restrict the command, the strongest first."""
         sizes = abs(self.multipliers)
         order = sorted((k for k in range(len(sizes)) if sizes[k] > SATURATED), key=lambda k: -sizes[k])
-        return tuple(dict.fromkeys(name for k in order for name in self.row_names[k]))
+        return tuple(dict.fromkeys(name for k in order for name in self.names_of_row(k)))
+
+    def names_of_row(self, index: int) -> tuple[str, ...]:
+        """Return the names of the constraints of a bound or row; of a contact, the names of both bodies."""
+        static = len(self.row_names)
+        if index < static:
+            return self.row_names[index]
+        pair = self.contacts[index - static]
+        return (f"contact of {pair.a} and {pair.b}",)

@@ -12,6 +12,7 @@ import numpy.typing as npt
 from kineverse.compile import compile  # noqa: A004
 from kineverse.errors import InfeasibleError, InvalidValueError, NotFiniteError, ShapeError, UnknownNameError
 from kineverse.expressions.expression import Expression, ExpressionLike, as_expression
+from kineverse.geometry import Scene
 from kineverse.geometry.dependence import FrameDependence
 from kineverse.lie import Array
 from kineverse.model.model_view import ModelView
@@ -20,6 +21,7 @@ from kineverse.state import State, StateLike, as_state
 from kineverse.symbols import Symbol, parameter
 
 from .command import Command, StepTimes
+from .contact_slots import ContactSlots
 from .formulation import Formulation, find_speeds
 from .infeasibility import Conflict, find_irreducible_conflict, find_least_violation
 from .quadratic_program import make_solver
@@ -27,6 +29,7 @@ from .tasks import Goal, Task
 from .velocity_program import Costs, VelocityProgram
 
 _DT = "control/dt"
+_CONTACT_GAIN = 10.0
 _LEAST_SHARE = 0.01
 """Smallest default weight of a speed, so that damping stays positive."""
 
@@ -36,8 +39,8 @@ class Controller:
 
     A step evaluates one compiled function of the state and solves one quadratic program; see
     :mod:`.velocity_program` for the equations. The program starts in CasADi's interpreter and continues in C
-    once that is compiled. Without contradictory tasks a step is feasible at every state: outside of its limits
-    a coordinate is led back. The controller is about the version of the model at construction.
+    once that is compiled. Without contradictory tasks a step is feasible at every state; outside of its
+    limits a coordinate is led back. The controller is about the version of the model at construction.
 
     Parameters
     ----------
@@ -59,6 +62,13 @@ class Controller:
     acceleration
         Limits on accelerations [m/s²], [rad/s²], a number or a mapping by coordinate or speed. They and those
         of the model are limits around the last command, and give way where nothing else is possible.
+    scene
+        Collision scene of the model; None to ignore collisions. Pairs that may touch, such as fingers and a
+        handle, are excepted by its rules. Each step updates it.
+    contacts
+        Number of contact slots: rows for the nearest pairs whose distance the speeds change.
+    margin, radius
+        Distance that pairs keep, and distance from which they count [m].
     solver
         ``"daqp"``, ``"proxsuite"`` or ``"osqp"``.
 
@@ -93,6 +103,10 @@ class Controller:
         jerk: float = 0.0,
         posture: float = 1e-3,
         acceleration: float | Mapping[Symbol | str, float] | None = None,
+        scene: Scene | None = None,
+        contacts: int = 24,
+        margin: float = 0.005,
+        radius: float = 0.05,
         solver: str = "daqp",
     ) -> None:
         for name, value in (("smooth", smooth), ("jerk", jerk), ("posture", posture)):
@@ -107,17 +121,28 @@ class Controller:
         self.tasks = formulation.tasks
         self.speeds = formulation.speeds
         stated, chosen = _accelerations(model, self.speeds, acceleration)
+        self._costs = Costs(smooth=smooth, jerk=jerk, posture=posture)
         self._program = VelocityProgram(
             formulation,
-            Costs(smooth=smooth, jerk=jerk, posture=posture),
+            self._costs,
             joint_weights=_joint_weights(model, self.speeds, weights),
             posture=_middles(formulation) if posture else {},
             accelerations=stated | chosen,
             hard_accelerations=bool(stated) and not formulation.holds,
-            contacts=0,
+            contacts=contacts if scene is not None else 0,
             dt=step,
         )
         self.inputs = self._program.inputs
+        self._contacts: ContactSlots | None = None
+        if scene is not None and contacts:
+            self._contacts = ContactSlots(
+                scene, self.speeds, contacts, margin=margin, radius=radius, gain=min(0.5 / dt, _CONTACT_GAIN)
+            )
+            both = {*self.inputs, *self._contacts.inputs}
+            self.inputs = tuple(sorted(both, key=lambda s: s.sort_key))
+            place = {s: k for k, s in enumerate(self.inputs)}
+            self._program_values = np.array([place[s] for s in self._program.inputs], dtype=np.intp)
+            self._contact_values = np.array([place[s] for s in self._contacts.inputs], dtype=np.intp)
         self._solver_name = solver
         self._solver = make_solver(solver, self._program.columns, self._program.rows, soft=None)
         self._relaxed = self._solver
@@ -126,8 +151,9 @@ class Controller:
                 solver, self._program.columns, self._program.rows, soft=self._program.soft
             )
         self._evaluate = self._program.function.bind()
-        n, first = len(self.speeds), len(self.inputs)
-        self._values = self._evaluate.input[:first]
+        n, first = len(self.speeds), len(self._program.inputs)
+        program_values = self._evaluate.input[:first]
+        self._values = np.zeros(len(self.inputs)) if self._contacts else program_values
         self._evaluate.input[first] = self.dt
         self._last = self._evaluate.input[first + 1 : first + 1 + n]
         self._before = self._evaluate.input[first + 1 + n :]
@@ -164,7 +190,8 @@ class Controller:
         Raises
         ------
         InfeasibleError
-            If hard rows contradict each other, with an irreducible set of them and the least-violating command.
+            If hard rows contradict each other; with an irreducible set of them, and the least-violating
+            command.
         NotFiniteError
             If the program or its solution has a NaN, with the tasks or constraints where it arises.
         UnknownNameError, ShapeError, InvalidValueError
@@ -172,9 +199,16 @@ class Controller:
         """
         start = perf_counter()
         self._read(state)
+        if self._contacts is not None:
+            self._evaluate.input[: len(self._program_values)] = self._values[self._program_values]
+            self._contacts.update(self._values[self._contact_values])
         read = perf_counter()
         self._evaluate()
         H, f, A, lower, upper, residuals, check = self._evaluate.outputs
+        if self._contacts is not None:
+            rows, first = self._program.contact_rows, self._program.columns
+            ends = slice(first + rows.start, first + rows.stop)
+            self._contacts.write(H, f, A[rows], lower[ends], upper[ends], self._costs.recovery)
         if not math.isfinite(check[()]):
             raise self._not_finite()
         evaluated = perf_counter()
@@ -204,6 +238,7 @@ class Controller:
             iterations,
             multipliers.copy(),
             self._row_names,
+            () if self._contacts is None else self._contacts.found,
         )
 
     def _read(self, state: StateLike | npt.ArrayLike) -> None:
@@ -226,7 +261,7 @@ class Controller:
         vector = np.asarray(state, dtype=float)
         if vector.shape != self._values.shape:
             raise ShapeError(
-                f"The vector of a state has the {len(self.inputs)} values of controller.inputs, not the shape "
+                f"The vector of a state has the {len(self.inputs)} values of controller.inputs, not shape "
                 f"{vector.shape}."
             )
         self._values[:] = vector
@@ -251,11 +286,11 @@ class Controller:
     def _infeasible(self, times: StepTimes) -> InfeasibleError:
         """Return the error with an irreducible conflict and the least-violating command."""
         _, _, A, lower, upper, residuals, _ = self._evaluate.outputs
-        names, n = self._program.names, len(self.speeds)
+        n = len(self.speeds)
         sides = find_irreducible_conflict(A, lower, upper)
         grouped: dict[str, Conflict] = {}
         for k, side in sides:
-            for name in names[k]:
+            for name in self._names_of_row(k):
                 bounds = (lower[k], math.inf) if side < 0 else (-math.inf, upper[k])
                 if name in grouped:
                     bounds = (max(bounds[0], grouped[name].lower), min(bounds[1], grouped[name].upper))
@@ -271,6 +306,13 @@ class Controller:
             tuple(grouped.values()),
             command,
         )
+
+    def _names_of_row(self, index: int) -> tuple[str, ...]:
+        names = self._program.names
+        if index < len(names) or self._contacts is None:
+            return names[index]
+        pair = self._contacts.found[index - len(names)]
+        return (f"contact of {pair.a} and {pair.b}",)
 
     def _operations(self, name: str) -> tuple[str, ...]:
         history = getattr(self.model, "history", None)
@@ -320,9 +362,9 @@ def _middles(formulation: Formulation) -> dict[Symbol, float]:
 
 def _accelerations(
     model: ModelView, speeds: Sequence[Symbol], chosen: float | Mapping[Symbol | str, float] | None
-) -> tuple[dict[Symbol, ExpressionLike], dict[Symbol, ExpressionLike]]:
+) -> tuple[dict[Symbol, Expression], dict[Symbol, Expression]]:
     """Return the limits on accelerations that the model states, and those that were chosen."""
-    stated: dict[Symbol, ExpressionLike] = {}
+    stated: dict[Symbol, Expression] = {}
     for constraint in model.constraints.values():
         symbol = constraint.expression
         if isinstance(symbol, Symbol) and symbol.order == 2 and symbol.integral() in speeds:
@@ -335,6 +377,10 @@ def _accelerations(
         given = dict.fromkeys(speeds, chosen)
     for speed, limit in given.items():
         if not (isinstance(limit, int | float) and 0 < limit < math.inf):
-            raise InvalidValueError(f"The acceleration of '{speed.position}' is a positive limit, not {limit!r}.")
-    both = {s: raw_min(as_expression(stated[s]), as_expression(a)) if s in stated else a for s, a in given.items()}
+            raise InvalidValueError(
+                f"The acceleration of '{speed.position}' is a positive limit, not {limit!r}."
+            )
+    both = {
+        s: raw_min(as_expression(stated[s]), as_expression(a)) if s in stated else a for s, a in given.items()
+    }
     return stated, both

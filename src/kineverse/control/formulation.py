@@ -112,9 +112,7 @@ class Formulation:
         self._still = find_speeds(model, still, "still")
         rates = model.rates
         every = dict(model.constraints)
-        errors = {
-            task: rates.carry(task.error) for task in self.tasks if isinstance(task, Goal | Hold)
-        }
+        errors = {task: rates.carry(task.error) for task in self.tasks if isinstance(task, Goal | Hold)}
         keeps = {
             self._names[task]: Constraint(
                 rates.carry(c.lower), rates.carry(c.expression), rates.carry(c.upper)
@@ -179,7 +177,8 @@ class Formulation:
     def parts(self) -> dict[str, Expression]:
         """All values and derivatives in the rows of each task and constraint, by name, flat."""
         found: dict[str, list[Expression]] = {}
-        for row in (*self.goals, *self.holds):
+        tasks: tuple[GoalRows | HoldRows, ...] = (*self.goals, *self.holds)
+        for row in tasks:
             found[row.name] = [row.error, row.jacobian.ravel()]
         rows = self.rows
         for k, name in enumerate(rows.names):
@@ -286,7 +285,9 @@ def _check_tasks(tasks: Iterable[Task]) -> tuple[Task, ...]:
         if not isinstance(task, Goal | Hold | Keep):
             raise ExpressionError(f"A task is a Goal, a Hold or a Keep, not {task!r}.")
     if not given:
-        raise InvalidValueError("A controller without a task has nothing to do; give it a Goal, Hold or Keep.")
+        raise InvalidValueError(
+            "A controller without a task has nothing to do; give it a Goal, Hold or Keep."
+        )
     return given
 
 

@@ -213,4 +213,6 @@ def _check_number(task: object, name: str, value: ExpressionLike, least: float) 
     if expression.shape:
         raise ShapeError(f"{task!r}: the {name} is a scalar, not of shape {expression.shape}.")
     if not expression.symbols and not (math.isfinite(float(expression)) and float(expression) >= least):
-        raise InvalidValueError(f"{task!r}: the {name} is a finite number of at least {least:g}, not {value!r}.")
+        raise InvalidValueError(
+            f"{task!r}: the {name} is a finite number of at least {least:g}, not {value!r}."
+        )

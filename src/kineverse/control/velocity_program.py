@@ -30,7 +30,7 @@ from kineverse.lie import Array
 from kineverse.model.speed_limits import INFINITE, ZERO, is_infinite, raw_max
 from kineverse.symbols import Symbol, parameter
 
-from .formulation import Formulation
+from .formulation import Formulation, GoalRows, HoldRows
 
 RECOVERY_WEIGHT = 1e3
 INWARDS = 1e-4
@@ -73,12 +73,12 @@ class VelocityProgram:
     Attributes
     ----------
     inputs
-        Symbols of the state, in the order of the vector; the time step, the last command and, with a weight on
-        jerk, the one before follow them.
+        Symbols of the state, in the order of the vector; the time step, the last command and, with a weight
+        on jerk, the one before follow them.
     columns
         Number of variables: the speeds, and the progress if anything is held.
     names
-        Name of the constraint of each bound and row; bounds may have several.
+        Names of the constraints of each bound and row, without those of contacts.
     equalities
         Names of holds, and of the progress.
     soft
@@ -180,24 +180,26 @@ class VelocityProgram:
                 soft.append(not hard_accelerations)
         first = len(soft)
         self.contact_rows = slice(first, first + contacts)
-        for k in range(contacts):
+        for _ in range(contacts):
             matrix += [ZERO] * self.columns
             lower.append(-INFINITE)
             upper.append(INFINITE)
-            names.append((f"contact {k}",))
             soft.append(False)
         self.equalities = frozenset({"progress", *(hold.name for hold in formulation.holds)})
         self.rows = len(soft)
         self.names = tuple(names)
         self.soft = np.array([False] * self.columns + soft)
-        A = array(matrix).reshape(self.rows, self.columns) if matrix else as_expression(
-            np.zeros((0, self.columns))
+        A = (
+            array(matrix).reshape(self.rows, self.columns)
+            if matrix
+            else as_expression(np.zeros((0, self.columns)))
         )
         f = array(linear)
         finite = [b for b in (*lower, *upper) if not is_infinite(b)]
         parts = [e for part in (H, f, A) for e in part.ravel()] + finite
         check = sum((part for part in parts if part.symbols), ZERO)
-        residuals = {row.name: norm(row.error) for row in (*formulation.goals, *formulation.holds)}
+        tasks: tuple[GoalRows | HoldRows, ...] = (*formulation.goals, *formulation.holds)
+        residuals = {row.name: norm(row.error) for row in tasks}
         residuals |= {name: self._keep_residual(name) for name in formulation.keeps}
         self.residuals = tuple(residuals)
         self.function: CompiledFunction[tuple[Array, ...]]
