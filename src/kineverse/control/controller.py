@@ -380,7 +380,6 @@ def _accelerations(
             raise InvalidValueError(
                 f"The acceleration of '{speed.position}' is a positive limit, not {limit!r}."
             )
-    both = {
-        s: raw_min(as_expression(stated[s]), as_expression(a)) if s in stated else a for s, a in given.items()
-    }
-    return stated, both
+    limits = {s: as_expression(limit) for s, limit in given.items()}
+    limits |= {s: raw_min(stated[s], limit) for s, limit in limits.items() if s in stated}
+    return stated, limits

@@ -128,11 +128,11 @@ class Formulation:
         for expression in subject:
             self._check_symbols(expression)
         relevant = model.constraints_for(subject, closure=True)
+        relevant |= keeps
         equalities = {name: c for name, c in relevant.items() if is_equality(c)}
         ranges = {name: c for name, c in relevant.items() if name not in equalities}
         if not speed_limits:
             ranges = {name: c for name, c in ranges.items() if c.order == 0}
-        self.equalities = equalities
         held = {name: rates.carry(c.expression - c.lower) for name, c in equalities.items()}
         gradients = {task: self._speed_gradient(task, error) for task, error in errors.items()}
         closures = {
@@ -140,7 +140,7 @@ class Formulation:
         }
         first = {s for g in (*gradients.values(), *closures.values()) for s in g}
         self._limits = every if speed_limits else {}
-        found = self._rows(ranges | keeps, dt, None)
+        found = self._rows(ranges, dt, None)
         columns = (first | set(found.speeds)) - self._still
         self.speeds: tuple[Symbol, ...] = tuple(sorted(columns, key=lambda s: s.sort_key))
         unknown = [s for s in self.speeds if s not in model.speeds]
@@ -149,8 +149,8 @@ class Formulation:
                 f"The tasks are about '{unknown[0]}', and nothing in the model moves with it. "
                 f"{suggest(str(unknown[0]), map(str, model.speeds), 'speed')}"
             )
-        self.rows = found if found.speeds == self.speeds else self._rows(ranges | keeps, dt, self.speeds)
-        self.keeps = tuple(keeps)
+        self.rows = found if found.speeds == self.speeds else self._rows(ranges, dt, self.speeds)
+        self.keeps = tuple(name for name in keeps if name not in equalities)
         self.goals = tuple(
             self._goal_rows(task, errors[task], gradients[task])
             for task in self.tasks
