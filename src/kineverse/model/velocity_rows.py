@@ -30,7 +30,7 @@ from typing import Literal, TypeAlias
 
 from kineverse._checks import real_number
 from kineverse.errors import InvalidValueError
-from kineverse.expressions.expression import Expression, ExpressionLike, array, as_expression
+from kineverse.expressions.expression import Expression, ExpressionLike, array
 from kineverse.expressions.functions import sqrt
 from kineverse.expressions.implicit import clamp_to_domains
 from kineverse.symbols import Symbol, check_symbols
@@ -42,49 +42,19 @@ from .speed_limits import (
     INFINITE,
     ZERO,
     AdmissibleSpeeds,
+    SpeedBounds,
     SpeedLimits,
     SpeedRow,
     clamp_above,
     clamp_below,
     is_infinite,
+    merge_bounds,
     raw_max,
-    raw_merge,
     raw_min,
     select_moving,
 )
 
 Recovery: TypeAlias = Literal["required", "allowed"]
-
-_ONE = as_expression(1.0)
-
-
-@dataclass(frozen=True)
-class SpeedBounds:
-    """Bounds ``lower <= v <= upper`` of single speeds v, those of several constraints merged.
-
-    The greatest of the lower bounds counts, and the least of the upper bounds. At states where constraints on
-    one speed contradict each other, a lower bound is above the upper one: where two speed limits exclude each
-    other, or one excludes zero speed and another constraint allows no other.
-
-    Attributes
-    ----------
-    speeds
-        The n speeds.
-    lower, upper
-        Expressions of shape (n,) in units of the speeds; ∓infinity for none.
-    violation
-        Signed excess of the position constraints of each speed, in units of its position, shape (n,):
-        positive if the speed has to be negative to reduce it. Of several on one side the largest counts;
-        violations of both sides are added. A goal of recovery is ``v = -gain * violation``.
-    names
-        Names of the constraints of each speed.
-    """
-
-    speeds: tuple[Symbol, ...]
-    lower: Expression
-    upper: Expression
-    violation: Expression
-    names: tuple[tuple[str, ...], ...]
 
 
 @dataclass(frozen=True)
@@ -147,37 +117,12 @@ class VelocityRows:
     @cached_property
     def bounds(self) -> SpeedBounds:
         """Rows that have a single column with a constant coefficient, as bounds of that speed."""
-        own: dict[Symbol, list[SpeedRow]] = {s: [] for s in self.speeds}
-        for row in filter(_is_simple, self.rows):
-            ((speed, weight),) = row.weights.items()
-            lower, upper, violation = (
-                e if float(weight) == 1 else e / weight for e in (row.lower, row.upper, row.violation)
-            )
-            ends = (lower, upper) if float(weight) > 0 else (upper, lower)
-            own[speed].append(SpeedRow(row.name, {speed: _ONE}, *ends, violation))
-        return SpeedBounds(
-            self.speeds,
-            array([raw_merge([row.lower for row in rows], -1) for rows in own.values()]),
-            array([raw_merge([row.upper for row in rows], 1) for rows in own.values()]),
-            array([_merge_violations([row.violation for row in rows]) for rows in own.values()]),
-            tuple(tuple(dict.fromkeys(row.name for row in rows)) for rows in own.values()),
-        )
+        return merge_bounds(self.speeds, [row for row in self.rows if row.is_simple])
 
     @cached_property
     def general(self) -> VelocityRows:
         """The rows that are not in :attr:`bounds`, with the same columns."""
-        return VelocityRows(self.speeds, tuple(row for row in self.rows if not _is_simple(row)), self.skipped)
-
-
-def _is_simple(row: SpeedRow) -> bool:
-    return len(row.weights) == 1 and not any(w.symbols for w in row.weights.values())
-
-
-def _merge_violations(violations: Sequence[Expression]) -> Expression:
-    found = [v for v in violations if v != ZERO]
-    if len(found) < 2:
-        return found[0] if found else ZERO
-    return clamp_below(raw_merge(found, -1), ZERO) + clamp_above(raw_merge(found, 1), ZERO)
+        return VelocityRows(self.speeds, tuple(row for row in self.rows if not row.is_simple), self.skipped)
 
 
 def velocity_rows(
