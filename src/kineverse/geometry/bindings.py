@@ -38,6 +38,7 @@ class _Struct(ctypes.Structure):
     _fields_ = (
         *((name, ctypes.c_int64) for name in ("count", "moving", "bodies", "axis")),
         *((name, ctypes.c_void_p) for name in (*_ARRAYS, "boxes", "leaves")),
+        ("node_count", ctypes.c_int64),
         ("leaf_count", ctypes.c_int64),
     )
 
@@ -167,7 +168,7 @@ class _TableBinding:
         static = np.arange(table.moving, table.count, dtype=np.int32)
         self.boxes, self.leaves = build_static_tree(table.low, table.high, static)
         self.struct.boxes, self.struct.leaves = self.boxes.ctypes.data, self.leaves.ctypes.data
-        self.struct.leaf_count = len(self.leaves)
+        self.struct.node_count, self.struct.leaf_count = len(self.boxes), len(self.leaves)
         table.static_changed = False
 
     def reserve(self, count: int) -> None:

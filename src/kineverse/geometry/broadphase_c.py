@@ -1,6 +1,6 @@
 """C text: broad phase, and the ordered search that comes after :mod:`.narrowphase_c`."""
 
-from .broadphase import MEMORY_SLOTS
+from .broadphase import MEMORY_SLOTS, TREE_WIDTH
 
 SWEEP = r"""
 #include <math.h>
@@ -28,10 +28,11 @@ typedef struct {
   Memory *memory;
   const double *boxes;
   const int32_t *leaves;
-  int64_t leaf_count;
+  int64_t node_count, leaf_count;
 } Table;
 
 #define MEMORY_BITS @BITS@
+#define TREE_WIDTH @WIDTH@
 #define EXPORT __attribute__((visibility("default")))
 
 /* Slot of a pair, which another pair may have overwritten. */
@@ -119,12 +120,6 @@ typedef struct {
   int64_t room, found;
 } Answer;
 
-static inline double square_gap(const double *low, const double *high, const double *from, const double *to) {
-  double gap = 0.0;
-  for (int r = 0; r < 3; r++) gap += square(larger(larger(low[r] - to[r], from[r] - high[r]), 0.0));
-  return gap;
-}
-
 /* Adds a pair whose boxes are near each other. */
 static void consider(const Table *t, int64_t one, int64_t other, Answer *answer) {
   if (!t->allowed[t->bodies * t->body[one] + t->body[other]] || !t->active[other]) return;
@@ -146,24 +141,35 @@ static void consider(const Table *t, int64_t one, int64_t other, Answer *answer)
   answer->found++;
 }
 
+/* Squared gaps between a box and W others, whose corners are in rows. */
+static inline void square_gaps_of_node(
+    const double *low, const double *high, const double *boxes, double *gap) {
+  for (int k = 0; k < TREE_WIDTH; k++) {
+    const double *box = boxes + k;
+    gap[k] = square(larger(larger(low[0] - box[3 * TREE_WIDTH], box[0] - high[0]), 0.0)) +
+             square(larger(larger(low[1] - box[4 * TREE_WIDTH], box[TREE_WIDTH] - high[1]), 0.0)) +
+             square(larger(larger(low[2] - box[5 * TREE_WIDTH], box[2 * TREE_WIDTH] - high[2]), 0.0));
+  }
+}
+
 /* Adds the pairs of an object with static ones, down the AABB tree of build_static_tree. */
 static void consider_static(const Table *t, int64_t one, Answer *answer) {
-  const double *low = t->low + 3 * one, *high = t->high + 3 * one, reach = answer->reach;
-  int64_t waiting[64] = {0};
+  const double *low = t->low + 3 * one, *high = t->high + 3 * one, square_reach = square(answer->reach);
+  const int64_t first_leaf = t->node_count - t->leaf_count;
+  int64_t waiting[128] = {0};
   int depth = 1;
   while (depth) {
     const int64_t node = waiting[--depth];
-    const double *box = t->boxes + 6 * node;
-    if (square_gap(low, high, box, box + 3) > reach * reach) continue;
-    if (node < t->leaf_count - 1) {
-      waiting[depth++] = 2 * node + 1;
-      waiting[depth++] = 2 * node + 2;
+    double gap[TREE_WIDTH];
+    square_gaps_of_node(low, high, t->boxes + 6 * TREE_WIDTH * node, gap);
+    if (node < first_leaf) {
+      for (int k = 0; k < TREE_WIDTH; k++)
+        if (gap[k] <= square_reach) waiting[depth++] = TREE_WIDTH * node + 1 + k;
       continue;
     }
-    const int32_t *leaf = t->leaves + 4 * (node - t->leaf_count + 1);
-    for (int k = 0; k < 4 && leaf[k] >= 0; k++)
-      if (square_gap(low, high, t->low + 3 * leaf[k], t->high + 3 * leaf[k]) <= reach * reach)
-        consider(t, one, leaf[k], answer);
+    const int32_t *leaf = t->leaves + TREE_WIDTH * (node - first_leaf);
+    for (int k = 0; k < TREE_WIDTH && leaf[k] >= 0; k++)
+      if (gap[k] <= square_reach) consider(t, one, leaf[k], answer);
   }
 }
 
@@ -204,7 +210,7 @@ EXPORT int64_t near(Table *t, double reach, int32_t *pairs, double *lows, int64_
   }
   return answer.found;
 }
-""".replace("@BITS@", str(MEMORY_SLOTS.bit_length() - 1))
+""".replace("@BITS@", str(MEMORY_SLOTS.bit_length() - 1)).replace("@WIDTH@", str(TREE_WIDTH))
 
 
 SEARCH = r"""
