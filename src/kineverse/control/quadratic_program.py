@@ -1,8 +1,8 @@
 """Quadratic programs: several solvers behind one interface.
 
-The problem is to minimise ``1/2 x'Hx + f'x`` subject to ``lower <= [x; A x] <= upper``. The first n entries of the
-bounds are those of x itself, the other m those of the rows of A. A bound may be infinite, and rows whose bounds are
-equal are equalities.
+The problem is to minimise ``1/2 x'Hx + f'x`` subject to ``lower <= [x; A x] <= upper``. The first n entries
+of the bounds are those of x itself, the other m those of the rows of A. A bound may be infinite, and rows
+whose bounds are equal are equalities.
 """
 
 from __future__ import annotations
@@ -34,13 +34,13 @@ class QpSolution(NamedTuple):
     x
         The minimiser, of shape (n,); zeros unless solved.
     multipliers
-        The multipliers of ``[x; A x]``, of shape (n + m,), with ``H x + f + [I; A]' multipliers = 0``: negative at a
-        lower bound, positive at an upper one; zeros unless solved.
+        The multipliers of ``[x; A x]``, of shape (n + m,), with ``H x + f + [I; A]' multipliers = 0``:
+        negative at a lower bound, positive at an upper one; zeros unless solved.
     iterations
         The number of iterations.
     status
-        "solved"; "infeasible" (no x satisfies all hard rows); "failed" (the data are not finite, H is not positive
-        definite, or the solver did not converge).
+        "solved"; "infeasible" (no x satisfies all hard rows, or a lower bound is above its upper one);
+        "failed" (the data are not finite, H is not positive definite, or the solver did not converge).
     """
 
     x: Vector
@@ -59,13 +59,13 @@ class QpSolver(ABC):
     m
         The number of rows of A, 0 or more.
     soft
-        The soft entries of ``[x; A x]``: a mask of shape (n + m,), or None. A violation s of a soft entry costs
-        ``soft_linear s + 1/2 soft_weight s^2``.
+        The soft entries of ``[x; A x]``: a mask of shape (n + m,), or None. A violation s of a soft entry
+        costs ``soft_linear s + 1/2 soft_weight s^2``.
     soft_weight
         The weight of the squared violation, above 0: a number or one per entry.
     soft_linear
-        The weight of the violation itself, at least 0: a number or one per entry. Above the multiplier of the row it
-        makes the penalty exact: a row that can be satisfied is.
+        The weight of the violation itself, at least 0: a number or one per entry. Above the multiplier of
+        the row it makes the penalty exact: a row that can be satisfied is.
 
     Raises
     ------
@@ -135,13 +135,7 @@ class QpSolver(ABC):
         np.less_equal(lower, upper, self._ordered)
         if np.count_nonzero(self._ordered) != self._ordered.size:
             return self._nothing("failed" if np.isnan(lower).any() or np.isnan(upper).any() else "infeasible")
-        solution = self._solve(H, f, A, lower, upper)
-        if solution[3] == "solved":
-            square = solution[0].dot(solution[0])
-            if square - square != 0.0:
-                self.reset()
-                return self._nothing("failed")
-        return solution
+        return self._solve(H, f, A, lower, upper)
 
     @abstractmethod
     def reset(self) -> None:
@@ -149,7 +143,7 @@ class QpSolver(ABC):
 
     @abstractmethod
     def _solve(self, H: Vector, f: Vector, A: Vector, lower: Vector, upper: Vector) -> QpSolution:
-        """Solve a problem with finite data and ordered bounds."""
+        """Solve a problem with finite data and ordered bounds; what counts as solved is finite."""
 
     def _nothing(self, status: Status, iterations: int = 0) -> QpSolution:
         return QpSolution(np.zeros(self.n), np.zeros(self.n + self.m), iterations, status)
@@ -188,8 +182,8 @@ def make_solver(
     Parameters
     ----------
     name
-        "daqp" (dual active set, for loops), "proxqp" (augmented Lagrangian; or "proxsuite") or "osqp" (operator
-        splitting).
+        "daqp" (dual active set, for loops), "proxqp" (augmented Lagrangian; or "proxsuite") or "osqp"
+        (operator splitting).
     n, m, soft, soft_weight, soft_linear
         See :class:`QpSolver`.
 
@@ -227,7 +221,7 @@ class DaqpSolver(QpSolver):
         self._run: Callable[[], tuple[Vector, float, int, dict[str, Any]]]
         self._warm = False
 
-    def reset(self) -> None:
+    def reset(self) -> None:  # noqa: D102
         self._warm = False
 
     def _solve(self, H: Vector, f: Vector, A: Vector, lower: Vector, upper: Vector) -> QpSolution:
@@ -235,18 +229,18 @@ class DaqpSolver(QpSolver):
             # The solver keeps these arrays, and the active set of the last solve unless senses are given.
             if self._update(H, f, A if self.m else None, upper, lower) == 0:
                 x, _, flag, info = self._run()
-                if flag == 1 or flag == 2:
+                if (flag == 1 or flag == 2) and x.dot(x) < np.inf:
                     return QpSolution(x, info["lam"], info["iterations"], "solved")
-            # From an unlucky active set it can fail where it succeeds from scratch.
+            # It fails, or returns NaN as solved, if bounds of the last active set are infinite now.
             self._warm = False
-        flag = self._start(H, f, A, lower, upper)
+        flag, iterations = self._start(H, f, A, lower, upper), 0
         if flag >= 0:
             x, _, flag, info = self._run()
-            if flag == 1 or flag == 2:
+            iterations = info["iterations"]
+            if (flag == 1 or flag == 2) and x.dot(x) < np.inf:
                 self._warm = True
-                return QpSolution(x, info["lam"], info["iterations"], "solved")
-            return self._nothing(_DAQP_STATUS.get(flag, "failed"), info["iterations"])
-        return self._nothing(_DAQP_STATUS.get(flag, "failed"))
+                return QpSolution(x, info["lam"], iterations, "solved")
+        return self._nothing(_DAQP_STATUS.get(flag, "failed"), iterations)
 
     def _start(self, H: Vector, f: Vector, A: Vector, lower: Vector, upper: Vector) -> int:
         if self._model is not None:
@@ -294,6 +288,8 @@ class _SlackSolver(QpSolver):
         self._H[:n, :n], self._f[:n], self._C[n:entries, :n] = H, f, A
         self._lower[:entries], self._upper[:entries] = lower, upper
         x, multipliers, iterations, status = self._solve_hard()
+        if status == "solved" and not x.dot(x) < np.inf:
+            status = "failed"
         if status != "solved":
             self.reset()
             return self._nothing(status, iterations)
@@ -305,11 +301,11 @@ class _SlackSolver(QpSolver):
 
 
 class ProxqpSolver(_SlackSolver):
-    """The proximal augmented Lagrangian solver ProxQP (Bambade et al. 2022), dense, started from the last solution."""
+    """The proximal augmented Lagrangian solver ProxQP (Bambade et al. 2022), dense."""
 
     _qp: Any = None
 
-    def reset(self) -> None:
+    def reset(self) -> None:  # noqa: D102
         self._qp = None
 
     def _solve_hard(self) -> tuple[Vector, Vector, int, Status]:
@@ -319,6 +315,7 @@ class ProxqpSolver(_SlackSolver):
         if self._qp is None:
             self._qp = library.dense.QP(len(self._f), 0, len(lower))
             self._qp.settings.eps_abs, self._qp.settings.eps_rel = _TOLERANCE, 0.0
+            self._qp.settings.eps_primal_inf = _TOLERANCE
             self._qp.settings.initial_guess = library.InitialGuess.WARM_START_WITH_PREVIOUS_RESULT
             self._qp.init(*data)
         else:
@@ -334,11 +331,11 @@ class ProxqpSolver(_SlackSolver):
 
 
 class OsqpSolver(_SlackSolver):
-    """The operator splitting solver OSQP (Stellato et al. 2020), with polishing, started from the last solution."""
+    """The operator splitting solver OSQP (Stellato et al. 2020), with polishing."""
 
     _qp: Any = None
 
-    def reset(self) -> None:
+    def reset(self) -> None:  # noqa: D102
         self._qp = None
 
     def _solve_hard(self) -> tuple[Vector, Vector, int, Status]:
@@ -380,7 +377,14 @@ _PROXQP_INFINITY = 1e20
 _DAQP_SOFT = 8
 _DAQP_SETTINGS = {"primal_tol": 1e-9}
 _DAQP_STATUS: dict[int, Status] = {-1: "infeasible", -6: "infeasible"}
-_OSQP_SETTINGS = {"verbose": False, "eps_abs": 1e-9, "eps_rel": 1e-9, "max_iter": 100_000, "polishing": True}
+_OSQP_SETTINGS = {
+    "verbose": False,
+    "eps_abs": 1e-9,
+    "eps_rel": 1e-9,
+    "max_iter": 100_000,
+    "polishing": True,
+    "eps_prim_inf": 1e-7,
+}
 
 
 def _library(name: str, extra: str) -> ModuleType:
