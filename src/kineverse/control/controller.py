@@ -3,14 +3,21 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Mapping
 from time import perf_counter
 
 import numpy as np
 import numpy.typing as npt
 
 from kineverse.compile import compile  # noqa: A004
-from kineverse.errors import InfeasibleError, InvalidValueError, NotFiniteError, ShapeError, UnknownNameError
+from kineverse.errors import (
+    InfeasibleError,
+    InvalidValueError,
+    NoSolutionError,
+    NotFiniteError,
+    ShapeError,
+    UnknownNameError,
+)
 from kineverse.expressions.expression import Expression, ExpressionLike, as_expression
 from kineverse.geometry import Scene
 from kineverse.geometry.dependence import FrameDependence
@@ -30,6 +37,7 @@ from .velocity_program import Costs, VelocityProgram
 
 _DT = "control/dt"
 _CONTACT_GAIN = 10.0
+_SAMPLES = 16
 _LEAST_SHARE = 0.01
 """Smallest default weight of a speed, so that damping stays positive."""
 
@@ -53,8 +61,8 @@ class Controller:
     still
         Coordinates or speeds that stay still, as symbols or names.
     weights
-        Factor on damping and smoothness by coordinate or speed, as symbol or name. The default is the share
-        of the bodies that a speed moves, so that fingers are preferred to bases.
+        Factor on damping, smoothness and posture by coordinate or speed, as symbol or name. The default is
+        the share of the bodies that a speed moves, so that fingers are preferred to bases.
     smooth, jerk
         Weights of the first and second differences of commands.
     posture
@@ -117,18 +125,20 @@ class Controller:
         self.model = model
         self.dt = float(dt)
         step = parameter(_DT, self.dt)
-        self._formulation = formulation = Formulation(model, tasks, dt=step, still=still)
+        stated, chosen = _accelerations(model, acceleration)
+        self._formulation = formulation = Formulation(
+            model, tasks, dt=step, still=still, accelerations=chosen
+        )
         self.tasks = formulation.tasks
         self.speeds = formulation.speeds
-        stated, chosen = _accelerations(model, self.speeds, acceleration)
         self._costs = Costs(smooth=smooth, jerk=jerk, posture=posture)
         self._program = VelocityProgram(
             formulation,
             self._costs,
-            joint_weights=_joint_weights(model, self.speeds, weights),
+            joint_weights=_joint_weights(formulation, weights),
             posture=_middles(formulation) if posture else {},
             accelerations=stated | chosen,
-            hard_accelerations=bool(stated) and not formulation.holds,
+            hard_accelerations=not formulation.holds and not chosen,
             contacts=contacts if scene is not None else 0,
             dt=step,
         )
@@ -326,23 +336,53 @@ class Controller:
 
 
 def _joint_weights(
-    model: ModelView, speeds: Sequence[Symbol], weights: Mapping[Symbol | str, ExpressionLike] | None
+    formulation: Formulation, weights: Mapping[Symbol | str, ExpressionLike] | None
 ) -> dict[Symbol, Expression]:
-    """Return the factor on damping and smoothness of each speed."""
-    found = {}
-    for speed in speeds:
-        moved = FrameDependence(model, [speed])
-        found[speed] = sum(moved.moves(body) for body in model.bodies)
-    most = max(found.values(), default=1) or 1
-    factors = {s: as_expression(max(count / most, _LEAST_SHARE)) for s, count in found.items()}
+    """Return the factor c_i of damping, smoothness and posture of each speed.
+
+    It is the mean square of the speed's column in the Jacobians of goals and holds over random states, so
+    that units of coordinates do not matter; times the share of bodies that the speed moves, or a given
+    factor.
+    """
+    model, speeds = formulation.model, formulation.speeds
+    moved = [sum(map(FrameDependence(model, [s]).moves, model.bodies)) for s in speeds]
+    most = max(moved, default=0)
+    share = [max(count / most, _LEAST_SHARE) if most else 1.0 for count in moved]
+    factors = dict(zip(speeds, map(as_expression, share), strict=True))
     for key, weight in (weights or {}).items():
         chosen = find_speeds(model, (key,), "weights")
-        unused = [s for s in chosen if s not in factors]
-        if unused:
+        if any(s not in factors for s in chosen):
             raise InvalidValueError(f"weights=: no task moves '{key}', so it has no weight.")
-        for speed in chosen:
-            factors[speed] = as_expression(weight)
-    return factors
+        factors |= dict.fromkeys(chosen, as_expression(weight))
+    scales = _column_scales(formulation)
+    return {s: float(scale) * factors[s] for s, scale in zip(speeds, scales, strict=True)}
+
+
+def _column_scales(formulation: Formulation) -> Array:
+    """Return the mean square of each column of the tasks' Jacobians over random states, (n,)."""
+    model, n = formulation.model, len(formulation.speeds)
+    jacobians = [row.jacobian for row in formulation.goals] + [row.jacobian for row in formulation.holds]
+    if not jacobians:
+        return np.ones(n)
+    function = compile([as_expression(np.concatenate(jacobians))], tier="interpreter")
+    generator, squares = np.random.default_rng(0), []
+    middle = model.default_state()
+    limits = {s: model.limits(s) for s in function.inputs if s.order == 0 and s in model.degrees_of_freedom}
+    for _ in range(_SAMPLES):
+        at = {}
+        for symbol, (lower, upper) in limits.items():
+            value = middle[symbol]
+            low, high = max(lower, value - math.pi), min(upper, value + math.pi)
+            at[symbol] = generator.uniform(low, max(low, high))
+        try:
+            (J,) = function(middle | at)
+        except NoSolutionError:  # outside of the domain of a closed loop
+            continue
+        if np.isfinite(J).all():
+            squares.append((J * J).sum(axis=0))
+    found = np.mean(squares, axis=0) if squares else np.ones(n)
+    positive = found[found > 0]
+    return np.where(found > 0, found, positive.mean() if len(positive) else 1.0)
 
 
 def _middles(formulation: Formulation) -> dict[Symbol, float]:
@@ -361,20 +401,20 @@ def _middles(formulation: Formulation) -> dict[Symbol, float]:
 
 
 def _accelerations(
-    model: ModelView, speeds: Sequence[Symbol], chosen: float | Mapping[Symbol | str, float] | None
+    model: ModelView, chosen: float | Mapping[Symbol | str, float] | None
 ) -> tuple[dict[Symbol, Expression], dict[Symbol, Expression]]:
-    """Return the limits on accelerations that the model states, and those that were chosen."""
+    """Return the limits on accelerations that the model states, and those that were chosen, by speed."""
     stated: dict[Symbol, Expression] = {}
     for constraint in model.constraints.values():
         symbol = constraint.expression
-        if isinstance(symbol, Symbol) and symbol.order == 2 and symbol.integral() in speeds:
+        if isinstance(symbol, Symbol) and symbol.order == 2:
             stated[symbol.integral()] = raw_min(-constraint.lower, constraint.upper)
     if chosen is None:
         return stated, {}
     if isinstance(chosen, Mapping):
         given = {s: a for key, a in chosen.items() for s in find_speeds(model, (key,), "acceleration")}
     else:
-        given = dict.fromkeys(speeds, chosen)
+        given = dict.fromkeys(model.speeds, chosen)
     for speed, limit in given.items():
         if not (isinstance(limit, int | float) and 0 < limit < math.inf):
             raise InvalidValueError(

@@ -8,7 +8,7 @@ closures of loops, are holds.
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -39,8 +39,8 @@ class GoalRows:
         (k,) expression minus target; of a goal about speeds, minus the target alone.
     jacobian
         (k, n) over the columns.
-    rate
-        (k,) wanted rates.
+    correction, rate
+        (k,) wanted rates by the error alone, and with those of the target.
     weight
         Weight of the squared difference.
     """
@@ -48,6 +48,7 @@ class GoalRows:
     name: str
     error: Expression
     jacobian: Expression
+    correction: Expression
     rate: Expression
     weight: Expression
 
@@ -75,6 +76,8 @@ class Formulation:
         Time step [s], a number or a parameter.
     still
         Coordinates and speeds that stay still, as symbols or names.
+    accelerations
+        Limits on the magnitudes of accelerations by speed, beside those of the model; braking respects both.
     speed_limits
         False to ignore all constraints on speeds and accelerations, for inverse kinematics.
 
@@ -104,6 +107,7 @@ class Formulation:
         *,
         dt: ExpressionLike,
         still: Iterable[Symbol | str] = (),
+        accelerations: Mapping[Symbol, ExpressionLike] | None = None,
         speed_limits: bool = True,
     ) -> None:
         self.model = model
@@ -139,7 +143,13 @@ class Formulation:
             name: rates.over_free_speeds(error.gradient(heuristic=False)) for name, error in held.items()
         }
         first = {s for g in (*gradients.values(), *closures.values()) for s in g}
-        self._limits = every if speed_limits else {}
+        brakes = {
+            f"acceleration of {speed.position}": Constraint.from_expressions(
+                -as_expression(limit), speed.derivative(), limit
+            )
+            for speed, limit in (accelerations or {}).items()
+        }
+        self._limits = every | brakes if speed_limits else {}
         found = self._rows(ranges, dt, None)
         columns = (first | set(found.speeds)) - self._still
         self.speeds: tuple[Symbol, ...] = tuple(sorted(columns, key=lambda s: s.sort_key))
@@ -217,14 +227,17 @@ class Formulation:
         if any(s.order for s in error.symbols):
             eliminated = self.model.rates.eliminate(error)
             constant = eliminated.substitute({s: 0.0 for s in eliminated.symbols if s.order})
-            return GoalRows(self._names[goal], constant, jacobian, -constant, as_expression(goal.weight))
-        rate = -as_expression(goal.gain) * error
+            none = as_expression(np.zeros(goal.error.size))
+            return GoalRows(
+                self._names[goal], constant, jacobian, none, -constant, as_expression(goal.weight)
+            )
+        rate = correction = -as_expression(goal.gain) * error
         if goal.speed is not None:
             speed = as_expression(goal.speed)
-            rate = rate * minimum(1.0, speed / norm(np.concatenate([rate, [speed]])))
+            rate = correction = rate * minimum(1.0, speed / norm(np.concatenate([rate, [speed]])))
         if goal.rate is not None:
             rate = rate + (as_expression(goal.rate) + ZERO * goal.expression).ravel()
-        return GoalRows(self._names[goal], error, jacobian, rate, as_expression(goal.weight))
+        return GoalRows(self._names[goal], error, jacobian, correction, rate, as_expression(goal.weight))
 
     def _matrix(self, task: Goal | Hold, gradient: dict[Symbol, Expression]) -> Expression:
         """Return the Jacobian over the columns, (k, n)."""

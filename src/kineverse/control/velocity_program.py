@@ -4,14 +4,16 @@ Over the speeds v and, if anything is held, the progress s in [0, 1]::
 
     minimise    Σ w |J v - r|²                      goals
               + Σ w_r |a·v + k x|²                  way back of violated rows, x the violation
-              + Σ c_i (d + d_e Σ w|r|²) v_i²        damping, larger where goals are far (Sugihara 2011)
-              + Σ c_i (m |v_i - v_i⁻|² + j |v_i - 2 v_i⁻ + v_i⁻⁻|²)      smoothness, jerk
-              + Σ p (v_i - g (q_i* - q_i))²         posture, while goals are not reached
+              + Σ c_i (d + d_e Δt Σ w|g e|) v_i²    damping, larger where goals are far (Sugihara 2011)
+              + Σ c_i (m (v_i - v_i⁻)² + j (v_i - 2 v_i⁻ + v_i⁻⁻)²)      smoothness, jerk
+              + Σ c_i p (v_i - g (q_i* - q_i))²     posture, while goals are not reached
               + w_s (1 - s)²                        progress
     subject to  J v = -k s e                        holds
                 lower <= [v; A v] <= upper          velocity rows, keeps, accelerations, contacts
 
-All rows but those of keeps on speeds contain 0. So v = 0, s = 0 is feasible.
+The damping by |g e| bounds the second derivative of the errors, Δt |g e| |∂J/∂q|, which a linear program
+leaves out. So a goal out of reach ends at rest, with a stretched arm. All rows but those of keeps on speeds
+contain 0, so v = 0, s = 0 is feasible.
 """
 
 from __future__ import annotations
@@ -33,7 +35,7 @@ from kineverse.symbols import Symbol, parameter
 from .formulation import Formulation, GoalRows, HoldRows
 
 RECOVERY_WEIGHT = 1e3
-INWARDS = 1e-4
+INWARDS = 1e-3
 """Distance inside of a bound at which a way back aims, so that it ends at the bound and not near it."""
 POSTURE_GAIN = 0.5
 REACHED = 1e-2
@@ -47,7 +49,7 @@ class Costs:
     Attributes
     ----------
     damping, error_damping
-        Weight of squared speeds, and of their product with the squared rates that goals want.
+        Weight of squared speeds, and factor of their product with the rates that goals want.
     smooth, jerk
         Weights of the first and second differences of commands.
     posture
@@ -59,7 +61,7 @@ class Costs:
     """
 
     damping: float = 1e-4
-    error_damping: float = 1e-3
+    error_damping: float = 1.0
     smooth: float = 1e-2
     jerk: float = 0.0
     posture: float = 1e-3
@@ -108,13 +110,14 @@ class VelocityProgram:
 
         diagonal, linear = [ZERO] * n, [ZERO] * n
         hessian: Expression = as_expression(np.zeros((n, n)))
-        effort = ZERO
+        effort = distance = ZERO
         for goal in formulation.goals:
             weighted = goal.jacobian * goal.weight
             hessian = hessian + weighted.T @ goal.jacobian
             pull = weighted.T @ goal.rate
             linear = [linear[i] - pull[i] for i in range(n)]
             effort = effort + goal.weight * (goal.rate @ goal.rate)
+            distance = distance + goal.weight * norm(goal.correction)
         rows = formulation.rows
         bounds, general = rows.bounds, rows.general
         for i in range(n):
@@ -134,14 +137,14 @@ class VelocityProgram:
         for i, speed in enumerate(speeds):
             share = as_expression(joint_weights[speed])
             steady = share * (costs.smooth + costs.jerk)
-            diagonal[i] = diagonal[i] + steady + share * (costs.damping + costs.error_damping * effort)
+            diagonal[i] = diagonal[i] + steady + share * (costs.damping + costs.error_damping * dt * distance)
             linear[i] = linear[i] - share * costs.smooth * last[i]
             if before:
                 linear[i] = linear[i] - share * costs.jerk * (2 * last[i] - before[i])
             if speed in posture:
                 pull = POSTURE_GAIN * (posture[speed] - formulation.model.rates.carry(speed.position))
-                diagonal[i] = diagonal[i] + costs.posture
-                linear[i] = linear[i] - costs.posture * fade * pull
+                diagonal[i] = diagonal[i] + share * costs.posture
+                linear[i] = linear[i] - share * costs.posture * fade * pull
         entries = [
             hessian[i, j] + diagonal[i] if i == j else hessian[i, j] for i in range(n) for j in range(n)
         ]
