@@ -23,7 +23,7 @@ from kineverse.symbols import Symbol
 
 from .bindings import collision_library
 from .broadphase import FURTHEST, TRAVEL_EXCEEDED, Indices, ObjectTable
-from .collision_filter import Rule, allowed_pairs, check_frame_names, parse_rules, read_rules
+from .collision_filter import Rule, allowed_pairs, check_frame_names, parse_known_rules, read_rules
 from .mesh_files import Floats
 from .narrowphase import ACCURACY, Narrowphase
 from .objects import CollisionObject, CollisionObjects, Exclusion, load_solids
@@ -70,8 +70,7 @@ class CollisionWorld:
         leave_out: Iterable[Exclusion],
     ) -> None:
         self.model = model
-        self._own_rules = parse_rules(rules)
-        check_frame_names("A rule is about", (name for rule in self._own_rules for name in rule[:2]), model)
+        self._own_rules = parse_known_rules(rules, model)
         patterns = tuple(_as_names(names) for names in (triangles, decomposed, leave_out))
         for what, names in zip(("triangles", "decomposed", "leave_out"), patterns, strict=True):
             bodies = (name if isinstance(name, str) else name[0] for name in names)
@@ -92,6 +91,11 @@ class CollisionWorld:
         collision_library.prepare()
         self.synchronize()
 
+    @property
+    def rules(self) -> tuple[Rule, ...]:
+        """Rules of the collision filter in their order: those of the model, then the world's own."""
+        return (*read_rules(self.model), *self._own_rules)
+
     # -- the model -----------------------------------------------------------------------------------------
 
     def synchronize(self) -> None:
@@ -99,7 +103,7 @@ class CollisionWorld:
         if self._version == self.model.version:
             return
         version = self.model.version
-        rules = (*read_rules(self.model), *self._own_rules)
+        rules = self.rules
         if self._source.synchronize(self.model):
             try:
                 self._rebuild(rules)
