@@ -12,6 +12,7 @@ import numpy.typing as npt
 from kineverse.errors import InvalidValueError, UnknownNameError, suggest
 from kineverse.lie import inverse
 from kineverse.model.frame import WORLD
+from kineverse.model.frame_dependence import FrameDependence
 from kineverse.model.kinematics import ancestors
 from kineverse.model.model_view import ModelView
 from kineverse.state import StateLike
@@ -21,7 +22,6 @@ from . import distance_queries, rays
 from .broadphase import Flags
 from .collision_filter import Rule
 from .collision_world import CollisionWorld
-from .dependence import FrameDependence
 from .distance_expressions import DistanceParameters, PairDistance, distance_expression, distance_parameters
 from .mesh_files import Floats
 from .objects import Exclusion
