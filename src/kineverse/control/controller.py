@@ -20,8 +20,8 @@ from kineverse.errors import (
 )
 from kineverse.expressions.expression import Expression, ExpressionLike, as_expression
 from kineverse.geometry import Scene
-from kineverse.geometry.dependence import FrameDependence
 from kineverse.lie import Array
+from kineverse.model.frame_dependence import FrameDependence
 from kineverse.model.model_view import ModelView
 from kineverse.model.speed_limits import raw_min
 from kineverse.state import State, StateLike, as_state
