@@ -2,6 +2,8 @@
 
 from .command import Command
 from .controller import Controller
+from .ik_result import IkResult
+from .inverse_kinematics import InverseKinematics, inverse_kinematics
 from .task_functions import look_at, same_orientation, same_pose, same_position
 from .tasks import Goal, Hold, Keep, Task
 
@@ -10,8 +12,11 @@ __all__ = [
     "Controller",
     "Goal",
     "Hold",
+    "IkResult",
+    "InverseKinematics",
     "Keep",
     "Task",
+    "inverse_kinematics",
     "look_at",
     "same_orientation",
     "same_pose",
