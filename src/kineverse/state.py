@@ -157,13 +157,7 @@ class State(Mapping[Symbol, float]):
             if symbol in changed:
                 raise duplicate_value_error(symbol)
             changed[symbol] = _number(symbol, value)
-        if stamp is not None:
-            return self._with(changed, stamp, source)
-        # The usual case, in loops: the symbols are those of this state, and all values are checked.
-        state = object.__new__(State)
-        state._values, state._by_name, state.stamp = {**self._values, **changed}, self._by_name, self.stamp
-        state.source = self.source if source is None else source
-        return state
+        return self._with(changed, stamp, source)
 
     def extended(self, values: StateLike, *, stamp: float | None = None, source: str | None = None) -> State:
         """Return a state with further symbols; stamp and source are kept unless given.
