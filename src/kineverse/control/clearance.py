@@ -2,15 +2,16 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 
 import numpy as np
 
 from kineverse.errors import NoSolutionError
 from kineverse.expressions.expression import Expression, array, as_expression
-from kineverse.geometry import Rule, Scene
+from kineverse.geometry import Scene
 from kineverse.geometry.results import DistanceResult
 from kineverse.lie import Array
+from kineverse.state import State
 from kineverse.symbols import Symbol
 
 from .contact_slots import ContactSlots
@@ -26,6 +27,8 @@ _SAMPLES = 16
 class Clearance:
     """Distances of bodies at the coordinates of a program, and steps that increase them.
 
+    Pairs that are nearer than the margin in all of some random states do not count.
+
     Parameters
     ----------
     scene
@@ -39,16 +42,15 @@ class Clearance:
     ----------
     inputs
         Symbols of the values of :meth:`load`.
-    overlapping
-        Pairs of bodies that do not count, because they are nearer than the margin in all of some random
-        states.
     """
 
     def __init__(self, scene: Scene, program: PositionProgram, margin: float) -> None:
         self._scene, self._program, self.margin = scene, program, margin
         self._speeds = [s.derivative() for s in program.coordinates]
-        self.overlapping = self._find_overlapping()
-        rules = [Rule(a, b, False, "always overlapping") for a, b in self.overlapping]
+        try:
+            rules = scene.find_always_colliding(self._sample(), margin)
+        except NoSolutionError:  # Some of the states are outside of the domain of a closed loop.
+            rules = scene.find_always_colliding(margin=margin)
         self._contacts = ContactSlots(
             scene,
             self._speeds,
@@ -122,22 +124,10 @@ class Clearance:
             columns.append(as_expression(np.concatenate([gradient[speed][:3, 3] + np.cross(p, w), w])))
         return array([column[i] for i in range(6) for column in columns]).reshape(6, len(columns))
 
-    def _find_overlapping(self) -> tuple[tuple[str, str], ...]:
-        """Return the pairs that are nearer than the margin in all of some random states."""
-        program, scene = self._program, self._scene
-        query = scene.watch(radius=self.margin, moving=self._speeds)
-        home, generator = scene.model.default_state(), np.random.default_rng(0)
-        start = home.vector(program.coordinates)
-        common: set[tuple[str, str]] | None = None
+    def _sample(self) -> Iterator[State]:
+        """Yield random states."""
+        home, generator = self._scene.model.default_state(), np.random.default_rng(0)
+        start = home.vector(self._program.coordinates)
         for _ in range(_SAMPLES):
-            q = program.draw(generator, start)
-            state = home | dict(zip(program.coordinates, q.tolist(), strict=True))
-            try:
-                scene.update(state)
-            except NoSolutionError:
-                continue
-            found = {(pair.a, pair.b) for pair in query()}
-            common = found if common is None else common & found
-            if not common:
-                break
-        return tuple(sorted(common or ()))
+            q = self._program.draw(generator, start)
+            yield home | dict(zip(self._program.coordinates, q.tolist(), strict=True))

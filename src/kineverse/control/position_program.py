@@ -61,8 +61,8 @@ class ErrorRows:
         Name of the task or constraint.
     error
         (k,) errors, in plain independent coordinates.
-    weight
-        Weight of their squares.
+    weights
+        (k,) weights of their squares.
     tolerance
         Largest entry where the task is done.
     exact
@@ -71,7 +71,7 @@ class ErrorRows:
 
     name: str
     error: Expression
-    weight: Expression
+    weights: Expression
     tolerance: float
     exact: bool
 
@@ -166,14 +166,14 @@ class PositionProgram:
         parts: list[ErrorRows] = []
         ranges: dict[str, Constraint] = {}
         for task, name in name_tasks(self.tasks).items():
-            one = as_expression(1.0)
+            ones = as_expression(np.ones(task.expression.size))
             if isinstance(task, Keep):
                 c = task.constraint
                 whole = Constraint(*map(self.make_plain, (c.lower, c.expression, c.upper)))
                 subject = [whole.lower, whole.expression, whole.upper]
                 if is_equality(whole):
                     error = (whole.expression - whole.lower).ravel()
-                    parts.append(ErrorRows(name, error, one, TOLERANCE, True))
+                    parts.append(ErrorRows(name, error, ones, TOLERANCE, True))
                 elif name in self.model.constraints:
                     raise DuplicateNameError(
                         f"The model has a constraint '{name}'; give the Keep another name."
@@ -184,9 +184,11 @@ class PositionProgram:
                 error = self.make_plain(task.error)
                 subject = [error]
                 if isinstance(task, Hold):
-                    parts.append(ErrorRows(name, error, one, TOLERANCE, True))
+                    parts.append(ErrorRows(name, error, ones, TOLERANCE, True))
                 else:
-                    parts.append(ErrorRows(name, error, self.make_plain(task.weight), tolerance, False))
+                    weights = self.make_plain(task.weight).ravel()
+                    weights = weights * ones if weights.size == 1 else weights
+                    parts.append(ErrorRows(name, error, weights, tolerance, False))
             for expression in subject:
                 self._check_symbols(task, expression)
         self.keeps = tuple(ranges)
@@ -213,7 +215,7 @@ class PositionProgram:
                 found |= symbols[name]
                 if is_equality(c):
                     error = (c.expression - c.lower).ravel()
-                    parts.append(ErrorRows(name, error, as_expression(1.0), TOLERANCE, True))
+                    parts.append(ErrorRows(name, error, as_expression(np.ones(error.size)), TOLERANCE, True))
                 else:
                     ranges[name] = c
         if not parts:
@@ -274,7 +276,7 @@ class PositionProgram:
         size = errors.size + len(away)
         self.weights = np.concatenate([scales, np.ones(len(away))])
         numbers = [parameter(f"inverse kinematics/weight/{k}", 1.0) for k in range(size)]
-        own = [part.weight for part in self.parts for _ in range(part.error.size)]
+        own = [weight for part in self.parts for weight in part.weights]
         w = [numbers[k] * own[k] for k in range(errors.size)]
         # A row within its bounds is no error; outside of them it is.
         w += [numbers[errors.size + k] * binary(ca.OP_NE, violation, 0) for k, violation in enumerate(away)]

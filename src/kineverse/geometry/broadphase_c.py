@@ -214,6 +214,9 @@ EXPORT int64_t near(Table *t, double reach, int32_t *pairs, double *lows, int64_
 
 
 SEARCH = r"""
+/* Largest error of a distance [m]. */
+#define ACCURACY 1e-4
+
 typedef struct {
   double distance;
   int64_t bodies;
@@ -254,12 +257,32 @@ static Found *sorted(Found *found, Found *spare, int64_t n) {
   return found;
 }
 
+/* Collects the pairs with a distance within a limit, and returns their number. */
+static int64_t collect(
+    const Table *t, const int32_t *pairs, int64_t n, const double *distances, double limit, Found *found) {
+  int64_t count = 0;
+  for (int64_t k = 0; k < n; k++)
+    if (distances[k] <= limit) {
+      const int32_t i = pairs[2 * k], j = pairs[2 * k + 1], a = t->body[i], b = t->body[j];
+      const int64_t bodies = a < b ? t->bodies * a + b : t->bodies * b + a;
+      found[count++] = (Found){distances[k], bodies, i, j, (int32_t)k};
+    }
+  return count;
+}
+
+/* Slot of a key, which is not 0, in a table with 2^k slots, of which some are empty. */
+static inline int64_t slot_of(const int64_t *known, int64_t slots, int64_t key) {
+  uint64_t slot = (uint64_t)key * 0x9E3779B97F4A7C15u >> 20 & (slots - 1);
+  while (known[slot] && known[slot] != key) slot = (slot + 1) & (slots - 1);
+  return (int64_t)slot;
+}
+
 /* Writes the indices of the pairs within a radius, nearest first, of each pair of bodies the nearest, or
    `all`; `order` has room for all. Returns their number, -1 without memory. */
 EXPORT int64_t rank(
     const Table *t, const int32_t *pairs, int64_t n, const double *distances, double radius, int64_t all,
     int64_t *order) {
-  int64_t count = 0, kept = 0, slots = 2;
+  int64_t kept = 0, slots = 2;
   while (slots < 2 * n) slots *= 2;
   Found *memory = malloc((2 * n + 1) * sizeof(Found)), *found = memory;
   int64_t *known = calloc(slots, sizeof(int64_t)); /* pairs of bodies that were found, plus 1 */
@@ -268,17 +291,10 @@ EXPORT int64_t rank(
     free(known);
     return -1;
   }
-  for (int64_t k = 0; k < n; k++)
-    if (distances[k] <= radius) {
-      const int32_t i = pairs[2 * k], j = pairs[2 * k + 1], a = t->body[i], b = t->body[j];
-      const int64_t bodies = a < b ? t->bodies * a + b : t->bodies * b + a;
-      found[count++] = (Found){distances[k], bodies, i, j, (int32_t)k};
-    }
+  const int64_t count = collect(t, pairs, n, distances, radius, found);
   found = sorted(found, found + n, count);
   for (int64_t k = 0; k < count; k++) {
-    const int64_t bodies = found[k].bodies + 1;
-    uint64_t slot = (uint64_t)bodies * 0x9E3779B97F4A7C15u >> 20 & (slots - 1);
-    while (known[slot] && known[slot] != bodies) slot = (slot + 1) & (slots - 1);
+    const int64_t bodies = found[k].bodies + 1, slot = slot_of(known, slots, bodies);
     if (all || !known[slot]) order[kept++] = found[k].at;
     known[slot] = bodies;
   }
@@ -308,6 +324,37 @@ EXPORT void gather(
   }
 }
 
+/* Measures pairs by their lower bounds, except those that cannot be the nearest of their bodies: their
+   distance is infinite. Returns 0 without memory. */
+static int measure_nearest(Table *t, const int32_t *pairs, int64_t n, const double *lows, double limit,
+                           double *distances, double *witnesses) {
+  int64_t slots = 2;
+  while (slots < 2 * n) slots *= 2;
+  Found *memory = malloc((2 * n + 1) * sizeof(Found)), *found = memory;
+  double *least = malloc(slots * sizeof(double));
+  int64_t *known = calloc(slots, sizeof(int64_t));
+  const int enough = found && least && known;
+  if (enough) {
+    const int64_t count = collect(t, pairs, n, lows, INFINITY, found);
+    found = sorted(found, found + n, count);
+    for (int64_t m = 0; m < count; m++) {
+      const int64_t k = found[m].at, key = found[m].bodies + 1, slot = slot_of(known, slots, key);
+      if (!known[slot]) least[slot] = INFINITY;
+      known[slot] = key;
+      if (lows[k] > least[slot] + ACCURACY) {
+        distances[k] = INFINITY;
+        continue;
+      }
+      measure(t, pairs + 2 * k, 1, limit, distances + k, witnesses + 9 * k);
+      if (distances[k] < least[slot]) least[slot] = distances[k];
+    }
+  }
+  free(memory);
+  free(least);
+  free(known);
+  return enough;
+}
+
 /* Whole query: pairs that may be within `reach` are measured, ranked, and gathered. Returns the number of
    measured pairs, and writes the number `kept`: -1 if some pairs are left to coal, or the buffers are too
    short. */
@@ -318,7 +365,8 @@ EXPORT int64_t search(
   const int64_t found = near(t, reach, pairs, lows, room);
   *kept = -1;
   if (found > room) return found;
-  measure(t, pairs, found, radius, distances, witnesses);
+  if (all || t->bodies == t->count || !measure_nearest(t, pairs, found, lows, radius, distances, witnesses))
+    measure(t, pairs, found, radius, distances, witnesses);
   for (int64_t k = 0; k < found; k++)
     if (isnan(distances[k])) return found;
   *kept = rank(t, pairs, found, distances, radius, all, order);

@@ -9,24 +9,24 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from kineverse.errors import InvalidValueError
-from kineverse.lie import inverse
+from kineverse.model.frame_dependence import FrameDependence
 from kineverse.model.model_view import ModelView
 from kineverse.state import StateLike
 from kineverse.symbols import Symbol
 
 from . import distance_queries, rays
-from .collision_filter import Rule, apply_rules, check_frame_names, parse_rules
+from .collision_filter import Rule, apply_rules, parse_known_rules
 from .collision_world import CollisionWorld
-from .dependence import FrameDependence
 from .distance_expressions import DistanceParameters, PairDistance, distance_expression, distance_parameters
 from .mesh_files import Floats
 from .objects import Exclusion
+from .observed_rules import except_always_within, except_never_within
 from .prepared_query import (
     PairFlags,
     PreparedQuery,
     flag_between,
     flag_matching,
+    flag_pair,
     flag_relatively_moving,
     flag_subtree,
 )
@@ -79,6 +79,7 @@ class Scene:
         self.model = model
         self._world = CollisionWorld(model, rules, triangles, decomposed, leave_out)
         self._parameters: dict[tuple[str, str], DistanceParameters] = {}
+        self._pair_queries: dict[tuple[str, str], PreparedQuery] = {}
         self._queries: dict[tuple[Any, ...], PreparedQuery] = {}
 
     @property
@@ -121,11 +122,8 @@ class Scene:
 
     def pose(self, body: str) -> npt.NDArray[np.float64]:
         """Return the pose of a body at the last update, world_T_body, (4, 4) [m]."""
-        world = self._world
-        world.prepare(())
-        first = world.members[world.body_index(body)][0]
-        world_T_object = np.vstack([world.table.poses[first], [0.0, 0.0, 0.0, 1.0]])
-        return np.asarray(world_T_object @ inverse(world.objects[first].shape.origin.matrix))
+        self._world.prepare(())
+        return self._world.body_pose(body)
 
     # -- distances -----------------------------------------------------------------------------------------
 
@@ -203,9 +201,8 @@ class Scene:
         InvalidValueError
             If the radius is negative or NaN.
         """
-        names = one, other
-        own, symbols = parse_rules(rules), None if moving is None else _as_list(moving)
-        check_frame_names("A rule is about", (name for rule in own for name in rule[:2]), self.model)
+        names, own = (one, other), parse_known_rules(rules, self.model)
+        symbols = None if moving is None else _as_list(moving)
 
         def choose() -> PairFlags:
             bodies = self.bodies
@@ -240,7 +237,12 @@ class Scene:
         return values
 
     def _with_poses(self, a: str, b: str) -> tuple[DistanceResult, Floats, Floats]:
-        return self.distance(a, b), self.pose(a), self.pose(b)
+        if (a, b) not in self._pair_queries:
+            self._pair_queries[a, b] = PreparedQuery(
+                self._world, lambda: flag_pair(self._world, a, b), math.inf
+            )
+        (closest,) = self._pair_queries[a, b]()
+        return closest if closest.a == a else closest.swap(), self.pose(a), self.pose(b)
 
     def first_contact(self, margin: float = 0.0) -> DistanceResult | None:
         """Return a pair within a margin [m], or None; always the same pair at the same state."""
@@ -256,28 +258,41 @@ class Scene:
         one, other = self._world.body_index(a), self._world.body_index(b)
         return bool(self._world.table.allowed[one, other])
 
-    def find_never_colliding(self, states: Iterable[StateLike], margin: float = 0.0) -> tuple[Rule, ...]:
-        """Return rules that except all pairs that are never within a margin [m] at the given states.
+    @property
+    def rules(self) -> tuple[Rule, ...]:
+        """The rules of the collision filter in their order: those of the model, then those of the scene."""
+        return self._world.rules
+
+    def find_never_colliding(
+        self, states: Iterable[StateLike] | None = None, margin: float = 0.0
+    ) -> tuple[Rule, ...]:
+        """Return rules that except all pairs that are never within a margin [m] at some states.
 
         This is an observation, not a proof: choose states over the whole range. The scene stays at the last
         state.
+
+        Parameters
+        ----------
+        states
+            The states; by default the default state and 200 random ones within limits.
 
         Raises
         ------
         InvalidValueError
             If there are no states.
         """
-        met: set[frozenset[str]] = set()
-        every = list(states)
-        if not every:
-            raise InvalidValueError("Pairs that never touch are found by sampling states, and none is given.")
-        for state in every:
-            self.update(state)
-            met.update(frozenset((found.a, found.b)) for found in self.pairs_within(margin))
-        bodies, table = self.bodies, self._world.table.allowed
-        pairs = [(a, b) for k, a in enumerate(bodies) for m, b in enumerate(bodies[:k]) if table[k, m]]
-        why = f"never within {margin:g} m at {len(every)} states"
-        return tuple(Rule(b, a, False, why) for a, b in pairs if frozenset((a, b)) not in met)
+        return except_never_within(self._world, states, margin)
+
+    def find_always_colliding(
+        self, states: Iterable[StateLike] | None = None, margin: float = 0.0
+    ) -> tuple[Rule, ...]:
+        """Return rules that except all pairs that are within a margin [m] at every one of some states.
+
+        Such are the links of a robot around a joint between them, whose shapes overlap. For parameters,
+        errors and the meaning see :meth:`find_never_colliding`. Of a single state, such as the default one,
+        these are the pairs that overlap there.
+        """
+        return except_always_within(self._world, states, margin)
 
     # -- rays and points -----------------------------------------------------------------------------------
 
