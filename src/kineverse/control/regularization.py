@@ -6,13 +6,14 @@ import math
 from collections.abc import Mapping
 from dataclasses import dataclass
 
+import casadi as ca
 import numpy as np
 
-from kineverse.compile import compile  # noqa: A004
-from kineverse.errors import InvalidValueError, NoSolutionError
+from kineverse.errors import InvalidValueError
 from kineverse.expressions.expression import Expression, ExpressionLike, as_expression
+from kineverse.expressions.graph import dense_column
 from kineverse.lie import Array
-from kineverse.model.frame_dependence import FrameDependence
+from kineverse.model.frame_dependence import count_moved_bodies
 from kineverse.model.model_view import ModelView
 from kineverse.model.speed_limits import raw_min
 from kineverse.symbols import Symbol
@@ -59,10 +60,11 @@ def joint_weights(
     factor.
     """
     model, speeds = formulation.model, formulation.speeds
-    moved = [sum(map(FrameDependence(model, [s]).moves, model.bodies)) for s in speeds]
-    most = max(moved, default=0)
-    share = [max(count / most, _LEAST_SHARE) if most else 1.0 for count in moved]
-    factors = dict(zip(speeds, map(as_expression, share), strict=True))
+    moved = count_moved_bodies(model, speeds)
+    most = max(moved.values(), default=0)
+    factors = {
+        s: as_expression(max(count / most, _LEAST_SHARE) if most else 1.0) for s, count in moved.items()
+    }
     for key, weight in (weights or {}).items():
         chosen = find_speeds(model, (key,), "weights")
         if any(s not in factors for s in chosen):
@@ -78,22 +80,21 @@ def _column_scales(formulation: Formulation) -> Array:
     jacobians = [row.jacobian for row in formulation.goals] + [row.jacobian for row in formulation.holds]
     if not jacobians:
         return np.ones(n)
-    function = compile([as_expression(np.concatenate(jacobians))], tier="interpreter")
+    stacked = as_expression(np.concatenate(jacobians))
+    symbols = stacked.symbols
+    # Each state counts once, so common parts are not looked for.
+    function = ca.Function("J", [ca.vertcat(*(s.sx for s in symbols))], [dense_column(stacked)])
     generator, squares = np.random.default_rng(0), []
-    middle = model.default_state()
-    limits = {s: model.limits(s) for s in function.inputs if s.order == 0 and s in model.degrees_of_freedom}
+    at = model.default_state()
+    ranges = []
+    for symbol in symbols:
+        value = at.given(symbol) or symbol.value or 0.0
+        lower, upper = model.limits(symbol) if symbol in model.degrees_of_freedom else (value, value)
+        ranges.append((max(lower, value - math.pi), min(upper, value + math.pi)))
     for _ in range(_SAMPLES):
-        at = {}
-        for symbol, (lower, upper) in limits.items():
-            value = middle[symbol]
-            low, high = max(lower, value - math.pi), min(upper, value + math.pi)
-            at[symbol] = generator.uniform(low, max(low, high))
-        try:
-            (J,) = function(middle | at)
-        except NoSolutionError:  # outside of the domain of a closed loop
-            continue
-        if np.isfinite(J).all():
-            squares.append((J * J).sum(axis=0))
+        J = np.array(function([generator.uniform(low, max(low, high)) for low, high in ranges]))
+        if np.isfinite(J).all():  # else outside of the domain of a closed loop
+            squares.append((J.reshape(-1, n) ** 2).sum(axis=0))
     found = np.mean(squares, axis=0) if squares else np.ones(n)
     positive = found[found > 0]
     return np.where(found > 0, found, positive.mean() if len(positive) else 1.0)

@@ -213,7 +213,7 @@ class PairSelection:
     Parameters
     ----------
     table
-        The table, all of whose objects have solids.
+        The table; the objects of selected bodies have solids.
     bodies
         (B, B) 1 for selected pairs, symmetric; 0 on the diagonal.
     """

@@ -17,6 +17,7 @@ from kineverse.errors import (
     duplicate_value_error,
     suggest,
 )
+from kineverse.lie import inverse
 from kineverse.model.model_view import ModelView
 from kineverse.state import State, StateLike
 from kineverse.symbols import Symbol
@@ -77,12 +78,14 @@ class CollisionWorld:
             check_frame_names(f"{what}= names", bodies, model)
         self._source = CollisionObjects(*patterns)
         self._version: int | None = None
-        self._values: dict[Symbol, float] = {}
+        self._placed_at: tuple[tuple[Symbol, ...], Floats] = (), np.zeros(0)  # symbols and values
         self._missing_state = ""
         self._evaluator: Any = None
         self.inputs: tuple[Symbol, ...] = ()
         self.objects: list[CollisionObject] = []
         self.bodies: tuple[str, ...] = ()
+        self._body_numbers: dict[str, int] = {}
+        self._origins: dict[int, Floats] = {}
         self.members: list[list[int]] = []
         self.shape_numbers: Indices = np.zeros(0, dtype=np.int32)
         self._solids: list[Solid | None] = []
@@ -124,7 +127,8 @@ class CollisionWorld:
         same = moving == self.objects[: old.moving]
         self.objects = [*moving, *(item for item in everything if not item.moves)]
         self.bodies = tuple(by_body)
-        number = {name: k for k, name in enumerate(self.bodies)}
+        self._body_numbers = number = {name: k for k, name in enumerate(self.bodies)}
+        self._origins.clear()
         body = np.array([number[item.body] for item in self.objects], dtype=np.int32)
         self.members = [[] for _ in self.bodies]
         self.shape_numbers = np.array([item.number for item in self.objects], dtype=np.int32)
@@ -165,7 +169,7 @@ class CollisionWorld:
         if self._evaluator is not None:
             self._evaluator(state)
             self._place()
-            self._values = dict(zip(self.inputs, self._evaluator.input.tolist(), strict=True))
+            self._placed_at = self.inputs, self._evaluator.input.copy()
         elif not isinstance(state, Mapping) and len(state):
             raise InvalidValueError(f"Nothing moves in this scene, and {len(state)} values are given.")
         self._missing_state = ""
@@ -201,7 +205,9 @@ class CollisionWorld:
 
     def _restore_poses(self) -> None:
         """Recompute all poses at the last state after an edit, if that state still determines them."""
-        values = {s: self._values.get(s, s.value) for s in self.inputs}
+        symbols, numbers = self._placed_at
+        known = dict(zip(symbols, numbers.tolist(), strict=True))
+        values = {s: known.get(s, s.value) for s in self.inputs}
         missing = [str(s) for s, value in values.items() if value is None]
         more = f" and {len(missing) - 12} more" if len(missing) > 12 else ""
         self._missing_state = f"There is no value for {', '.join(missing[:12])}{more}" if missing else ""
@@ -233,6 +239,8 @@ class CollisionWorld:
         wanted = [
             k for k in (range(len(self.objects)) if objects is None else objects) if self._solids[k] is None
         ]
+        if not wanted and objects is not None:
+            return
         # The choice between C and coal is made before the first distance, so that answers never change.
         collision_library.prepare(wait=True)
         first = self.table.active.any()
@@ -325,10 +333,20 @@ class CollisionWorld:
         """
         self.synchronize()
         try:
-            return self.bodies.index(body)
-        except ValueError:
+            return self._body_numbers[body]
+        except KeyError:
             what = "has no shapes here" if body in self.model.frames else "is no frame of the model"
             raise UnknownNameError(f"'{body}' {what}. {suggest(str(body), self.bodies, 'body')}") from None
+
+    def body_pose(self, body: str) -> Floats:
+        """Return the pose of a body at the last update, world_T_body, (4, 4) [m]."""
+        first = self.members[self.body_index(body)][0]
+        if first not in self._origins:
+            self._origins[first] = inverse(self.objects[first].shape.origin.matrix)
+        world_T_body = np.empty((4, 4))
+        np.matmul(self.table.poses[first], self._origins[first], out=world_T_body[:3])
+        world_T_body[3] = 0.0, 0.0, 0.0, 1.0
+        return world_T_body
 
     def solid(self, index: int) -> Solid:
         """Return the solid of an object that :meth:`prepare` has made."""

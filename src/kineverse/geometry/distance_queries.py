@@ -45,10 +45,10 @@ def find_pairs_within(
     """Return the pairs of bodies within a radius [m], nearest first.
 
     All checked pairs are searched, or only the selected ones. If ``per_shape``, the results are all pairs of
-    collision objects, else the nearest of each pair of bodies.
+    collision objects, else the nearest of each pair of bodies. Selected objects have solids already.
     """
     check_radius(radius)
-    world.prepare()
+    world.prepare(None if selection is None else ())
     table = world.table
     reach = radius + ACCURACY
     pairs, lows, distances, witnesses, nearest = collision_library.search(

@@ -8,7 +8,7 @@ from typing import TypeAlias
 import numpy as np
 import numpy.typing as npt
 
-from kineverse.errors import UnknownNameError, suggest
+from kineverse.errors import InvalidValueError, UnknownNameError, suggest
 from kineverse.model.frame import WORLD
 from kineverse.model.frame_dependence import FrameDependence
 from kineverse.model.kinematics import ancestors
@@ -55,11 +55,14 @@ class PreparedQuery:
 
     def __call__(self, radius: float | None = None) -> DistanceResults:
         """Return the selected pairs within the radius [m], or within another one, nearest first."""
-        self._world.prepare()
-        if self._selection is None or self._version != self._world.model.version:
-            self._selection = PairSelection(self._world.table, self._selected())
+        world = self._world
+        if self._selection is None or self._version != world.model.version:
+            flags = self._selected()
+            involved = np.asarray(flags.any(axis=1))
+            world.prepare(k for k, body in enumerate(world.table.body.tolist()) if involved[body])
+            self._selection = PairSelection(world.table, flags)
         within = self.radius if radius is None else radius
-        return find_pairs_within(self._world, within, self._selection, self.per_shape)
+        return find_pairs_within(world, within, self._selection, self.per_shape)
 
     @property
     def pairs(self) -> Indices:
@@ -78,6 +81,24 @@ class PreparedQuery:
     def __repr__(self) -> str:
         what = "pairs of bodies, each pair of shapes" if self.per_shape else "pairs of bodies"
         return f"<PreparedQuery: {len(self.pairs)} {what}, within {self.radius:g} m>"
+
+
+def flag_pair(world: CollisionWorld, a: str, b: str) -> Flags:
+    """Return (B, B) flags of one pair of bodies.
+
+    Raises
+    ------
+    UnknownNameError
+        If one has no shapes.
+    InvalidValueError
+        If both are the same.
+    """
+    one, other = world.body_index(a), world.body_index(b)
+    if one == other:
+        raise InvalidValueError(f"'{a}' is asked for its distance to itself.")
+    flags = np.zeros_like(world.table.allowed)
+    flags[one, other] = flags[other, one] = 1
+    return flags
 
 
 def flag_between(ones: PairFlags, others: PairFlags) -> npt.NDArray[np.bool_]:

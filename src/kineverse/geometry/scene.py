@@ -9,7 +9,6 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from kineverse.lie import inverse
 from kineverse.model.frame_dependence import FrameDependence
 from kineverse.model.model_view import ModelView
 from kineverse.state import StateLike
@@ -27,6 +26,7 @@ from .prepared_query import (
     PreparedQuery,
     flag_between,
     flag_matching,
+    flag_pair,
     flag_relatively_moving,
     flag_subtree,
 )
@@ -79,6 +79,7 @@ class Scene:
         self.model = model
         self._world = CollisionWorld(model, rules, triangles, decomposed, leave_out)
         self._parameters: dict[tuple[str, str], DistanceParameters] = {}
+        self._pair_queries: dict[tuple[str, str], PreparedQuery] = {}
         self._queries: dict[tuple[Any, ...], PreparedQuery] = {}
 
     @property
@@ -121,11 +122,8 @@ class Scene:
 
     def pose(self, body: str) -> npt.NDArray[np.float64]:
         """Return the pose of a body at the last update, world_T_body, (4, 4) [m]."""
-        world = self._world
-        world.prepare(())
-        first = world.members[world.body_index(body)][0]
-        world_T_object = np.vstack([world.table.poses[first], [0.0, 0.0, 0.0, 1.0]])
-        return np.asarray(world_T_object @ inverse(world.objects[first].shape.origin.matrix))
+        self._world.prepare(())
+        return self._world.body_pose(body)
 
     # -- distances -----------------------------------------------------------------------------------------
 
@@ -239,7 +237,12 @@ class Scene:
         return values
 
     def _with_poses(self, a: str, b: str) -> tuple[DistanceResult, Floats, Floats]:
-        return self.distance(a, b), self.pose(a), self.pose(b)
+        if (a, b) not in self._pair_queries:
+            self._pair_queries[a, b] = PreparedQuery(
+                self._world, lambda: flag_pair(self._world, a, b), math.inf
+            )
+        (closest,) = self._pair_queries[a, b]()
+        return closest if closest.a == a else closest.swap(), self.pose(a), self.pose(b)
 
     def first_contact(self, margin: float = 0.0) -> DistanceResult | None:
         """Return a pair within a margin [m], or None; always the same pair at the same state."""

@@ -218,7 +218,8 @@ class Integrator:
                 raise self._divergence(dt, done)
 
     def _divergence(self, dt: float, done: float) -> InvalidValueError:
-        free = self._q + dt * np.array([self._pace(s) for s in self.symbols])
+        with np.errstate(over="ignore"):
+            free = self._q + dt * np.array([self._pace(s) for s in self.symbols])
         for place in np.flatnonzero(~np.isfinite(free)):
             return InvalidValueError(
                 f"'{self.symbols[place]}' runs to {free[place]} in {dt:g} s. Take a shorter time."
@@ -232,6 +233,10 @@ class Integrator:
     def _pace(self, coordinate: Symbol) -> float:
         speed = coordinate.derivative() if coordinate in self.moving else None
         return float(self._v[self.speeds.index(speed)]) if speed in self.speeds else 0.0
+
+    def wait(self, timeout: float | None = None) -> bool:
+        """Wait until C is ready or has failed, see :meth:`.CompiledFunction.wait`."""
+        return self._function.wait(timeout)
 
     def __repr__(self) -> str:
         return f"Integrator({len(self.symbols)} symbols, {len(self.speeds)} speeds)"

@@ -117,6 +117,6 @@ def _no_mass(frame: str, bodies: Mapping[str, Body], lookup: FrameLookup) -> Mod
         return ModelError(f"There is no body {where}, so there is no centre of mass.")
     shown = ", ".join(map(repr, names[:6])) + (f" and {len(names) - 6} more" if len(names) > 6 else "")
     return ModelError(
-        f"No body {where} has a mass, so there is no centre of mass: {shown}. Give one a mass with "
-        f"edit.write('bodies/{names[0]}', Body(inertia=Inertia(mass=..., tensor=...)))."
+        f"No body {where} has a mass, so there is no centre of mass: {shown}. A body gets one by its "
+        "inertia: edit.add_frame(name, parent, transform, Body(inertia=Inertia(mass=..., tensor=...)))."
     )

@@ -168,6 +168,10 @@ class ConstraintChecker:
         found = (Violation(self.names[i], *(float(row[i]) for row in rows)) for i in broken)
         return Violations(found, self.unchecked)
 
+    def wait(self, timeout: float | None = None) -> bool:
+        """Wait until C is ready or has failed, see :meth:`.CompiledFunction.wait`."""
+        return self._function.wait(timeout)
+
     def __repr__(self) -> str:
         return f"ConstraintChecker({len(self.symbols)} symbols, {len(self.names)} constraints)"
 
@@ -194,6 +198,8 @@ def _excess_columns(
 
 def _excess(low: SX, value: SX, high: SX) -> SX:
     """Return the larger of low - value and value - high; NaN if one of the three is."""
+    if _is_infinite(low) and _is_infinite(high):
+        return ca.if_else(value <= math.inf, -math.inf, value)
     if _is_infinite(low) or _is_infinite(high):
         return value - high if _is_infinite(low) else low - value
     below, above = low - value, value - high
