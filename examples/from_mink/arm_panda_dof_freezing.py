@@ -1,4 +1,4 @@
-"""Follow a target with a Panda whose first three joints freeze now and then; mink's ``arm_panda_dof_freezing.py``."""
+"""Follow a target with a Panda, first without three of its joints; mink's ``arm_panda_dof_freezing.py``."""
 
 import numpy as np
 

@@ -1,4 +1,4 @@
-"""Move the gripper of a TIAGo whose base rests where it can; mink's ``mobile_tidybot.py``, with another robot."""
+"""Move the gripper of a TIAGo, in the end without its base; mink's ``mobile_tidybot.py``."""
 
 import numpy as np
 

@@ -12,6 +12,7 @@ from dataclasses import dataclass
 from functools import cache
 from pathlib import Path
 from types import MappingProxyType
+from typing import Protocol
 from xml.etree import ElementTree
 
 import numpy as np
@@ -19,7 +20,7 @@ import numpy as np
 from kineverse.articulations import Floating, OmniBase
 from kineverse.compile import compile  # noqa: A004
 from kineverse.formats import load
-from kineverse.lie import Array, rpy, transform, translation
+from kineverse.lie import Array, translation
 from kineverse.model.frame import WORLD
 from kineverse.model.model import Model
 
@@ -27,6 +28,25 @@ from .workloads import strip_shapes
 
 ROOT = "root_joint"
 """Name of floating joints; pink finds the floating base by it."""
+
+
+class ControlLoop(Protocol):
+    """Control loop of a library: controller, robot and targets."""
+
+    def reset(self) -> None:
+        """Return to the start."""
+
+    def aim(self, time: float) -> None:
+        """Move the targets to a time [s]; a script's work, which is not part of a step."""
+
+    def step(self) -> None:
+        """Compute the command at the present state, which is what is measured."""
+
+    def advance(self) -> None:
+        """Integrate the command."""
+
+    def error(self) -> float:
+        """Return the error of the most important task [m], [rad]."""
 
 
 @dataclass(frozen=True)
@@ -140,22 +160,6 @@ def _mobile_arm() -> Model:
     return model
 
 
-DOOR_GAIN = 1.0
-"""Gain of the door's opening [1/s]."""
-
-HAND, GRASP, DOOR = "pr2/r_gripper_tool_frame", "grasp", "kitchen/fridge_door"
-"""Gripper of the PR2, the frame on the handle that it holds, and the joint of the door."""
-
-
-def _robot_at_fridge() -> Model:
-    model = load("pr2")
-    with model.edit() as edit:
-        edit.include("kitchen", "kitchen")
-        grasp = transform(rpy(np.array([np.pi / 2, 0.0, np.pi])), np.array([0.04, 0.0, 0.0]))
-        edit.add_frame(GRASP, "kitchen/fridge_door_handle", grasp)
-    return model
-
-
 HANDS = ("left_rubber_hand", "right_rubber_hand")
 FEET = ("left_ankle_roll_link", "right_ankle_roll_link")
 QUADRUPED_FEET = ("FL_foot", "FR_foot", "RL_foot", "RR_foot")
@@ -208,26 +212,11 @@ _CAMERA = {
     "wrist_2_joint": 1.3,
 }
 
-_HOLDING = {
-    "pr2/base/x": 0.26238378,
-    "pr2/base/y": -0.83776453,
-    "pr2/base/angle": -0.07982436,
-    "pr2/torso_lift_joint": 0.29513498,
-    "pr2/r_shoulder_pan_joint": -0.52575779,
-    "pr2/r_shoulder_lift_joint": -0.26218824,
-    "pr2/r_upper_arm_roll_joint": -1.97707196,
-    "pr2/r_elbow_flex_joint": -0.62745708,
-    "pr2/r_forearm_roll_joint": 0.85714988,
-    "pr2/r_wrist_flex_joint": -0.03863926,
-    "pr2/r_wrist_roll_joint": 1.1927375,
-}
-
 G1, GO2 = "g1_description/urdf/g1_29dof_rev_1_0.urdf", "go2_description/urdf/go2.urdf"
 FINGER_JOINTS = ("panda_finger_joint1", "panda_finger_joint2")
 
 WORKLOADS: Mapping[str, ControlWorkload] = MappingProxyType(
     {
-        "pr2_opens_fridge": ControlWorkload("", _robot_at_fridge, _HOLDING, period=0.02, steps=250),
         "arm_ur5": ControlWorkload(
             "pink examples/arm_ur5.py", _robot("ur_description/urdf/ur5_robot.urdf"), _BENT
         ),

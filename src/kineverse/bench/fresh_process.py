@@ -90,6 +90,21 @@ def load_with_pinocchio(file: str, frame: str) -> dict[str, Any]:
     return {"first": seconds, "pose": pose.tolist(), "columns": columns}
 
 
+def build_controller(robot: str) -> dict[str, Any]:
+    """Return the time of building a controller [s], and from there the time until C runs [s].
+
+    ``build_controller ROBOT``
+    """
+    from kineverse.bench.opening import make_opening
+
+    opening = make_opening(robot)
+    start = perf_counter()
+    controller = opening.controller()
+    built = perf_counter()
+    controller.wait()
+    return {"build": built - start, "ready": perf_counter() - built}
+
+
 def memory_of_robot(library: str, file: str, frame: str) -> dict[str, Any]:
     """Return the memory of a robot beyond that of the imports [MB], loaded and evaluated.
 
@@ -131,7 +146,14 @@ def _load_mujoco(module: Any, file: str) -> tuple[Any, ...]:
 
 
 _LOADERS = {"kineverse": _load_kineverse, "pinocchio": _load_pinocchio, "mujoco": _load_mujoco}
-_PROGRAMS = (import_time, load_with_kineverse, load_with_mujoco, load_with_pinocchio, memory_of_robot)
+_PROGRAMS = (
+    import_time,
+    load_with_kineverse,
+    load_with_mujoco,
+    load_with_pinocchio,
+    build_controller,
+    memory_of_robot,
+)
 
 if __name__ == "__main__":
     print(json.dumps({program.__name__: program for program in _PROGRAMS}[sys.argv[1]](*sys.argv[2:])))

@@ -58,6 +58,10 @@ class BenchmarkSettings:
         Number of operations and constraints of large models.
     boxes
         Largest number of boxes around the arm.
+    robots
+        Robots that open a fridge.
+    examples
+        Examples of other libraries; all if empty.
     progress
         Progress reporter that wraps an iterable, such as :func:`kineverse.cli.output.show_progress`.
     """
@@ -71,6 +75,8 @@ class BenchmarkSettings:
     rows: int = 100_000
     operations: int = 10_000
     boxes: int = 3000
+    robots: Sequence[str] = ("pr2", "fetch", "hsr")
+    examples: Sequence[str] = ()
     progress: Progress = _no_progress
 
 
@@ -208,11 +214,11 @@ def time_contenders(
 
 
 DISTRIBUTIONS: Mapping[str, str] = MappingProxyType(
-    {"pinocchio": "pin", "ripl_articulation": "ripl-articulation"}
+    {"pinocchio": "pin", "pink": "pin-pink", "ripl_articulation": "ripl-articulation"}
 )
 """Distributions of modules with another name."""
 
-BENCH_EXTRA = ("pinocchio", "mujoco", "pybullet")
+BENCH_EXTRA = ("pinocchio", "mujoco", "pybullet", "pink", "mink")
 """Modules that the extra ``bench`` installs."""
 
 

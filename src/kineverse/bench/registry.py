@@ -22,6 +22,8 @@ BENCHMARKS: Mapping[str, str] = MappingProxyType(
         "geometry": "what is near, and how near: an arm among boxes, a robot in a kitchen",
         "tracking": "a kitchen's coordinates from noisy poses of its doors and drawers",
         "identification": "the joint between two parts, from twenty poses of both and from one more",
+        "control": "a controller's step, a robot that opens a fridge; beside pink and mink",
+        "examples": "published examples of pink and mink, beside the same ones of this library",
         "import": "importing the library, and how many packages that takes",
         "memory": "the memory of a loaded robot",
         "document": "a robot in a kitchen, written down and read again; models of up to a million nodes",

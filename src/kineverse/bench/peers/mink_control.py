@@ -14,12 +14,8 @@ import mujoco
 import numpy as np
 
 from kineverse.bench.control_workloads import (
-    DOOR,
-    DOOR_GAIN,
     FEET,
     FINGERS,
-    GRASP,
-    HAND,
     HAND_SPHERES,
     HANDS,
     ROOT,
@@ -38,6 +34,7 @@ from kineverse.bench.control_workloads import (
     nod,
     orbit,
 )
+from kineverse.bench.opening import DOOR, DOOR_GAIN, GRASP, GRIPPERS, OPENING
 from kineverse.lie import Array
 
 from .mujoco_kinematics import add_mujoco_options
@@ -118,20 +115,24 @@ class MinkLoop:
     def __post_init__(self) -> None:
         self.limits = self.limits or [mink.ConfigurationLimit(self.robot.model)]
         self._kept: list[Any] | None = None
+        self._q = self.robot.start
+        self._velocity = np.zeros(self.robot.model.nv)
 
     def reset(self) -> None:
         """Return to the start."""
         self.robot.reset()
+        self._q = self.robot.start
 
     def aim(self, time: float) -> None:
-        """Move the targets to a time [s]; a script's work, which is not part of a step."""
+        """Move the targets to a time [s]."""
         self.move(time)
         self._kept = self.constraints(time)
 
     def step(self) -> None:
-        """Solve and integrate."""
+        """Update the configuration and solve."""
         configuration = self.robot.configuration
-        velocity = mink.solve_ik(
+        configuration.update(self._q)
+        self._velocity = mink.solve_ik(
             configuration,
             self.tasks,
             self.period,
@@ -140,12 +141,16 @@ class MinkLoop:
             limits=self.limits,
             constraints=self._kept,
         )
-        configuration.integrate_inplace(velocity, self.period)
+
+    def advance(self) -> None:
+        """Integrate."""
+        self.robot.configuration.integrate_inplace(self._velocity, self.period)
+        self._q = self.robot.configuration.q
 
 
-def make_mink_loop(name: str) -> MinkLoop:
-    """Return the control loop of a workload."""
-    workload = WORKLOADS[name]
+def make_mink_loop(name: str, workload: ControlWorkload | None = None) -> MinkLoop:
+    """Return the control loop of a workload, by default that of the name."""
+    workload = workload or WORKLOADS[name]
     make_model, make_loop = MINK_LOOPS[name]
     speeds = {} if make_model is _with_loops else joint_speeds(workload.urdf())
     return make_loop(MinkRobot(make_model(workload), workload.start, speeds), workload.period)
@@ -274,7 +279,7 @@ def _work_at_a_table(robot: MinkRobot, period: float) -> MinkLoop:
             hand.set_target(_at(start, start.translation() + lean(time)))
 
     return MinkLoop(
-        robot, period, tasks, move, _distance(robot, feet[0]), 0.1, [mink.ConfigurationLimit(model), avoid]
+        robot, period, tasks, move, _distance(robot, hands[0]), 0.1, [mink.ConfigurationLimit(model), avoid]
     )
 
 
@@ -295,7 +300,10 @@ def _stand_with_closed_loops(robot: MinkRobot, period: float) -> MinkLoop:
     def move(time: float) -> None:
         centre.set_target(start + nod(time))
 
-    return MinkLoop(robot, period, tasks, move, _distance(robot, feet[0]), 0.1)
+    def error() -> float:
+        return float(np.linalg.norm(centre.compute_error(robot.configuration)))
+
+    return MinkLoop(robot, period, tasks, move, error, 0.1)
 
 
 def _grasp(robot: MinkRobot, period: float) -> MinkLoop:
@@ -364,7 +372,7 @@ def _open_fridge(robot: MinkRobot, period: float) -> MinkLoop:
     opening, posture = mink.PostureTask(model, cost, gain=DOOR_GAIN * period), mink.PostureTask(model, 0.01)
     opening.set_target(goal)
     held = mink.RelativeFrameTask(
-        HAND, "body", GRASP, "body", position_cost=1.0, orientation_cost=1.0, gain=0.5
+        GRIPPERS["pr2"], "body", GRASP, "body", position_cost=1.0, orientation_cost=1.0, gain=0.5
     )
     held.set_target(mink.SE3.identity())
     _at_start(robot, (posture,))
@@ -379,7 +387,7 @@ def _open_fridge(robot: MinkRobot, period: float) -> MinkLoop:
 
 
 MINK_LOOPS: Mapping[str, tuple[Callable[[ControlWorkload], Any], Callable[[MinkRobot, float], MinkLoop]]] = {
-    "pr2_opens_fridge": (_plain, _open_fridge),
+    OPENING: (_plain, _open_fridge),
     "arm_panda_dof_freezing": (_plain, _freeze),
     "humanoid_g1_teleop": (_with_table, _work_at_a_table),
     "biped_cassie": (_with_loops, _stand_with_closed_loops),

@@ -20,11 +20,7 @@ from pink.tasks import (
 )
 
 from kineverse.bench.control_workloads import (
-    DOOR,
-    DOOR_GAIN,
     FEET,
-    GRASP,
-    HAND,
     HANDS,
     QUADRUPED_FEET,
     ROOT,
@@ -34,6 +30,7 @@ from kineverse.bench.control_workloads import (
     squat,
     swing,
 )
+from kineverse.bench.opening import DOOR, DOOR_GAIN, GRASP, GRIPPERS, OPENING
 from kineverse.lie import Array
 
 SOLVER = "daqp"
@@ -105,26 +102,37 @@ class PinkLoop:
     options: dict[str, Any] = field(default_factory=dict)
     after: Callable[[Array], None] | None = None
 
+    def __post_init__(self) -> None:
+        self._q = self.robot.start
+        self._velocity = np.zeros(self.robot.model.nv)
+
     def reset(self) -> None:
         """Return to the start."""
         self.robot.reset()
+        self._q = self.robot.start
 
     def aim(self, time: float) -> None:
-        """Move the targets to a time [s]; a script's work, which is not part of a step."""
+        """Move the targets to a time [s]."""
         self.move(time)
 
     def step(self) -> None:
-        """Solve and integrate."""
+        """Update the configuration and solve."""
         configuration = self.robot.configuration
-        velocity = pink.solve_ik(configuration, self.tasks, self.period, solver=SOLVER, **self.options)
-        configuration.integrate_inplace(velocity, self.period)
+        configuration.update(self._q)
+        self._velocity = pink.solve_ik(configuration, self.tasks, self.period, solver=SOLVER, **self.options)
+
+    def advance(self) -> None:
+        """Integrate."""
+        configuration = self.robot.configuration
+        configuration.integrate_inplace(self._velocity, self.period)
+        self._q = configuration.q
         if self.after is not None:
-            self.after(velocity)
+            self.after(self._velocity)
 
 
-def make_pink_loop(name: str) -> PinkLoop:
-    """Return the control loop of a workload."""
-    workload = WORKLOADS[name]
+def make_pink_loop(name: str, workload: ControlWorkload | None = None) -> PinkLoop:
+    """Return the control loop of a workload, by default that of the name."""
+    workload = workload or WORKLOADS[name]
     return PINK_LOOPS[name](PinkRobot(workload), workload.period)
 
 
@@ -230,6 +238,9 @@ def _squat_on_four_legs(robot: PinkRobot, period: float) -> PinkLoop:
 class PinkTargetLoop(PinkLoop):
     """Iterated inverse kinematics: a step is one target, reached within 1e-8 from the zero position."""
 
+    def advance(self) -> None:
+        """Stay at the solution."""
+
     def step(self) -> None:
         """Iterate until the target is reached."""
         self.reset()
@@ -264,7 +275,7 @@ def _open_fridge(robot: PinkRobot, period: float) -> PinkLoop:
         row, np.array([0.5 * np.pi]), pin.neutral(model), cost=np.array([1.0]), gain=DOOR_GAIN * period
     )
     posture = PostureTask(cost=0.01)
-    held = RelativeFrameTask(HAND, GRASP, position_cost=1.0, orientation_cost=1.0, gain=0.5)
+    held = RelativeFrameTask(GRIPPERS["pr2"], GRASP, position_cost=1.0, orientation_cost=1.0, gain=0.5)
     held.set_target(pin.SE3.Identity())
     _at_start(robot, (posture,))
 
@@ -276,7 +287,7 @@ def _open_fridge(robot: PinkRobot, period: float) -> PinkLoop:
 
 
 PINK_LOOPS: Mapping[str, Callable[[PinkRobot, float], PinkLoop]] = {
-    "pr2_opens_fridge": _open_fridge,
+    OPENING: _open_fridge,
     "arm_ur5": _reach,
     "arm_ur3_velocity_smoothing": _reach_smoothly,
     "flying_dual_arm_ur3": _fly,
