@@ -104,7 +104,7 @@ def measure(settings: BenchmarkSettings) -> BenchmarkResult:
             compare_speed(measured, room[OURS], room[SEARCH]),
             *(compare_speed(measured, room[OURS], room[peer], 1.0) for peer in (BULLET, COAL)),
             bound_median(measured[whole], 150e-6),
-            bound_median(measured[f"{robot.name}: {OURS}{_WATCHED}, {QUERY}"], 120e-6),
+            bound_median(measured[f"{robot.name}: {OURS}{_WATCHED}, {QUERY}"], 130e-6),
             compare_speed(measured, whole, room[OURS]),
             compare_speed(measured, whole, f"{robot.name}: {COAL}{_WHOLE}, {QUERY}", 1.0),
             _growth(measured, sizes),
