@@ -2,6 +2,7 @@
 
 from .command import Command
 from .controller import Controller
+from .targets import Target
 from .task_functions import look_at, same_orientation, same_pose, same_position
 from .tasks import Goal, Hold, Keep, Task
 
@@ -11,6 +12,7 @@ __all__ = [
     "Goal",
     "Hold",
     "Keep",
+    "Target",
     "Task",
     "look_at",
     "same_orientation",

@@ -18,9 +18,9 @@ import numpy as np
 from kineverse.compile import compile  # noqa: A004
 from kineverse.expressions.expression import Expression, array, as_expression
 from kineverse.geometry import Scene
-from kineverse.geometry.dependence import FrameDependence
 from kineverse.geometry.results import DistanceResults
 from kineverse.lie import Array
+from kineverse.model.frame_dependence import FrameDependence
 from kineverse.symbols import Symbol
 
 from .velocity_program import INWARDS, RECOVERY_WEIGHT

@@ -13,33 +13,30 @@ from kineverse.compile import compile  # noqa: A004
 from kineverse.errors import (
     InfeasibleError,
     InvalidValueError,
-    NoSolutionError,
     NotFiniteError,
     ShapeError,
     UnknownNameError,
+    suggest,
 )
-from kineverse.expressions.expression import Expression, ExpressionLike, as_expression
+from kineverse.expressions.expression import ExpressionLike
 from kineverse.geometry import Scene
-from kineverse.geometry.dependence import FrameDependence
 from kineverse.lie import Array
 from kineverse.model.model_view import ModelView
-from kineverse.model.speed_limits import raw_min
 from kineverse.state import State, StateLike, as_state
 from kineverse.symbols import Symbol, parameter
 
 from .command import Command, StepTimes
 from .contact_slots import ContactSlots
-from .formulation import Formulation, find_speeds
+from .formulation import Formulation
 from .infeasibility import Conflict, find_irreducible_conflict, find_least_violation
 from .quadratic_program import make_solver
-from .tasks import Goal, Task
-from .velocity_program import Costs, VelocityProgram
+from .regularization import Costs, acceleration_limits, check_weight, find_posture, joint_weights
+from .targets import Target
+from .tasks import Task
+from .velocity_program import VelocityProgram, arrange_inputs
 
 _DT = "control/dt"
 _CONTACT_GAIN = 10.0
-_SAMPLES = 16
-_LEAST_SHARE = 0.01
-"""Smallest default weight of a speed, so that damping stays positive."""
 
 
 class Controller:
@@ -66,7 +63,8 @@ class Controller:
     smooth, jerk
         Weights of the first and second differences of commands.
     posture
-        Weight of the pull to the middle of limits while goals are not reached; 0 for none.
+        Weight of the pull to the middle of limits while goals are not reached; 0 for none. A mapping by
+        coordinate gives weights to these alone.
     acceleration
         Limits on accelerations [m/s²], [rad/s²], a number or a mapping by coordinate or speed. They and those
         of the model are limits around the last command, and give way where nothing else is possible.
@@ -109,7 +107,7 @@ class Controller:
         weights: Mapping[Symbol | str, ExpressionLike] | None = None,
         smooth: float = 1e-2,
         jerk: float = 0.0,
-        posture: float = 1e-3,
+        posture: float | Mapping[Symbol | str, float] = 1e-3,
         acceleration: float | Mapping[Symbol | str, float] | None = None,
         scene: Scene | None = None,
         contacts: int = 24,
@@ -117,26 +115,25 @@ class Controller:
         radius: float = 0.05,
         solver: str = "daqp",
     ) -> None:
-        for name, value in (("smooth", smooth), ("jerk", jerk), ("posture", posture)):
-            if not (isinstance(value, int | float) and 0 <= value < math.inf):
-                raise InvalidValueError(f"{name}= is a weight of at least 0, not {value!r}.")
+        check_weight("smooth", smooth)
+        check_weight("jerk", jerk)
         if not (isinstance(dt, int | float) and 0 < dt < math.inf):
             raise InvalidValueError(f"dt= is a positive time in seconds, not {dt!r}.")
         self.model = model
         self.dt = float(dt)
         step = parameter(_DT, self.dt)
-        stated, chosen = _accelerations(model, acceleration)
+        stated, chosen = acceleration_limits(model, acceleration)
         self._formulation = formulation = Formulation(
             model, tasks, dt=step, still=still, accelerations=chosen
         )
         self.tasks = formulation.tasks
         self.speeds = formulation.speeds
-        self._costs = Costs(smooth=smooth, jerk=jerk, posture=posture)
+        self._costs = Costs(smooth=smooth, jerk=jerk)
         self._program = VelocityProgram(
             formulation,
             self._costs,
-            joint_weights=_joint_weights(formulation, weights),
-            posture=_middles(formulation) if posture else {},
+            joint_weights=joint_weights(formulation, weights),
+            posture=find_posture(formulation, posture),
             accelerations=stated | chosen,
             hard_accelerations=not formulation.holds and not chosen,
             contacts=contacts if scene is not None else 0,
@@ -148,12 +145,10 @@ class Controller:
             self._contacts = ContactSlots(
                 scene, self.speeds, contacts, margin=margin, radius=radius, gain=min(0.5 / dt, _CONTACT_GAIN)
             )
-            both = {*self.inputs, *self._contacts.inputs}
-            self.inputs = tuple(sorted(both, key=lambda s: s.sort_key))
+            self.inputs = arrange_inputs({*self.inputs, *self._contacts.inputs})
             place = {s: k for k, s in enumerate(self.inputs)}
             self._program_values = np.array([place[s] for s in self._program.inputs], dtype=np.intp)
             self._contact_values = np.array([place[s] for s in self._contacts.inputs], dtype=np.intp)
-        self._solver_name = solver
         self._solver = make_solver(solver, self._program.columns, self._program.rows, soft=None)
         self._relaxed = self._solver
         if self._program.soft.any():
@@ -164,6 +159,10 @@ class Controller:
         n, first = len(self.speeds), len(self._program.inputs)
         program_values = self._evaluate.input[:first]
         self._values = np.zeros(len(self.inputs)) if self._contacts else program_values
+        self._coordinates = tuple(s for s in self.inputs if s.value is None)
+        self._parameters = {s: k for k, s in enumerate(self.inputs) if s.value is not None}
+        self._settings = {s: float(s.value or 0.0) for s in self._parameters}
+        self._values[len(self._coordinates) :] = list(self._settings.values())
         self._evaluate.input[first] = self.dt
         self._last = self._evaluate.input[first + 1 : first + 1 + n]
         self._before = self._evaluate.input[first + 1 + n :]
@@ -187,6 +186,32 @@ class Controller:
         self._last[:] = [known.given(s) or 0.0 for s in self.speeds]
         if len(self._before):
             self._before[:] = self._last
+
+    def set(self, target: Target | Symbol, value: npt.ArrayLike) -> None:
+        """Set a target, or a parameter, for all further steps; the value in a state has precedence.
+
+        Raises
+        ------
+        UnknownNameError
+            For a parameter that no task of the controller has.
+        ShapeError, InvalidValueError
+            For a value of another shape, or one that is not finite.
+        """
+        if isinstance(target, Target):
+            values = target.values(value)
+        else:
+            values = {target: float(np.asarray(value, dtype=float))}
+        for symbol, number in values.items():
+            if symbol not in self._parameters:
+                if isinstance(target, Target) and any(s in self._parameters for s in target.parameters):
+                    continue
+                known = map(str, self._parameters)
+                raise UnknownNameError(
+                    f"No task depends on '{symbol}'. {suggest(str(symbol), known, 'parameter')}"
+                )
+            if not math.isfinite(number):
+                raise InvalidValueError(f"The value of '{symbol}' has to be finite, not {number!r}.")
+            self._values[self._parameters[symbol]] = self._settings[symbol] = number
 
     def step(self, state: StateLike | npt.ArrayLike) -> Command:
         """Return the command for one time step at a state.
@@ -256,17 +281,10 @@ class Controller:
         if isinstance(state, Mapping):
             if not isinstance(state, State):
                 state = as_state(state, (*self.model.symbols, *self.model.speeds, *self.inputs))
-            given = state.given
-            for k, symbol in enumerate(self.inputs):
-                value = given(symbol)
-                if value is None:
-                    value = symbol.value
-                    if value is None:
-                        raise UnknownNameError(
-                            f"The state has no value for '{symbol}', which the controller needs. "
-                            "model.default_state() has one for everything."
-                        )
-                self._values[k] = value
+            self._values[: len(self._coordinates)] = state.vector(self._coordinates)
+            for symbol, place in self._parameters.items():
+                value = state.given(symbol)
+                self._values[place] = self._settings[symbol] if value is None else value
             return
         vector = np.asarray(state, dtype=float)
         if vector.shape != self._values.shape:
@@ -333,93 +351,3 @@ class Controller:
             f"<Controller: {len(self.tasks)} tasks, {len(self.speeds)} speeds, "
             f"{self._program.rows} rows, dt {self.dt:g} s>"
         )
-
-
-def _joint_weights(
-    formulation: Formulation, weights: Mapping[Symbol | str, ExpressionLike] | None
-) -> dict[Symbol, Expression]:
-    """Return the factor c_i of damping, smoothness and posture of each speed.
-
-    It is the mean square of the speed's column in the Jacobians of goals and holds over random states, so
-    that units of coordinates do not matter; times the share of bodies that the speed moves, or a given
-    factor.
-    """
-    model, speeds = formulation.model, formulation.speeds
-    moved = [sum(map(FrameDependence(model, [s]).moves, model.bodies)) for s in speeds]
-    most = max(moved, default=0)
-    share = [max(count / most, _LEAST_SHARE) if most else 1.0 for count in moved]
-    factors = dict(zip(speeds, map(as_expression, share), strict=True))
-    for key, weight in (weights or {}).items():
-        chosen = find_speeds(model, (key,), "weights")
-        if any(s not in factors for s in chosen):
-            raise InvalidValueError(f"weights=: no task moves '{key}', so it has no weight.")
-        factors |= dict.fromkeys(chosen, as_expression(weight))
-    scales = _column_scales(formulation)
-    return {s: float(scale) * factors[s] for s, scale in zip(speeds, scales, strict=True)}
-
-
-def _column_scales(formulation: Formulation) -> Array:
-    """Return the mean square of each column of the tasks' Jacobians over random states, (n,)."""
-    model, n = formulation.model, len(formulation.speeds)
-    jacobians = [row.jacobian for row in formulation.goals] + [row.jacobian for row in formulation.holds]
-    if not jacobians:
-        return np.ones(n)
-    function = compile([as_expression(np.concatenate(jacobians))], tier="interpreter")
-    generator, squares = np.random.default_rng(0), []
-    middle = model.default_state()
-    limits = {s: model.limits(s) for s in function.inputs if s.order == 0 and s in model.degrees_of_freedom}
-    for _ in range(_SAMPLES):
-        at = {}
-        for symbol, (lower, upper) in limits.items():
-            value = middle[symbol]
-            low, high = max(lower, value - math.pi), min(upper, value + math.pi)
-            at[symbol] = generator.uniform(low, max(low, high))
-        try:
-            (J,) = function(middle | at)
-        except NoSolutionError:  # outside of the domain of a closed loop
-            continue
-        if np.isfinite(J).all():
-            squares.append((J * J).sum(axis=0))
-    found = np.mean(squares, axis=0) if squares else np.ones(n)
-    positive = found[found > 0]
-    return np.where(found > 0, found, positive.mean() if len(positive) else 1.0)
-
-
-def _middles(formulation: Formulation) -> dict[Symbol, float]:
-    """Return the middle of the limits by speed, for coordinates that no goal is about directly."""
-    model = formulation.model
-    asked = {task.expression for task in formulation.tasks if isinstance(task, Goal)}
-    found = {}
-    for speed in formulation.speeds:
-        coordinate = speed.position
-        if coordinate in asked or coordinate in model.rates or coordinate not in model.degrees_of_freedom:
-            continue
-        lower, upper = model.limits(coordinate)
-        if math.isfinite(lower) and math.isfinite(upper):
-            found[speed] = (lower + upper) / 2
-    return found
-
-
-def _accelerations(
-    model: ModelView, chosen: float | Mapping[Symbol | str, float] | None
-) -> tuple[dict[Symbol, Expression], dict[Symbol, Expression]]:
-    """Return the limits on accelerations that the model states, and those that were chosen, by speed."""
-    stated: dict[Symbol, Expression] = {}
-    for constraint in model.constraints.values():
-        symbol = constraint.expression
-        if isinstance(symbol, Symbol) and symbol.order == 2:
-            stated[symbol.integral()] = raw_min(-constraint.lower, constraint.upper)
-    if chosen is None:
-        return stated, {}
-    if isinstance(chosen, Mapping):
-        given = {s: a for key, a in chosen.items() for s in find_speeds(model, (key,), "acceleration")}
-    else:
-        given = dict.fromkeys(model.speeds, chosen)
-    for speed, limit in given.items():
-        if not (isinstance(limit, int | float) and 0 < limit < math.inf):
-            raise InvalidValueError(
-                f"The acceleration of '{speed.position}' is a positive limit, not {limit!r}."
-            )
-    limits = {s: as_expression(limit) for s, limit in given.items()}
-    limits |= {s: raw_min(stated[s], limit) for s, limit in limits.items() if s in stated}
-    return stated, limits

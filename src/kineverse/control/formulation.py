@@ -42,7 +42,7 @@ class GoalRows:
     correction, rate
         (k,) wanted rates by the error alone, and with those of the target.
     weight
-        Weight of the squared difference.
+        (k,) weights of the squared differences.
     """
 
     name: str
@@ -224,20 +224,20 @@ class Formulation:
 
     def _goal_rows(self, goal: Goal, error: Expression, gradient: dict[Symbol, Expression]) -> GoalRows:
         jacobian = self._matrix(goal, gradient)
+        given = as_expression(goal.weight).ravel()
+        weight = array([given[k if given.size > 1 else 0] for k in range(goal.error.size)])
         if any(s.order for s in error.symbols):
             eliminated = self.model.rates.eliminate(error)
             constant = eliminated.substitute({s: 0.0 for s in eliminated.symbols if s.order})
             none = as_expression(np.zeros(goal.error.size))
-            return GoalRows(
-                self._names[goal], constant, jacobian, none, -constant, as_expression(goal.weight)
-            )
+            return GoalRows(self._names[goal], constant, jacobian, none, -constant, weight)
         rate = correction = -as_expression(goal.gain) * error
         if goal.speed is not None:
             speed = as_expression(goal.speed)
             rate = correction = rate * minimum(1.0, speed / norm(np.concatenate([rate, [speed]])))
         if goal.rate is not None:
             rate = rate + (as_expression(goal.rate) + ZERO * goal.expression).ravel()
-        return GoalRows(self._names[goal], error, jacobian, correction, rate, as_expression(goal.weight))
+        return GoalRows(self._names[goal], error, jacobian, correction, rate, weight)
 
     def _matrix(self, task: Goal | Hold, gradient: dict[Symbol, Expression]) -> Expression:
         """Return the Jacobian over the columns, (k, n)."""

@@ -9,7 +9,6 @@ from __future__ import annotations
 
 import importlib
 from abc import ABC, abstractmethod
-from collections.abc import Callable
 from types import ModuleType
 from typing import Any, Literal, NamedTuple
 
@@ -98,8 +97,9 @@ class QpSolver(ABC):
         if not (np.isfinite(self._linear) & (self._linear >= 0)).all():
             raise InvalidValueError("The linear weights of soft rows are finite and at least 0.")
         self._bound: tuple[object, ...] = (None,) * 5
-        self._flat = (np.zeros(0), np.zeros(0), np.zeros(0))
-        self._ordered = np.zeros(n + m, bool)
+        self._hard = None if not self.soft.any() else (~self.soft).astype(float)
+        self._values, self._violations = np.zeros(n + m), np.zeros(n + m)
+        self._x, self._rows = self._values[:n], self._values[n:]
 
     def solve(self, H: Vector, f: Vector, A: Vector, lower: Vector, upper: Vector) -> QpSolution:
         """Minimise ``1/2 x'Hx + f'x`` subject to ``lower <= [x; A x] <= upper``.
@@ -124,17 +124,9 @@ class QpSolver(ABC):
             For arrays of another shape, or that are not C-contiguous doubles. Numbers raise nothing, see
             :class:`QpSolution`.
         """
-        h0, f0, a0, l0, u0 = self._bound
-        if H is not h0 or f is not f0 or A is not a0 or lower is not l0 or upper is not u0:
+        h, g, a, low, high = self._bound
+        if H is not h or f is not g or A is not a or lower is not low or upper is not high:
             self._bind(H, f, A, lower, upper)
-        h, g, a = self._flat
-        # Squares tell all that is not finite (NaN included) in one sum, the cheapest way from Python.
-        square = h.dot(h) + g.dot(g) + a.dot(a)
-        if square - square != 0.0:
-            return self._nothing("failed")
-        np.less_equal(lower, upper, self._ordered)
-        if np.count_nonzero(self._ordered) != self._ordered.size:
-            return self._nothing("failed" if np.isnan(lower).any() or np.isnan(upper).any() else "infeasible")
         return self._solve(H, f, A, lower, upper)
 
     @abstractmethod
@@ -143,7 +135,29 @@ class QpSolver(ABC):
 
     @abstractmethod
     def _solve(self, H: Vector, f: Vector, A: Vector, lower: Vector, upper: Vector) -> QpSolution:
-        """Solve a problem with finite data and ordered bounds; what counts as solved is finite."""
+        """Solve a problem with arrays of the right shapes and any numbers."""
+
+    def _satisfies(self, x: Vector, A: Vector, lower: Vector, upper: Vector) -> bool:
+        """Return whether x satisfies the hard rows; any NaN, in the data or in x, makes that False."""
+        values, violations = self._values, self._violations
+        self._x[:] = x
+        A.dot(x, self._rows)
+        np.maximum(values, lower, out=violations)
+        np.minimum(violations, upper, out=violations)
+        np.subtract(values, violations, out=violations)
+        if self._hard is not None:
+            # Both are finite unless a value is not; then 0 * NaN is NaN.
+            np.multiply(violations, self._hard, out=violations)
+        return bool(violations.dot(violations) <= _FEASIBLE * (1.0 + values.dot(values)))
+
+    @staticmethod
+    def _unsolvable(H: Vector, f: Vector, A: Vector, lower: Vector, upper: Vector) -> Status | None:
+        """Return the status of a problem that no solver needs to see; None for any other."""
+        if not all(np.isfinite(array).all() for array in (H, f, A)):
+            return "failed"
+        if np.isnan(lower).any() or np.isnan(upper).any() or (H.diagonal() <= 0.0).any():
+            return "failed"
+        return None if (lower <= upper).all() else "infeasible"
 
     def _nothing(self, status: Status, iterations: int = 0) -> QpSolution:
         return QpSolution(np.zeros(self.n), np.zeros(self.n + self.m), iterations, status)
@@ -165,7 +179,6 @@ class QpSolver(ABC):
             if array.shape != shape:
                 raise ShapeError(f"{name} has the shape {array.shape}, not {shape} (n = {n}, m = {m}).")
         self._bound = (H, f, A, lower, upper)
-        self._flat = (H.reshape(-1), f, A.reshape(-1))
 
 
 def make_solver(
@@ -215,10 +228,7 @@ class DaqpSolver(QpSolver):
     ) -> None:
         super().__init__(n, m, soft, soft_weight, soft_linear)
         self._daqp = _library("daqp", "control")
-        self._sense = np.where(self.soft, _DAQP_SOFT, 0).astype(np.intc)
         self._model: Any = None
-        self._update: Callable[..., int]
-        self._run: Callable[[], tuple[Vector, float, int, dict[str, Any]]]
         self._warm = False
 
     def reset(self) -> None:  # noqa: D102
@@ -226,35 +236,68 @@ class DaqpSolver(QpSolver):
 
     def _solve(self, H: Vector, f: Vector, A: Vector, lower: Vector, upper: Vector) -> QpSolution:
         if self._warm:
-            # The solver keeps these arrays, and the active set of the last solve unless senses are given.
-            if self._update(H, f, A if self.m else None, upper, lower) == 0:
-                x, _, flag, info = self._run()
-                if (flag == 1 or flag == 2) and x.dot(x) < np.inf:
+            # The solver keeps these arrays, and the active set of the last solve.
+            model = self._model
+            if model.update(H, f, A if self.m else None, upper, lower) == 0:
+                x, _, flag, info = model.solve()
+                if (flag == 1 or flag == 2) and self._satisfies(x, A, lower, upper):
                     return QpSolution(x, info["lam"], info["iterations"], "solved")
-            # It fails, or returns NaN as solved, if bounds of the last active set are infinite now.
-            self._warm = False
-        flag, iterations = self._start(H, f, A, lower, upper), 0
-        if flag >= 0:
-            x, _, flag, info = self._run()
-            iterations = info["iterations"]
-            if (flag == 1 or flag == 2) and x.dot(x) < np.inf:
-                self._warm = True
-                return QpSolution(x, info["lam"], iterations, "solved")
-        return self._nothing(_DAQP_STATUS.get(flag, "failed"), iterations)
+        # It may have failed, or returned NaN as solved: so it does if bounds of the last active set are
+        # infinite now.
+        self._warm = False
+        status = self._unsolvable(H, f, A, lower, upper)
+        if status is not None:
+            return self._nothing(status)
+        return self._solve_anew(H, f, A, lower, upper)
 
-    def _start(self, H: Vector, f: Vector, A: Vector, lower: Vector, upper: Vector) -> int:
-        if self._model is not None:
-            flag: int = self._update(H, f, A if self.m else None, upper, lower, self._sense)
-            return flag
-        model = self._daqp.Model()
-        model.settings = _DAQP_SETTINGS
-        flag, _ = model.setup(H, f, A, upper, lower, self._sense)
-        if flag >= 0:
-            if self.soft.any():
-                rho, w = 1.0 / self._weight, self._linear
-                model.soft_weights(rho, rho, w, w)
-            self._model, self._update, self._run = model, model.update, model.solve
-        return flag
+    def _solve_anew(self, H: Vector, f: Vector, A: Vector, lower: Vector, upper: Vector) -> QpSolution:
+        flag, x, multipliers, iterations = self._start(
+            H, f, A, lower, upper, np.ones(self.n + self.m), _DAQP_SETTINGS
+        )
+        if flag >= 1 and self._satisfies(x, A, lower, upper):
+            self._warm = True
+            return QpSolution(x, multipliers, iterations, "solved")
+        # Its tolerances are absolute: data of many decades are scaled to unknowns and rows of length 1.
+        unit = 1.0 / np.sqrt(H.diagonal())
+        rows = A * unit
+        length = np.sqrt(np.einsum("ij,ij->i", rows, rows))
+        scale = np.concatenate([1.0 / unit, 1.0 / np.where(length > 0.0, length, 1.0)])
+        flag, x, multipliers, iterations = self._start(
+            np.ascontiguousarray(H * np.outer(unit, unit)),
+            f * unit,
+            rows * scale[self.n :, None],
+            lower * scale,
+            upper * scale,
+            scale,
+            _DAQP_SCALED_SETTINGS,
+        )
+        x = x * unit
+        if flag >= 1 and self._satisfies(x, A, lower, upper):
+            return QpSolution(x, multipliers * scale, iterations, "solved")
+        return self._nothing("infeasible" if flag in _DAQP_INFEASIBLE else "failed", iterations)
+
+    def _start(
+        self,
+        H: Vector,
+        f: Vector,
+        A: Vector,
+        lower: Vector,
+        upper: Vector,
+        scale: Vector,
+        settings: dict[str, float],
+    ) -> tuple[int, Vector, Vector, int]:
+        """Solve a problem from scratch, whose entries of [x; A x] are multiples of the user's."""
+        model = self._model = self._daqp.Model()
+        model.settings = settings
+        sense = np.where(self.soft, _DAQP_SOFT, 0).astype(np.intc)
+        flag, _ = model.setup(H, f, A, upper, lower, sense)
+        if flag < 0:
+            return flag, np.zeros(self.n), np.zeros(self.n + self.m), 0
+        if self._hard is not None:
+            reciprocal, linear = scale**2 / self._weight, self._linear / scale
+            model.soft_weights(reciprocal, reciprocal, linear, linear)
+        x, _, flag, info = model.solve()
+        return flag, x, info["lam"], info["iterations"]
 
 
 class _SlackSolver(QpSolver):
@@ -284,11 +327,14 @@ class _SlackSolver(QpSolver):
         self._lower, self._upper = np.zeros(n + m + 2 * k), np.full(n + m + 2 * k, np.inf)
 
     def _solve(self, H: Vector, f: Vector, A: Vector, lower: Vector, upper: Vector) -> QpSolution:
+        unsolvable = self._unsolvable(H, f, A, lower, upper)
+        if unsolvable is not None:
+            return self._nothing(unsolvable)
         n, entries = self.n, self.n + self.m
         self._H[:n, :n], self._f[:n], self._C[n:entries, :n] = H, f, A
         self._lower[:entries], self._upper[:entries] = lower, upper
         x, multipliers, iterations, status = self._solve_hard()
-        if status == "solved" and not x.dot(x) < np.inf:
+        if status == "solved" and not self._satisfies(x[:n], A, lower, upper):
             status = "failed"
         if status != "solved":
             self.reset()
@@ -373,10 +419,13 @@ SOLVERS: dict[str, type[QpSolver]] = {
 """The solvers by name."""
 
 _TOLERANCE = 1e-9
+_FEASIBLE = 1e-8**2
 _PROXQP_INFINITY = 1e20
 _DAQP_SOFT = 8
 _DAQP_SETTINGS = {"primal_tol": 1e-9}
-_DAQP_STATUS: dict[int, Status] = {-1: "infeasible", -6: "infeasible"}
+_DAQP_SCALED_SETTINGS = {"primal_tol": 1e-9, "sing_tol": 1e-13}
+"""Rows that are nearly parallel are told apart, at the price of a less stable factorisation."""
+_DAQP_INFEASIBLE = (-1, -6)
 _OSQP_SETTINGS = {
     "verbose": False,
     "eps_abs": 1e-9,

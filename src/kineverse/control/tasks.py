@@ -34,7 +34,8 @@ class Goal:
     rate
         Feed-forward rate of the target, such as that of a trajectory; None for 0.
     weight
-        Weight of the squared rate error, a number or an expression; 0 switches the goal off.
+        Weight of the squared rate error: a scalar, or one for each entry of the expression; numbers or
+        expressions. 0 switches the goal off.
     heuristic
         Whether trends of logic count as gradients; see :mod:`kineverse.logic`.
 
@@ -62,7 +63,13 @@ class Goal:
         _check_positive(self, "gain", self.gain)
         if self.speed is not None:
             _check_positive(self, "speed", self.speed)
-        _check_number(self, "weight", self.weight, 0.0)
+        weights = as_expression(self.weight)
+        if weights.shape not in ((), self.expression.shape):
+            raise ShapeError(
+                f"{self!r}: the weight is a scalar or has shape {self.expression.shape}, not {weights.shape}."
+            )
+        for weight in weights.ravel():
+            _check_number(self, "weight", weight, 0.0)
         if self.rate is not None and as_expression(self.rate).shape not in ((), error.shape):
             raise ShapeError(
                 f"{self!r}: the rate has shape {as_expression(self.rate).shape}, not {error.shape}."

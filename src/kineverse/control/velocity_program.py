@@ -18,8 +18,7 @@ contain 0, so v = 0, s = 0 is feasible.
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from dataclasses import dataclass
+from collections.abc import Iterable, Mapping
 from functools import reduce
 
 import casadi as ca
@@ -33,6 +32,7 @@ from kineverse.model.speed_limits import INFINITE, ZERO, is_infinite, raw_max
 from kineverse.symbols import Symbol, parameter
 
 from .formulation import Formulation, GoalRows, HoldRows
+from .regularization import Costs
 
 RECOVERY_WEIGHT = 1e3
 INWARDS = 1e-3
@@ -40,33 +40,6 @@ INWARDS = 1e-3
 POSTURE_GAIN = 0.5
 REACHED = 1e-2
 """Wanted rate of goals below which the posture fades [unit/s]."""
-
-
-@dataclass(frozen=True)
-class Costs:
-    """Weights of the terms that no task states.
-
-    Attributes
-    ----------
-    damping, error_damping
-        Weight of squared speeds, and factor of their product with the rates that goals want.
-    smooth, jerk
-        Weights of the first and second differences of commands.
-    posture
-        Weight of the pull to the middle of limits.
-    progress
-        Weight of the progress of holds.
-    recovery
-        Rate at which violations of limits decay [1/s].
-    """
-
-    damping: float = 1e-4
-    error_damping: float = 1.0
-    smooth: float = 1e-2
-    jerk: float = 0.0
-    posture: float = 1e-3
-    progress: float = 10.0
-    recovery: float = 5.0
 
 
 class VelocityProgram:
@@ -95,7 +68,7 @@ class VelocityProgram:
         costs: Costs,
         *,
         joint_weights: Mapping[Symbol, ExpressionLike],
-        posture: Mapping[Symbol, float],
+        posture: Mapping[Symbol, tuple[float, float]],
         accelerations: Mapping[Symbol, ExpressionLike],
         hard_accelerations: bool,
         contacts: int,
@@ -112,12 +85,12 @@ class VelocityProgram:
         hessian: Expression = as_expression(np.zeros((n, n)))
         effort = distance = ZERO
         for goal in formulation.goals:
-            weighted = goal.jacobian * goal.weight
+            weighted = goal.jacobian * goal.weight.reshape(goal.weight.size, 1)
             hessian = hessian + weighted.T @ goal.jacobian
             pull = weighted.T @ goal.rate
             linear = [linear[i] - pull[i] for i in range(n)]
-            effort = effort + goal.weight * (goal.rate @ goal.rate)
-            distance = distance + goal.weight * norm(goal.correction)
+            effort = effort + (goal.weight * goal.rate) @ goal.rate
+            distance = distance + norm(goal.weight * goal.correction)
         rows = formulation.rows
         bounds, general = rows.bounds, rows.general
         for i in range(n):
@@ -142,9 +115,10 @@ class VelocityProgram:
             if before:
                 linear[i] = linear[i] - share * costs.jerk * (2 * last[i] - before[i])
             if speed in posture:
-                pull = POSTURE_GAIN * (posture[speed] - formulation.model.rates.carry(speed.position))
-                diagonal[i] = diagonal[i] + share * costs.posture
-                linear[i] = linear[i] - share * costs.posture * fade * pull
+                own, middle = posture[speed]
+                towards = POSTURE_GAIN * (middle - speed.position)
+                diagonal[i] = diagonal[i] + share * own
+                linear[i] = linear[i] - share * own * fade * towards
         entries = [
             hessian[i, j] + diagonal[i] if i == j else hessian[i, j] for i in range(n) for j in range(n)
         ]
@@ -208,7 +182,7 @@ class VelocityProgram:
         self.function: CompiledFunction[tuple[Array, ...]]
         outputs = [H, f, A, array(lower), array(upper), array(list(residuals.values())), check]
         used = {s for output in outputs for s in output.symbols}
-        self.inputs = tuple(sorted(used - {dt, *last, *before}, key=lambda s: s.sort_key))
+        self.inputs = arrange_inputs(used - {dt, *last, *before})
         self.function = compile(outputs, (*self.inputs, dt, *last, *before))
 
     def _keep_residual(self, name: str) -> Expression:
@@ -216,6 +190,11 @@ class VelocityProgram:
         rows = self.formulation.rows
         own = [abs(rows.violation[k]) for k, row in enumerate(rows.names) if row == name]
         return reduce(raw_max, own, ZERO)
+
+
+def arrange_inputs(symbols: Iterable[Symbol]) -> tuple[Symbol, ...]:
+    """Return symbols in the order of vectors of states: coordinates first, then parameters."""
+    return tuple(sorted(symbols, key=lambda s: (s.value is not None, s.sort_key)))
 
 
 def _way_back(violation: Expression, gain: float) -> tuple[Expression, Expression]:

@@ -10,13 +10,13 @@ import numpy.typing as npt
 
 from kineverse.errors import InvalidValueError, UnknownNameError, suggest
 from kineverse.model.frame import WORLD
+from kineverse.model.frame_dependence import FrameDependence
 from kineverse.model.kinematics import ancestors
 from kineverse.model.model_view import ModelView
 from kineverse.symbols import Symbol
 
 from .broadphase import Flags, Indices, PairSelection
 from .collision_world import CollisionWorld
-from .dependence import FrameDependence
 from .distance_queries import check_radius, find_pairs_within
 from .objects import matches_pattern
 from .results import DistanceResults

@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
+from kineverse.model.frame_dependence import FrameDependence
 from kineverse.model.model_view import ModelView
 from kineverse.state import StateLike
 from kineverse.symbols import Symbol
@@ -16,7 +17,6 @@ from kineverse.symbols import Symbol
 from . import distance_queries, rays
 from .collision_filter import Rule, apply_rules, parse_known_rules
 from .collision_world import CollisionWorld
-from .dependence import FrameDependence
 from .distance_expressions import DistanceParameters, PairDistance, distance_expression, distance_parameters
 from .mesh_files import Floats
 from .objects import Exclusion
