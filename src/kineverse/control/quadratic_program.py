@@ -142,13 +142,16 @@ class QpSolver(ABC):
         values, violations = self._values, self._violations
         self._x[:] = x
         A.dot(x, self._rows)
+        size = values.dot(values)
+        if not size < np.inf:
+            return False
         np.maximum(values, lower, out=violations)
         np.minimum(violations, upper, out=violations)
         np.subtract(values, violations, out=violations)
         if self._hard is not None:
-            # Both are finite unless a value is not; then 0 * NaN is NaN.
+            # A NaN is a NaN also in a soft row.
             np.multiply(violations, self._hard, out=violations)
-        return bool(violations.dot(violations) <= _FEASIBLE * (1.0 + values.dot(values)))
+        return bool(violations.dot(violations) <= _FEASIBLE * (1.0 + size))
 
     @staticmethod
     def _unsolvable(H: Vector, f: Vector, A: Vector, lower: Vector, upper: Vector) -> Status | None:
@@ -339,7 +342,9 @@ class _SlackSolver(QpSolver):
         if status != "solved":
             self.reset()
             return self._nothing(status, iterations)
-        return QpSolution(x[:n].copy(), multipliers[:entries].copy(), iterations, status)
+        # They are tiny, not zero, where there is no bound.
+        least, most = np.where(np.isinf(lower), 0.0, -np.inf), np.where(np.isinf(upper), 0.0, np.inf)
+        return QpSolution(x[:n].copy(), np.clip(multipliers[:entries], least, most), iterations, status)
 
     @abstractmethod
     def _solve_hard(self) -> tuple[Vector, Vector, int, Status]:
@@ -347,9 +352,14 @@ class _SlackSolver(QpSolver):
 
 
 class ProxqpSolver(_SlackSolver):
-    """The proximal augmented Lagrangian solver ProxQP (Bambade et al. 2022), dense."""
+    """The proximal augmented Lagrangian solver ProxQP (Bambade et al. 2022), dense.
+
+    It starts from its last solution while the same rows are equalities, and the same have bounds. It may say
+    "failed" of an infeasible problem.
+    """
 
     _qp: Any = None
+    _kinds = b""
 
     def reset(self) -> None:  # noqa: D102
         self._qp = None
@@ -357,23 +367,38 @@ class ProxqpSolver(_SlackSolver):
     def _solve_hard(self) -> tuple[Vector, Vector, int, Status]:
         library = _library("proxsuite", "bench").proxqp
         lower, upper = np.maximum(self._lower, -_PROXQP_INFINITY), np.minimum(self._upper, _PROXQP_INFINITY)
-        data = (self._H, self._f, None, None, self._C, lower, upper)
-        if self._qp is None:
-            self._qp = library.dense.QP(len(self._f), 0, len(lower))
-            self._qp.settings.eps_abs, self._qp.settings.eps_rel = _TOLERANCE, 0.0
-            self._qp.settings.eps_primal_inf = _TOLERANCE
+        equal = lower == upper
+        between = ~equal & (np.isfinite(self._lower) | np.isfinite(self._upper))
+        data = (
+            self._H,
+            self._f,
+            self._C[equal],
+            lower[equal],
+            self._C[between],
+            lower[between],
+            upper[between],
+        )
+        warm = self._qp is not None and self._kinds == equal.tobytes() + between.tobytes()
+        if warm:
+            self._qp.update(*data, update_preconditioner=True)
+            self._qp.solve()
+        if not warm or self._qp.results.info.status != library.PROXQP_SOLVED:
+            self._qp = library.dense.QP(len(self._f), np.count_nonzero(equal), np.count_nonzero(between))
+            self._kinds = equal.tobytes() + between.tobytes()
+            for key, value in _PROXQP_SETTINGS.items():
+                setattr(self._qp.settings, key, value)
             self._qp.settings.initial_guess = library.InitialGuess.WARM_START_WITH_PREVIOUS_RESULT
             self._qp.init(*data)
-        else:
-            self._qp.update(*data, update_preconditioner=True)
-        self._qp.solve()
-        result, known = self._qp.results, library
+            self._qp.solve()
+        result = self._qp.results
         status: Status = "failed"
-        if result.info.status == known.PROXQP_SOLVED:
+        if result.info.status == library.PROXQP_SOLVED:
             status = "solved"
-        elif result.info.status == known.PROXQP_PRIMAL_INFEASIBLE:
+        elif result.info.status == library.PROXQP_PRIMAL_INFEASIBLE:
             status = "infeasible"
-        return np.asarray(result.x), np.asarray(result.z), result.info.iter, status
+        multipliers = np.zeros(len(lower))
+        multipliers[equal], multipliers[between] = result.y, result.z
+        return np.asarray(result.x), multipliers, result.info.iter, status
 
 
 class OsqpSolver(_SlackSolver):
@@ -401,7 +426,7 @@ class OsqpSolver(_SlackSolver):
             self._qp.setup(P, self._f, C, self._lower, self._upper, **_OSQP_SETTINGS)
         else:
             self._qp.update(q=self._f, l=self._lower, u=self._upper, Px=quadratic, Ax=linear.ravel())
-        result = self._qp.solve()
+        result = self._qp.solve(raise_error=False)
         status: Status = "failed"
         if result.info.status_val == library.SolverStatus.OSQP_SOLVED:
             status = "solved"
@@ -418,7 +443,6 @@ SOLVERS: dict[str, type[QpSolver]] = {
 }
 """The solvers by name."""
 
-_TOLERANCE = 1e-9
 _FEASIBLE = 1e-8**2
 _PROXQP_INFINITY = 1e20
 _DAQP_SOFT = 8
@@ -426,6 +450,15 @@ _DAQP_SETTINGS = {"primal_tol": 1e-9}
 _DAQP_SCALED_SETTINGS = {"primal_tol": 1e-9, "sing_tol": 1e-13}
 """Rows that are nearly parallel are told apart, at the price of a less stable factorisation."""
 _DAQP_INFEASIBLE = (-1, -6)
+_PROXQP_SETTINGS = {
+    "eps_abs": 1e-9,
+    "eps_rel": 0.0,
+    "eps_primal_inf": 1e-9,
+    "check_duality_gap": True,
+    "eps_duality_gap_abs": 1e-8,
+    "eps_duality_gap_rel": 0.0,
+    "max_iter": 300,
+}
 _OSQP_SETTINGS = {
     "verbose": False,
     "eps_abs": 1e-9,
