@@ -8,7 +8,8 @@ from __future__ import annotations
 
 import difflib
 import re
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Mapping, Sequence
+from typing import Any
 
 
 class KineverseError(Exception):
@@ -71,6 +72,38 @@ class UnknownAttributeError(KineverseError, AttributeError):
 
 class FormatError(KineverseError, ValueError):
     """A file or document does not follow its format."""
+
+
+class InfeasibleError(KineverseError, ValueError):
+    """No command satisfies all hard constraints of a controller.
+
+    Attributes
+    ----------
+    conflict
+        An irreducible set of contradictory constraints, each with ``name``, ``operations``, ``lower`` and
+        ``upper``: without any of them the others can be satisfied.
+    command
+        The command that violates the rows least, within the limits of single speeds.
+    """
+
+    def __init__(self, message: str, conflict: Sequence[Any] = (), command: Any = None) -> None:
+        super().__init__(message)
+        self.conflict: tuple[Any, ...] = tuple(conflict)
+        self.command = command
+
+
+class NotFiniteError(KineverseError, ArithmeticError):
+    """A value or derivative is NaN or infinite at a state.
+
+    Attributes
+    ----------
+    names
+        The tasks and constraints with such values.
+    """
+
+    def __init__(self, message: str, names: Sequence[str] = ()) -> None:
+        super().__init__(message)
+        self.names: tuple[str, ...] = tuple(names)
 
 
 class MissingDependencyError(KineverseError, ImportError):

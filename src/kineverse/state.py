@@ -4,8 +4,10 @@ from __future__ import annotations
 
 import math
 from collections import Counter
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from typing import TYPE_CHECKING, Any, TypeAlias
+
+import numpy as np
 
 from ._checks import real_number
 from ._synonyms import STATE_SYNONYMS
@@ -21,6 +23,7 @@ from .errors import (
     unknown_attribute_error,
 )
 from .expressions.printing import html_table
+from .lie import Array
 from .symbols import Symbol, parse_symbol_name
 
 StateLike: TypeAlias = "State | Mapping[Symbol, float] | Mapping[str, float] | Mapping[Symbol | str, float]"
@@ -130,6 +133,29 @@ class State(Mapping[Symbol, float]):
         if value is None and symbol.role != "dof":
             return self._values.get(Symbol(symbol.path, symbol.order))
         return value
+
+    def vector(self, symbols: Sequence[Symbol]) -> Array:
+        """Return the values of symbols in their order, shape (n,).
+
+        The fast way from a state to the input of a compiled function, ``state.vector(function.inputs)``.
+        The state may have more symbols. Parameters without a value in the state have their own.
+
+        Raises
+        ------
+        UnknownNameError
+            For symbols without a value.
+        """
+        try:
+            return np.fromiter(map(self._values.__getitem__, symbols), np.float64, len(symbols))
+        except KeyError:
+            pass
+        held = [self.given(s) for s in symbols]
+        values = [s.value if v is None else v for s, v in zip(symbols, held, strict=True)]
+        missing = [str(s) for s, value in zip(symbols, values, strict=True) if value is None]
+        if missing:
+            more = f" and {len(missing) - 12} more" if len(missing) > 12 else ""
+            raise UnknownNameError(f"No value is given for {', '.join(map(repr, missing[:12]))}{more}.")
+        return np.array(values, dtype=np.float64)
 
     def __contains__(self, key: object) -> bool:
         return key in self._by_name if isinstance(key, str) else key in self._values

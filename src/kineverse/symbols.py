@@ -44,13 +44,12 @@ class Symbol(Expression):
         The default value of a parameter; None for other roles.
     """
 
-    __slots__ = ("_hash", "_text", "order", "path", "role", "sort_key", "value")
+    __slots__ = ("_text", "order", "path", "role", "sort_key", "value")
 
     path: str
     order: int
     role: Role
     value: float | None
-    _hash: int
     _text: str
     sort_key: tuple[str, int, str, float]
 
@@ -79,7 +78,6 @@ class Symbol(Expression):
         self._leaves = ((self,), ())
         self.path, self.order, self.role, self.value = path, order, role, value
         self.sort_key = (path, order, role, 0.0 if value is None else value)  # from here on immutable
-        self._hash = hash(self.sort_key)
         with _INTERNING:
             known = _INTERNED.get(key)
             if known is None:
@@ -141,8 +139,9 @@ class Symbol(Expression):
     def __repr__(self) -> str:
         return self._text
 
-    def __hash__(self) -> int:
-        return self._hash
+    # There is one symbol of a kind, so identity is enough. A hash without Python code takes a third of the
+    # time, and loops look up dozens of values by symbol.
+    __hash__ = object.__hash__
 
     if not TYPE_CHECKING:
 

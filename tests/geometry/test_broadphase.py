@@ -11,7 +11,7 @@ from scipy.spatial.transform import Rotation
 from hypothesis_profiles import attempts
 from kineverse.geometry import broadphase
 from kineverse.geometry.bindings import CollisionLibrary
-from kineverse.geometry.broadphase import ObjectTable, build_static_tree
+from kineverse.geometry.broadphase import TREE_WIDTH, ObjectTable, build_static_tree
 
 
 @pytest.fixture(scope="module")
@@ -154,19 +154,19 @@ def test_static_tree_contains_every_object_once_in_enclosing_boxes(seed, count):
     high = low + rng.uniform(0, 1, (80, 3))
     pieces = rng.permutation(80)[:count].astype(np.int32)
     boxes, leaves = build_static_tree(low, high, pieces)
-    assert len(boxes) == 2 * len(leaves) - 1
+    assert boxes.shape[1:] == (6, TREE_WIDTH)
+    assert leaves.shape[1] == TREE_WIDTH
     assert sorted(leaves[leaves >= 0].tolist()) == sorted(pieces.tolist())
     for number, leaf in enumerate(leaves):
         assert (np.diff((leaf < 0).astype(int)) >= 0).all()  # those that are none come last
-        node = len(leaves) - 1 + number
-        for piece in leaf[leaf >= 0]:
-            above = node
+        for child, piece in enumerate(leaf[leaf >= 0]):
+            node = len(boxes) - len(leaves) + number
             while True:
-                assert (boxes[above, :3] <= low[piece]).all()
-                assert (boxes[above, 3:] >= high[piece]).all()
-                if above == 0:
+                assert (boxes[node, :3, child] <= low[piece]).all()
+                assert (boxes[node, 3:, child] >= high[piece]).all()
+                if node == 0:
                     break
-                above = (above - 1) // 2
+                node, child = divmod(node - 1, TREE_WIDTH)
 
 
 @pytest.mark.compiler

@@ -40,6 +40,9 @@ def test_gradient_of_a_distance_expression_matches_finite_differences():
             values = state | kv.State(scene.expression_values(distance))
             measured = scene.distance(*pair)
             assert distance.expression(values) == pytest.approx(measured.distance, abs=1e-9)
+            for name in ("point_a", "point_b", "normal"):
+                given, found = getattr(distance, name)(values), getattr(measured, name)
+                np.testing.assert_allclose(given, found, atol=1e-9)
             exact = distance.expression.jacobian(symbols)(values)
             np.testing.assert_allclose(exact, slopes(scene, state, pair, symbols), atol=2e-3)
             signs.add(measured.distance > 0)

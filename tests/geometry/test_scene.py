@@ -422,6 +422,33 @@ def test_find_never_colliding_excepts_pairs_that_never_touch(model):
         scene.find_never_colliding([])
 
 
+def test_find_always_colliding_excepts_pairs_that_always_overlap(model):
+    scene = Scene(model)
+    assert not scene.find_always_colliding()
+    rules = scene.find_always_colliding([model.default_state()], margin=0.3)
+    scene.update(model.default_state())
+    assert {frozenset(rule[:2]) for rule in rules} == by_names(scene.pairs_within(0.3)).keys()
+    assert {rule.why for rule in rules} == {"within 0.3 m at all of 1 states"}
+    quiet = Scene(model, rules=rules)
+    assert quiet.rules == rules
+    quiet.update(model.default_state())
+    assert not quiet.pairs_within(0.3)
+
+
+def test_links_that_overlap_around_a_joint_are_always_colliding():
+    model = arm_among_boxes()
+    with model.edit() as edit:  # as wide as the joint to link0, and joined only to the base
+        edit.add_frame("cover", "base", kv.rotation_z(kv.position("spin")), body(Sphere(0.2)))
+    scene = Scene(model)
+    rules = scene.find_always_colliding()
+    assert [set(rule[:2]) for rule in rules] == [{"link0", "cover"}]
+    assert rules[0].why == "within 0 m at all of 201 states"
+    with model.edit() as edit:
+        edit.write(kv.geometry.RULES, kv.geometry.rules_as_data(rules))
+    assert scene.rules == rules
+    assert not scene.find_always_colliding()
+
+
 def test_visual_shapes_replace_missing_collision_shapes():
     model = kv.Model()
     with model.edit() as edit:

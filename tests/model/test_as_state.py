@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from typing import Any
 
+import numpy as np
 import pytest
 
 import kineverse as kv
@@ -94,6 +95,20 @@ def test_a_constraint_on_a_speed_alone() -> None:
     assert (list(found), found.unchecked) == ([], ("a/speed",))
     found = model.violations(dict(state.extended({"kitchen/a:velocity": 3.0})))
     assert [(v.name, v.excess) for v in found] == [("a/speed", 2.0)]
+
+
+def test_a_state_is_a_vector_in_the_order_of_inputs() -> None:
+    state = kv.State({b: 2.0, a: 1.0, "elsewhere": 9.0})
+    f = kv.compile(a - 3 * b * SIZE, [b, SIZE, a], tier="interpreter")
+    np.testing.assert_array_equal(state.vector(f.inputs), [2, 2, 1])
+    np.testing.assert_array_equal(state.vector([a, b]), [1, 2])
+    np.testing.assert_array_equal(state.extended({"kitchen/size": 4.0}).vector(f.inputs), [2, 4, 1])
+    assert f(state) == f(state.vector(f.inputs)) == -11
+    assert state.vector([]).shape == (0,)
+    with pytest.raises(kv.errors.UnknownNameError, match=r"No value is given for 'kitchen/a:velocity'\."):
+        state.vector([a, a.derivative()])
+    with pytest.raises(kv.errors.UnknownNameError, match="Not among the inputs: 'elsewhere'"):
+        f(dict(state))
 
 
 def test_as_state_accepts_the_default_state_of_shipped_models() -> None:

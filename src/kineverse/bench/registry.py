@@ -18,6 +18,7 @@ BENCHMARKS: Mapping[str, str] = MappingProxyType(
         "frames": "the poses of all frames at one configuration",
         "batch": "pose and Jacobian at 100 000 configurations",
         "loop": "a closed loop and its derivative at one configuration",
+        "motion": "coordinates after a step, and constraints: a robot in a kitchen, as a control loop asks",
         "geometry": "what is near, and how near: an arm among boxes, a robot in a kitchen",
         "tracking": "a kitchen's coordinates from noisy poses of its doors and drawers",
         "identification": "the joint between two parts, from twenty poses of both and from one more",

@@ -228,13 +228,7 @@ class KitchenRobot:
 def make_kitchen_robot(steps: int) -> KitchenRobot:
     """Return the first PR2 and kitchen that are found, with hulls for meshes."""
     robot, kitchen = _first_found(PR2), _first_found(tuple(KITCHENS))
-    model = Model()
-    with model.edit() as edit:
-        edit.include(kitchen, "kitchen")
-        edit.include(robot, "robot")
-        edit.apply(OmniBase(name="base", parent=WORLD, child="base"))
-        root = next(name for name, frame in model.frames.items() if _is_root(name, frame.parent))
-        edit.attach(root, "base", np.eye(4))
+    model = _on_omni_base(robot, kitchen)
     scene = _make_scene(model)
     x, y = KITCHENS[kitchen]
     home = {**model.default_state(), model.symbol("base/x"): x, model.symbol("base/y"): y}
@@ -244,6 +238,23 @@ def make_kitchen_robot(steps: int) -> KitchenRobot:
     walk = np.cumsum(random.normal(size=(steps, len(start))) * _WALK_STEP, axis=0)
     name = f"{_model_name(robot)} in {_model_name(kitchen)}"
     return KitchenRobot(name, model, start + moving * np.clip(walk, -_WALK_RANGE, _WALK_RANGE))
+
+
+def make_kitchen_model() -> tuple[str, Model]:
+    """Return the first PR2 that is found, on an omnidirectional base in the shipped kitchen, and a name."""
+    robot, kitchen = _first_found(PR2), "kitchen"
+    return f"{_model_name(robot)} in {_model_name(kitchen)}", _on_omni_base(robot, kitchen)
+
+
+def _on_omni_base(robot: str, kitchen: str) -> Model:
+    model = Model()
+    with model.edit() as edit:
+        edit.include(kitchen, "kitchen")
+        edit.include(robot, "robot")
+        edit.apply(OmniBase(name="base", parent=WORLD, child="base"))
+        root = next(name for name, frame in model.frames.items() if _is_root(name, frame.parent))
+        edit.attach(root, "base", np.eye(4))
+    return model
 
 
 def _make_scene(model: Model) -> Scene:

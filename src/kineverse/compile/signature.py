@@ -55,7 +55,7 @@ class Signature:
         Parameters
         ----------
         x
-            A sequence of n numbers, or a mapping from symbols or names to numbers.
+            A sequence of n numbers; or a mapping from symbols or names to numbers; or a state.
 
         Raises
         ------
@@ -66,6 +66,8 @@ class Signature:
         InvalidValueError
             If a mapping contains NaN or values that are not numbers.
         """
+        if isinstance(x, State):  # which may have more symbols
+            return x.vector(self.inputs)
         if isinstance(x, Mapping):
             return self._from_mapping(x)
         if self.size and isinstance(x, tuple) and not x:
@@ -78,9 +80,6 @@ class Signature:
         return np.ascontiguousarray(array) if array.flags.aligned else array.copy()
 
     def _from_mapping(self, values: Mapping[Any, Any]) -> Array:
-        if isinstance(values, State):  # which may have more symbols
-            held = [(s, values.given(s)) for s in self.inputs]
-            return self._complete([s.value if value is None else value for s, value in held])
         positions = self.positions
         vector = [s.value for s in self.inputs]
         unknown = []
@@ -99,9 +98,6 @@ class Signature:
             raise UnknownNameError(
                 f"Not among the inputs: {_listed(unknown)}. {suggest(unknown[0], self.names, 'input')}"
             )
-        return self._complete(vector)
-
-    def _complete(self, vector: list[float | None]) -> Array:
         missing = [name for name, value in zip(self.names, vector, strict=True) if value is None]
         if missing:
             raise UnknownNameError(f"No value is given for {_listed(missing)}.")

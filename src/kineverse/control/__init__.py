@@ -1,1 +1,21 @@
 """Control: a QP velocity controller and inverse kinematics for any model (layer 5)."""
+
+from .command import Command
+from .controller import Controller
+from .targets import Target
+from .task_functions import look_at, same_orientation, same_pose, same_position
+from .tasks import Goal, Hold, Keep, Task
+
+__all__ = [
+    "Command",
+    "Controller",
+    "Goal",
+    "Hold",
+    "Keep",
+    "Target",
+    "Task",
+    "look_at",
+    "same_orientation",
+    "same_pose",
+    "same_position",
+]

@@ -5,7 +5,7 @@ The rows are those of a quadratic program, ``lower <= [x; A x] <= upper`` (:mod:
 
 from __future__ import annotations
 
-from typing import Literal, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -16,19 +16,38 @@ from .qp_solver import Vector
 from .quadratic_program import make_solver
 
 
+class Conflict(NamedTuple):
+    """One member of a set of contradictory constraints.
+
+    Attributes
+    ----------
+    name
+        The name of the constraint.
+    operations
+        The operations of the model that wrote it.
+    lower, upper
+        The bounds that take part; infinite where that side does not.
+    """
+
+    name: str
+    operations: tuple[str, ...]
+    lower: float
+    upper: float
+
+
 class ConflictingBound(NamedTuple):
-    """One bound of a conflict.
+    """One bound of a conflict of rows.
 
     Attributes
     ----------
     row
         The index of the row in ``[x; A x]``.
     side
-        "lower" or "upper".
+        -1 for its lower bound, 1 for its upper one.
     """
 
     row: int
-    side: Literal["lower", "upper"]
+    side: int
 
 
 class LeastViolation(NamedTuple):
@@ -51,7 +70,9 @@ class LeastViolation(NamedTuple):
     hard_rows_hold: bool
 
 
-def irreducible_conflict(A: ArrayLike, lower: ArrayLike, upper: ArrayLike) -> tuple[ConflictingBound, ...]:
+def find_irreducible_conflict(
+    A: ArrayLike, lower: ArrayLike, upper: ArrayLike
+) -> tuple[ConflictingBound, ...]:
     """Find bounds that contradict each other, none of which can be left out.
 
     These are an irreducible infeasible subset: with all of its bounds there is no x, without any one of them
@@ -82,7 +103,7 @@ def irreducible_conflict(A: ArrayLike, lower: ArrayLike, upper: ArrayLike) -> tu
     gap = low - high
     worst = int(np.argmax(gap))
     if gap[worst] > 0.0:
-        return ConflictingBound(worst, "lower"), ConflictingBound(worst, "upper")
+        return ConflictingBound(worst, -1), ConflictingBound(worst, 1)
     # One-sided rows g x <= h of length 1: first the upper bounds, then the lower ones.
     length = np.sqrt(np.einsum("ij,ij->i", rows, rows))
     unit = 1.0 / np.where(length > _SHORTEST, length, 1.0)
@@ -105,12 +126,12 @@ def irreducible_conflict(A: ArrayLike, lower: ArrayLike, upper: ArrayLike) -> tu
                 kept = rest
     count = len(rows)
     return tuple(
-        ConflictingBound(int(i % count), "upper" if i < count else "lower")
+        ConflictingBound(int(i % count), 1 if i < count else -1)
         for i in sorted(kept, key=lambda i: (i % count, i < count))
     )
 
 
-def least_violation(
+def find_least_violation(
     A: ArrayLike,
     lower: ArrayLike,
     upper: ArrayLike,

@@ -189,8 +189,9 @@ def _refuse_speeds(speeds: Sequence[Symbol]) -> None:
         raise ExpressionError(
             f"'{speeds[0]}' is a speed, and the columns of a jacobian are named by positions: that of "
             f"'{speeds[0].integral()}' is D(e)['{speeds[0]}']. Pass positions, as model.degrees_of_freedom, "
-            "or read e.gradient(), whose keys are speeds. For the derivative by a speed itself, which is 0 "
-            "here, there is partial([...])."
+            "or read e.gradient(), whose keys are speeds; model.rates.over_free_speeds(e.gradient()) has "
+            "columns for all free speeds, those of wheels as well. For the derivative by a speed "
+            "itself, which is 0 here, there is partial([...])."
         )
 
 

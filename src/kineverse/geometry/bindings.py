@@ -14,7 +14,7 @@ import numpy.typing as npt
 from kineverse.compile.c_library import SourceLibrary
 
 from . import broadphase
-from .broadphase import Flags, Indices, ObjectTable, build_static_tree
+from .broadphase import Indices, ObjectTable, PairSelection, build_static_tree
 from .broadphase_c import SEARCH, SWEEP
 from .mesh_files import Floats
 from .narrowphase_c import NARROW, PENETRATION, SIMPLEX
@@ -38,6 +38,7 @@ class _Struct(ctypes.Structure):
     _fields_ = (
         *((name, ctypes.c_int64) for name in ("count", "moving", "bodies", "axis")),
         *((name, ctypes.c_void_p) for name in (*_ARRAYS, "boxes", "leaves")),
+        ("node_count", ctypes.c_int64),
         ("leaf_count", ctypes.c_int64),
     )
 
@@ -83,16 +84,16 @@ class CollisionLibrary(SourceLibrary):
         return distances, witnesses
 
     def rank(
-        self, table: ObjectTable, pairs: Indices, distances: Floats, radius: float
+        self, table: ObjectTable, pairs: Indices, distances: Floats, radius: float, per_shape: bool = False
     ) -> npt.NDArray[np.int64]:
         """Rank pairs as :func:`.broadphase.rank_pairs` does; all arrays are contiguous."""
         if self._code is not None:
             order = np.empty(len(pairs), dtype=np.int64)
-            where = pairs.ctypes.data, len(pairs), distances.ctypes.data, radius, order.ctypes.data
+            where = pairs.ctypes.data, len(pairs), distances.ctypes.data, radius, per_shape, order.ctypes.data
             found = self._code.rank(_bind_table(table).address, *where)
             if found >= 0:
                 return order[:found]
-        return broadphase.rank_pairs(table, pairs, distances, radius)
+        return broadphase.rank_pairs(table, pairs, distances, radius, per_shape)
 
     def gather(
         self,
@@ -114,26 +115,32 @@ class CollisionLibrary(SourceLibrary):
         return objects, bodies, near, points
 
     def search(
-        self, table: ObjectTable, reach: float, radius: float, wanted: Flags | None = None
+        self,
+        table: ObjectTable,
+        reach: float,
+        radius: float,
+        selection: PairSelection | None = None,
+        per_shape: bool = False,
     ) -> SearchResult:
         """Apply :meth:`near`, :meth:`measure` and, if none is left to coal, :meth:`rank` and :meth:`gather`.
 
-        The search covers the pairs of bodies flagged in ``wanted``, (B, B), or all checked pairs if None.
+        The search covers the selected pairs of bodies, or all checked pairs if None.
         """
         if self._code is None:
+            wanted = None if selection is None else selection.bodies
             pairs, lows = broadphase.find_near_pairs(table, reach, wanted)
             return pairs, lows, *self.measure(table, pairs, radius), None
         binding = _bind_table(table)
-        checked = binding.struct.allowed
-        if wanted is not None:
-            binding.struct.allowed = wanted.ctypes.data
+        struct = binding.struct
+        checked = struct.allowed, struct.active
+        if selection is not None:
+            struct.allowed, struct.active = selection.addresses
+        asked = binding.address, reach, radius, per_shape
         try:
-            while (found := self._code.search(binding.address, reach, radius, *binding.everything)) > len(
-                binding.lows
-            ):
+            while (found := self._code.search(*asked, *binding.everything)) > len(binding.lows):
                 binding.reserve(2 * found)
         finally:
-            binding.struct.allowed = checked
+            struct.allowed, struct.active = checked
         kept = binding.kept.value
         pairs, lows, distances, witnesses = binding.pairs, binding.lows, binding.distances, binding.witnesses
         if kept < 0:
@@ -161,7 +168,7 @@ class _TableBinding:
         static = np.arange(table.moving, table.count, dtype=np.int32)
         self.boxes, self.leaves = build_static_tree(table.low, table.high, static)
         self.struct.boxes, self.struct.leaves = self.boxes.ctypes.data, self.leaves.ctypes.data
-        self.struct.leaf_count = len(self.leaves)
+        self.struct.node_count, self.struct.leaf_count = len(self.boxes), len(self.leaves)
         table.static_changed = False
 
     def reserve(self, count: int) -> None:
@@ -195,11 +202,11 @@ def _declare_signatures(code: Any) -> None:
     code.near.restype = ctypes.c_int64
     code.measure.argtypes = (pointer, pointer, ctypes.c_int64, ctypes.c_double, pointer, pointer)
     code.measure.restype = None
-    code.rank.argtypes = (pointer, pointer, ctypes.c_int64, pointer, ctypes.c_double, pointer)
+    code.rank.argtypes = (pointer, pointer, ctypes.c_int64, pointer, ctypes.c_double, ctypes.c_int64, pointer)
     code.rank.restype = ctypes.c_int64
     code.gather.argtypes = (*(pointer,) * 5, ctypes.c_int64, *(pointer,) * 4)
     code.gather.restype = None
-    code.search.argtypes = (pointer, *(ctypes.c_double,) * 2, ctypes.c_int64, *(pointer,) * 10)
+    code.search.argtypes = (pointer, *(ctypes.c_double,) * 2, *(ctypes.c_int64,) * 2, *(pointer,) * 10)
     code.search.restype = ctypes.c_int64
 
 

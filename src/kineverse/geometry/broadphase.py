@@ -207,12 +207,31 @@ class ObjectTable:
         return distances
 
 
-LEAF_SIZE = 4
-"""Number of objects in a leaf of the static tree."""
+class PairSelection:
+    """Selected pairs of bodies of a table, for a search among these only.
+
+    Parameters
+    ----------
+    table
+        The table; the objects of selected bodies have solids.
+    bodies
+        (B, B) 1 for selected pairs, symmetric; 0 on the diagonal.
+    """
+
+    def __init__(self, table: ObjectTable, bodies: Flags) -> None:
+        self.bodies = np.ascontiguousarray(bodies)
+        involved = np.asarray(self.bodies.any(axis=1), dtype=np.uint8)
+        self._objects = np.ascontiguousarray(involved[table.body])
+        self.addresses = self.bodies.ctypes.data, self._objects.ctypes.data
+        """Addresses of the flags of the pairs, and of those of the objects that are in any pair."""
+
+
+TREE_WIDTH = 8
+"""Number of children of a node of the static tree, whose boxes are tested at once."""
 
 
 def build_static_tree(low: Floats, high: Floats, objects: Indices) -> tuple[Floats, Indices]:
-    """Build an AABB tree: a full binary tree of boxes, split at the median of the longest edge.
+    """Build an AABB tree: a full tree of boxes, split at medians of the longest edge.
 
     Parameters
     ----------
@@ -224,13 +243,13 @@ def build_static_tree(low: Floats, high: Floats, objects: Indices) -> tuple[Floa
     Returns
     -------
     boxes, leaves
-        (2 L - 1, 6) corners of the box of each node; the children of node k are 2 k + 1 and 2 k + 2. (L, 4)
-        objects of the leaves, which are the last L nodes; -1 for none.
+        (N, 6, W) corners of the boxes of the W = :data:`TREE_WIDTH` children of each node; those of node k
+        are W k + 1 to W k + W. (L, W) objects that are the children of the last L nodes; -1 for none.
     """
     count = 1
-    while LEAF_SIZE * count < len(objects):
-        count *= 2
-    leaves = np.full((count, LEAF_SIZE), -1, dtype=np.int32)
+    while TREE_WIDTH * count < len(objects):
+        count *= TREE_WIDTH
+    leaves = np.full((count, TREE_WIDTH), -1, dtype=np.int32)
     parts = [(objects, 0, count)]
     while parts:
         some, first, width = parts.pop()
@@ -242,15 +261,14 @@ def build_static_tree(low: Floats, high: Floats, objects: Indices) -> tuple[Floa
         order = some[np.argsort(middle[:, axis], kind="stable")]
         half = (len(some) + 1) // 2
         parts += [(order[:half], first, width // 2), (order[half:], first + width // 2, width // 2)]
-    boxes = np.empty((2 * count - 1, 6))
     # Index -1 finds one more row, the empty box; there may be no object at all.
     nothing = np.full((1, 3), np.inf)
-    boxes[count - 1 :, :3] = np.concatenate([low, nothing])[leaves].min(axis=1)
-    boxes[count - 1 :, 3:] = np.concatenate([high, -nothing])[leaves].max(axis=1)
-    for k in range(count - 2, -1, -1):
-        one, other = boxes[2 * k + 1], boxes[2 * k + 2]
-        boxes[k, :3], boxes[k, 3:] = np.minimum(one[:3], other[:3]), np.maximum(one[3:], other[3:])
-    return boxes, leaves
+    lows, highs = np.concatenate([low, nothing])[leaves], np.concatenate([high, -nothing])[leaves]
+    levels = [np.concatenate([lows, highs], axis=2)]
+    while len(lows) > 1:
+        lows, highs = (ends.reshape(-1, TREE_WIDTH, 3) for ends in (lows.min(axis=1), highs.max(axis=1)))
+        levels.append(np.concatenate([lows, highs], axis=2))
+    return np.ascontiguousarray(np.concatenate(levels[::-1]).transpose(0, 2, 1)), leaves
 
 
 FURTHEST = 1e12
@@ -317,9 +335,12 @@ def find_near_pairs(table: ObjectTable, reach: float, allowed: Flags | None = No
     return np.stack([ones[keep], others[keep]], axis=1), lows[keep]
 
 
-def rank_pairs(table: ObjectTable, pairs: Indices, distances: Floats, radius: float) -> npt.NDArray[np.int64]:
+def rank_pairs(
+    table: ObjectTable, pairs: Indices, distances: Floats, radius: float, per_shape: bool = False
+) -> npt.NDArray[np.int64]:
     """Return the pairs that are the nearest of their bodies, by index, within a radius [m], nearest first.
 
+    If ``per_shape``, all pairs within the radius are returned.
     Ties are broken by the indices of the bodies and then of the objects.
 
     Parameters
@@ -331,6 +352,8 @@ def rank_pairs(table: ObjectTable, pairs: Indices, distances: Floats, radius: fl
     low, high = owners.min(axis=1, initial=len(table.allowed)), owners.max(axis=1, initial=0)
     order = np.lexsort((pairs[:, 1], pairs[:, 0], high, low, distances))
     order = order[: np.searchsorted(distances[order], radius, side="right")]
+    if per_shape:
+        return np.asarray(order)
     bodies = low[order].astype(np.int64) * len(table.allowed) + high[order]
     leading = np.unique(bodies, return_index=True)[1]
     return np.asarray(order[np.sort(leading)])

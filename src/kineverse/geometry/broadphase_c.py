@@ -1,6 +1,6 @@
 """C text: broad phase, and the ordered search that comes after :mod:`.narrowphase_c`."""
 
-from .broadphase import MEMORY_SLOTS
+from .broadphase import MEMORY_SLOTS, TREE_WIDTH
 
 SWEEP = r"""
 #include <math.h>
@@ -28,10 +28,11 @@ typedef struct {
   Memory *memory;
   const double *boxes;
   const int32_t *leaves;
-  int64_t leaf_count;
+  int64_t node_count, leaf_count;
 } Table;
 
 #define MEMORY_BITS @BITS@
+#define TREE_WIDTH @WIDTH@
 #define EXPORT __attribute__((visibility("default")))
 
 /* Slot of a pair, which another pair may have overwritten. */
@@ -119,12 +120,6 @@ typedef struct {
   int64_t room, found;
 } Answer;
 
-static inline double square_gap(const double *low, const double *high, const double *from, const double *to) {
-  double gap = 0.0;
-  for (int r = 0; r < 3; r++) gap += square(larger(larger(low[r] - to[r], from[r] - high[r]), 0.0));
-  return gap;
-}
-
 /* Adds a pair whose boxes are near each other. */
 static void consider(const Table *t, int64_t one, int64_t other, Answer *answer) {
   if (!t->allowed[t->bodies * t->body[one] + t->body[other]] || !t->active[other]) return;
@@ -146,24 +141,35 @@ static void consider(const Table *t, int64_t one, int64_t other, Answer *answer)
   answer->found++;
 }
 
+/* Squared gaps between a box and W others, whose corners are in rows. */
+static inline void square_gaps_of_node(
+    const double *low, const double *high, const double *boxes, double *gap) {
+  for (int k = 0; k < TREE_WIDTH; k++) {
+    const double *box = boxes + k;
+    gap[k] = square(larger(larger(low[0] - box[3 * TREE_WIDTH], box[0] - high[0]), 0.0)) +
+             square(larger(larger(low[1] - box[4 * TREE_WIDTH], box[TREE_WIDTH] - high[1]), 0.0)) +
+             square(larger(larger(low[2] - box[5 * TREE_WIDTH], box[2 * TREE_WIDTH] - high[2]), 0.0));
+  }
+}
+
 /* Adds the pairs of an object with static ones, down the AABB tree of build_static_tree. */
 static void consider_static(const Table *t, int64_t one, Answer *answer) {
-  const double *low = t->low + 3 * one, *high = t->high + 3 * one, reach = answer->reach;
-  int64_t waiting[64] = {0};
+  const double *low = t->low + 3 * one, *high = t->high + 3 * one, square_reach = square(answer->reach);
+  const int64_t first_leaf = t->node_count - t->leaf_count;
+  int64_t waiting[128] = {0};
   int depth = 1;
   while (depth) {
     const int64_t node = waiting[--depth];
-    const double *box = t->boxes + 6 * node;
-    if (square_gap(low, high, box, box + 3) > reach * reach) continue;
-    if (node < t->leaf_count - 1) {
-      waiting[depth++] = 2 * node + 1;
-      waiting[depth++] = 2 * node + 2;
+    double gap[TREE_WIDTH];
+    square_gaps_of_node(low, high, t->boxes + 6 * TREE_WIDTH * node, gap);
+    if (node < first_leaf) {
+      for (int k = 0; k < TREE_WIDTH; k++)
+        if (gap[k] <= square_reach) waiting[depth++] = TREE_WIDTH * node + 1 + k;
       continue;
     }
-    const int32_t *leaf = t->leaves + 4 * (node - t->leaf_count + 1);
-    for (int k = 0; k < 4 && leaf[k] >= 0; k++)
-      if (square_gap(low, high, t->low + 3 * leaf[k], t->high + 3 * leaf[k]) <= reach * reach)
-        consider(t, one, leaf[k], answer);
+    const int32_t *leaf = t->leaves + TREE_WIDTH * (node - first_leaf);
+    for (int k = 0; k < TREE_WIDTH && leaf[k] >= 0; k++)
+      if (gap[k] <= square_reach) consider(t, one, leaf[k], answer);
   }
 }
 
@@ -204,10 +210,13 @@ EXPORT int64_t near(Table *t, double reach, int32_t *pairs, double *lows, int64_
   }
   return answer.found;
 }
-""".replace("@BITS@", str(MEMORY_SLOTS.bit_length() - 1))
+""".replace("@BITS@", str(MEMORY_SLOTS.bit_length() - 1)).replace("@WIDTH@", str(TREE_WIDTH))
 
 
 SEARCH = r"""
+/* Largest error of a distance [m]. */
+#define ACCURACY 1e-4
+
 typedef struct {
   double distance;
   int64_t bodies;
@@ -248,11 +257,32 @@ static Found *sorted(Found *found, Found *spare, int64_t n) {
   return found;
 }
 
-/* Writes the indices of the pairs that are the nearest of their bodies within a radius, nearest first;
-   `order` has room for all. Returns their number, -1 without memory. */
+/* Collects the pairs with a distance within a limit, and returns their number. */
+static int64_t collect(
+    const Table *t, const int32_t *pairs, int64_t n, const double *distances, double limit, Found *found) {
+  int64_t count = 0;
+  for (int64_t k = 0; k < n; k++)
+    if (distances[k] <= limit) {
+      const int32_t i = pairs[2 * k], j = pairs[2 * k + 1], a = t->body[i], b = t->body[j];
+      const int64_t bodies = a < b ? t->bodies * a + b : t->bodies * b + a;
+      found[count++] = (Found){distances[k], bodies, i, j, (int32_t)k};
+    }
+  return count;
+}
+
+/* Slot of a key, which is not 0, in a table with 2^k slots, of which some are empty. */
+static inline int64_t slot_of(const int64_t *known, int64_t slots, int64_t key) {
+  uint64_t slot = (uint64_t)key * 0x9E3779B97F4A7C15u >> 20 & (slots - 1);
+  while (known[slot] && known[slot] != key) slot = (slot + 1) & (slots - 1);
+  return (int64_t)slot;
+}
+
+/* Writes the indices of the pairs within a radius, nearest first, of each pair of bodies the nearest, or
+   `all`; `order` has room for all. Returns their number, -1 without memory. */
 EXPORT int64_t rank(
-    const Table *t, const int32_t *pairs, int64_t n, const double *distances, double radius, int64_t *order) {
-  int64_t count = 0, kept = 0, slots = 2;
+    const Table *t, const int32_t *pairs, int64_t n, const double *distances, double radius, int64_t all,
+    int64_t *order) {
+  int64_t kept = 0, slots = 2;
   while (slots < 2 * n) slots *= 2;
   Found *memory = malloc((2 * n + 1) * sizeof(Found)), *found = memory;
   int64_t *known = calloc(slots, sizeof(int64_t)); /* pairs of bodies that were found, plus 1 */
@@ -261,18 +291,11 @@ EXPORT int64_t rank(
     free(known);
     return -1;
   }
-  for (int64_t k = 0; k < n; k++)
-    if (distances[k] <= radius) {
-      const int32_t i = pairs[2 * k], j = pairs[2 * k + 1], a = t->body[i], b = t->body[j];
-      const int64_t bodies = a < b ? t->bodies * a + b : t->bodies * b + a;
-      found[count++] = (Found){distances[k], bodies, i, j, (int32_t)k};
-    }
+  const int64_t count = collect(t, pairs, n, distances, radius, found);
   found = sorted(found, found + n, count);
   for (int64_t k = 0; k < count; k++) {
-    const int64_t bodies = found[k].bodies + 1;
-    uint64_t slot = (uint64_t)bodies * 0x9E3779B97F4A7C15u >> 20 & (slots - 1);
-    while (known[slot] && known[slot] != bodies) slot = (slot + 1) & (slots - 1);
-    if (!known[slot]) order[kept++] = found[k].at;
+    const int64_t bodies = found[k].bodies + 1, slot = slot_of(known, slots, bodies);
+    if (all || !known[slot]) order[kept++] = found[k].at;
     known[slot] = bodies;
   }
   free(memory);
@@ -301,20 +324,52 @@ EXPORT void gather(
   }
 }
 
+/* Measures pairs by their lower bounds, except those that cannot be the nearest of their bodies: their
+   distance is infinite. Returns 0 without memory. */
+static int measure_nearest(Table *t, const int32_t *pairs, int64_t n, const double *lows, double limit,
+                           double *distances, double *witnesses) {
+  int64_t slots = 2;
+  while (slots < 2 * n) slots *= 2;
+  Found *memory = malloc((2 * n + 1) * sizeof(Found)), *found = memory;
+  double *least = malloc(slots * sizeof(double));
+  int64_t *known = calloc(slots, sizeof(int64_t));
+  const int enough = found && least && known;
+  if (enough) {
+    const int64_t count = collect(t, pairs, n, lows, INFINITY, found);
+    found = sorted(found, found + n, count);
+    for (int64_t m = 0; m < count; m++) {
+      const int64_t k = found[m].at, key = found[m].bodies + 1, slot = slot_of(known, slots, key);
+      if (!known[slot]) least[slot] = INFINITY;
+      known[slot] = key;
+      if (lows[k] > least[slot] + ACCURACY) {
+        distances[k] = INFINITY;
+        continue;
+      }
+      measure(t, pairs + 2 * k, 1, limit, distances + k, witnesses + 9 * k);
+      if (distances[k] < least[slot]) least[slot] = distances[k];
+    }
+  }
+  free(memory);
+  free(least);
+  free(known);
+  return enough;
+}
+
 /* Whole query: pairs that may be within `reach` are measured, ranked, and gathered. Returns the number of
    measured pairs, and writes the number `kept`: -1 if some pairs are left to coal, or the buffers are too
    short. */
 EXPORT int64_t search(
-    Table *t, double reach, double radius, int64_t room, int32_t *pairs, double *lows, double *distances,
-    double *witnesses, int64_t *order, int64_t *kept, int32_t *pieces, int32_t *bodies, double *distance,
-    double *witness) {
+    Table *t, double reach, double radius, int64_t all, int64_t room, int32_t *pairs, double *lows,
+    double *distances, double *witnesses, int64_t *order, int64_t *kept, int32_t *pieces, int32_t *bodies,
+    double *distance, double *witness) {
   const int64_t found = near(t, reach, pairs, lows, room);
   *kept = -1;
   if (found > room) return found;
-  measure(t, pairs, found, radius, distances, witnesses);
+  if (all || t->bodies == t->count || !measure_nearest(t, pairs, found, lows, radius, distances, witnesses))
+    measure(t, pairs, found, radius, distances, witnesses);
   for (int64_t k = 0; k < found; k++)
     if (isnan(distances[k])) return found;
-  *kept = rank(t, pairs, found, distances, radius, order);
+  *kept = rank(t, pairs, found, distances, radius, all, order);
   if (*kept > 0) gather(t, pairs, distances, witnesses, order, *kept, pieces, bodies, distance, witness);
   return found;
 }

@@ -71,6 +71,19 @@ def parse_rules(entries: Any) -> tuple[Rule, ...]:
     return tuple(rules)
 
 
+def parse_known_rules(entries: Any, model: ModelView) -> tuple[Rule, ...]:
+    """Return rules from their data as :func:`parse_rules` does, after checking their names.
+
+    Raises
+    ------
+    UnknownNameError
+        If a rule names a frame that does not exist.
+    """
+    rules = parse_rules(entries)
+    check_frame_names("A rule is about", (name for rule in rules for name in rule[:2]), model)
+    return rules
+
+
 def read_rules(model: ModelView) -> tuple[Rule, ...]:
     """Return the rules that a model keeps: first those of included models, below their prefix, then its own.
 
@@ -102,7 +115,12 @@ def check_frame_names(what: str, names: Iterable[str], model: ModelView) -> None
 
 def allowed_pairs(model: ModelView, bodies: Sequence[str], rules: Sequence[Rule]) -> Flags:
     """Return (B, B) flags, 1 for pairs that are checked."""
-    table = 1 - adjacent_pairs(model, bodies)
+    return apply_rules(1 - adjacent_pairs(model, bodies), bodies, rules)
+
+
+def apply_rules(flags: Flags, bodies: Sequence[str], rules: Sequence[Rule]) -> Flags:
+    """Return (B, B) flags of checked pairs, changed by rules."""
+    table = flags.copy()
     index = {name: k for k, name in enumerate(bodies)}
     matches: dict[str, list[int]] = {}
     for rule in rules:

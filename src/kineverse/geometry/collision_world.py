@@ -17,13 +17,14 @@ from kineverse.errors import (
     duplicate_value_error,
     suggest,
 )
+from kineverse.lie import inverse
 from kineverse.model.model_view import ModelView
 from kineverse.state import State, StateLike
 from kineverse.symbols import Symbol
 
 from .bindings import collision_library
 from .broadphase import FURTHEST, TRAVEL_EXCEEDED, Indices, ObjectTable
-from .collision_filter import Rule, allowed_pairs, check_frame_names, parse_rules, read_rules
+from .collision_filter import Rule, allowed_pairs, check_frame_names, parse_known_rules, read_rules
 from .mesh_files import Floats
 from .narrowphase import ACCURACY, Narrowphase
 from .objects import CollisionObject, CollisionObjects, Exclusion, load_solids
@@ -55,6 +56,8 @@ class CollisionWorld:
         Names of the bodies that have objects, in the order of the model.
     members
         Indices of the objects of each body, in the order of :attr:`bodies`.
+    shape_numbers
+        (M,) index of the shape of each object among the shapes of its body.
     table, narrowphase
         Tables of the broad phase, and the narrow phase by coal.
     """
@@ -68,26 +71,33 @@ class CollisionWorld:
         leave_out: Iterable[Exclusion],
     ) -> None:
         self.model = model
-        self._own_rules = parse_rules(rules)
-        check_frame_names("A rule is about", (name for rule in self._own_rules for name in rule[:2]), model)
+        self._own_rules = parse_known_rules(rules, model)
         patterns = tuple(_as_names(names) for names in (triangles, decomposed, leave_out))
         for what, names in zip(("triangles", "decomposed", "leave_out"), patterns, strict=True):
             bodies = (name if isinstance(name, str) else name[0] for name in names)
             check_frame_names(f"{what}= names", bodies, model)
         self._source = CollisionObjects(*patterns)
         self._version: int | None = None
-        self._values: dict[Symbol, float] = {}
+        self._placed_at: tuple[tuple[Symbol, ...], Floats] = (), np.zeros(0)  # symbols and values
         self._missing_state = ""
         self._evaluator: Any = None
         self.inputs: tuple[Symbol, ...] = ()
         self.objects: list[CollisionObject] = []
         self.bodies: tuple[str, ...] = ()
+        self._body_numbers: dict[str, int] = {}
+        self._origins: dict[int, Floats] = {}
         self.members: list[list[int]] = []
+        self.shape_numbers: Indices = np.zeros(0, dtype=np.int32)
         self._solids: list[Solid | None] = []
         self._all_loaded = False
         self.table = ObjectTable(0, np.zeros(0, dtype=np.int32), np.zeros((0, 0), dtype=np.uint8))
         collision_library.prepare()
         self.synchronize()
+
+    @property
+    def rules(self) -> tuple[Rule, ...]:
+        """Rules of the collision filter in their order: those of the model, then the world's own."""
+        return (*read_rules(self.model), *self._own_rules)
 
     # -- the model -----------------------------------------------------------------------------------------
 
@@ -96,7 +106,7 @@ class CollisionWorld:
         if self._version == self.model.version:
             return
         version = self.model.version
-        rules = (*read_rules(self.model), *self._own_rules)
+        rules = self.rules
         if self._source.synchronize(self.model):
             try:
                 self._rebuild(rules)
@@ -117,9 +127,11 @@ class CollisionWorld:
         same = moving == self.objects[: old.moving]
         self.objects = [*moving, *(item for item in everything if not item.moves)]
         self.bodies = tuple(by_body)
-        number = {name: k for k, name in enumerate(self.bodies)}
+        self._body_numbers = number = {name: k for k, name in enumerate(self.bodies)}
+        self._origins.clear()
         body = np.array([number[item.body] for item in self.objects], dtype=np.int32)
         self.members = [[] for _ in self.bodies]
+        self.shape_numbers = np.array([item.number for item in self.objects], dtype=np.int32)
         for k, owner in enumerate(body.tolist()):
             self.members[owner].append(k)
         self.table = table = ObjectTable(len(moving), body, allowed_pairs(self.model, self.bodies, rules))
@@ -157,7 +169,7 @@ class CollisionWorld:
         if self._evaluator is not None:
             self._evaluator(state)
             self._place()
-            self._values = dict(zip(self.inputs, self._evaluator.input.tolist(), strict=True))
+            self._placed_at = self.inputs, self._evaluator.input.copy()
         elif not isinstance(state, Mapping) and len(state):
             raise InvalidValueError(f"Nothing moves in this scene, and {len(state)} values are given.")
         self._missing_state = ""
@@ -193,7 +205,9 @@ class CollisionWorld:
 
     def _restore_poses(self) -> None:
         """Recompute all poses at the last state after an edit, if that state still determines them."""
-        values = {s: self._values.get(s, s.value) for s in self.inputs}
+        symbols, numbers = self._placed_at
+        known = dict(zip(symbols, numbers.tolist(), strict=True))
+        values = {s: known.get(s, s.value) for s in self.inputs}
         missing = [str(s) for s, value in values.items() if value is None]
         more = f" and {len(missing) - 12} more" if len(missing) > 12 else ""
         self._missing_state = f"There is no value for {', '.join(missing[:12])}{more}" if missing else ""
@@ -225,6 +239,8 @@ class CollisionWorld:
         wanted = [
             k for k in (range(len(self.objects)) if objects is None else objects) if self._solids[k] is None
         ]
+        if not wanted and objects is not None:
+            return
         # The choice between C and coal is made before the first distance, so that answers never change.
         collision_library.prepare(wait=True)
         first = self.table.active.any()
@@ -258,14 +274,24 @@ class CollisionWorld:
         return distances, witnesses
 
     def measure_remaining(
-        self, pairs: Indices, lows: Floats, limit: float, distances: Floats, witnesses: Floats
+        self,
+        pairs: Indices,
+        lows: Floats,
+        limit: float,
+        distances: Floats,
+        witnesses: Floats,
+        per_shape: bool = False,
     ) -> None:
-        """Measure by coal the pairs whose distance is NaN, see :meth:`measure`."""
+        """Measure by coal the pairs whose distance is NaN, see :meth:`measure`.
+
+        If ``per_shape``, all of them are measured, also beside a nearer pair of the same bodies.
+        """
         owners = self.table.body[pairs]
         keys = owners.min(axis=1).astype(np.int64) * len(self.bodies) + owners.max(axis=1)
         unsolved = np.flatnonzero(np.isnan(distances))
         # Most bodies have one object; then no other pair of the same bodies can be nearer.
-        nearest = _NearestByBodies(keys, distances) if len(np.unique(keys)) < len(keys) else None
+        several = not per_shape and len(np.unique(keys)) < len(keys)
+        nearest = _NearestByBodies(keys, distances) if several else None
         for k in unsolved[np.argsort(lows[unsolved], kind="stable")].tolist():
             if nearest is not None and nearest.has_nearer(k, lows[k]):
                 distances[k] = math.inf
@@ -307,10 +333,20 @@ class CollisionWorld:
         """
         self.synchronize()
         try:
-            return self.bodies.index(body)
-        except ValueError:
+            return self._body_numbers[body]
+        except KeyError:
             what = "has no shapes here" if body in self.model.frames else "is no frame of the model"
             raise UnknownNameError(f"'{body}' {what}. {suggest(str(body), self.bodies, 'body')}") from None
+
+    def body_pose(self, body: str) -> Floats:
+        """Return the pose of a body at the last update, world_T_body, (4, 4) [m]."""
+        first = self.members[self.body_index(body)][0]
+        if first not in self._origins:
+            self._origins[first] = inverse(self.objects[first].shape.origin.matrix)
+        world_T_body = np.empty((4, 4))
+        np.matmul(self.table.poses[first], self._origins[first], out=world_T_body[:3])
+        world_T_body[3] = 0.0, 0.0, 0.0, 1.0
+        return world_T_body
 
     def solid(self, index: int) -> Solid:
         """Return the solid of an object that :meth:`prepare` has made."""

@@ -37,6 +37,10 @@ class PairDistance:
         The bodies.
     expression
         The signed distance [m], a scalar. Value and gradient are exact for up-to-date parameters.
+    point_a, point_b
+        The nearest points in the world, (3,) [m], fixed in their bodies: expressions of the same coordinates.
+    normal
+        The unit normal from a to b in the world, (3,): an expression of parameters only.
     parameters
         (3, 3) symbols: the nearest point of a in a, the nearest point of b in b, and the normal in the world.
         Their default values are those at the state of construction.
@@ -45,6 +49,9 @@ class PairDistance:
     a: str
     b: str
     expression: Expression
+    point_a: Expression
+    point_b: Expression
+    normal: Expression
     parameters: tuple[tuple[Symbol, ...], ...]
 
     def values(self, closest: DistanceResult, world_T_a: Floats, world_T_b: Floats) -> dict[Symbol, float]:
@@ -91,11 +98,12 @@ def distance_parameters(
 
 def distance_expression(model: ModelView, a: str, b: str, parameters: DistanceParameters) -> PairDistance:
     """Return the distance of two bodies as an expression of a model's coordinates."""
-    point_a, point_b, normal = (array(list(row)) for row in parameters)
-    world_T_a, world_T_b = model.fk(a), model.fk(b)
-    world_a = world_T_a[:3, :3] @ point_a + world_T_a[:3, 3]
-    world_b = world_T_b[:3, :3] @ point_b + world_T_b[:3, 3]
-    return PairDistance(a, b, normal @ (world_b - world_a), parameters)
+    a_p, b_p, normal = (array(list(row)) for row in parameters)
+    point_a, point_b = (
+        world_T_body[:3, :3] @ body_p + world_T_body[:3, 3]
+        for world_T_body, body_p in ((model.fk(a), a_p), (model.fk(b), b_p))
+    )
+    return PairDistance(a, b, normal @ (point_b - point_a), point_a, point_b, normal, parameters)
 
 
 def _escape_to(body: str) -> str:

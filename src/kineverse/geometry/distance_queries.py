@@ -10,7 +10,7 @@ import numpy.typing as npt
 from kineverse.errors import InvalidValueError
 
 from .bindings import collision_library
-from .broadphase import Flags, Indices
+from .broadphase import Indices, PairSelection
 from .collision_world import CollisionWorld
 from .mesh_files import Floats
 from .narrowphase import ACCURACY
@@ -36,20 +36,28 @@ def find_distance(world: CollisionWorld, a: str, b: str) -> DistanceResult:
     return found if found.a == a else found.swap()
 
 
-def find_pairs_within(world: CollisionWorld, radius: float, wanted: Flags | None = None) -> DistanceResults:
+def find_pairs_within(
+    world: CollisionWorld,
+    radius: float,
+    selection: PairSelection | None = None,
+    per_shape: bool = False,
+) -> DistanceResults:
     """Return the pairs of bodies within a radius [m], nearest first.
 
-    All checked pairs are searched, or only those flagged in ``wanted``, (B, B).
+    All checked pairs are searched, or only the selected ones. If ``per_shape``, the results are all pairs of
+    collision objects, else the nearest of each pair of bodies. Selected objects have solids already.
     """
     check_radius(radius)
-    world.prepare()
+    world.prepare(None if selection is None else ())
     table = world.table
     reach = radius + ACCURACY
-    pairs, lows, distances, witnesses, nearest = collision_library.search(table, reach, radius, wanted)
+    pairs, lows, distances, witnesses, nearest = collision_library.search(
+        table, reach, radius, selection, per_shape
+    )
     if nearest is not None:
         return DistanceResults(world, *nearest)
-    world.measure_remaining(pairs, lows, radius, distances, witnesses)
-    order = collision_library.rank(table, pairs, distances, radius)
+    world.measure_remaining(pairs, lows, radius, distances, witnesses, per_shape)
+    order = collision_library.rank(table, pairs, distances, radius, per_shape)
     return _make_results(world, pairs, distances, witnesses, order)
 
 

@@ -6,6 +6,8 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import overload
 
+import numpy as np
+
 from .broadphase import Indices
 from .collision_world import CollisionWorld
 from .mesh_files import Floats
@@ -125,15 +127,22 @@ class DistanceResults(Sequence[DistanceResult]):
         (K,) signed distances [m].
     points_a, points_b, normals
         (K, 3) each, as in :class:`DistanceResult`.
+    body_indices
+        (K, 2) indices of both bodies in the scene's ``bodies`` at the time of the query.
     """
 
     def __init__(
         self, world: CollisionWorld, objects: Indices, bodies: Indices, distances: Floats, witnesses: Floats
     ) -> None:
-        self._bodies, self._objects = world.bodies, world.objects
-        self._object_indices, self._body_indices = objects, bodies
+        self._bodies, self._shape_numbers = world.bodies, world.shape_numbers
+        self._object_indices, self.body_indices = objects, bodies
         self.distances = distances
         self.points_a, self.points_b, self.normals = witnesses[:, :3], witnesses[:, 3:6], witnesses[:, 6:]
+
+    @property
+    def shape_indices(self) -> Indices:
+        """Indices (K, 2) of both shapes among the shapes of their bodies."""
+        return np.asarray(self._shape_numbers[self._object_indices])
 
     def __len__(self) -> int:
         return len(self.distances)
@@ -145,7 +154,7 @@ class DistanceResults(Sequence[DistanceResult]):
     def __getitem__(self, index: int | slice) -> DistanceResult | list[DistanceResult]:
         if isinstance(index, slice):
             return [self[k] for k in range(*index.indices(len(self)))]
-        (a, b), (i, j) = self._body_indices[index].tolist(), self._object_indices[index].tolist()
+        (a, b), shapes = self.body_indices[index].tolist(), self._shape_numbers[self._object_indices[index]]
         return DistanceResult(
             self._bodies[a],
             self._bodies[b],
@@ -153,8 +162,7 @@ class DistanceResults(Sequence[DistanceResult]):
             self.points_a[index],
             self.points_b[index],
             self.normals[index],
-            self._objects[i].number,
-            self._objects[j].number,
+            *shapes.tolist(),
         )
 
     def __repr__(self) -> str:

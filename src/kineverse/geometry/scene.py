@@ -9,25 +9,30 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from kineverse.errors import InvalidValueError, UnknownNameError, suggest
-from kineverse.lie import inverse
-from kineverse.model.frame import WORLD
-from kineverse.model.kinematics import ancestors
+from kineverse.model.frame_dependence import FrameDependence
 from kineverse.model.model_view import ModelView
 from kineverse.state import StateLike
 from kineverse.symbols import Symbol
 
 from . import distance_queries, rays
-from .broadphase import Flags
-from .collision_filter import Rule
+from .collision_filter import Rule, apply_rules, parse_known_rules
 from .collision_world import CollisionWorld
-from .dependence import FrameDependence
 from .distance_expressions import DistanceParameters, PairDistance, distance_expression, distance_parameters
 from .mesh_files import Floats
 from .objects import Exclusion
+from .observed_rules import except_always_within, except_never_within
+from .prepared_query import (
+    PairFlags,
+    PreparedQuery,
+    flag_between,
+    flag_matching,
+    flag_pair,
+    flag_relatively_moving,
+    flag_subtree,
+)
 from .results import DistanceResult, DistanceResults, NearestPoint, RayHit
 
-_MAX_SELECTIONS = 32
+_MAX_QUERIES = 32
 
 
 class Scene:
@@ -74,8 +79,8 @@ class Scene:
         self.model = model
         self._world = CollisionWorld(model, rules, triangles, decomposed, leave_out)
         self._parameters: dict[tuple[str, str], DistanceParameters] = {}
-        self._selections: dict[tuple[Any, ...], Flags] = {}
-        self._version: int | None = None
+        self._pair_queries: dict[tuple[str, str], PreparedQuery] = {}
+        self._queries: dict[tuple[Any, ...], PreparedQuery] = {}
 
     @property
     def collision_world(self) -> CollisionWorld:
@@ -117,11 +122,8 @@ class Scene:
 
     def pose(self, body: str) -> npt.NDArray[np.float64]:
         """Return the pose of a body at the last update, world_T_body, (4, 4) [m]."""
-        world = self._world
-        world.prepare(())
-        first = world.members[world.body_index(body)][0]
-        world_T_object = np.vstack([world.table.poses[first], [0.0, 0.0, 0.0, 1.0]])
-        return np.asarray(world_T_object @ inverse(world.objects[first].shape.origin.matrix))
+        self._world.prepare(())
+        return self._world.body_pose(body)
 
     # -- distances -----------------------------------------------------------------------------------------
 
@@ -157,9 +159,60 @@ class Scene:
 
     def pairs_between(self, one: str, other: str, radius: float) -> DistanceResults:
         """Return the pairs within a radius [m] between the subtrees of two frames, nearest first."""
-        return distance_queries.find_pairs_within(
-            self._world, radius, self._select_pairs(("between", one, other), self._between_subtrees)
-        )
+
+        def choose() -> PairFlags:
+            return flag_between(*(flag_subtree(self.model, self.bodies, frame) for frame in (one, other)))
+
+        return self._query_pairs(("between", one, other), choose)(radius)
+
+    def watch(
+        self,
+        one: str | Iterable[str] = "*",
+        other: str | Iterable[str] = "*",
+        radius: float = 0.1,
+        *,
+        moving: Symbol | str | Iterable[Symbol | str] | None = None,
+        rules: Iterable[Rule] = (),
+        per_shape: bool = False,
+    ) -> PreparedQuery:
+        """Return a prepared query: the near pairs among selected pairs of bodies, for loops.
+
+        Each call of it, after :meth:`update`, returns what :meth:`pairs_within` does for these pairs. The
+        pairs are selected once, and again after an edit of the model.
+
+        Parameters
+        ----------
+        one, other
+            Names of bodies or patterns, as in :class:`Rule`, or several of them; a pair has one body of each.
+        radius
+            Largest distance of the results [m].
+        moving
+            Symbols; only pairs whose distance depends on one of them are selected. All by default.
+        rules
+            Rules for this query, applied after those of the scene.
+        per_shape
+            True for one result for each pair of shapes; of a decomposed mesh, for each of its hulls. By
+            default the nearest of each pair of bodies.
+
+        Raises
+        ------
+        UnknownNameError
+            If a name or pattern matches no body, or the model has no such symbol.
+        InvalidValueError
+            If the radius is negative or NaN.
+        """
+        names, own = (one, other), parse_known_rules(rules, self.model)
+        symbols = None if moving is None else _as_list(moving)
+
+        def choose() -> PairFlags:
+            bodies = self.bodies
+            wanted = apply_rules(self._world.table.allowed, bodies, own)
+            wanted *= flag_between(*(flag_matching(bodies, each) for each in names))
+            return wanted if symbols is None else wanted * flag_relatively_moving(self.model, bodies, symbols)
+
+        query = PreparedQuery(self._world, choose, radius, per_shape)
+        _ = query.pairs  # raises for unknown names
+        return query
 
     def self_pairs(self, frame: str, radius: float) -> DistanceResults:
         """Return the pairs within a radius [m] inside the subtree of a frame: self-collision."""
@@ -184,7 +237,12 @@ class Scene:
         return values
 
     def _with_poses(self, a: str, b: str) -> tuple[DistanceResult, Floats, Floats]:
-        return self.distance(a, b), self.pose(a), self.pose(b)
+        if (a, b) not in self._pair_queries:
+            self._pair_queries[a, b] = PreparedQuery(
+                self._world, lambda: flag_pair(self._world, a, b), math.inf
+            )
+        (closest,) = self._pair_queries[a, b]()
+        return closest if closest.a == a else closest.swap(), self.pose(a), self.pose(b)
 
     def first_contact(self, margin: float = 0.0) -> DistanceResult | None:
         """Return a pair within a margin [m], or None; always the same pair at the same state."""
@@ -200,28 +258,41 @@ class Scene:
         one, other = self._world.body_index(a), self._world.body_index(b)
         return bool(self._world.table.allowed[one, other])
 
-    def find_never_colliding(self, states: Iterable[StateLike], margin: float = 0.0) -> tuple[Rule, ...]:
-        """Return rules that except all pairs that are never within a margin [m] at the given states.
+    @property
+    def rules(self) -> tuple[Rule, ...]:
+        """The rules of the collision filter in their order: those of the model, then those of the scene."""
+        return self._world.rules
+
+    def find_never_colliding(
+        self, states: Iterable[StateLike] | None = None, margin: float = 0.0
+    ) -> tuple[Rule, ...]:
+        """Return rules that except all pairs that are never within a margin [m] at some states.
 
         This is an observation, not a proof: choose states over the whole range. The scene stays at the last
         state.
+
+        Parameters
+        ----------
+        states
+            The states; by default the default state and 200 random ones within limits.
 
         Raises
         ------
         InvalidValueError
             If there are no states.
         """
-        met: set[frozenset[str]] = set()
-        every = list(states)
-        if not every:
-            raise InvalidValueError("Pairs that never touch are found by sampling states, and none is given.")
-        for state in every:
-            self.update(state)
-            met.update(frozenset((found.a, found.b)) for found in self.pairs_within(margin))
-        bodies, table = self.bodies, self._world.table.allowed
-        pairs = [(a, b) for k, a in enumerate(bodies) for m, b in enumerate(bodies[:k]) if table[k, m]]
-        why = f"never within {margin:g} m at {len(every)} states"
-        return tuple(Rule(b, a, False, why) for a, b in pairs if frozenset((a, b)) not in met)
+        return except_never_within(self._world, states, margin)
+
+    def find_always_colliding(
+        self, states: Iterable[StateLike] | None = None, margin: float = 0.0
+    ) -> tuple[Rule, ...]:
+        """Return rules that except all pairs that are within a margin [m] at every one of some states.
+
+        Such are the links of a robot around a joint between them, whose shapes overlap. For parameters,
+        errors and the meaning see :meth:`find_never_colliding`. Of a single state, such as the default one,
+        these are the pairs that overlap there.
+        """
+        return except_always_within(self._world, states, margin)
 
     # -- rays and points -----------------------------------------------------------------------------------
 
@@ -274,41 +345,22 @@ class Scene:
         self, symbols: Symbol | str | Iterable[Symbol | str], radius: float
     ) -> DistanceResults:
         """Return the pairs within a radius [m] whose distance depends on some symbols, nearest first."""
-        return distance_queries.find_pairs_within(
-            self._world,
-            radius,
-            self._select_pairs(("moved by", *_as_list(symbols)), self._relatively_moving),
-        )
+        moving = _as_list(symbols)
 
-    def _select_pairs(self, key: tuple[Any, ...], choose: Callable[..., npt.NDArray[np.bool_]]) -> Flags:
-        """Return flags (B, B) of the checked pairs that are chosen, cached for this version of the model."""
-        self._world.synchronize()
-        if self._version != self.model.version or len(self._selections) > _MAX_SELECTIONS:
-            self._selections.clear()
-            self._version = self.model.version
-        if key not in self._selections:
-            self._selections[key] = np.ascontiguousarray(self._world.table.allowed * choose(*key[1:]))
-        return self._selections[key]
+        def choose() -> PairFlags:
+            return flag_relatively_moving(self.model, self.bodies, moving)
 
-    def _between_subtrees(self, one: str, other: str) -> npt.NDArray[np.bool_]:
-        between = np.logical_and.outer(self._in_subtree(one), self._in_subtree(other))
-        return np.asarray(between | between.T)
+        return self._query_pairs(("moved by", *moving), choose)(radius)
 
-    def _relatively_moving(self, *symbols: Symbol | str) -> npt.NDArray[np.bool_]:
-        motion = FrameDependence(self.model, symbols)
-        ancestors_of = [motion.moving_ancestors(body) for body in self.bodies]
-        numbers = {moving: k for k, moving in enumerate(dict.fromkeys(ancestors_of))}
-        number = np.array([numbers[moving] for moving in ancestors_of], dtype=int)
-        return np.asarray(np.not_equal.outer(number, number))
-
-    def _in_subtree(self, frame: str) -> npt.NDArray[np.bool_]:
-        frames = self.model.frames
-        if frame != WORLD and frame not in frames:
-            raise UnknownNameError(f"There is no frame '{frame}'. {suggest(frame, frames, 'frame')}")
-        lookup = frames.__getitem__
-        return np.array(
-            [frame in (WORLD, body) or frame in ancestors(body, lookup) for body in self.bodies], dtype=bool
-        )
+    def _query_pairs(self, key: tuple[Any, ...], choose: Callable[[], PairFlags]) -> PreparedQuery:
+        """Return the query about the checked pairs that are chosen, made once for a key."""
+        if key not in self._queries:
+            if len(self._queries) >= _MAX_QUERIES:
+                self._queries.clear()
+            self._queries[key] = PreparedQuery(
+                self._world, lambda: self._world.table.allowed * choose(), math.inf
+            )
+        return self._queries[key]
 
     def __repr__(self) -> str:
         return f"<Scene: {len(self._world.objects)} collision objects of {len(self._world.bodies)} bodies>"

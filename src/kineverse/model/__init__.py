@@ -12,12 +12,14 @@ from .constraint import Constraint
 from .diff import Change, Diff
 from .edit import Edit
 from .frame import WORLD, Frame
+from .frame_dependence import count_moved_bodies, moved_frames
+from .integrator import Integrator
 from .model import Model, Snapshot
 from .operation import Operation, Writes
 from .operations import AddFrame, Attach, Constrain, Override, SetData, SetRate
 from .rates import Rates
 from .read_recorder import ReadRecorder
-from .violations import Violation, Violations
+from .violations import ConstraintChecker, Violation, Violations
 
 __all__ = [
     "WORLD",
@@ -31,12 +33,14 @@ __all__ = [
     "Cone",
     "Constrain",
     "Constraint",
+    "ConstraintChecker",
     "Cylinder",
     "Diff",
     "Edit",
     "Ellipsoid",
     "Frame",
     "Inertia",
+    "Integrator",
     "Mesh",
     "Model",
     "Operation",
@@ -53,6 +57,8 @@ __all__ = [
     "Violations",
     "Writes",
     "compare_models",
+    "count_moved_bodies",
+    "moved_frames",
 ]
 
 

@@ -7,27 +7,28 @@ from __future__ import annotations
 
 import math
 import os
-from collections.abc import Collection, Iterable, Sequence
+from collections.abc import Collection, Iterable, Mapping, Sequence
 from html import escape
 from typing import Any
 
 import numpy as np
 
 from kineverse._checks import check_flag
-from kineverse.errors import InvalidValueError, UnknownNameError, suggest
-from kineverse.expressions.expression import Expression
+from kineverse.errors import DuplicateNameError, InvalidValueError, UnknownNameError, suggest
+from kineverse.expressions.expression import Expression, ExpressionLike
 from kineverse.state import State, StateLike, as_state, check_meant
-from kineverse.symbols import Symbol, parse_symbol_name
+from kineverse.symbols import Symbol, check_symbols, parse_symbol_name
 
 from . import registry
-from .constraint import Constraint
-from .integration import integrate
+from .constraint import Constraint, ConstraintLike, as_constraint
+from .integration import StateIntegrator
+from .integrator import Integrator
 from .operation import ARTICULATIONS, CONSTRAINTS
 from .projection import TOLERANCE, EqualityConstraints, project
 from .registry import SaveResult
 from .symbolic_view import SymbolicView
-from .velocity_rows import VelocityRows, velocity_rows
-from .violations import Checks, Violations, find_violations
+from .velocity_rows import Recovery, VelocityRows, velocity_rows
+from .violations import ConstraintChecker, Violations, find_violations
 
 
 class ModelView(SymbolicView):
@@ -113,13 +114,31 @@ class ModelView(SymbolicView):
         """
         with self._lock:
             self._catch_up()
-            if self._checks is None:
-                followed = {name: self._eliminate_dependent(c) for name, c in self._head[CONSTRAINTS].items()}
-                self._checks = Checks(followed, self.rates.dependent.values())
-            found = find_violations(self._checks, values, self._known(values), tolerance)
-            if isinstance(values, State) and 0 < len(found.unchecked) == len(self._checks.names):
+            if self._checker is None:
+                self._checker = self._make_checker(None)
+            found = find_violations(self._checker, values, self._known(values), tolerance)
+            if isinstance(values, State) and 0 < len(found.unchecked) == len(self._checker.names):
                 check_meant(values, self._known({}))
             return found
+
+    def constraint_checker(self, symbols: Iterable[Symbol] | None = None) -> ConstraintChecker:
+        """Return the constraints as a compiled function of a vector, for loops.
+
+        It is :meth:`violations` of the present version of the model. Each thread needs one of its own.
+
+        Parameters
+        ----------
+        symbols
+            Symbols of the vector, by default :attr:`symbols`; for constraints on speeds append these.
+            Constraints on others are not checked. Parameters that are not given have their own values.
+        """
+        with self._lock:
+            return self._make_checker(self.symbols if symbols is None else tuple(check_symbols(symbols)))
+
+    def _make_checker(self, symbols: tuple[Symbol, ...] | None) -> ConstraintChecker:
+        self._catch_up()
+        followed = {name: self._eliminate_dependent(c) for name, c in self._head[CONSTRAINTS].items()}
+        return ConstraintChecker(followed, symbols, self.rates.dependent.values())
 
     def _known(self, values: object) -> tuple[Symbol, ...]:
         """Return the symbols allowed in a plain mapping; a state may have any."""
@@ -246,27 +265,78 @@ class ModelView(SymbolicView):
 
     def velocity_rows(
         self,
-        dt: float,
+        dt: ExpressionLike,
         subject: Expression | str | Iterable[Symbol | Expression | str] | None = None,
         *,
         speeds: Sequence[Symbol] | None = None,
-        gain: float | None = None,
+        gain: ExpressionLike | None = None,
+        recovery: Recovery = "required",
+        extra: Mapping[str, ConstraintLike] | None = None,
     ) -> VelocityRows:
         """Return linear rows in the speeds that enforce constraints over a step of ``dt`` seconds.
 
         With a subject, these are the constraints relevant for it and the speed limits of all coordinates that
         they involve; without one, all constraints. See :meth:`constraints_for` and
-        :mod:`kineverse.model.velocity_rows`.
+        :mod:`kineverse.model.velocity_rows`, for ``gain`` and ``recovery`` as well.
+
+        Parameters
+        ----------
+        dt
+            Control period [s], a number or an expression.
+        subject
+            One or several expressions, symbols, or names of frames, which stand for their poses.
+        speeds
+            Columns; by default the speeds of the constraints, sorted. All other speeds are assumed to be 0.
+        gain
+            Gain [1/s] in (0, 1/dt], a number or an expression; 1/dt by default.
+        recovery
+            ``"required"`` or ``"allowed"`` outside of bounds.
+        extra
+            Further constraints by name, as (lower, expression, upper), which the model does not have. They
+            are rows whatever the subject is, with the constraints relevant for their expressions.
+
+        Raises
+        ------
+        DuplicateNameError
+            For an extra constraint with the name of a constraint of the model.
+        InvalidValueError
+            For a step, gain or recovery that is not possible, or an extra constraint that is none.
         """
         with self._lock:
             every = dict(self.constraints)
-            constraints = every if subject is None else self.constraints_for(subject)
+            added = self._extra_constraints({} if extra is None else extra)
+            if subject is None:
+                constraints = every
+            else:
+                constraints = self.constraints_for(subject)
+                for constraint in added.values():
+                    constraints |= self.constraints_for(constraint.expression)
             return velocity_rows(
-                constraints, dt, rates=self.rates, speeds=speeds, gain=gain, speed_limits=every
+                {**constraints, **added},
+                dt,
+                rates=self.rates,
+                speeds=speeds,
+                gain=gain,
+                speed_limits=every,
+                recovery=recovery,
             )
 
+    def _extra_constraints(self, extra: Mapping[str, ConstraintLike]) -> dict[str, Constraint]:
+        """Return further constraints by name, coordinates carried by their rates."""
+        for name in extra:
+            if name in self._head[CONSTRAINTS]:
+                raise DuplicateNameError(
+                    f"The model has a constraint {name!r} already; give the extra one another name."
+                )
+        checked = {name: as_constraint(value) for name, value in extra.items()}
+        carry = self.rates.carry
+        return {
+            name: Constraint(carry(c.lower), carry(c.expression), carry(c.upper))
+            for name, c in checked.items()
+        }
+
     def integrate(self, state: StateLike, speeds: StateLike, dt: float, *, clip: bool = False) -> State:
-        """Return the state after ``dt`` seconds at constant speeds; see :mod:`kineverse.model.integration`.
+        """Return the state after ``dt`` seconds at constant speeds; see :mod:`kineverse.model.integrator`.
 
         **Limits and other constraints are ignored.** At 100 rad/s, a door with a limit of 1.57 rad is at 100
         rad after one second, and :meth:`violations` reports it.
@@ -293,15 +363,50 @@ class ModelView(SymbolicView):
             For NaN or an infinite step, or if coordinates diverge.
         """
         with self._lock:
-            coordinates, rates = self.degrees_of_freedom, self.rates
+            self._settle()
             check_flag("clip", clip)
-            given = as_state(state, self._known(state))
-            after = integrate(coordinates, rates, given, speeds, dt)
+            if self._integrator is None:
+                self._integrator = StateIntegrator(self.degrees_of_freedom, self.rates)
+            after = self._integrator.integrate(as_state(state, self._known(state)), speeds, dt)
             if not clip:
                 return after
             values = dict(after)
-            self._clip(values, [s for s in coordinates if s in values])
+            self._clip(values, [s for s in self.degrees_of_freedom if s in values])
             return after.updated(values)
+
+    def integrator(
+        self, speeds: Iterable[Symbol] | None = None, symbols: Iterable[Symbol] | None = None
+    ) -> Integrator:
+        """Return the motion at constant speeds as a compiled function of vectors, for loops.
+
+        It is :meth:`integrate` without clipping, of the present version of the model. Each thread needs one
+        of its own.
+
+        Parameters
+        ----------
+        speeds
+            Speeds of the vector of speeds; all others are zero. By default :attr:`speeds`.
+        symbols
+            Symbols of the vector of coordinates, by default :attr:`symbols`. Coordinates that the rates of
+            moving ones contain have to be among them; parameters that are not have their own values.
+
+        Raises
+        ------
+        UnknownNameError
+            If a symbol is not in the model, or a speed moves none of the symbols.
+        DuplicateNameError
+            If a symbol is given twice.
+        """
+        with self._lock:
+            layout = self.symbols if symbols is None else tuple(check_symbols(symbols))
+            columns = self.speeds if speeds is None else tuple(check_symbols(speeds))
+            for given, known, noun in ((layout, self.symbols, "symbol"), (columns, self.speeds, "speed")):
+                for s in given:
+                    if s not in known:
+                        raise UnknownNameError(
+                            f"The model has no {noun} '{s}'. {suggest(str(s), map(str, known), noun)}"
+                        )
+            return Integrator(self.rates, layout, columns)
 
     def project(
         self, state: StateLike, *, fixed: Iterable[Symbol | str] = (), tolerance: float = TOLERANCE

@@ -282,6 +282,24 @@ class Rates(Mapping[Symbol, Mapping[Symbol, Expression]]):
         }
         return apply_substitution(expression, wanted)
 
+    def over_free_speeds(self, gradient: Mapping[Symbol, Expression]) -> dict[Symbol, Expression]:
+        """Return a gradient D(e) with the speeds of driven and dependent coordinates eliminated.
+
+        The result has the coefficients of the rate ``ė = Σ coefficient·v`` by free speed v: the columns of a
+        task Jacobian, wheels included. It has no zero entries that the gradient lacks.
+
+        Parameters
+        ----------
+        gradient
+            Gradient of an expression: ``e.gradient(heuristic=False)`` for its rate.
+        """
+        result: dict[Symbol, Expression] = {}
+        for key, entry in gradient.items():
+            row = self.row(key.position) if key.order == 1 else None
+            terms = {key: entry} if row is None else {v: entry * self.carry(g) for v, g in row.items()}
+            _add(result, terms)
+        return result
+
     def eliminate(self, expression: Expression) -> Expression:
         """Replace every remaining ẋ in an expression by ``Σ R[x][v]·v``."""
         wanted = {}

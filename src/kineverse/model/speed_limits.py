@@ -3,13 +3,13 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Collection, Mapping
+from collections.abc import Collection, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import TypeAlias
 
 import casadi as ca
 
-from kineverse.expressions.expression import Expression, as_expression, binary, unary
+from kineverse.expressions.expression import Expression, array, as_expression, binary, unary
 from kineverse.expressions.functions import norm
 from kineverse.expressions.gradient import partial
 from kineverse.expressions.implicit import clamp_to_domains
@@ -63,16 +63,64 @@ SpeedBox: TypeAlias = dict[Symbol, tuple[Expression, Expression]]
 
 ZERO = as_expression(0.0)
 INFINITE = as_expression(math.inf)
+_ONE = as_expression(1.0)
 
 
 @dataclass(frozen=True)
 class SpeedRow:
-    """Row ``lower <= Σ weight·speed <= upper``, with the name of its constraint."""
+    """Row ``lower <= Σ weight·speed <= upper`` of a constraint.
+
+    Attributes
+    ----------
+    name
+        Name of the constraint.
+    weights
+        Coefficients by speed.
+    lower, upper
+        Bounds, scalars.
+    violation
+        Signed excess of a position constraint: positive above its upper bound, negative below its lower one.
+    """
 
     name: str
     weights: Weights
     lower: Expression
     upper: Expression
+    violation: Expression = ZERO
+
+    @property
+    def is_simple(self) -> bool:
+        """True if the row bounds a single speed, by a constant coefficient."""
+        return len(self.weights) == 1 and not any(w.symbols for w in self.weights.values())
+
+
+@dataclass(frozen=True)
+class SpeedBounds:
+    """Bounds ``lower <= v <= upper`` of single speeds v, those of several constraints merged.
+
+    The greatest of the lower bounds counts, and the least of the upper bounds. At states where constraints on
+    one speed contradict each other, a lower bound is above the upper one: where two speed limits exclude each
+    other, or one excludes zero speed and another constraint allows no other.
+
+    Attributes
+    ----------
+    speeds
+        The n speeds.
+    lower, upper
+        Expressions of shape (n,) in units of the speeds; ∓infinity for none.
+    violation
+        Signed excess of the position constraints of each speed, in units of its position, shape (n,):
+        positive if the speed has to be negative to reduce it. Of several on one side the largest counts;
+        violations of both sides are added. A goal of recovery is ``v = -gain * violation``.
+    names
+        Names of the constraints of each speed.
+    """
+
+    speeds: tuple[Symbol, ...]
+    lower: Expression
+    upper: Expression
+    violation: Expression
+    names: tuple[tuple[str, ...], ...]
 
 
 @dataclass(frozen=True)
@@ -191,6 +239,31 @@ class SpeedLimits:
         return None
 
 
+def merge_bounds(speeds: Sequence[Symbol], rows: Iterable[SpeedRow]) -> SpeedBounds:
+    """Merge rows of single speeds with constant coefficients to bounds of these speeds."""
+    own: dict[Symbol, list[SpeedRow]] = {s: [] for s in speeds}
+    for row in rows:
+        ((speed, weight),) = row.weights.items()
+        factor = float(weight)
+        lower, upper, violation = (_divide_bound(e, factor) for e in (row.lower, row.upper, row.violation))
+        ends = (lower, upper) if factor > 0 else (upper, lower)
+        own[speed].append(SpeedRow(row.name, {speed: _ONE}, *ends, violation))
+    return SpeedBounds(
+        tuple(speeds),
+        array([_raw_extreme([row.lower for row in found], -1) for found in own.values()]),
+        array([_raw_extreme([row.upper for row in found], 1) for found in own.values()]),
+        array([_merge_violations([row.violation for row in found]) for found in own.values()]),
+        tuple(tuple(dict.fromkeys(row.name for row in found)) for found in own.values()),
+    )
+
+
+def _merge_violations(violations: Sequence[Expression]) -> Expression:
+    found = [v for v in violations if v.symbols or float(v)]
+    if len(found) < 2:
+        return found[0] if found else ZERO
+    return clamp_below(_raw_extreme(found, -1), ZERO) + clamp_above(_raw_extreme(found, 1), ZERO)
+
+
 def is_infinite(bound: Expression) -> bool:
     """Return whether a bound is infinite at all states."""
     return not bound.symbols and math.isinf(float(bound))
@@ -219,6 +292,25 @@ def clamp_below(value: Expression, least: Expression) -> Expression:
 def clamp_above(value: Expression, most: Expression) -> Expression:
     """Return the minimum, or NaN if the value is NaN."""
     return _replace_where(value, binary(ca.OP_LT, most, value), most)
+
+
+def _raw_extreme(values: Sequence[Expression], sign: int) -> Expression:
+    """Return the minimum (sign 1) or maximum (sign -1) of values, without a gradient; NaN if any is NaN."""
+    numbers = [v for v in values if not v.symbols]
+    end = sign * min((sign * float(v) for v in numbers), default=math.inf)
+    others = [v for v in values if v.symbols]
+    if not others:
+        return as_expression(end)
+    result, *others = others
+    for other in others:
+        least = clamp_above(result, other) if sign > 0 else clamp_below(result, other)
+        # Neither comparison holds for NaN.
+        ordered = binary(ca.OP_OR, binary(ca.OP_LE, result, other), binary(ca.OP_LT, other, result))
+        result = least + binary(ca.OP_IF_ELSE_ZERO, unary(ca.OP_NOT, ordered), other)
+    if math.isinf(end):
+        return result
+    bound = as_expression(end)
+    return clamp_above(result, bound) if sign > 0 else clamp_below(result, bound)
 
 
 def _replace_where(value: Expression, beyond: Expression, end: Expression) -> Expression:

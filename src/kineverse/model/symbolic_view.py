@@ -18,18 +18,19 @@ from kineverse.expressions.expression import NO_NODES, Expression, as_expression
 from kineverse.spatial import OneAxisTransform
 from kineverse.symbols import Symbol, check_symbols
 
-from . import kinematics
+from . import kinematics, mass_properties
 from .articulation import Articulation
 from .body import Body
 from .constraint import Constraint
 from .display import as_html, as_lines
 from .frame import WORLD, Frame
+from .integration import StateIntegrator
 from .operation import ARTICULATIONS, BODIES, CONSTRAINTS, DATA, FRAMES, RATES, Cell
 from .projection import EqualityConstraints
 from .rates import RateEntry, Rates
 from .read_recorder import ABSENT, unknown_name_error
 from .relevance import Relevance, SymbolIndex
-from .violations import Checks
+from .violations import ConstraintChecker
 
 
 class NamedMapping(Mapping[str, Any]):
@@ -130,7 +131,8 @@ class SymbolicView:
         self._jacobians: dict[Any, Expression] = {}
         self._carried_constraints: dict[str, Constraint] = {}
         self._all_symbols: tuple[Symbol, ...] | None = None
-        self._checks: Checks | None = None
+        self._checker: ConstraintChecker | None = None
+        self._integrator: StateIntegrator | None = None
         self._equalities: EqualityConstraints | None = None
 
     def _invalidate(self, changes: Sequence[tuple[Cell, Any, Any]]) -> None:
@@ -139,6 +141,7 @@ class SymbolicView:
         if self._is_indexed:
             self._pending += changes
         self._all_symbols = None
+        self._integrator = None
         if RATES in kinds:
             self._rates = None
             self._carried_constraints.clear()
@@ -150,7 +153,7 @@ class SymbolicView:
         if kinds & {CONSTRAINTS, RATES, ARTICULATIONS}:
             self._equalities = None
         if CONSTRAINTS in kinds or RATES in kinds:
-            self._checks = None
+            self._checker = None
             for (kind, name), _, _ in changes:
                 if kind == CONSTRAINTS:
                     self._carried_constraints.pop(name, None)
@@ -402,6 +405,42 @@ class SymbolicView:
         nodes = NO_NODES.union(*(p.nodes for p in parts))
         sx = ca.horzcat(*(p.sx for p in parts)) if parts else ca.SX(6, 0)
         return from_casadi(ca.densify(sx), (6, len(parts)), nodes)
+
+    def mass(self, frame: str = WORLD) -> float:
+        """Return the mass [kg] of the bodies at or below a frame, by default of all; 0 without any."""
+        with self._lock:
+            self._settle()
+            bodies = self._head[BODIES]
+            found = mass_properties.find_masses(self._existing(frame), bodies, self._frame)
+            return float(sum(bodies[name].inertia.mass for name in found))
+
+    def center_of_mass(self, frame: str = WORLD) -> Expression:
+        """Return the centre of mass, (3,) [m] in the world; coordinates are carried by their rates.
+
+        Bodies without mass do not count.
+
+        Parameters
+        ----------
+        frame
+            Frame whose bodies count, with those of all frames below it; by default all bodies.
+
+        Raises
+        ------
+        UnknownNameError
+            If the frame does not exist, with similar names.
+        ModelError
+            If none of the bodies has a mass, with their names.
+        """
+        with self._lock:
+            self._settle()
+            return self.rates.carry(
+                mass_properties.center_of_mass(self._existing(frame), self._head[BODIES], self._frame)
+            )
+
+    def _existing(self, frame: str) -> str:
+        if frame != WORLD:
+            self._frame(frame)
+        return frame
 
     def speeds_of(self, frame: str, relative_to: str = WORLD) -> tuple[Symbol, ...]:
         """Return the free speeds that move a frame, sorted: the columns of :meth:`jacobian`."""

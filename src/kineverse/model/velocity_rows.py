@@ -4,11 +4,13 @@ For a constraint on positions, ``l <= φ <= u``, at rate γ <= 1/Δt and without
 
     (D(φ) - D(u))·v <= γ (u - φ)        (D(φ) - D(l))·v >= γ (l - φ)
 
-so one step of Δt never crosses a bound. Outside a bound, the right side demands a recovery speed of γ times
-the violation, reduced until one motion satisfies all rows: :mod:`.feasibility`. So all rows together are
-feasible at every state, if zero speed is allowed. Limits on speeds that exclude zero are kept, and may make
-the rows infeasible. With limits on accelerations, the speed towards a bound is at most the one that can be
-braked within the remaining distance, also during recovery.
+so one step of Δt never crosses a bound. Outside a bound, with required recovery, the right side demands a
+recovery speed of γ times the violation, reduced until one motion satisfies all rows: :mod:`.feasibility`. So
+all rows together are feasible at every state, if zero speed is allowed. With allowed recovery, the right side
+is 0 outside a bound: the violation must not grow. So zero speed satisfies all rows at every state, if it is
+allowed. Limits on speeds that exclude zero are kept, and may make the rows infeasible. With limits on
+accelerations, the speed towards a bound is at most the one that can be braked within the remaining distance,
+also during recovery.
 
 A constraint that is affine in speeds is a row itself. A bound on the norm of two speeds becomes the 16 sides
 of the polygon inscribed in the circle, which loses at most 1.9 % and never exceeds the limit; of three
@@ -22,11 +24,13 @@ from __future__ import annotations
 
 import math
 from collections.abc import Collection, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from functools import cached_property
+from typing import Literal, TypeAlias
 
 from kineverse._checks import real_number
 from kineverse.errors import InvalidValueError
-from kineverse.expressions.expression import Expression, array
+from kineverse.expressions.expression import Expression, ExpressionLike, array
 from kineverse.expressions.functions import sqrt
 from kineverse.expressions.implicit import clamp_to_domains
 from kineverse.symbols import Symbol, check_symbols
@@ -38,14 +42,19 @@ from .speed_limits import (
     INFINITE,
     ZERO,
     AdmissibleSpeeds,
+    SpeedBounds,
     SpeedLimits,
     SpeedRow,
     clamp_above,
+    clamp_below,
     is_infinite,
+    merge_bounds,
     raw_max,
     raw_min,
     select_moving,
 )
+
+Recovery: TypeAlias = Literal["required", "allowed"]
 
 
 @dataclass(frozen=True)
@@ -56,30 +65,75 @@ class VelocityRows:
     ----------
     speeds
         Speeds in the order of the n columns.
-    matrix, lower, upper
-        Expressions of positions (and parameters), shapes (m, n), (m,) and (m,).
-    names
-        Name of the constraint of each row.
+    rows
+        The m rows, with their nonzero coefficients by speed.
     skipped
         Constraints that cannot be rows, as pairs (name, reason).
     """
 
     speeds: tuple[Symbol, ...]
-    matrix: Expression
-    lower: Expression
-    upper: Expression
-    names: tuple[str, ...]
+    rows: tuple[SpeedRow, ...]
     skipped: tuple[tuple[str, str], ...]
+
+    @cached_property
+    def names(self) -> tuple[str, ...]:
+        """Name of the constraint of each row."""
+        return tuple(row.name for row in self.rows)
+
+    @cached_property
+    def matrix(self) -> Expression:
+        """Coefficients as an expression of positions (and parameters), shape (m, n)."""
+        weights = [row.weights.get(s, ZERO) for row in self.rows for s in self.speeds]
+        return array(weights).reshape(len(self.rows), len(self.speeds))
+
+    @cached_property
+    def entries(self) -> tuple[tuple[int, int, Expression], ...]:
+        """Structurally nonzero entries of the matrix as (row, column, coefficient), row by row."""
+        columns = {s: k for k, s in enumerate(self.speeds)}
+        return tuple(
+            (i, columns[s], weight) for i, row in enumerate(self.rows) for s, weight in row.weights.items()
+        )
+
+    @cached_property
+    def lower(self) -> Expression:
+        """Lower bounds, shape (m,); -infinity for none."""
+        return array([row.lower for row in self.rows])
+
+    @cached_property
+    def upper(self) -> Expression:
+        """Upper bounds, shape (m,); infinity for none."""
+        return array([row.upper for row in self.rows])
+
+    @cached_property
+    def violation(self) -> Expression:
+        """Signed excess of the position constraint of each row, in its unit, shape (m,).
+
+        It is positive above the upper bound, negative below the lower bound, and 0 between them and for rows
+        of constraints on speeds. A goal of recovery is ``matrix @ v = -gain * violation``. If the bounds of a
+        constraint move differently, each has a row and its own violation.
+        """
+        return array([row.violation for row in self.rows])
+
+    @cached_property
+    def bounds(self) -> SpeedBounds:
+        """Rows that have a single column with a constant coefficient, as bounds of that speed."""
+        return merge_bounds(self.speeds, [row for row in self.rows if row.is_simple])
+
+    @cached_property
+    def general(self) -> VelocityRows:
+        """The rows that are not in :attr:`bounds`, with the same columns."""
+        return VelocityRows(self.speeds, tuple(row for row in self.rows if not row.is_simple), self.skipped)
 
 
 def velocity_rows(
     constraints: Mapping[str, Constraint],
-    dt: float,
+    dt: ExpressionLike,
     *,
     rates: Rates | None = None,
     speeds: Sequence[Symbol] | None = None,
-    gain: float | None = None,
+    gain: ExpressionLike | None = None,
     speed_limits: Mapping[str, Constraint] | None = None,
+    recovery: Recovery = "required",
 ) -> VelocityRows:
     """Return the rows that enforce constraints over the next step; see the module for the equations.
 
@@ -88,28 +142,31 @@ def velocity_rows(
     constraints
         Constraints by name, from :attr:`.Model.constraints` or :meth:`.Model.constraints_for`.
     dt
-        Control period Δt [s].
+        Control period Δt [s]: a number, or an expression such as a parameter. Values of an expression have to
+        be positive.
     rates
         Rate table of the model, to eliminate the speeds of driven coordinates.
     speeds
         Columns; by default the speeds of the constraints, sorted. All other speeds are assumed to be zero.
     gain
-        Gain γ [1/s], at most 1/Δt, which is the default.
+        Gain γ [1/s], at most 1/Δt, which is the default; a number or an expression. If γ or Δt is an
+        expression, its values have to satisfy 0 < γ <= 1/Δt, or a step may cross a bound.
     speed_limits
         Further constraints. Those on speeds and accelerations of columns are enforced as well, and so are
         those of the columns that they add. Others are ignored.
+    recovery
+        ``"required"``: outside a bound, a row demands a recovery speed. ``"allowed"``: outside a bound, a row
+        demands that the violation does not grow, so ``lower <= 0 <= upper`` for all position constraints.
 
     Raises
     ------
     InvalidValueError
-        For a Δt that is not positive or a gain outside (0, 1/Δt].
+        For a Δt that is not positive, a gain outside (0, 1/Δt], expressions of them that are not scalar or
+        contain speeds, or another recovery.
     """
-    dt, gain = _checked(dt, "The step dt"), None if gain is None else _checked(gain, "The gain")
-    if not 0 < dt < math.inf:
-        raise InvalidValueError(f"The step dt is a positive time in seconds, not {dt!r}.")
-    gamma = 1 / dt if gain is None else gain
-    if not 0 < gamma <= 1 / dt * (1 + 1e-12):
-        raise InvalidValueError(f"The gain must lie in (0, 1/dt] = (0, {1 / dt:g}], not {gain!r}.")
+    if recovery not in ("required", "allowed"):
+        raise InvalidValueError(f"The recovery is 'required' or 'allowed', not {recovery!r}.")
+    dt, gamma = _check_step(dt, gain)
     table = rates if rates is not None else Rates({})
     limits = SpeedLimits(table)
     skipped: list[tuple[str, str]] = []
@@ -145,26 +202,35 @@ def velocity_rows(
         if speeds is None:
             moving.update(s for row in limits.rows[known:] for s in row.weights)
     columns = tuple(speeds) if speeds is not None else tuple(sorted(moving, key=lambda s: s.sort_key))
-    rows = limits.rows + _position_rows(
-        constraints, gaps, limits.admissible_speeds(moving), moving, gamma, dt, brakes
-    )
-    rows = [row for row in rows if any(s in row.weights for s in columns)]
-    weights = [row.weights.get(s, ZERO) for row in rows for s in columns]
-    return VelocityRows(
-        columns,
-        array(weights).reshape(len(rows), len(columns)),
-        array([row.lower for row in rows]),
-        array([row.upper for row in rows]),
-        tuple(row.name for row in rows),
-        tuple(skipped),
-    )
+    admissible = limits.admissible_speeds(moving) if recovery == "required" else None
+    rows = limits.rows + _position_rows(constraints, gaps, admissible, moving, gamma, dt, brakes)
+    rows = [replace(row, weights=select_moving(row.weights, columns)) for row in rows]
+    return VelocityRows(columns, tuple(row for row in rows if row.weights), tuple(skipped))
 
 
-def _checked(value: float, what: str) -> float:
+def _check_step(
+    dt: ExpressionLike, gain: ExpressionLike | None
+) -> tuple[float | Expression, float | Expression]:
+    """Return the step Δt and the gain γ, as numbers unless they are expressions."""
+    step = _checked(dt, "The step dt")
+    if not isinstance(step, Expression) and not 0 < step < math.inf:
+        raise InvalidValueError(f"The step dt is a positive time in seconds, not {step!r}.")
+    gamma = 1 / step if gain is None else _checked(gain, "The gain")
+    most = math.inf if isinstance(step, Expression) else 1 / step
+    if not isinstance(gamma, Expression) and not 0 < gamma <= most * (1 + 1e-12):
+        raise InvalidValueError(f"The gain must lie in (0, 1/dt] = (0, {most:g}], not {gain!r}.")
+    return step, gamma
+
+
+def _checked(value: ExpressionLike, what: str) -> float | Expression:
+    if isinstance(value, Expression) and value.symbols:
+        if value.shape or any(s.order for s in value.symbols):
+            raise InvalidValueError(f"{what} is a scalar that depends on no speed, not {value!r}.")
+        return value
     try:
-        return real_number(value)
+        return float(value) if isinstance(value, Expression) else real_number(value)
     except (TypeError, ValueError, OverflowError):
-        raise InvalidValueError(f"{what} is a number, not {value!r}.") from None
+        raise InvalidValueError(f"{what} is a number or an expression, not {value!r}.") from None
 
 
 def _about_speeds(
@@ -213,7 +279,7 @@ def _gaps(constraint: Constraint, rates: Rates) -> list[_Gap]:
     for sign, bound in ((-1, constraint.lower), (1, constraint.upper)):
         if not is_infinite(bound):
             distance = sign * (bound - constraint.expression)
-            away = _over_free_speeds(distance.gradient(heuristic=False), rates)
+            away = rates.over_free_speeds(distance.gradient(heuristic=False))
             away = {s: clamp_to_domains(weight) for s, weight in away.items()}
             found.append(_Gap(sign, clamp_to_domains(distance), select_moving(away, away)))
     return found
@@ -222,17 +288,20 @@ def _gaps(constraint: Constraint, rates: Rates) -> list[_Gap]:
 def _position_rows(
     constraints: Mapping[str, Constraint],
     gaps: Mapping[str, list[_Gap]],
-    limits: AdmissibleSpeeds,
+    limits: AdmissibleSpeeds | None,
     moving: Collection[Symbol],
-    gamma: float,
-    dt: float,
+    gamma: float | Expression,
+    dt: float | Expression,
     brakes: Mapping[Symbol, Expression],
 ) -> list[SpeedRow]:
-    """Return the rows of position constraints; speeds that are no columns are zero."""
-    named: list[tuple[str, list[int]]] = []
+    """Return the rows of position constraints; speeds that are no columns are zero.
+
+    The limits are those of recovery speeds; None if recovery is allowed instead of required.
+    """
+    named: list[tuple[str, list[_Gap]]] = []
     bounds = []
     for name, found in gaps.items():
-        sides, signs, braked = [], [], False
+        sides, kept, braked = [], [], False
         for gap in found:
             away = select_moving(gap.away, moving)
             if not away:
@@ -245,34 +314,33 @@ def _position_rows(
                 step = deceleration * dt
                 left = 2 * deceleration * raw_max(gap.distance, ZERO)
                 room = clamp_above(room, sqrt(step * step + left) - step)
-            sides.append(RecoveryBound(away, room))
-            signs.append(gap.sign)
+            sides.append(RecoveryBound(away, room if limits is not None else clamp_below(room, ZERO)))
+            kept.append(gap)
         if sides:
             constant = not constraints[name].lower.symbols and not constraints[name].upper.symbols
-            named.append((name, signs))
+            named.append((name, kept))
             bounds.append(RecoveryBounds(tuple(sides), apart=constant and not braked))
+    if limits is not None:
+        all_rooms = limit_recovery(bounds, limits)
+    else:
+        all_rooms = [[bound.room for bound in both.bounds] for both in bounds]
     rows = []
-    for (name, signs), both, rooms in zip(named, bounds, limit_recovery(bounds, limits), strict=True):
+    for (name, kept), both, rooms in zip(named, bounds, all_rooms, strict=True):
         ends = []
-        for sign, bound, room in zip(signs, both.bounds, rooms, strict=True):
-            weights = bound.away if sign < 0 else {s: -w for s, w in bound.away.items()}
-            low, high = (-room, INFINITE) if sign < 0 else (-INFINITE, room)
-            ends.append(SpeedRow(name, weights, low, high))
+        for gap, bound, room in zip(kept, both.bounds, rooms, strict=True):
+            if gap.sign < 0:
+                below = clamp_above(gap.distance, ZERO)
+                ends.append(SpeedRow(name, bound.away, -room, INFINITE, below))
+            else:
+                outwards = {s: -w for s, w in bound.away.items()}
+                above = clamp_below(-gap.distance, ZERO)
+                ends.append(SpeedRow(name, outwards, -INFINITE, room, above))
         if len(ends) == 2 and ends[0].weights == ends[1].weights:
-            ends = [SpeedRow(name, ends[0].weights, ends[0].lower, ends[1].upper)]
+            low, high = ends
+            total = low.violation + high.violation
+            ends = [SpeedRow(name, low.weights, low.lower, high.upper, total)]
         rows += ends
     return rows
-
-
-def _over_free_speeds(gradient: Mapping[Symbol, Expression], rates: Rates) -> dict[Symbol, Expression]:
-    """Return a gradient in terms of free speeds."""
-    result: dict[Symbol, Expression] = {}
-    for key, entry in gradient.items():
-        row = rates.row(key.position) if key.order == 1 else None
-        terms = {key: entry} if row is None else {v: entry * rates.carry(g) for v, g in row.items()}
-        for speed, term in terms.items():
-            result[speed] = result[speed] + term if speed in result else term
-    return result
 
 
 def _total(

@@ -60,7 +60,11 @@ def make_robot_mjcf(robot: BenchmarkRobot) -> str:
 
     By default MuJoCo requires mesh files, merges fixed links, and refuses moving links without inertia.
     """
-    root = ElementTree.fromstring(strip_shapes(robot.file))
+    return add_mujoco_options(ElementTree.fromstring(strip_shapes(robot.file)))
+
+
+def add_mujoco_options(root: ElementTree.Element) -> str:
+    """Return the text of a URDF without shapes, with options that MuJoCo needs."""
     options = {"fusestatic": "false", "balanceinertia": "true", "boundmass": "1e-6", "boundinertia": "1e-9"}
     ElementTree.SubElement(ElementTree.SubElement(root, "mujoco"), "compiler", options)
     return ElementTree.tostring(root, encoding="unicode")

@@ -1,0 +1,138 @@
+"""Contact slots: rows of a controller about the near pairs of bodies, whose numbers change each step.
+
+With the distance d of a pair, its nearest points p and normal n (from a to b)::
+
+    ḋ = n·(ṗ_b - ṗ_a) >= -γ max(d - margin, 0)
+
+by the envelope theorem; see :mod:`kineverse.geometry.distance_expressions`. The velocity of a point follows
+from the twist of its body. Twists are compiled once for each group of bodies that move together, so other
+bodies may come near without another compilation. Within the margin a soft goal leads back.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+
+from kineverse.compile import compile  # noqa: A004
+from kineverse.expressions.expression import Expression, array, as_expression
+from kineverse.geometry import Scene
+from kineverse.geometry.results import DistanceResults
+from kineverse.lie import Array
+from kineverse.model.frame_dependence import FrameDependence
+from kineverse.symbols import Symbol
+
+from .velocity_program import INWARDS, RECOVERY_WEIGHT
+
+
+class ContactSlots:
+    """Rows of the nearest pairs of bodies.
+
+    Parameters
+    ----------
+    scene
+        Collision scene of the controller's model.
+    speeds
+        The columns.
+    count
+        Largest number of rows; further pairs are omitted, the farthest first.
+    margin
+        Distance that is kept [m].
+    radius
+        Distance up to which pairs count [m].
+    gain
+        Rate γ at which a distance may shrink to the margin [1/s].
+
+    Attributes
+    ----------
+    inputs
+        Symbols of :meth:`update`, in the order of its vector.
+    found
+        Near pairs of the last update, nearest first, all of them.
+    """
+
+    found: DistanceResults
+
+    def __init__(
+        self,
+        scene: Scene,
+        speeds: Sequence[Symbol],
+        count: int,
+        *,
+        margin: float,
+        radius: float,
+        gain: float,
+    ) -> None:
+        model = scene.model
+        self.scene, self.count = scene, count
+        self.margin, self.gain = margin, gain
+        motion = FrameDependence(model, speeds)
+        moved = [motion.moving_ancestors(body) for body in scene.bodies]
+        groups = {group: k for k, group in enumerate(dict.fromkeys(((), *moved)))}
+        self._group = np.array([groups[group] for group in moved], dtype=np.intp)
+        members = dict(zip(moved, scene.bodies, strict=True))
+        twists: list[Expression] = [as_expression(np.zeros((6, len(speeds))))]
+        twists += [model.jacobian(members[group], form="world", symbols=speeds) for group in groups if group]
+        stacked = array([e for twist in twists for e in twist.ravel()]).reshape(len(twists), 6, len(speeds))
+        self.inputs = tuple(sorted({*scene.inputs, *stacked.symbols}, key=lambda s: s.sort_key))
+        self._function = compile([stacked])
+        self._twists = self._function.bind()
+        place = {s: k for k, s in enumerate(self.inputs)}
+        self._scene_values = np.array([place[s] for s in scene.inputs], dtype=np.intp)
+        self._twist_values = np.array([place[s] for s in self._function.inputs], dtype=np.intp)
+        self._query = scene.watch(radius=radius, moving=speeds, per_shape=True)
+
+    def update(self, values: Array) -> None:
+        """Find the near pairs at the values of :attr:`inputs`."""
+        self.scene.update(values[self._scene_values])
+        self.found = self._query()
+        self._twists.input[:] = values[self._twist_values]
+        self._twists()
+
+    def write(self, H: Array, f: Array, A: Array, lower: Array, upper: Array, recovery: float) -> None:
+        """Write the rows of the nearest pairs into the rows of a program, and the soft goals into its costs.
+
+        Parameters
+        ----------
+        H, f
+            Costs over all variables, the speeds first; changed in place.
+        A, lower, upper
+            The rows of the slots, (count, n) and (count,), all zero and unbounded before.
+        recovery
+            Rate at which a pair within the margin separates [1/s].
+        """
+        found = self.found
+        used = min(len(found), self.count)
+        if not used:
+            return
+        distances, normals = found.distances[:used], found.normals[:used]
+        groups = self._group[found.body_indices[:used]]
+        twists = self._twists.outputs[0]
+        n = twists.shape[2]
+        rows = _project(normals, found.points_b[:used], twists[groups[:, 1]])
+        rows -= _project(normals, found.points_a[:used], twists[groups[:, 0]])
+        gap = distances - self.margin
+        A[:used, :n] = rows
+        lower[:used] = -self.gain * np.maximum(gap, 0.0)
+        for k in np.flatnonzero(gap < 0.0).tolist():
+            row = rows[k]
+            H[:n, :n] += RECOVERY_WEIGHT * np.outer(row, row)
+            f[:n] -= RECOVERY_WEIGHT * recovery * (INWARDS - gap[k]) * row
+
+    @property
+    def omitted(self) -> int:
+        """Number of near pairs of the last update that have no row."""
+        return max(0, len(self.found) - self.count)
+
+
+def _project(normals: Array, points: Array, twists: Array) -> Array:
+    """Return n·(v + ω × p) for each of K points and each column: (K, 3), (K, 3), (K, 6, n) -> (K, n)."""
+    nx, ny, nz = normals.T
+    px, py, pz = points.T
+    wrench = np.empty((len(normals), 1, 6))
+    wrench[:, 0, :3] = normals
+    wrench[:, 0, 3] = py * nz - pz * ny
+    wrench[:, 0, 4] = pz * nx - px * nz
+    wrench[:, 0, 5] = px * ny - py * nx
+    return np.asarray((wrench @ twists)[:, 0, :])

@@ -1,0 +1,353 @@
+"""QP velocity controller: one compiled function and one quadratic program a step."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterable, Mapping
+from time import perf_counter
+
+import numpy as np
+import numpy.typing as npt
+
+from kineverse.compile import compile  # noqa: A004
+from kineverse.errors import (
+    InfeasibleError,
+    InvalidValueError,
+    NotFiniteError,
+    ShapeError,
+    UnknownNameError,
+    suggest,
+)
+from kineverse.expressions.expression import ExpressionLike
+from kineverse.geometry import Scene
+from kineverse.lie import Array
+from kineverse.model.model_view import ModelView
+from kineverse.state import State, StateLike, as_state
+from kineverse.symbols import Symbol, parameter
+
+from .command import Command, StepTimes
+from .contact_slots import ContactSlots
+from .formulation import Formulation
+from .infeasibility import Conflict, find_irreducible_conflict, find_least_violation
+from .quadratic_program import make_solver
+from .regularization import Costs, acceleration_limits, check_weight, find_posture, joint_weights
+from .targets import Target
+from .tasks import Task
+from .velocity_program import VelocityProgram, arrange_inputs
+
+_DT = "control/dt"
+_CONTACT_GAIN = 10.0
+
+
+class Controller:
+    """Velocity controller that serves tasks within the constraints of a model.
+
+    A step evaluates one compiled function of the state and solves one quadratic program; see
+    :mod:`.velocity_program` for the equations. The program starts in CasADi's interpreter and continues in C
+    once that is compiled. Without contradictory tasks a step is feasible at every state; outside of its
+    limits a coordinate is led back. The controller is about the version of the model at construction.
+
+    Parameters
+    ----------
+    model
+        The model of everything that the tasks are about: robot, objects, or both.
+    tasks
+        Goals, holds and keeps.
+    dt
+        Time between two steps [s].
+    still
+        Coordinates or speeds that stay still, as symbols or names.
+    weights
+        Factor on damping, smoothness and posture by coordinate or speed, as symbol or name. The default is
+        the share of the bodies that a speed moves, so that fingers are preferred to bases.
+    smooth, jerk
+        Weights of the first and second differences of commands.
+    posture
+        Weight of the pull to the middle of limits while goals are not reached; 0 for none. A mapping by
+        coordinate gives weights to these alone.
+    acceleration
+        Limits on accelerations [m/s²], [rad/s²], a number or a mapping by coordinate or speed. They and those
+        of the model are limits around the last command, and give way where nothing else is possible.
+    scene
+        Collision scene of the model; None to ignore collisions. Pairs that may touch, such as fingers and a
+        handle, are excepted by its rules. Each step updates it.
+    contacts
+        Number of contact slots: rows for the nearest pairs whose distance the speeds change.
+    margin, radius
+        Distance that pairs keep, and distance from which they count [m].
+    solver
+        ``"daqp"``, ``"proxsuite"`` or ``"osqp"``.
+
+    Attributes
+    ----------
+    model
+        The model.
+    tasks
+        The tasks.
+    speeds
+        The speeds of commands, found from the tasks and the constraints that they meet.
+    inputs
+        The symbols whose values a step needs.
+
+    Raises
+    ------
+    InvalidValueError, UnknownNameError, DuplicateNameError
+        As :class:`.Formulation`; also for a time step that is not positive.
+    MissingDependencyError
+        If the solver is not installed.
+    """
+
+    def __init__(
+        self,
+        model: ModelView,
+        tasks: Iterable[Task],
+        *,
+        dt: float,
+        still: Iterable[Symbol | str] = (),
+        weights: Mapping[Symbol | str, ExpressionLike] | None = None,
+        smooth: float = 1e-2,
+        jerk: float = 0.0,
+        posture: float | Mapping[Symbol | str, float] = 1e-3,
+        acceleration: float | Mapping[Symbol | str, float] | None = None,
+        scene: Scene | None = None,
+        contacts: int = 24,
+        margin: float = 0.005,
+        radius: float = 0.05,
+        solver: str = "daqp",
+    ) -> None:
+        check_weight("smooth", smooth)
+        check_weight("jerk", jerk)
+        if not (isinstance(dt, int | float) and 0 < dt < math.inf):
+            raise InvalidValueError(f"dt= is a positive time in seconds, not {dt!r}.")
+        self.model = model
+        self.dt = float(dt)
+        step = parameter(_DT, self.dt)
+        stated, chosen = acceleration_limits(model, acceleration)
+        self._formulation = formulation = Formulation(
+            model, tasks, dt=step, still=still, accelerations=chosen
+        )
+        self.tasks = formulation.tasks
+        self.speeds = formulation.speeds
+        self._costs = Costs(smooth=smooth, jerk=jerk)
+        self._program = VelocityProgram(
+            formulation,
+            self._costs,
+            joint_weights=joint_weights(formulation, weights),
+            posture=find_posture(formulation, posture),
+            accelerations=stated | chosen,
+            hard_accelerations=not formulation.holds and not chosen,
+            contacts=contacts if scene is not None else 0,
+            dt=step,
+        )
+        self.inputs = self._program.inputs
+        self._contacts: ContactSlots | None = None
+        if scene is not None and contacts:
+            self._contacts = ContactSlots(
+                scene, self.speeds, contacts, margin=margin, radius=radius, gain=min(0.5 / dt, _CONTACT_GAIN)
+            )
+            self.inputs = arrange_inputs({*self.inputs, *self._contacts.inputs})
+            place = {s: k for k, s in enumerate(self.inputs)}
+            self._program_values = np.array([place[s] for s in self._program.inputs], dtype=np.intp)
+            self._contact_values = np.array([place[s] for s in self._contacts.inputs], dtype=np.intp)
+        self._solver = make_solver(solver, self._program.columns, self._program.rows, soft=None)
+        self._relaxed = self._solver
+        if self._program.soft.any():
+            self._relaxed = make_solver(
+                solver, self._program.columns, self._program.rows, soft=self._program.soft
+            )
+        self._evaluate = self._program.function.bind()
+        n, first = len(self.speeds), len(self._program.inputs)
+        program_values = self._evaluate.input[:first]
+        self._values = np.zeros(len(self.inputs)) if self._contacts else program_values
+        self._coordinates = tuple(s for s in self.inputs if s.value is None)
+        self._parameters = {s: k for k, s in enumerate(self.inputs) if s.value is not None}
+        self._settings = {s: float(s.value or 0.0) for s in self._parameters}
+        self._values[len(self._coordinates) :] = list(self._settings.values())
+        self._evaluate.input[first] = self.dt
+        self._last = self._evaluate.input[first + 1 : first + 1 + n]
+        self._before = self._evaluate.input[first + 1 + n :]
+        equalities = self._program.equalities
+        self._row_names = tuple(
+            tuple(name for name in names if name not in equalities) for names in self._program.names
+        )
+
+    @property
+    def tier(self) -> str:
+        """Present kind of evaluation: ``"interpreter"``, or ``"c"`` once that is compiled."""
+        return self._program.function.tier
+
+    def wait(self, timeout: float | None = None) -> bool:
+        """Wait until the program is compiled, at most for a time [s], and return whether it is."""
+        return self._program.function.wait(timeout)
+
+    def reset(self, speeds: StateLike | None = None) -> None:
+        """Forget the last commands: the next step starts from given speeds, by default from rest."""
+        known = as_state(speeds or {}, self.speeds)
+        self._last[:] = [known.given(s) or 0.0 for s in self.speeds]
+        if len(self._before):
+            self._before[:] = self._last
+
+    def set(self, target: Target | Symbol, value: npt.ArrayLike) -> None:
+        """Set a target, or a parameter, for all further steps; the value in a state has precedence.
+
+        Raises
+        ------
+        UnknownNameError
+            For a parameter that no task of the controller has.
+        ShapeError, InvalidValueError
+            For a value of another shape, or one that is not finite.
+        """
+        if isinstance(target, Target):
+            values = target.values(value)
+        else:
+            values = {target: float(np.asarray(value, dtype=float))}
+        for symbol, number in values.items():
+            if symbol not in self._parameters:
+                if isinstance(target, Target) and any(s in self._parameters for s in target.parameters):
+                    continue
+                known = map(str, self._parameters)
+                raise UnknownNameError(
+                    f"No task depends on '{symbol}'. {suggest(str(symbol), known, 'parameter')}"
+                )
+            if not math.isfinite(number):
+                raise InvalidValueError(f"The value of '{symbol}' has to be finite, not {number!r}.")
+            self._values[self._parameters[symbol]] = self._settings[symbol] = number
+
+    def step(self, state: StateLike | npt.ArrayLike) -> Command:
+        """Return the command for one time step at a state.
+
+        Parameters
+        ----------
+        state
+            A state; a mapping by symbol or name; or the values of :attr:`inputs` as a vector, which is the
+            fastest. Parameters without a value have their own.
+
+        Raises
+        ------
+        InfeasibleError
+            If hard rows contradict each other; with an irreducible set of them, and the least-violating
+            command.
+        NotFiniteError
+            If the program or its solution has a NaN, with the tasks or constraints where it arises.
+        UnknownNameError, ShapeError, InvalidValueError
+            For a state that lacks a value, or has another length, or a NaN.
+        """
+        start = perf_counter()
+        self._read(state)
+        if self._contacts is not None:
+            self._evaluate.input[: len(self._program_values)] = self._values[self._program_values]
+            self._contacts.update(self._values[self._contact_values])
+        read = perf_counter()
+        self._evaluate()
+        H, f, A, lower, upper, residuals, check = self._evaluate.outputs
+        if self._contacts is not None:
+            rows, first = self._program.contact_rows, self._program.columns
+            ends = slice(first + rows.start, first + rows.stop)
+            self._contacts.write(H, f, A[rows], lower[ends], upper[ends], self._costs.recovery)
+        if not math.isfinite(check[()]):
+            raise self._not_finite()
+        evaluated = perf_counter()
+        found = self._solver.solve(H, f, A, lower, upper)
+        if found.status != "solved" and self._relaxed is not self._solver:
+            found = self._relaxed.solve(H, f, A, lower, upper)
+        solved = perf_counter()
+        times = StepTimes(read - start, evaluated - read, solved - evaluated, solved - start)
+        if found.status != "solved":
+            raise self._infeasible(times)
+        return self._command(found.x, found.multipliers, found.iterations, residuals, times)
+
+    def _command(
+        self, x: Array, multipliers: Array, iterations: int, residuals: Array, times: StepTimes
+    ) -> Command:
+        """Return the command of a solution, and remember it as the last one."""
+        n = len(self.speeds)
+        if len(self._before):
+            self._before[:] = self._last
+        self._last[:] = x[:n]
+        values = x.tolist()
+        return Command(
+            dict(zip(self.speeds, values, strict=False)),
+            dict(zip(self._program.residuals, residuals.tolist(), strict=True)),
+            values[n] if len(values) > n else 1.0,
+            times,
+            iterations,
+            multipliers.copy(),
+            self._row_names,
+            () if self._contacts is None else self._contacts.found,
+        )
+
+    def _read(self, state: StateLike | npt.ArrayLike) -> None:
+        """Write the values of the inputs at a state."""
+        if isinstance(state, Mapping):
+            if not isinstance(state, State):
+                state = as_state(state, (*self.model.symbols, *self.model.speeds, *self.inputs))
+            self._values[: len(self._coordinates)] = state.vector(self._coordinates)
+            for symbol, place in self._parameters.items():
+                value = state.given(symbol)
+                self._values[place] = self._settings[symbol] if value is None else value
+            return
+        vector = np.asarray(state, dtype=float)
+        if vector.shape != self._values.shape:
+            raise ShapeError(
+                f"The vector of a state has the {len(self.inputs)} values of controller.inputs, not shape "
+                f"{vector.shape}."
+            )
+        self._values[:] = vector
+
+    def _not_finite(self) -> NotFiniteError:
+        """Return the error that names the tasks and constraints with values that are not finite."""
+        values = self._evaluate.input
+        wrong = [str(s) for s, v in zip(self.inputs, values, strict=False) if not math.isfinite(v)]
+        if wrong:
+            return NotFiniteError(f"The state has no finite value for {', '.join(map(repr, wrong[:6]))}.")
+        parts = self._formulation.parts
+        symbols = self._program.function.inputs
+        found = compile(list(parts.values()), symbols, tier="interpreter")(values)
+        names = [name for name, part in zip(parts, found, strict=True) if not np.isfinite(part).all()]
+        where = ", ".join(map(repr, names[:6])) or "the sum of the terms, which is too large"
+        return NotFiniteError(
+            f"A value or derivative is not finite at this state, in {where}: the state is a singularity of "
+            "the expression, such as the end of a range where a speed becomes infinite. No command was made.",
+            names,
+        )
+
+    def _infeasible(self, times: StepTimes) -> InfeasibleError:
+        """Return the error with an irreducible conflict and the least-violating command."""
+        _, _, A, lower, upper, residuals, _ = self._evaluate.outputs
+        n = len(self.speeds)
+        sides = find_irreducible_conflict(A, lower, upper)
+        grouped: dict[str, Conflict] = {}
+        for k, side in sides:
+            for name in self._names_of_row(k):
+                bounds = (lower[k], math.inf) if side < 0 else (-math.inf, upper[k])
+                if name in grouped:
+                    bounds = (max(bounds[0], grouped[name].lower), min(bounds[1], grouped[name].upper))
+                grouped[name] = Conflict(name, self._operations(name), *map(float, bounds))
+        hard = np.zeros(len(lower), dtype=bool)
+        hard[:n] = True
+        least = find_least_violation(A, lower, upper, hard=hard).x
+        command = self._command(least, np.zeros(len(lower)), 0, residuals, times)
+        listed = "; ".join(map(str, grouped.values()))
+        return InfeasibleError(
+            f"No command satisfies all hard rows. These contradict each other: {listed}. "
+            "error.command is the least-violating one.",
+            tuple(grouped.values()),
+            command,
+        )
+
+    def _names_of_row(self, index: int) -> tuple[str, ...]:
+        names = self._program.names
+        if index < len(names) or self._contacts is None:
+            return names[index]
+        pair = self._contacts.found[index - len(names)]
+        return (f"contact of {pair.a} and {pair.b}",)
+
+    def _operations(self, name: str) -> tuple[str, ...]:
+        history = getattr(self.model, "history", None)
+        return () if history is None else tuple(history.writers(f"constraints/{name}"))
+
+    def __repr__(self) -> str:
+        return (
+            f"<Controller: {len(self.tasks)} tasks, {len(self.speeds)} speeds, "
+            f"{self._program.rows} rows, dt {self.dt:g} s>"
+        )

@@ -1,0 +1,317 @@
+"""Linearisation of tasks and constraints over the free speeds that serve them.
+
+The columns are found, not listed: the speeds in the gradients of the tasks (wheels included), then those of
+all constraints that share a coordinate with them, until nothing is added. Equalities of the model, such as
+closures of loops, are holds.
+"""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from kineverse.errors import DuplicateNameError, ExpressionError, InvalidValueError, UnknownNameError, suggest
+from kineverse.expressions.expression import Expression, ExpressionLike, array, as_expression
+from kineverse.expressions.functions import minimum, norm
+from kineverse.model.constraint import Constraint
+from kineverse.model.model_view import ModelView
+from kineverse.model.projection import is_equality
+from kineverse.model.velocity_rows import VelocityRows, velocity_rows
+from kineverse.symbols import Symbol
+
+from .tasks import Goal, Hold, Keep, Task
+
+ZERO = as_expression(0.0)
+
+
+@dataclass(frozen=True)
+class GoalRows:
+    """Goal as rows ``jacobian @ v ≈ rate``.
+
+    Attributes
+    ----------
+    name
+        Name of the goal.
+    error
+        (k,) expression minus target; of a goal about speeds, minus the target alone.
+    jacobian
+        (k, n) over the columns.
+    correction, rate
+        (k,) wanted rates by the error alone, and with those of the target.
+    weight
+        (k,) weights of the squared differences.
+    """
+
+    name: str
+    error: Expression
+    jacobian: Expression
+    correction: Expression
+    rate: Expression
+    weight: Expression
+
+
+@dataclass(frozen=True)
+class HoldRows:
+    """Equality as rows ``jacobian @ v == -gain·s·error``, s the progress."""
+
+    name: str
+    error: Expression
+    jacobian: Expression
+    gain: Expression
+
+
+class Formulation:
+    """Tasks and constraints of a model over its free speeds, for the quadratic programs of controllers.
+
+    Parameters
+    ----------
+    model
+        The model.
+    tasks
+        Goals, holds and keeps.
+    dt
+        Time step [s], a number or a parameter.
+    still
+        Coordinates and speeds that stay still, as symbols or names.
+    accelerations
+        Limits on the magnitudes of accelerations by speed, beside those of the model; braking respects both.
+    speed_limits
+        False to ignore all constraints on speeds and accelerations, for inverse kinematics.
+
+    Attributes
+    ----------
+    speeds
+        The n columns.
+    goals, holds
+        Rows of the tasks; holds include the equalities of the model.
+    rows
+        Rows of constraints and keeps, without recovery speeds; see :mod:`kineverse.model.velocity_rows`.
+
+    Raises
+    ------
+    UnknownNameError
+        For a task about a symbol that the model does not have, or an unknown name in ``still``.
+    InvalidValueError
+        If there is no task, or one that no speed serves.
+    DuplicateNameError
+        For two tasks of one name.
+    """
+
+    def __init__(
+        self,
+        model: ModelView,
+        tasks: Iterable[Task],
+        *,
+        dt: ExpressionLike,
+        still: Iterable[Symbol | str] = (),
+        accelerations: Mapping[Symbol, ExpressionLike] | None = None,
+        speed_limits: bool = True,
+    ) -> None:
+        self.model = model
+        self.tasks = _check_tasks(tasks)
+        self._names = _name_tasks(self.tasks)
+        self._still = find_speeds(model, still, "still")
+        rates = model.rates
+        every = dict(model.constraints)
+        errors = {task: rates.carry(task.error) for task in self.tasks if isinstance(task, Goal | Hold)}
+        keeps = {
+            self._names[task]: Constraint(
+                rates.carry(c.lower), rates.carry(c.expression), rates.carry(c.upper)
+            )
+            for task in self.tasks
+            if isinstance(task, Keep)
+            for c in [task.constraint]
+        }
+        taken = [name for name in keeps if name in every]
+        if taken:
+            raise DuplicateNameError(f"The model has a constraint '{taken[0]}'; give the Keep another name.")
+        subject = [*errors.values(), *(c.expression for c in keeps.values())]
+        for expression in subject:
+            self._check_symbols(expression)
+        relevant = model.constraints_for(subject, closure=True)
+        relevant |= keeps
+        equalities = {name: c for name, c in relevant.items() if is_equality(c)}
+        ranges = {name: c for name, c in relevant.items() if name not in equalities}
+        if not speed_limits:
+            ranges = {name: c for name, c in ranges.items() if c.order == 0}
+        held = {name: rates.carry(c.expression - c.lower) for name, c in equalities.items()}
+        gradients = {task: self._speed_gradient(task, error) for task, error in errors.items()}
+        closures = {
+            name: rates.over_free_speeds(error.gradient(heuristic=False)) for name, error in held.items()
+        }
+        first = {s for g in (*gradients.values(), *closures.values()) for s in g}
+        brakes = {
+            f"acceleration of {speed.position}": Constraint.from_expressions(
+                -as_expression(limit), speed.derivative(), limit
+            )
+            for speed, limit in (accelerations or {}).items()
+        }
+        self._limits = every | brakes if speed_limits else {}
+        found = self._rows(ranges, dt, None)
+        columns = (first | set(found.speeds)) - self._still
+        self.speeds: tuple[Symbol, ...] = tuple(sorted(columns, key=lambda s: s.sort_key))
+        unknown = [s for s in self.speeds if s not in model.speeds]
+        if unknown:
+            raise UnknownNameError(
+                f"The tasks are about '{unknown[0]}', and nothing in the model moves with it. "
+                f"{suggest(str(unknown[0]), map(str, model.speeds), 'speed')}"
+            )
+        self.rows = found if found.speeds == self.speeds else self._rows(ranges, dt, self.speeds)
+        self.keeps = tuple(name for name in keeps if name not in equalities)
+        self.goals = tuple(
+            self._goal_rows(task, errors[task], gradients[task])
+            for task in self.tasks
+            if isinstance(task, Goal)
+        )
+        limit = 0.5 / as_expression(dt)
+        default = minimum(limit, 10.0)
+        holds = [
+            HoldRows(
+                self._names[task],
+                errors[task],
+                self._matrix(task, gradients[task]),
+                default if task.gain is None else minimum(as_expression(task.gain), 2 * limit),
+            )
+            for task in self.tasks
+            if isinstance(task, Hold)
+        ]
+        for name, error in held.items():
+            flat = error.ravel()
+            holds.append(HoldRows(name, flat, self._stack(closures[name], 1), default))
+        self.holds = tuple(holds)
+
+    @property
+    def parts(self) -> dict[str, Expression]:
+        """All values and derivatives in the rows of each task and constraint, by name, flat."""
+        found: dict[str, list[Expression]] = {}
+        tasks: tuple[GoalRows | HoldRows, ...] = (*self.goals, *self.holds)
+        for row in tasks:
+            found[row.name] = [row.error, row.jacobian.ravel()]
+        rows = self.rows
+        for k, name in enumerate(rows.names):
+            ends = [e for e in (rows.lower[k], rows.upper[k], rows.violation[k]) if e.symbols]
+            found.setdefault(name, []).extend([rows.matrix[k], *(e.ravel() for e in ends)])
+        return {name: as_expression(np.concatenate(part)) for name, part in found.items()}
+
+    def _rows(
+        self, constraints: dict[str, Constraint], dt: ExpressionLike, speeds: Sequence[Symbol] | None
+    ) -> VelocityRows:
+        return velocity_rows(
+            constraints,
+            dt,
+            rates=self.model.rates,
+            speeds=speeds,
+            speed_limits=self._limits,
+            recovery="allowed",
+        )
+
+    def _speed_gradient(self, task: Task, error: Expression) -> dict[Symbol, Expression]:
+        """Return the gradient over free speeds; of a goal about speeds, its coefficients."""
+        rates = self.model.rates
+        if isinstance(task, Goal) and any(s.order for s in error.symbols):
+            eliminated = rates.eliminate(error)
+            speeds = [s for s in eliminated.symbols if s.order == 1]
+            slopes = eliminated.partial(speeds)
+            if any(s.order for s in slopes.symbols) or any(s.order > 1 for s in eliminated.symbols):
+                raise InvalidValueError(f"{task!r} is not linear in speeds, so no goal can be made of it.")
+            return {s: slopes[:, i] for i, s in enumerate(speeds)}
+        heuristic = task.heuristic if isinstance(task, Goal) else False
+        found: dict[Symbol, Expression] = rates.over_free_speeds(error.gradient(heuristic=heuristic))
+        return found
+
+    def _goal_rows(self, goal: Goal, error: Expression, gradient: dict[Symbol, Expression]) -> GoalRows:
+        jacobian = self._matrix(goal, gradient)
+        given = as_expression(goal.weight).ravel()
+        weight = array([given[k if given.size > 1 else 0] for k in range(goal.error.size)])
+        if any(s.order for s in error.symbols):
+            eliminated = self.model.rates.eliminate(error)
+            constant = eliminated.substitute({s: 0.0 for s in eliminated.symbols if s.order})
+            none = as_expression(np.zeros(goal.error.size))
+            return GoalRows(self._names[goal], constant, jacobian, none, -constant, weight)
+        rate = correction = -as_expression(goal.gain) * error
+        if goal.speed is not None:
+            speed = as_expression(goal.speed)
+            rate = correction = rate * minimum(1.0, speed / norm(np.concatenate([rate, [speed]])))
+        if goal.rate is not None:
+            rate = rate + (as_expression(goal.rate) + ZERO * goal.expression).ravel()
+        return GoalRows(self._names[goal], error, jacobian, correction, rate, weight)
+
+    def _matrix(self, task: Goal | Hold, gradient: dict[Symbol, Expression]) -> Expression:
+        """Return the Jacobian over the columns, (k, n)."""
+        if not any(s in gradient for s in self.speeds):
+            named = ", ".join(f"'{s}'" for s in sorted(gradient, key=lambda s: s.sort_key))
+            raise InvalidValueError(
+                f"{task!r} is moved by {named or 'no speed'} only, and all of that is to stay still."
+            )
+        return self._stack(gradient, task.error.size)
+
+    def _stack(self, gradient: dict[Symbol, Expression], count: int) -> Expression:
+        columns = [gradient[s].ravel() if s in gradient else array([ZERO] * count) for s in self.speeds]
+        return array([columns[j][i] for i in range(count) for j in range(len(columns))]).reshape(
+            count, len(columns)
+        )
+
+    def _check_symbols(self, expression: Expression) -> None:
+        """Refuse degrees of freedom that the model does not have."""
+        model = self.model
+        known = {s.path for s in (*model.symbols, *model.rates.dependent, *model.speeds)}
+        for symbol in expression.symbols:
+            if symbol.role == "dof" and symbol.path not in known:
+                raise UnknownNameError(
+                    f"A task is about '{symbol}', which is not in the model. "
+                    f"{suggest(symbol.path, known, 'symbol')}"
+                )
+
+
+def find_speeds(model: ModelView, names: Iterable[Symbol | str], argument: str) -> frozenset[Symbol]:
+    """Return the free speeds that stand for coordinates or speeds, given as symbols or names.
+
+    A driven or dependent coordinate stands for all speeds in its row.
+    """
+    if isinstance(names, str | Symbol):
+        names = (names,)
+    found: set[Symbol] = set()
+    for item in names:
+        symbol = model.symbol(item) if isinstance(item, str) else item
+        if not isinstance(symbol, Symbol):
+            raise ExpressionError(f"{argument}= takes symbols or their names, not {item!r}.")
+        row = model.rates.row(symbol.position) if symbol.order <= 1 else None
+        speeds = {symbol.derivative() if symbol.order == 0 else symbol} if row is None else set(row)
+        unknown = [s for s in speeds if s not in model.speeds]
+        if unknown:
+            raise UnknownNameError(
+                f"{argument}=: nothing in the model moves with '{unknown[0]}'. "
+                f"{suggest(str(unknown[0]), map(str, model.speeds), 'speed')}"
+            )
+        found |= speeds
+    return frozenset(found)
+
+
+def _check_tasks(tasks: Iterable[Task]) -> tuple[Task, ...]:
+    if isinstance(tasks, Goal | Hold | Keep):
+        tasks = (tasks,)
+    given = tuple(tasks)
+    for task in given:
+        if not isinstance(task, Goal | Hold | Keep):
+            raise ExpressionError(f"A task is a Goal, a Hold or a Keep, not {task!r}.")
+    if not given:
+        raise InvalidValueError(
+            "A controller without a task has nothing to do; give it a Goal, Hold or Keep."
+        )
+    return given
+
+
+def _name_tasks(tasks: Sequence[Task]) -> dict[Task, str]:
+    """Return a name for each task: its own, that of its only symbol, or its kind and number."""
+    named: dict[Task, str] = {}
+    for k, task in enumerate(tasks):
+        own = str(task.expression) if isinstance(task.expression, Symbol) else ""
+        kind = type(task).__name__.lower()
+        named[task] = task.name or (f"{kind} {own}" if own else f"{kind} {k + 1}")
+    twice = [name for name, count in Counter(named.values()).items() if count > 1]
+    if twice:
+        raise DuplicateNameError(f"Two tasks have the name {twice[0]!r}; give each a name=... of its own.")
+    return named

@@ -1,0 +1,204 @@
+"""Quadratic program of one control step, as one compiled function of the state.
+
+Over the speeds v and, if anything is held, the progress s in [0, 1]::
+
+    minimise    Σ w |J v - r|²                      goals
+              + Σ w_r |a·v + k x|²                  way back of violated rows, x the violation
+              + Σ c_i (d + d_e Δt Σ w|g e|) v_i²    damping, larger where goals are far (Sugihara 2011)
+              + Σ c_i (m (v_i - v_i⁻)² + j (v_i - 2 v_i⁻ + v_i⁻⁻)²)      smoothness, jerk
+              + Σ c_i p (v_i - g (q_i* - q_i))²     posture, while goals are not reached
+              + w_s (1 - s)²                        progress
+    subject to  J v = -k s e                        holds
+                lower <= [v; A v] <= upper          velocity rows, keeps, accelerations, contacts
+
+The damping by |g e| bounds the second derivative of the errors, Δt |g e| |∂J/∂q|, which a linear program
+leaves out. So a goal out of reach ends at rest, with a stretched arm. All rows but those of keeps on speeds
+contain 0, so v = 0, s = 0 is feasible.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping
+from functools import reduce
+
+import casadi as ca
+import numpy as np
+
+from kineverse.compile import CompiledFunction, compile  # noqa: A004
+from kineverse.expressions.expression import Expression, ExpressionLike, array, as_expression, binary
+from kineverse.expressions.functions import norm
+from kineverse.lie import Array
+from kineverse.model.speed_limits import INFINITE, ZERO, is_infinite, raw_max
+from kineverse.symbols import Symbol, parameter
+
+from .formulation import Formulation, GoalRows, HoldRows
+from .regularization import Costs
+
+RECOVERY_WEIGHT = 1e3
+INWARDS = 1e-3
+"""Distance inside of a bound at which a way back aims, so that it ends at the bound and not near it."""
+POSTURE_GAIN = 0.5
+REACHED = 1e-2
+"""Wanted rate of goals below which the posture fades [unit/s]."""
+
+
+class VelocityProgram:
+    """Compiled quadratic program of a formulation.
+
+    Attributes
+    ----------
+    inputs
+        Symbols of the state, in the order of the vector; the time step, the last command and, with a weight
+        on jerk, the one before follow them.
+    columns
+        Number of variables: the speeds, and the progress if anything is held.
+    names
+        Names of the constraints of each bound and row, without those of contacts.
+    equalities
+        Names of holds, and of the progress.
+    soft
+        Flags of rows that may be violated: accelerations.
+    contact_rows
+        Slice of the rows of contacts in A, which are zero here.
+    """
+
+    def __init__(
+        self,
+        formulation: Formulation,
+        costs: Costs,
+        *,
+        joint_weights: Mapping[Symbol, ExpressionLike],
+        posture: Mapping[Symbol, tuple[float, float]],
+        accelerations: Mapping[Symbol, ExpressionLike],
+        hard_accelerations: bool,
+        contacts: int,
+        dt: Symbol,
+    ) -> None:
+        self.formulation = formulation
+        self.speeds = speeds = formulation.speeds
+        n, held = len(speeds), bool(formulation.holds)
+        self.columns = n + held
+        last = [parameter(f"control/last/{s}", 0.0) for s in speeds]
+        before = [parameter(f"control/before/{s}", 0.0) for s in speeds] if costs.jerk else []
+
+        diagonal, linear = [ZERO] * n, [ZERO] * n
+        hessian: Expression = as_expression(np.zeros((n, n)))
+        effort = distance = ZERO
+        for goal in formulation.goals:
+            weighted = goal.jacobian * goal.weight.reshape(goal.weight.size, 1)
+            hessian = hessian + weighted.T @ goal.jacobian
+            pull = weighted.T @ goal.rate
+            linear = [linear[i] - pull[i] for i in range(n)]
+            effort = effort + (goal.weight * goal.rate) @ goal.rate
+            distance = distance + norm(goal.weight * goal.correction)
+        rows = formulation.rows
+        bounds, general = rows.bounds, rows.general
+        for i in range(n):
+            violation = bounds.violation[i]
+            if violation.symbols:
+                weight, rate = _way_back(violation, costs.recovery)
+                diagonal[i] = diagonal[i] + weight
+                linear[i] = linear[i] - weight * rate
+        for k in range(len(general.names)):
+            violation = general.violation[k]
+            if violation.symbols:
+                weight, rate = _way_back(violation, costs.recovery)
+                row = general.matrix[k]
+                hessian = hessian + weight * (row.reshape(n, 1) @ row.reshape(1, n))
+                linear = [linear[i] - weight * rate * row[i] for i in range(n)]
+        fade = effort / (effort + REACHED**2)
+        for i, speed in enumerate(speeds):
+            share = as_expression(joint_weights[speed])
+            steady = share * (costs.smooth + costs.jerk)
+            diagonal[i] = diagonal[i] + steady + share * (costs.damping + costs.error_damping * dt * distance)
+            linear[i] = linear[i] - share * costs.smooth * last[i]
+            if before:
+                linear[i] = linear[i] - share * costs.jerk * (2 * last[i] - before[i])
+            if speed in posture:
+                own, middle = posture[speed]
+                towards = POSTURE_GAIN * (middle - speed.position)
+                diagonal[i] = diagonal[i] + share * own
+                linear[i] = linear[i] - share * own * fade * towards
+        entries = [
+            hessian[i, j] + diagonal[i] if i == j else hessian[i, j] for i in range(n) for j in range(n)
+        ]
+        H = array(entries).reshape(n, n)
+        lower, upper = [bounds.lower[i] for i in range(n)], [bounds.upper[i] for i in range(n)]
+        names: list[tuple[str, ...]] = list(bounds.names)
+        if held:
+            column = as_expression(np.zeros((n, 1)))
+            corner = as_expression([[costs.progress]])
+            H = as_expression(np.block([[H, column], [column.T, corner]]))
+            linear = [*linear, as_expression(-costs.progress)]
+            lower, upper = [*lower, ZERO], [*upper, as_expression(1.0)]
+            names.append(("progress",))
+        matrix: list[Expression] = []
+        soft: list[bool] = []
+        for hold in formulation.holds:
+            for k in range(hold.error.size):
+                matrix += [*hold.jacobian[k], hold.gain * hold.error[k]]
+                lower.append(ZERO)
+                upper.append(ZERO)
+                names.append((hold.name,))
+                soft.append(False)
+        for k, name in enumerate(general.names):
+            matrix += [*general.matrix[k], *[ZERO] * held]
+            lower.append(general.lower[k])
+            upper.append(general.upper[k])
+            names.append((name,))
+            soft.append(False)
+        for i, speed in enumerate(speeds):
+            if speed in accelerations:
+                change = as_expression(accelerations[speed]) * dt
+                matrix += [as_expression(float(i == j)) for j in range(self.columns)]
+                lower.append(last[i] - change)
+                upper.append(last[i] + change)
+                names.append((f"acceleration of {speed.position}",))
+                soft.append(not hard_accelerations)
+        first = len(soft)
+        self.contact_rows = slice(first, first + contacts)
+        for _ in range(contacts):
+            matrix += [ZERO] * self.columns
+            lower.append(-INFINITE)
+            upper.append(INFINITE)
+            soft.append(False)
+        self.equalities = frozenset({"progress", *(hold.name for hold in formulation.holds)})
+        self.rows = len(soft)
+        self.names = tuple(names)
+        self.soft = np.array([False] * self.columns + soft)
+        A = (
+            array(matrix).reshape(self.rows, self.columns)
+            if matrix
+            else as_expression(np.zeros((0, self.columns)))
+        )
+        f = array(linear)
+        finite = [b for b in (*lower, *upper) if not is_infinite(b)]
+        parts = [e for part in (H, f, A) for e in part.ravel()] + finite
+        check = sum((part for part in parts if part.symbols), ZERO)
+        tasks: tuple[GoalRows | HoldRows, ...] = (*formulation.goals, *formulation.holds)
+        residuals = {row.name: norm(row.error) for row in tasks}
+        residuals |= {name: self._keep_residual(name) for name in formulation.keeps}
+        self.residuals = tuple(residuals)
+        self.function: CompiledFunction[tuple[Array, ...]]
+        outputs = [H, f, A, array(lower), array(upper), array(list(residuals.values())), check]
+        used = {s for output in outputs for s in output.symbols}
+        self.inputs = arrange_inputs(used - {dt, *last, *before})
+        self.function = compile(outputs, (*self.inputs, dt, *last, *before))
+
+    def _keep_residual(self, name: str) -> Expression:
+        """Return the violation of a keep; 0 for one on speeds, which a command satisfies."""
+        rows = self.formulation.rows
+        own = [abs(rows.violation[k]) for k, row in enumerate(rows.names) if row == name]
+        return reduce(raw_max, own, ZERO)
+
+
+def arrange_inputs(symbols: Iterable[Symbol]) -> tuple[Symbol, ...]:
+    """Return symbols in the order of vectors of states: coordinates first, then parameters."""
+    return tuple(sorted(symbols, key=lambda s: (s.value is not None, s.sort_key)))
+
+
+def _way_back(violation: Expression, gain: float) -> tuple[Expression, Expression]:
+    """Return weight and wanted rate of a violated row; the weight is 0 inside of the bounds."""
+    outside = binary(ca.OP_NE, violation, 0)
+    sign = binary(ca.OP_LT, 0, violation) - binary(ca.OP_LT, violation, 0)
+    return RECOVERY_WEIGHT * outside, -gain * (violation + INWARDS * sign)

@@ -1,0 +1,160 @@
+"""Queries about selected pairs of bodies, prepared once for many states."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable, Sequence
+from typing import TypeAlias
+
+import numpy as np
+import numpy.typing as npt
+
+from kineverse.errors import InvalidValueError, UnknownNameError, suggest
+from kineverse.model.frame import WORLD
+from kineverse.model.frame_dependence import FrameDependence
+from kineverse.model.kinematics import ancestors
+from kineverse.model.model_view import ModelView
+from kineverse.symbols import Symbol
+
+from .broadphase import Flags, Indices, PairSelection
+from .collision_world import CollisionWorld
+from .distance_queries import check_radius, find_pairs_within
+from .objects import matches_pattern
+from .results import DistanceResults
+
+PairFlags: TypeAlias = npt.NDArray[np.bool_] | Flags
+"""Flags (B, B) of pairs of bodies, symmetric."""
+
+
+class PreparedQuery:
+    """Query for the near pairs among some pairs of bodies, created by :meth:`.Scene.watch`.
+
+    A call returns the pairs within the radius at the scene's present state, nearest first. The pairs are
+    selected again only after an edit of the model.
+
+    Parameters
+    ----------
+    world
+        The collision world.
+    choose
+        Function that returns the selected pairs, for the present version of the model.
+    radius
+        Largest distance of the results [m].
+    per_shape
+        True for one result for each pair of collision objects, False for the nearest of each pair of bodies.
+    """
+
+    def __init__(
+        self, world: CollisionWorld, choose: Callable[[], PairFlags], radius: float, per_shape: bool = False
+    ) -> None:
+        check_radius(radius)
+        self._world, self._choose = world, choose
+        self.radius, self.per_shape = float(radius), per_shape
+        self._version: int | None = None
+        self._flags: Flags = np.zeros((0, 0), dtype=np.uint8)
+        self._selection: PairSelection | None = None
+
+    def __call__(self, radius: float | None = None) -> DistanceResults:
+        """Return the selected pairs within the radius [m], or within another one, nearest first."""
+        world = self._world
+        if self._selection is None or self._version != world.model.version:
+            flags = self._selected()
+            involved = np.asarray(flags.any(axis=1))
+            world.prepare(k for k, body in enumerate(world.table.body.tolist()) if involved[body])
+            self._selection = PairSelection(world.table, flags)
+        within = self.radius if radius is None else radius
+        return find_pairs_within(world, within, self._selection, self.per_shape)
+
+    @property
+    def pairs(self) -> Indices:
+        """Selected pairs (K, 2), by the indices of their bodies in the order of the scene's ``bodies``."""
+        return np.argwhere(np.triu(self._selected())).astype(np.int32)
+
+    def _selected(self) -> Flags:
+        """Return the flags of the selected pairs at the model's present version."""
+        self._world.synchronize()
+        if self._version != self._world.model.version:
+            self._selection = None
+            self._flags = np.asarray(self._choose(), dtype=np.uint8)
+            self._version = self._world.model.version
+        return self._flags
+
+    def __repr__(self) -> str:
+        what = "pairs of bodies, each pair of shapes" if self.per_shape else "pairs of bodies"
+        return f"<PreparedQuery: {len(self.pairs)} {what}, within {self.radius:g} m>"
+
+
+def flag_pair(world: CollisionWorld, a: str, b: str) -> Flags:
+    """Return (B, B) flags of one pair of bodies.
+
+    Raises
+    ------
+    UnknownNameError
+        If one has no shapes.
+    InvalidValueError
+        If both are the same.
+    """
+    one, other = world.body_index(a), world.body_index(b)
+    if one == other:
+        raise InvalidValueError(f"'{a}' is asked for its distance to itself.")
+    flags = np.zeros_like(world.table.allowed)
+    flags[one, other] = flags[other, one] = 1
+    return flags
+
+
+def flag_between(ones: PairFlags, others: PairFlags) -> npt.NDArray[np.bool_]:
+    """Return (B, B) flags of the pairs with one body of some, (B,), and the other of others, (B,)."""
+    between = np.logical_and.outer(ones, others)
+    return np.asarray(between | between.T)
+
+
+def flag_matching(bodies: Sequence[str], patterns: str | Iterable[str]) -> npt.NDArray[np.bool_]:
+    """Return (B,) flags of the bodies that match one of some names or patterns.
+
+    Raises
+    ------
+    UnknownNameError
+        If a name or pattern matches no body.
+    """
+    found = np.zeros(len(bodies), dtype=bool)
+    for pattern in (patterns,) if isinstance(patterns, str) else tuple(patterns):
+        matching = np.array([matches_pattern(body, (pattern,)) for body in bodies], dtype=bool)
+        if not matching.any():
+            raise UnknownNameError(
+                f"No body of the scene is named or matched by '{pattern}'. {suggest(pattern, bodies, 'body')}"
+            )
+        found |= matching
+    return found
+
+
+def flag_subtree(model: ModelView, bodies: Sequence[str], frame: str) -> npt.NDArray[np.bool_]:
+    """Return (B,) flags of the bodies at or below a frame.
+
+    Raises
+    ------
+    UnknownNameError
+        If there is no such frame.
+    """
+    frames = model.frames
+    if frame != WORLD and frame not in frames:
+        raise UnknownNameError(f"There is no frame '{frame}'. {suggest(frame, frames, 'frame')}")
+    lookup = frames.__getitem__
+    return np.array(
+        [frame in (WORLD, body) or frame in ancestors(body, lookup) for body in bodies], dtype=bool
+    )
+
+
+def flag_relatively_moving(
+    model: ModelView, bodies: Sequence[str], symbols: Iterable[Symbol | str]
+) -> npt.NDArray[np.bool_]:
+    """Return (B, B) flags of the pairs whose relative pose depends on some symbols.
+
+    Raises
+    ------
+    UnknownNameError
+        For a symbol that the model does not know.
+    """
+    motion = FrameDependence(model, symbols)
+    ancestors_of = [motion.moving_ancestors(body) for body in bodies]
+    numbers = {moving: k for k, moving in enumerate(dict.fromkeys(ancestors_of))}
+    number = np.array([numbers[moving] for moving in ancestors_of], dtype=int)
+    return np.asarray(np.not_equal.outer(number, number))

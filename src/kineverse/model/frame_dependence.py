@@ -1,0 +1,148 @@
+"""Dependence of frames on symbols."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping
+
+from kineverse.errors import UnknownNameError, suggest
+from kineverse.expressions.expression import Expression
+from kineverse.expressions.graph import gradient_keys
+from kineverse.symbols import Symbol
+
+from .body import is_empty_body
+from .frame import WORLD, Frame
+from .model_view import ModelView
+from .rate_nodes import collect_symbols
+
+
+class FrameDependence:
+    """Frames of a model that move when some symbols change.
+
+    Symbols are compared as coordinates, whatever their order, as for constraints. A speed moves the frames
+    that its position moves, and those of every coordinate whose rate contains the speed. An independent
+    coordinate of a closed loop moves the frames of its dependent coordinates.
+
+    Parameters
+    ----------
+    model
+        The model.
+    symbols
+        Symbols or their names.
+
+    Raises
+    ------
+    UnknownNameError
+        For a symbol that the model does not know.
+    """
+
+    def __init__(self, model: ModelView, symbols: Iterable[Symbol | str]) -> None:
+        self._frames: Mapping[str, Frame] = dict(model.frames)
+        known = _known_paths(model)
+        asked = (s if isinstance(s, Symbol) else model.symbol(s) for s in symbols)
+        self._paths = _driven_coordinates(model, {_known_path(s, known) for s in asked})
+        self._moving_ancestors: dict[str, tuple[str, ...]] = {WORLD: ()}
+
+    def moves(self, frame: str) -> bool:
+        """Return True if a frame moves in the world."""
+        return bool(self.moving_ancestors(frame))
+
+    def moves_between(self, one: str, other: str) -> bool:
+        """Return True if two frames move with respect to each other."""
+        return self.moving_ancestors(one) != self.moving_ancestors(other)
+
+    def moving_ancestors(self, name: str) -> tuple[str, ...]:
+        """Return those frames on the path from the world to a frame that move in their parent."""
+        above = []
+        while name not in self._moving_ancestors:
+            above.append(name)
+            name = self._frames[name].parent
+        moving = self._moving_ancestors[name]
+        for frame in reversed(above):
+            moving = (*moving, frame) if self._moves_in_parent(frame) else moving
+            self._moving_ancestors[frame] = moving
+        return moving
+
+    def _moves_in_parent(self, name: str) -> bool:
+        return not self._paths.isdisjoint(_paths_in_parent(self._frames[name]))
+
+
+def moved_frames(model: ModelView, symbols: Iterable[Symbol | str]) -> dict[Symbol, tuple[str, ...]]:
+    """Return the frames that each symbol moves in the world, for many symbols at once.
+
+    The symbols are compared as in :class:`FrameDependence`. The frames are in the order of the model.
+
+    Parameters
+    ----------
+    model
+        The model.
+    symbols
+        Symbols or their names, such as the speeds of a controller.
+
+    Raises
+    ------
+    UnknownNameError
+        For a symbol that the model does not know.
+    """
+    asked = [s if isinstance(s, Symbol) else model.symbol(s) for s in symbols]
+    known = _known_paths(model)
+    # One bit for each symbol, in the masks of coordinates and of frames.
+    bits: dict[str, int] = {}
+    for i, symbol in enumerate(asked):
+        for path in _driven_coordinates(model, {_known_path(symbol, known)}):
+            bits[path] = bits.get(path, 0) | 1 << i
+    frames: Mapping[str, Frame] = dict(model.frames)
+    masks = {WORLD: 0}
+    for frame in frames:
+        above = []
+        while frame not in masks:
+            above.append(frame)
+            frame = frames[frame].parent
+        mask = masks[frame]
+        for name in reversed(above):
+            for path in _paths_in_parent(frames[name]):
+                mask |= bits.get(path, 0)
+            masks[name] = mask
+    found: dict[Symbol, tuple[str, ...]] = {}
+    for i, symbol in enumerate(asked):
+        found[symbol] = tuple(name for name in frames if masks[name] >> i & 1)
+    return found
+
+
+def count_moved_bodies(model: ModelView, symbols: Iterable[Symbol | str]) -> dict[Symbol, int]:
+    """Return the number of bodies with shapes or inertia that each symbol moves, see :func:`moved_frames`."""
+    bodies = {name for name, body in model.bodies.items() if not is_empty_body(body)}
+    return {s: len(bodies.intersection(frames)) for s, frames in moved_frames(model, symbols).items()}
+
+
+def _paths_in_parent(frame: Frame) -> set[str]:
+    """Return the paths of the symbols that move a frame in its parent, those of gradients included."""
+    found: set[str] = set()
+    for factor in frame.factors:
+        if isinstance(factor, Expression):
+            found.update(s.path for s in collect_symbols(factor))
+            found.update(s.path for s in gradient_keys(factor, heuristic=False))
+    return found
+
+
+def _known_paths(model: ModelView) -> set[str]:
+    return {s.path for s in (*model.symbols, *model.rates.dependent, *model.speeds)}
+
+
+def _known_path(symbol: Symbol, known: set[str]) -> str:
+    if symbol.path not in known:
+        raise UnknownNameError(f"The model has no symbol '{symbol}'. {suggest(symbol.path, known, 'symbol')}")
+    return symbol.path
+
+
+def _driven_coordinates(model: ModelView, paths: set[str]) -> set[str]:
+    """Return the paths of all coordinates that move with the given ones, including these."""
+    rates = model.rates
+    found = set(paths)
+    for coordinate, row in rates.items():
+        if any(speed.path in paths for speed in row):
+            found.add(coordinate.path)
+    # A coordinate in such a row may in turn determine dependent coordinates.
+    for coordinate, expression in rates.dependent.items():
+        if any(s.path in found for s in expression.symbols):
+            found.add(coordinate.path)
+    return found

@@ -1,0 +1,134 @@
+"""Prepared queries return what the scene's own queries do, for the selected pairs only."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from scene_models import arm_among_boxes, body, brute_force, by_names, random_state
+
+import kineverse as kv
+from kineverse.geometry import Rule, Scene, bindings, collision_world, distance_queries
+from kineverse.model.body import Body, Box, Pose, Shape, Sphere
+
+
+@pytest.fixture(scope="module")
+def model():
+    return arm_among_boxes()
+
+
+@pytest.fixture(params=["numpy", pytest.param("c", marks=pytest.mark.compiler)])
+def either_search(request, monkeypatch):
+    """Search in numpy and in C."""
+    library = bindings.CollisionLibrary()
+    if request.param == "c":
+        assert library.prepare(wait=True)
+    else:
+        library.prepare = lambda wait=False: False
+    for module in (collision_world, distance_queries):
+        monkeypatch.setattr(module, "collision_library", library)
+
+
+def among(pairs):
+    return lambda a, b: (a, b) in pairs or (b, a) in pairs
+
+
+def test_watch_matches_brute_force_at_each_state(model, either_search):
+    scene = Scene(model)
+    watches = {
+        scene.watch("link*", "box*", 0.3): lambda a, b: {a[:3], b[:3]} == {"lin", "box"},
+        scene.watch(["hand", "ball/*"], radius=0.3): lambda a, b: {a, b} & {"hand", "ball/body"},
+        scene.watch(moving="j2", radius=0.3): among(scene.pairs_affected_by("j2")),
+        scene.watch(moving=[model.symbol("rail")], radius=0.3): among(scene.pairs_affected_by("rail")),
+        scene.watch("box*", "box*", 0.3): lambda a, b: a[:3] == b[:3] == "box",
+        scene.watch(radius=0.3): lambda a, b: True,
+        scene.watch(radius=0.3, moving=()): lambda a, b: False,
+        scene.watch("hand", radius=0.3, rules=[Rule("hand", "box[1-5]")]): (
+            lambda a, b: "hand" in (a, b) and not {a, b} & {f"box{k}" for k in range(1, 6)}
+        ),
+    }
+    rng = np.random.default_rng(3)
+    for _ in range(2):
+        state = random_state(model, rng)
+        scene.update(state)
+        everything = brute_force(scene, state)
+        for watch, chosen in watches.items():
+            near = {names: d for names, d in everything.items() if d <= 0.3}
+            want = {
+                frozenset(names): pytest.approx(d, abs=1e-6) for names, d in near.items() if chosen(*names)
+            }
+            assert by_names(watch()) == want
+
+
+def test_arrays_of_indices_name_bodies_and_shapes(model):
+    scene = Scene(model)
+    scene.update(random_state(model, np.random.default_rng(0)))
+    found = scene.watch(radius=0.5)()
+    assert len(found) > 5
+    assert found.body_indices.shape == found.shape_indices.shape == (len(found), 2)
+    for pair, bodies, shapes in zip(found, found.body_indices, found.shape_indices, strict=True):
+        assert (pair.a, pair.b) == tuple(scene.bodies[k] for k in bodies)
+        assert (pair.shape_a, pair.shape_b) == tuple(shapes)
+    watch = scene.watch("link*", "box1")
+    assert {tuple(scene.bodies[k] for k in pair) for pair in watch.pairs} == {
+        (f"link{k}", "box1") for k in range(5)
+    }
+    assert watch.pairs.dtype == np.int32
+    assert repr(watch) == "<PreparedQuery: 5 pairs of bodies, within 0.1 m>"
+
+
+def test_per_shape_returns_every_pair_of_shapes(either_search):
+    model = kv.Model()
+    with model.edit() as edit:
+        bar = body(Box((0.1, 0.1, 1.0)))
+        places = (Pose.from_matrix(np.array(kv.translation(0, 0, z)())) for z in (-0.3, 0.0, 0.3))
+        handle = Body(collisions=tuple(Shape(Sphere(0.05), place) for place in places))
+        edit.add_frame("bar", "world", kv.translation(kv.position("x"), 0, 0), bar)
+        edit.add_frame("handle", "world", kv.translation(0.2, 0, 0), handle)
+    scene = Scene(model)
+    scene.update({"x": 0.02})
+    one, each = scene.watch(radius=0.2), scene.watch(radius=0.2, per_shape=True)
+    assert len(one()) == 1
+    assert sorted(each().shape_indices[:, 1].tolist()) == [0, 1, 2]
+    np.testing.assert_allclose(each().distances, 0.08, atol=1e-8)
+    np.testing.assert_allclose(sorted(each().points_b[:, 2]), [-0.3, 0.0, 0.3], atol=1e-8)
+    assert "each pair of shapes" in repr(each)
+
+
+def test_watch_follows_the_model():
+    model = arm_among_boxes()
+    scene = Scene(model)
+    scene.update(random_state(model, np.random.default_rng(0)))
+    watch = scene.watch("hand", "box*", 5.0)
+    assert len(watch()) == len(watch.pairs) == 8
+    with model.edit() as edit:
+        edit.add_frame("box/new", "world", np.eye(4), body(Box((0.1, 0.1, 0.1))), tag="new")
+    assert len(watch.pairs) == 9
+    beside_boxes = [pair for pair in scene.distances_to("hand") if pair.b.startswith("box")]
+    assert by_names(watch()) == by_names(beside_boxes)
+    with model.edit() as edit:
+        edit.remove("new")
+        edit.write(kv.geometry.RULES, kv.geometry.rules_as_data([Rule("hand", "box1")]))
+    assert len(watch()) == len(watch.pairs) == 7
+
+
+def test_pairs_of_a_watch_are_selected_once(model, monkeypatch):
+    scene = Scene(model)
+    scene.update(model.default_state())
+    watch = scene.watch(moving=["rail"], radius=0.2)
+    watch()
+    monkeypatch.setattr(kv.geometry.scene, "flag_relatively_moving", None)
+    assert by_names(watch(0.1)) == {k: d for k, d in by_names(watch()).items() if d <= 0.1}
+
+
+def test_watch_names_what_does_not_exist(model):
+    scene = Scene(model)
+    with pytest.raises(kv.errors.UnknownNameError, match=r"'lnik\*'"):
+        scene.watch("lnik*")
+    with pytest.raises(kv.errors.UnknownNameError, match="Did you mean 'hand'"):
+        scene.watch("hnad")
+    with pytest.raises(kv.errors.UnknownNameError, match="raill"):
+        scene.watch(moving="raill")
+    with pytest.raises(kv.errors.UnknownNameError, match="A rule is about 'bxo1'"):
+        scene.watch(rules=[Rule("bxo1")])
+    with pytest.raises(kv.errors.InvalidValueError, match="radius"):
+        scene.watch(radius=-1.0)
