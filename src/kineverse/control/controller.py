@@ -325,7 +325,7 @@ class Controller:
                 grouped[name] = Conflict(name, self._operations(name), *map(float, bounds))
         hard = np.zeros(len(lower), dtype=bool)
         hard[:n] = True
-        least = find_least_violation(A, lower, upper, hard)
+        least = find_least_violation(A, lower, upper, hard=hard).x
         command = self._command(least, np.zeros(len(lower)), 0, residuals, times)
         listed = "; ".join(map(str, grouped.values()))
         return InfeasibleError(
