@@ -49,12 +49,13 @@ class DaqpSolver(QpSolver):
         return self._solve_anew(H, f, A, lower, upper)
 
     def _solve_anew(self, H: Vector, f: Vector, A: Vector, lower: Vector, upper: Vector) -> QpSolution:
-        flag, x, multipliers, iterations = self._start(
-            H, f, A, lower, upper, np.ones(self.n + self.m), _SETTINGS
-        )
-        if flag >= 1 and self._satisfies(x, A, lower, upper):
-            self._warm = True
-            return QpSolution(x, multipliers, iterations, "solved")
+        one = np.ones(self.n + self.m)
+        # Where equalities are nearly dependent, it succeeds after it has eliminated them.
+        for settings in (_SETTINGS, _REDUCED_SETTINGS):
+            flag, x, multipliers, iterations = self._start(H, f, A, lower, upper, one, settings)
+            if flag >= 1 and self._satisfies(x, A, lower, upper):
+                self._warm = settings is _SETTINGS
+                return QpSolution(x, multipliers, iterations, "solved")
         # Its tolerances are absolute: data of many decades are scaled to unknowns and rows of length 1.
         unit = 1.0 / np.sqrt(H.diagonal())
         rows = A * unit
@@ -88,6 +89,8 @@ class DaqpSolver(QpSolver):
         model = self._model = self._daqp.Model()
         model.settings = settings
         sense = np.where(self.soft, _SOFT, 0).astype(np.intc)
+        if settings is _REDUCED_SETTINGS:
+            sense[(lower == upper) & ~self.soft] = _EQUALITY
         flag, _ = model.setup(H, f, A, upper, lower, sense)
         if flag < 0:
             return flag, np.zeros(self.n), np.zeros(self.n + self.m), 0
@@ -98,8 +101,9 @@ class DaqpSolver(QpSolver):
         return flag, x, info["lam"], info["iterations"]
 
 
-_SOFT = 8
+_SOFT, _EQUALITY = 8, 5
 _INFEASIBLE = (-1, -6)
 _SETTINGS = {"primal_tol": 1e-9}
+_REDUCED_SETTINGS = {"primal_tol": 1e-9, "eq_reduction": 1}
 _SCALED_SETTINGS = {"primal_tol": 1e-9, "sing_tol": 1e-13}
 """Rows that are nearly parallel are told apart, at the price of a less stable factorisation."""
