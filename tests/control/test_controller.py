@@ -378,7 +378,7 @@ def test_wrong_tasks_are_refused(build, error, message) -> None:
 @pytest.mark.parametrize(
     ("arguments", "error", "message"),
     [
-        ({"tasks": []}, InvalidValueError, "without a task"),
+        ({"tasks": []}, InvalidValueError, "Without a task"),
         ({"tasks": [3]}, ExpressionError, "Goal, a Hold or a Keep"),
         ({"dt": 0.0}, InvalidValueError, "dt"),
         ({"dt": math.nan}, InvalidValueError, "dt"),

@@ -2,6 +2,8 @@
 
 from .command import Command
 from .controller import Controller
+from .ik_result import IkResult
+from .inverse_kinematics import InverseKinematics, inverse_kinematics
 from .targets import Target
 from .task_functions import look_at, same_orientation, same_pose, same_position
 from .tasks import Goal, Hold, Keep, Task
@@ -11,9 +13,12 @@ __all__ = [
     "Controller",
     "Goal",
     "Hold",
+    "IkResult",
+    "InverseKinematics",
     "Keep",
     "Target",
     "Task",
+    "inverse_kinematics",
     "look_at",
     "same_orientation",
     "same_pose",

@@ -11,13 +11,13 @@ bodies may come near without another compilation. Within the margin a soft goal 
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Iterable, Sequence
 
 import numpy as np
 
 from kineverse.compile import compile  # noqa: A004
 from kineverse.expressions.expression import Expression, array, as_expression
-from kineverse.geometry import Scene
+from kineverse.geometry import Rule, Scene
 from kineverse.geometry.results import DistanceResults
 from kineverse.lie import Array
 from kineverse.model.frame_dependence import FrameDependence
@@ -43,6 +43,10 @@ class ContactSlots:
         Distance up to which pairs count [m].
     gain
         Rate γ at which a distance may shrink to the margin [1/s].
+    twist
+        Function that returns the twist of a body, (6, n) over the columns; by default the model's Jacobian.
+    rules
+        Further rules on the pairs that count, after those of the scene.
 
     Attributes
     ----------
@@ -63,6 +67,8 @@ class ContactSlots:
         margin: float,
         radius: float,
         gain: float,
+        twist: Callable[[str], Expression] | None = None,
+        rules: Iterable[Rule] = (),
     ) -> None:
         model = scene.model
         self.scene, self.count = scene, count
@@ -73,7 +79,8 @@ class ContactSlots:
         self._group = np.array([groups[group] for group in moved], dtype=np.intp)
         members = dict(zip(moved, scene.bodies, strict=True))
         twists: list[Expression] = [as_expression(np.zeros((6, len(speeds))))]
-        twists += [model.jacobian(members[group], form="world", symbols=speeds) for group in groups if group]
+        twist = twist or (lambda body: model.jacobian(body, form="world", symbols=speeds))
+        twists += [twist(members[group]) for group in groups if group]
         stacked = array([e for twist in twists for e in twist.ravel()]).reshape(len(twists), 6, len(speeds))
         self.inputs = tuple(sorted({*scene.inputs, *stacked.symbols}, key=lambda s: s.sort_key))
         self._function = compile([stacked])
@@ -81,7 +88,7 @@ class ContactSlots:
         place = {s: k for k, s in enumerate(self.inputs)}
         self._scene_values = np.array([place[s] for s in scene.inputs], dtype=np.intp)
         self._twist_values = np.array([place[s] for s in self._function.inputs], dtype=np.intp)
-        self._query = scene.watch(radius=radius, moving=speeds, per_shape=True)
+        self._query = scene.watch(radius=radius, moving=speeds, rules=rules, per_shape=True)
 
     def update(self, values: Array) -> None:
         """Find the near pairs at the values of :attr:`inputs`."""

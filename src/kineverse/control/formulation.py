@@ -111,8 +111,8 @@ class Formulation:
         speed_limits: bool = True,
     ) -> None:
         self.model = model
-        self.tasks = _check_tasks(tasks)
-        self._names = _name_tasks(self.tasks)
+        self.tasks = check_tasks(tasks)
+        self._names = name_tasks(self.tasks)
         self._still = find_speeds(model, still, "still")
         rates = model.rates
         every = dict(model.constraints)
@@ -290,7 +290,8 @@ def find_speeds(model: ModelView, names: Iterable[Symbol | str], argument: str) 
     return frozenset(found)
 
 
-def _check_tasks(tasks: Iterable[Task]) -> tuple[Task, ...]:
+def check_tasks(tasks: Iterable[Task]) -> tuple[Task, ...]:
+    """Return the tasks as a tuple, after a check of their kinds and number."""
     if isinstance(tasks, Goal | Hold | Keep):
         tasks = (tasks,)
     given = tuple(tasks)
@@ -298,13 +299,11 @@ def _check_tasks(tasks: Iterable[Task]) -> tuple[Task, ...]:
         if not isinstance(task, Goal | Hold | Keep):
             raise ExpressionError(f"A task is a Goal, a Hold or a Keep, not {task!r}.")
     if not given:
-        raise InvalidValueError(
-            "A controller without a task has nothing to do; give it a Goal, Hold or Keep."
-        )
+        raise InvalidValueError("Without a task there is nothing to do; give a Goal, Hold or Keep.")
     return given
 
 
-def _name_tasks(tasks: Sequence[Task]) -> dict[Task, str]:
+def name_tasks(tasks: Sequence[Task]) -> dict[Task, str]:
     """Return a name for each task: its own, that of its only symbol, or its kind and number."""
     named: dict[Task, str] = {}
     for k, task in enumerate(tasks):

@@ -1,0 +1,133 @@
+"""Steps out of collision for inverse kinematics: contact rows over coordinates."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping, Sequence
+
+import numpy as np
+
+from kineverse.errors import NoSolutionError
+from kineverse.expressions.expression import Expression, array, as_expression
+from kineverse.geometry import Scene
+from kineverse.geometry.results import DistanceResult
+from kineverse.lie import Array
+from kineverse.state import State
+from kineverse.symbols import Symbol
+
+from .contact_slots import ContactSlots
+from .position_program import PositionProgram
+from .quadratic_program import make_solver
+
+_SLOTS, _RADIUS = 24, 0.1
+_LONGEST = 0.2
+"""Largest step of a coordinate [m], [rad], since contact rows are valid only nearby."""
+_SAMPLES = 16
+
+
+class Clearance:
+    """Distances of bodies at the coordinates of a program, and steps that increase them.
+
+    Pairs that are nearer than the margin in all of some random states do not count.
+
+    Parameters
+    ----------
+    scene
+        Collision scene of the model.
+    program
+        Program of the tasks, to which rows for near pairs are added.
+    margin
+        Least distance of pairs of bodies [m].
+
+    Attributes
+    ----------
+    inputs
+        Symbols of the values of :meth:`load`.
+    """
+
+    def __init__(self, scene: Scene, program: PositionProgram, margin: float) -> None:
+        self._scene, self._program, self.margin = scene, program, margin
+        self._speeds = [s.derivative() for s in program.coordinates]
+        try:
+            rules = scene.find_always_colliding(self._sample(), margin)
+        except NoSolutionError:  # Some of the states are outside of the domain of a closed loop.
+            rules = scene.find_always_colliding(margin=margin)
+        self._contacts = ContactSlots(
+            scene,
+            self._speeds,
+            _SLOTS,
+            margin=margin,
+            radius=margin + _RADIUS,
+            gain=1.0,
+            twist=self._twist,
+            rules=rules,
+        )
+        self.inputs: Sequence[Symbol] = self._contacts.inputs
+        place = {s: k for k, s in enumerate(program.coordinates)}
+        self._values = np.zeros(len(self.inputs))
+        moved = [k for k, s in enumerate(self.inputs) if s in place]
+        self._moved = np.array(moved, dtype=np.intp)
+        self._source = np.array([place[self.inputs[k]] for k in moved], dtype=np.intp)
+        n, rows = len(program.coordinates), len(program.names) - len(program.coordinates)
+        self._n, self._static = n, n + rows
+        self._A = np.zeros((rows + _SLOTS, n))
+        self._lower, self._upper = np.zeros((2, n + rows + _SLOTS))
+        self._solver = make_solver("daqp", n, rows + _SLOTS)
+
+    def load(self, values: Mapping[Symbol, float]) -> None:
+        """Set the values of all inputs."""
+        self._values[:] = [values[s] for s in self.inputs]
+
+    def measure(self, coordinates: Array) -> float:
+        """Find the near pairs, and return what the nearest lacks to the margin [m]; 0 if it lacks nothing."""
+        self._values[self._moved] = coordinates[self._source]
+        self._contacts.update(self._values)
+        distances = self._contacts.found.distances
+        return max(0.0, self.margin - float(distances[0])) if len(distances) else 0.0
+
+    @property
+    def near(self) -> tuple[DistanceResult, ...]:
+        """Pairs of the last measurement that are nearer than the margin, nearest first."""
+        found = self._contacts.found
+        count = int(np.count_nonzero(found.distances < self.margin))
+        return tuple(found[k] for k in range(count))
+
+    def find_step(self, H: Array, f: Array, A: Array, lower: Array, upper: Array) -> Array | None:
+        """Return the step of the coordinates for the last near pairs, None if there is none.
+
+        Parameters
+        ----------
+        H, f, A, lower, upper
+            Quadratic program of the tasks at the same coordinates; H and f are changed in place.
+        """
+        n, static = self._n, self._static
+        self._A[: static - n], self._A[static - n :] = A, 0.0
+        self._lower[:static], self._lower[static:] = lower, -np.inf
+        self._upper[:static], self._upper[static:] = upper, np.inf
+        self._lower[:n] = np.maximum(lower[:n], -_LONGEST)
+        self._upper[:n] = np.minimum(upper[:n], _LONGEST)
+        self._contacts.write(H, f, self._A[static - n :], self._lower[static:], self._upper[static:], 1.0)
+        found = self._solver.solve(H, f, self._A, self._lower, self._upper)
+        return found.x if found.status == "solved" else None
+
+    def _twist(self, body: str) -> Expression:
+        """Return the spatial twist of a body over the coordinates, (6, n)."""
+        pose = self._program.make_plain(self._scene.model.fk(body))
+        gradient = pose.gradient(heuristic=False)
+        R, p = pose[:3, :3], pose[:3, 3]
+        columns: list[Expression] = []
+        for speed in self._speeds:
+            if speed not in gradient:
+                columns.append(as_expression(np.zeros(6)))
+                continue
+            W = gradient[speed][:3, :3] @ R.T
+            w = array([W[2, 1], W[0, 2], W[1, 0]])
+            columns.append(as_expression(np.concatenate([gradient[speed][:3, 3] + np.cross(p, w), w])))
+        return array([column[i] for i in range(6) for column in columns]).reshape(6, len(columns))
+
+    def _sample(self) -> Iterator[State]:
+        """Yield random states."""
+        home, generator = self._scene.model.default_state(), np.random.default_rng(0)
+        start = home.vector(self._program.coordinates)
+        for _ in range(_SAMPLES):
+            q = self._program.draw(generator, start)
+            yield home | dict(zip(self._program.coordinates, q.tolist(), strict=True))

@@ -1,0 +1,423 @@
+"""Quadratic program of one Gauss-Newton step towards tasks, as one compiled function of the coordinates.
+
+The unknowns are steps δ of the coordinates q themselves, not of speeds: a configuration is not restricted by
+rolling, so a differential drive may be placed anywhere. With the errors e of goals, holds and equalities of
+the model, the violations x of other constraints φ on positions, and row weights w::
+
+    minimise    ½ Σ w (e + J δ)² + ½ Σ w (x + A δ)² + ½ λ |δ|²,    λ = 0.03 Σ w (e² + x²) + 1e-6
+    subject to  lower - φ <= A δ <= upper - φ,    outside of a bound: not further away
+
+The damping λ is that of Sugihara, Solvability-unconcerned inverse kinematics by the Levenberg-Marquardt
+method, IEEE Transactions on Robotics 27, 2011.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass
+from functools import reduce
+
+import casadi as ca
+import numpy as np
+import numpy.typing as npt
+
+from kineverse.compile import compile  # noqa: A004
+from kineverse.errors import (
+    DuplicateNameError,
+    ExpressionError,
+    InvalidValueError,
+    NoSolutionError,
+    UnknownNameError,
+    suggest,
+)
+from kineverse.expressions.expression import Expression, ExpressionLike, array, as_expression, binary
+from kineverse.lie import Array
+from kineverse.model.constraint import Constraint
+from kineverse.model.model_view import ModelView
+from kineverse.model.projection import TOLERANCE, is_equality
+from kineverse.model.rate_nodes import to_plain
+from kineverse.model.rates import Rates
+from kineverse.model.speed_limits import INFINITE, ZERO, raw_max
+from kineverse.model.velocity_rows import velocity_rows
+from kineverse.symbols import Symbol, parameter
+
+from .formulation import check_tasks, name_tasks
+from .tasks import Hold, Keep, Task
+
+_DAMPING, _LEAST_DAMPING = 0.03, 1e-6
+_SAMPLES = 12
+_QUATERNION = ("qx", "qy", "qz", "qw")
+_SAME = 1e-9
+
+
+@dataclass(frozen=True)
+class ErrorRows:
+    """Rows of one task, or of an equality of the model.
+
+    Attributes
+    ----------
+    name
+        Name of the task or constraint.
+    error
+        (k,) errors, in plain independent coordinates.
+    weights
+        (k,) weights of their squares.
+    tolerance
+        Largest entry where the task is done.
+    exact
+        True for holds and equalities, which are kept where goals are out of reach.
+    """
+
+    name: str
+    error: Expression
+    weights: Expression
+    tolerance: float
+    exact: bool
+
+
+class PositionProgram:
+    """Compiled quadratic program of a Gauss-Newton step.
+
+    Parameters
+    ----------
+    model
+        The model.
+    tasks
+        Goals, holds and keeps of positions.
+    still
+        Coordinates that stay still, as symbols or names; see :func:`find_coordinates`.
+    tolerance
+        Largest entry of the errors of a goal that is reached.
+
+    Attributes
+    ----------
+    coordinates
+        The n coordinates that move.
+    inputs
+        The coordinates, then all other symbols; k row weights follow them.
+    parts
+        Rows of tasks and equalities. The errors are those of all parts, then violations of the n bounds, then
+        those of the general rows.
+    weights
+        (k,) default row weights. They make errors comparable: one unit for a usual motion of coordinates.
+    names
+        Names of the constraints of the n bounds and the general rows.
+    keeps
+        Names of the keeps that are ranges.
+    lower, upper
+        (n,) limits of the coordinates, ±inf for none, at the default values of parameters.
+    fixed_limits
+        (n,) flags of coordinates whose limits are numbers.
+    turning
+        (n,) flags of coordinates q for which q + 2π is the same. They have no bounds in the program.
+    quaternions
+        Indices of the four coordinates of each quaternion.
+    function
+        Function with the outputs H, f, A, lower, upper, the k errors and violations, the weighted sum of
+        their squares, and the largest of them as a multiple of its tolerance.
+    """
+
+    def __init__(
+        self, model: ModelView, tasks: Iterable[Task], still: Iterable[Symbol | str], tolerance: float
+    ) -> None:
+        self.model = model
+        self.tasks = check_tasks(tasks)
+        fixed = find_coordinates(model, still)
+        parts, ranges = self._collect(tolerance)
+        self.parts, ranges = self._close(parts, ranges)
+        errors = as_expression(np.concatenate([part.error for part in self.parts]))
+        subjects = [errors, *(e for c in ranges.values() for e in (c.lower, c.expression, c.upper))]
+        moving = {s.position for e in subjects for s in e.gradient(heuristic=False)} - fixed
+        self._check_moved(fixed)
+        self.coordinates = tuple(sorted(moving, key=lambda s: s.sort_key))
+        place = {s: k for k, s in enumerate(self.coordinates)}
+        self.quaternions = [
+            [place[s] for s in four]
+            for record in model.articulations.values()
+            for four in [[s for s in record.coordinates if s.path.rpartition("/")[2] in _QUATERNION]]
+            if len(four) == 4 and all(s in place for s in four)
+        ]
+        self.turning = np.zeros(len(self.coordinates), dtype=bool)
+        self._find_limits(ranges)
+        self._compile(errors, ranges)
+
+    def _find_limits(self, ranges: Mapping[str, Constraint]) -> None:
+        """Set the limits of the coordinates by the model and by keeps."""
+        limits = np.array([self.model.limits(s) for s in self.coordinates], dtype=float).reshape(-1, 2)
+        self.lower, self.upper = limits[:, 0].copy(), limits[:, 1].copy()
+        self.fixed_limits = np.ones(len(self.coordinates), dtype=bool)
+        for i, symbol in enumerate(self.coordinates):
+            for c in ranges.values():
+                if symbol in c.expression.symbols and (c.lower.symbols or c.upper.symbols):
+                    self.fixed_limits[i] = False
+                elif c.expression == symbol:
+                    self.lower[i] = max(self.lower[i], float(c.lower))
+                    self.upper[i] = min(self.upper[i], float(c.upper))
+        # A range that is empty is an error of the program, not of the limits.
+        self.upper = np.maximum(self.lower, self.upper)
+
+    def make_plain(self, expression: ExpressionLike) -> Expression:
+        """Return an expression in independent plain coordinates."""
+        return self.model.rates.resolve(to_plain(as_expression(expression)))
+
+    def _collect(self, tolerance: float) -> tuple[list[ErrorRows], dict[str, Constraint]]:
+        """Return the rows of goals and holds, and the ranges of keeps."""
+        parts: list[ErrorRows] = []
+        ranges: dict[str, Constraint] = {}
+        for task, name in name_tasks(self.tasks).items():
+            ones = as_expression(np.ones(task.expression.size))
+            if isinstance(task, Keep):
+                c = task.constraint
+                whole = Constraint(*map(self.make_plain, (c.lower, c.expression, c.upper)))
+                subject = [whole.lower, whole.expression, whole.upper]
+                if is_equality(whole):
+                    error = (whole.expression - whole.lower).ravel()
+                    parts.append(ErrorRows(name, error, ones, TOLERANCE, True))
+                elif name in self.model.constraints:
+                    raise DuplicateNameError(
+                        f"The model has a constraint '{name}'; give the Keep another name."
+                    )
+                else:
+                    ranges[name] = whole
+            else:
+                error = self.make_plain(task.error)
+                subject = [error]
+                if isinstance(task, Hold):
+                    parts.append(ErrorRows(name, error, ones, TOLERANCE, True))
+                else:
+                    weights = self.make_plain(task.weight).ravel()
+                    weights = weights * ones if weights.size == 1 else weights
+                    parts.append(ErrorRows(name, error, weights, tolerance, False))
+            for expression in subject:
+                self._check_symbols(task, expression)
+        self.keeps = tuple(ranges)
+        return parts, ranges
+
+    def _close(
+        self, parts: list[ErrorRows], ranges: dict[str, Constraint]
+    ) -> tuple[tuple[ErrorRows, ...], dict[str, Constraint]]:
+        """Add the constraints on positions that share a coordinate with the tasks, repeatedly."""
+        waiting = {}
+        for name, c in self.model.plain_constraints().items():
+            if not any(s.order for s in c.symbols):
+                waiting[name] = (
+                    c
+                    if self.model.rates.is_empty
+                    else Constraint(*map(self.make_plain, (c.lower, c.expression, c.upper)))
+                )
+        symbols = {name: {s for s in c.symbols if s.has_derivative} for name, c in waiting.items()}
+        found = {s for part in parts for s in part.error.symbols}
+        found |= {s for c in ranges.values() for s in c.symbols}
+        while named := [name for name in waiting if not found.isdisjoint(symbols[name])]:
+            for name in named:
+                c = waiting.pop(name)
+                found |= symbols[name]
+                if is_equality(c):
+                    error = (c.expression - c.lower).ravel()
+                    parts.append(ErrorRows(name, error, as_expression(np.ones(error.size)), TOLERANCE, True))
+                else:
+                    ranges[name] = c
+        if not parts:
+            raise InvalidValueError("There is no goal and no hold, so there is nothing to reach.")
+        return tuple(parts), ranges
+
+    def _check_moved(self, fixed: frozenset[Symbol]) -> None:
+        for part in self.parts:
+            moved = {s.position for s in part.error.gradient(heuristic=False)}
+            if part.name not in self.model.constraints and moved and moved <= fixed:
+                named = ", ".join(f"'{s}'" for s in sorted(moved, key=lambda s: s.sort_key))
+                raise InvalidValueError(
+                    f"'{part.name}' is moved by {named} only, and all of that is to stay still."
+                )
+
+    def _check_symbols(self, task: Task, expression: Expression) -> None:
+        """Refuse speeds, and degrees of freedom that the model does not have."""
+        if any(s.order for s in expression.symbols):
+            raise InvalidValueError(
+                f"{task!r} is about speeds, and inverse kinematics about positions. A Controller serves it."
+            )
+        known = {s.path for s in self.model.symbols}
+        for symbol in expression.symbols:
+            if symbol.role == "dof" and symbol.path not in known:
+                raise UnknownNameError(
+                    f"{task!r} is about '{symbol}', which is not in the model. "
+                    f"{suggest(symbol.path, known, 'symbol')}"
+                )
+
+    def _compile(self, errors: Expression, ranges: dict[str, Constraint]) -> None:
+        n = len(self.coordinates)
+        gradient = errors.gradient(heuristic=False)
+        none = array([ZERO] * errors.size)
+        columns = [gradient.get(s.derivative(), none) for s in self.coordinates]
+        jacobian = array([column[i] for i in range(errors.size) for column in columns])
+        jacobian = jacobian.reshape(errors.size, n)
+        table = velocity_rows(
+            ranges,
+            1.0,
+            rates=Rates({}),
+            speeds=[s.derivative() for s in self.coordinates],
+            recovery="allowed",
+        )
+        bounds, general = table.bounds, table.general
+        count = len(general.names)
+        scales, self.turning = self._sample(errors, jacobian, ranges)
+        self.names = (*bounds.names, *((name,) for name in general.names))
+        free = self.turning
+        lower = [-INFINITE if free[i] else bounds.lower[i] for i in range(n)]
+        upper = [INFINITE if free[i] else bounds.upper[i] for i in range(n)]
+        away = [ZERO if free[i] else bounds.violation[i] for i in range(n)]
+        away += [general.violation[k] for k in range(count)]
+        lower += [general.lower[k] for k in range(count)]
+        upper += [general.upper[k] for k in range(count)]
+        identity = np.eye(n)
+        rows = [as_expression(identity[i]) for i in range(n)] + [general.matrix[k] for k in range(count)]
+
+        size = errors.size + len(away)
+        self.weights = np.concatenate([scales, np.ones(len(away))])
+        numbers = [parameter(f"inverse kinematics/weight/{k}", 1.0) for k in range(size)]
+        own = [weight for part in self.parts for weight in part.weights]
+        w = [numbers[k] * own[k] for k in range(errors.size)]
+        # A row within its bounds is no error; outside of them it is.
+        w += [numbers[errors.size + k] * binary(ca.OP_NE, violation, 0) for k, violation in enumerate(away)]
+        weighted = jacobian * array(w[: errors.size]).reshape(errors.size, 1)
+        H, f = weighted.T @ jacobian, weighted.T @ errors
+        for k, violation in enumerate(away):
+            if violation.symbols:
+                pull = w[errors.size + k] * rows[k]
+                H = H + pull.reshape(n, 1) @ rows[k].reshape(1, n)
+                f = f + violation * pull
+        values = array([*(errors[k] for k in range(errors.size)), *away])
+        total = sum((w[k] * values[k] * values[k] for k in range(size)), ZERO)
+        damping = _DAMPING * total + _LEAST_DAMPING
+        H = array([H[i, j] + damping if i == j else H[i, j] for i in range(n) for j in range(n)]).reshape(
+            n, n
+        )
+        A = general.matrix if count else as_expression(np.zeros((0, n)))
+        tolerances = [part.tolerance for part in self.parts for _ in range(part.error.size)]
+        tolerances += [TOLERANCE] * len(away)
+        sizes = [abs(values[k]) * binary(ca.OP_NE, w[k], 0) / tolerances[k] for k in range(size)]
+        outputs = [H, f, A, array(lower), array(upper), values, total, reduce(raw_max, sizes, ZERO)]
+        used = {s for output in outputs for s in output.symbols} - {*numbers, *self.coordinates}
+        self.inputs = (*self.coordinates, *sorted(used, key=lambda s: s.sort_key))
+        self.function = compile(outputs, (*self.inputs, *numbers))
+
+    def _sample(
+        self, errors: Expression, jacobian: Expression, ranges: Mapping[str, Constraint]
+    ) -> tuple[Array, npt.NDArray[np.bool_]]:
+        """Return the weight of each error row, and the flags of coordinates with the period 2π.
+
+        The weight is the inverse mean square of the row's derivatives over random states, within one task at
+        most that of a row with 5 % of the largest derivatives.
+        """
+        n = len(self.coordinates)
+        limits = {name for name, c in ranges.items() if isinstance(c.expression, Symbol)}
+        parts = [jacobian.ravel(), errors]
+        parts += [c.expression.ravel() for name, c in ranges.items() if name not in limits]
+        parts += [end.ravel() for c in ranges.values() for end in (c.lower, c.upper) if end.symbols]
+        stacked = as_expression(np.concatenate(parts))
+        others = sorted({*stacked.symbols} - {*self.coordinates}, key=lambda s: s.sort_key)
+        function = compile([stacked], (*self.coordinates, *others), tier="interpreter").bind()
+        home = self.model.default_state()
+        function.input[n:] = home.vector(others)
+        start = home.vector(self.coordinates)
+        turning = self.upper - self.lower >= math.tau - _SAME
+        for four in self.quaternions:
+            turning[four] = False
+        bound = {c.expression for c in ranges.values() if c.lower.symbols or c.upper.symbols}
+        for i, symbol in enumerate(self.coordinates):
+            turning[i] &= symbol not in bound
+
+        def evaluate(q: Array) -> Array | None:
+            function.input[:n] = q
+            try:
+                function()
+            except NoSolutionError:
+                return None
+            found: Array = function.outputs[0].copy()
+            return found if np.isfinite(found).all() else None
+
+        squares: list[Array] = []
+        generator = np.random.default_rng(0)
+        for _ in range(_SAMPLES):
+            q = self.draw(generator, start)
+            value = evaluate(q)
+            if value is None:
+                continue
+            for i in np.flatnonzero(turning).tolist() if len(squares) < 3 else ():
+                turned = q.copy()
+                turned[i] += math.tau
+                other = evaluate(turned)
+                turning[i] = other is not None and np.allclose(other, value, rtol=_SAME, atol=_SAME)
+            squares.append((value[: jacobian.size].reshape(-1, n) ** 2).sum(axis=1))
+        if not squares:
+            return np.ones(errors.size), np.zeros(n, dtype=bool)
+        mean, first = np.mean(squares, axis=0), 0
+        for part in self.parts:
+            rows = slice(first, first + part.error.size)
+            mean[rows] = np.maximum(mean[rows], 0.05**2 * mean[rows].max())
+            first = rows.stop
+        return 1.0 / np.where(mean > 0, mean, 1.0), turning
+
+    def draw(self, generator: np.random.Generator, start: Array) -> Array:
+        """Return random coordinates (n,): uniform within limits, around given ones where there are none."""
+        width = np.where(self.turning, math.pi, 1.0)
+        low = np.where(np.isfinite(self.lower), self.lower, np.minimum(start, self.upper) - width)
+        high = np.where(np.isfinite(self.upper), self.upper, np.maximum(start, self.lower) + width)
+        q = generator.uniform(low, np.maximum(low, high))
+        for four in self.quaternions:
+            q[four] = start[four] + generator.standard_normal(4) / 2
+        self.normalize(q)
+        return q
+
+    def normalize(self, q: Array) -> None:
+        """Give quaternions their unit length, in place."""
+        for four in self.quaternions:
+            q[four] /= math.sqrt(q[four].dot(q[four]))
+
+    def bring_back(self, q: Array, start: Array) -> None:
+        """Bring coordinates with the period 2π within their limits, as near to given ones as possible."""
+        for i in np.flatnonzero(self.turning):
+            value = q[i] - math.tau * round((q[i] - start[i]) / math.tau)
+            if value > self.upper[i]:
+                value -= math.tau * math.ceil((value - self.upper[i]) / math.tau)
+            elif value < self.lower[i]:
+                value += math.tau * math.ceil((self.lower[i] - value) / math.tau)
+            q[i] = value
+        np.clip(q, self.lower, self.upper, out=q, where=self.fixed_limits)
+
+
+def find_coordinates(model: ModelView, names: Iterable[Symbol | str]) -> frozenset[Symbol]:
+    """Return independent coordinates of a model, given as symbols or names.
+
+    A dependent coordinate stands for those that determine it, an articulation for all of its coordinates, and
+    a speed for the coordinates that it drives.
+
+    Raises
+    ------
+    UnknownNameError
+        For another name, with similar ones.
+    ExpressionError
+        For what is neither a symbol nor a name.
+    """
+    found: set[Symbol] = set()
+    for item in (names,) if isinstance(names, str | Symbol) else names:
+        if isinstance(item, str) and item in model.articulations and item not in map(str, model.symbols):
+            found |= find_coordinates(model, model.articulations[item].coordinates)
+            continue
+        symbol = model.symbol(item) if isinstance(item, str) else item
+        if not isinstance(symbol, Symbol):
+            raise ExpressionError(f"still= takes symbols or their names, not {item!r}.")
+        known = {*model.symbols, *model.rates.dependent, *model.speeds}
+        if symbol not in known and symbol.position not in known:
+            raise UnknownNameError(
+                f"still=: the model has no '{symbol}'. {suggest(str(symbol), map(str, known), 'symbol')}"
+            )
+        dependent = model.rates.dependent.get(symbol.position)
+        if dependent is not None:
+            found |= {s for s in dependent.symbols if s.has_derivative}
+        else:
+            found.add(symbol.position)
+        if symbol.order == 1:
+            found |= {x for x, row in model.rates.items() if symbol in row}
+    return frozenset(found)
