@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from time import perf_counter
+from typing import Any
 
 import numpy as np
 import numpy.typing as npt
@@ -24,6 +25,7 @@ from kineverse.symbols import Symbol, parameter
 
 from .command import Command, StepTimes
 from .contact_slots import ContactSlots
+from .control_loop import LoopReport, run_control_loop
 from .diagnosis import Diagnosis
 from .formulation import Formulation
 from .quadratic_program import make_solver
@@ -116,11 +118,9 @@ class Controller:
     ) -> None:
         check_weight("smooth", smooth)
         check_weight("jerk", jerk)
-        if not (isinstance(dt, int | float) and 0 < dt < math.inf):
-            raise InvalidValueError(f"dt= is a positive time in seconds, not {dt!r}.")
+        _check_step(dt)
         self.model = model
-        self.dt = float(dt)
-        step = parameter(_DT, self.dt)
+        step = parameter(_DT, float(dt))
         stated, chosen = acceleration_limits(model, acceleration)
         self._formulation = formulation = Formulation(
             model, tasks, dt=step, still=still, accelerations=chosen
@@ -162,7 +162,8 @@ class Controller:
         self._parameters = {s: k for k, s in enumerate(self.inputs) if s.value is not None}
         self._settings = {s: float(s.value or 0.0) for s in self._parameters}
         self._values[len(self._coordinates) :] = list(self._settings.values())
-        self._evaluate.input[first] = self.dt
+        self._dt = self._evaluate.input[first : first + 1]
+        self._dt[:] = dt
         self._last = self._evaluate.input[first + 1 : first + 1 + n]
         self._before = self._evaluate.input[first + 1 + n :]
         self._diagnosis = Diagnosis(model, formulation, self._program, self._evaluate, self._contacts)
@@ -170,6 +171,16 @@ class Controller:
         self._row_names = tuple(
             tuple(name for name in names if name not in equalities) for names in self._program.names
         )
+
+    @property
+    def dt(self) -> float:
+        """Time between two steps [s]; it can be set without another compilation."""
+        return float(self._dt[0])
+
+    @dt.setter
+    def dt(self, value: float) -> None:
+        _check_step(value)
+        self._dt[:] = value
 
     @property
     def tier(self) -> str:
@@ -298,8 +309,40 @@ class Controller:
             )
         self._values[:] = vector
 
+    def run(
+        self,
+        *,
+        source: Callable[[], State | None],
+        sink: Callable[[dict[Symbol, float]], object],
+        rate: float | None = None,
+        **options: Any,
+    ) -> LoopReport:
+        """Run the controller at a fixed rate, and return a report; see :func:`.run_control_loop`.
+
+        Parameters
+        ----------
+        source
+            Returns the latest state, or None if there is no new one.
+        sink
+            Takes speeds by symbol, in every cycle.
+        rate
+            Cycles per second, by default ``1/dt``; another rate sets :attr:`dt`.
+        options
+            ``stale``, ``acceleration``, ``duration``, ``until``, ``on_error``, ``clock``, ``sleep``.
+        """
+        if rate is not None:
+            if not 0 < rate < math.inf:
+                raise InvalidValueError(f"rate= is a positive number of cycles per second, not {rate!r}.")
+            self.dt = 1 / rate
+        return run_control_loop(self, rate=1 / self.dt, source=source, sink=sink, **options)
+
     def __repr__(self) -> str:
         return (
             f"<Controller: {len(self.tasks)} tasks, {len(self.speeds)} speeds, "
             f"{self._program.rows} rows, dt {self.dt:g} s>"
         )
+
+
+def _check_step(dt: float) -> None:
+    if not (isinstance(dt, int | float) and 0 < dt < math.inf):
+        raise InvalidValueError(f"dt= is a positive time in seconds, not {dt!r}.")
