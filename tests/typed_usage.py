@@ -92,7 +92,7 @@ except kv.errors.UnknownNameError as error:
 scene: kv.geometry.Scene
 tracker: kv.estimation.Tracker
 goal = kv.control.Goal(a, 0.5, weight=2.0)
-controller = kv.control.Controller(model, [goal, kv.control.Keep(0, b, 1)], dt=0.02)
+controller = kv.control.Controller(model, [goal, kv.control.Keep(0, 2 * a, 1)], dt=0.02)
 assert_type(controller.step(home).residuals["goal a"], float)
 found: kv.reasoning.Interlocks
 shower = kv.show

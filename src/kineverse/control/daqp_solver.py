@@ -28,20 +28,23 @@ class DaqpSolver(QpSolver):
         self._daqp = import_solver("daqp", "control")
         self._model: Any = None
         self._warm = False
+        self._least, self._most = np.full(n + m, -_INFINITY), np.full(n + m, _INFINITY)
+        self._lower, self._upper = self._least.copy(), self._most.copy()
 
     def reset(self) -> None:  # noqa: D102
         self._warm = False
 
     def _solve(self, H: Vector, f: Vector, A: Vector, lower: Vector, upper: Vector) -> QpSolution:
         if self._warm:
+            # A bound of the last active set that is infinite now gives wrong solutions, reported as solved.
+            low = np.maximum(lower, self._least, out=self._lower)
+            high = np.minimum(upper, self._most, out=self._upper)
             # The solver keeps these arrays, and the active set of the last solve.
             model = self._model
-            if model.update(H, f, A if self.m else None, upper, lower) == 0:
+            if model.update(H, f, A if self.m else None, high, low) == 0:
                 x, _, flag, info = model.solve()
                 if (flag == 1 or flag == 2) and self._satisfies(x, A, lower, upper):
                     return QpSolution(x, info["lam"], info["iterations"], "solved")
-        # It may have failed, or returned NaN as solved: so it does if bounds of the last active set are
-        # infinite now.
         self._warm = False
         status = self._unsolvable(H, f, A, lower, upper)
         if status is not None:
@@ -102,6 +105,8 @@ class DaqpSolver(QpSolver):
 
 
 _SOFT, _EQUALITY = 8, 5
+_INFINITY = 1e8
+"""Bounds beyond are none in warm starts: far from all speeds and lengths, but near enough for doubles."""
 _INFEASIBLE = (-1, -6)
 _SETTINGS = {"primal_tol": 1e-9}
 _REDUCED_SETTINGS = {"primal_tol": 1e-9, "eq_reduction": 1}
