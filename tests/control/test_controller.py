@@ -405,3 +405,32 @@ def test_tasks_about_foreign_symbols_and_double_names_are_refused() -> None:
         Controller(model, [Goal(q, 1.0), Goal(q, 0.0)], dt=DT)
     with pytest.raises(DuplicateNameError):
         Controller(model, [Keep(0.0, q, 1.0, name="joint1/position")], dt=DT)
+
+
+def test_run_takes_states_and_gives_commands_until_a_condition() -> None:
+    model = planar_arm()
+    q = model.symbol("joint1")
+    controller = Controller(model, [Goal(q, 0.3)], dt=0.1)
+    now, state = [0.0], model.default_state()
+
+    def source() -> kv.State:
+        return kv.State(state, stamp=now[0])
+
+    def sink(speeds: dict) -> None:
+        nonlocal state
+        state = model.integrate(state, speeds, controller.dt)
+
+    def sleep(seconds: float) -> None:
+        now[0] += seconds
+
+    report = controller.run(
+        rate=50, source=source, sink=sink, until=lambda s: s[q] > 0.29, clock=lambda: now[0], sleep=sleep
+    )
+    assert controller.dt == 0.02
+    assert report.missed_deadlines == 0
+    assert report.cycles > 50
+    assert state[q] == pytest.approx(0.29, abs=0.01)
+    with pytest.raises(InvalidValueError, match="rate"):
+        controller.run(rate=0, source=source, sink=sink)
+    with pytest.raises(InvalidValueError, match="dt"):
+        controller.dt = -1.0

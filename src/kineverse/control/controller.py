@@ -3,17 +3,15 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from time import perf_counter
+from typing import Any
 
 import numpy as np
 import numpy.typing as npt
 
-from kineverse.compile import compile  # noqa: A004
 from kineverse.errors import (
-    InfeasibleError,
     InvalidValueError,
-    NotFiniteError,
     ShapeError,
     UnknownNameError,
     suggest,
@@ -27,8 +25,9 @@ from kineverse.symbols import Symbol, parameter
 
 from .command import Command, StepTimes
 from .contact_slots import ContactSlots
+from .control_loop import LoopReport, run_control_loop
+from .diagnosis import Diagnosis
 from .formulation import Formulation
-from .infeasibility import Conflict, find_irreducible_conflict, find_least_violation
 from .quadratic_program import make_solver
 from .regularization import Costs, acceleration_limits, check_weight, find_posture, joint_weights
 from .targets import Target
@@ -37,6 +36,8 @@ from .velocity_program import VelocityProgram, arrange_inputs
 
 _DT = "control/dt"
 _CONTACT_GAIN = 10.0
+_FEASIBLE = 1e-6
+"""Largest violation of a row, in its unit per second, that counts as none where the solver failed."""
 
 
 class Controller:
@@ -117,11 +118,9 @@ class Controller:
     ) -> None:
         check_weight("smooth", smooth)
         check_weight("jerk", jerk)
-        if not (isinstance(dt, int | float) and 0 < dt < math.inf):
-            raise InvalidValueError(f"dt= is a positive time in seconds, not {dt!r}.")
+        _check_step(dt)
         self.model = model
-        self.dt = float(dt)
-        step = parameter(_DT, self.dt)
+        step = parameter(_DT, float(dt))
         stated, chosen = acceleration_limits(model, acceleration)
         self._formulation = formulation = Formulation(
             model, tasks, dt=step, still=still, accelerations=chosen
@@ -163,13 +162,25 @@ class Controller:
         self._parameters = {s: k for k, s in enumerate(self.inputs) if s.value is not None}
         self._settings = {s: float(s.value or 0.0) for s in self._parameters}
         self._values[len(self._coordinates) :] = list(self._settings.values())
-        self._evaluate.input[first] = self.dt
+        self._dt = self._evaluate.input[first : first + 1]
+        self._dt[:] = dt
         self._last = self._evaluate.input[first + 1 : first + 1 + n]
         self._before = self._evaluate.input[first + 1 + n :]
+        self._diagnosis = Diagnosis(model, formulation, self._program, self._evaluate, self._contacts)
         equalities = self._program.equalities
         self._row_names = tuple(
             tuple(name for name in names if name not in equalities) for names in self._program.names
         )
+
+    @property
+    def dt(self) -> float:
+        """Time between two steps [s]; it can be set without another compilation."""
+        return float(self._dt[0])
+
+    @dt.setter
+    def dt(self, value: float) -> None:
+        _check_step(value)
+        self._dt[:] = value
 
     @property
     def tier(self) -> str:
@@ -245,7 +256,7 @@ class Controller:
             ends = slice(first + rows.start, first + rows.stop)
             self._contacts.write(H, f, A[rows], lower[ends], upper[ends], self._costs.recovery)
         if not math.isfinite(check[()]):
-            raise self._not_finite()
+            raise self._diagnosis.not_finite()
         evaluated = perf_counter()
         found = self._solver.solve(H, f, A, lower, upper)
         if found.status != "solved" and self._relaxed is not self._solver:
@@ -253,7 +264,11 @@ class Controller:
         solved = perf_counter()
         times = StepTimes(read - start, evaluated - read, solved - evaluated, solved - start)
         if found.status != "solved":
-            raise self._infeasible(times)
+            least = self._diagnosis.least_violation()
+            command = self._command(least.x, np.zeros(len(lower)), 0, residuals, times)
+            if np.abs(least.violations).max() < _FEASIBLE:
+                return command  # the solver failed, not the problem
+            raise self._diagnosis.infeasible(command)
         return self._command(found.x, found.multipliers, found.iterations, residuals, times)
 
     def _command(
@@ -294,60 +309,40 @@ class Controller:
             )
         self._values[:] = vector
 
-    def _not_finite(self) -> NotFiniteError:
-        """Return the error that names the tasks and constraints with values that are not finite."""
-        values = self._evaluate.input
-        wrong = [str(s) for s, v in zip(self.inputs, values, strict=False) if not math.isfinite(v)]
-        if wrong:
-            return NotFiniteError(f"The state has no finite value for {', '.join(map(repr, wrong[:6]))}.")
-        parts = self._formulation.parts
-        symbols = self._program.function.inputs
-        found = compile(list(parts.values()), symbols, tier="interpreter")(values)
-        names = [name for name, part in zip(parts, found, strict=True) if not np.isfinite(part).all()]
-        where = ", ".join(map(repr, names[:6])) or "the sum of the terms, which is too large"
-        return NotFiniteError(
-            f"A value or derivative is not finite at this state, in {where}: the state is a singularity of "
-            "the expression, such as the end of a range where a speed becomes infinite. No command was made.",
-            names,
-        )
+    def run(
+        self,
+        *,
+        source: Callable[[], State | None],
+        sink: Callable[[dict[Symbol, float]], object],
+        rate: float | None = None,
+        **options: Any,
+    ) -> LoopReport:
+        """Run the controller at a fixed rate, and return a report; see :func:`.run_control_loop`.
 
-    def _infeasible(self, times: StepTimes) -> InfeasibleError:
-        """Return the error with an irreducible conflict and the least-violating command."""
-        _, _, A, lower, upper, residuals, _ = self._evaluate.outputs
-        n = len(self.speeds)
-        sides = find_irreducible_conflict(A, lower, upper)
-        grouped: dict[str, Conflict] = {}
-        for k, side in sides:
-            for name in self._names_of_row(k):
-                bounds = (lower[k], math.inf) if side < 0 else (-math.inf, upper[k])
-                if name in grouped:
-                    bounds = (max(bounds[0], grouped[name].lower), min(bounds[1], grouped[name].upper))
-                grouped[name] = Conflict(name, self._operations(name), *map(float, bounds))
-        hard = np.zeros(len(lower), dtype=bool)
-        hard[:n] = True
-        least = find_least_violation(A, lower, upper, hard)
-        command = self._command(least, np.zeros(len(lower)), 0, residuals, times)
-        listed = "; ".join(map(str, grouped.values()))
-        return InfeasibleError(
-            f"No command satisfies all hard rows. These contradict each other: {listed}. "
-            "error.command is the least-violating one.",
-            tuple(grouped.values()),
-            command,
-        )
-
-    def _names_of_row(self, index: int) -> tuple[str, ...]:
-        names = self._program.names
-        if index < len(names) or self._contacts is None:
-            return names[index]
-        pair = self._contacts.found[index - len(names)]
-        return (f"contact of {pair.a} and {pair.b}",)
-
-    def _operations(self, name: str) -> tuple[str, ...]:
-        history = getattr(self.model, "history", None)
-        return () if history is None else tuple(history.writers(f"constraints/{name}"))
+        Parameters
+        ----------
+        source
+            Returns the latest state, or None if there is no new one.
+        sink
+            Takes speeds by symbol, in every cycle.
+        rate
+            Cycles per second, by default ``1/dt``; another rate sets :attr:`dt`.
+        options
+            ``stale``, ``acceleration``, ``duration``, ``until``, ``on_error``, ``clock``, ``sleep``.
+        """
+        if rate is not None:
+            if not 0 < rate < math.inf:
+                raise InvalidValueError(f"rate= is a positive number of cycles per second, not {rate!r}.")
+            self.dt = 1 / rate
+        return run_control_loop(self, rate=1 / self.dt, source=source, sink=sink, **options)
 
     def __repr__(self) -> str:
         return (
             f"<Controller: {len(self.tasks)} tasks, {len(self.speeds)} speeds, "
             f"{self._program.rows} rows, dt {self.dt:g} s>"
         )
+
+
+def _check_step(dt: float) -> None:
+    if not (isinstance(dt, int | float) and 0 < dt < math.inf):
+        raise InvalidValueError(f"dt= is a positive time in seconds, not {dt!r}.")
