@@ -8,7 +8,7 @@ from scene_models import arm_among_boxes, body, brute_force, by_names, random_st
 
 import kineverse as kv
 from kineverse.geometry import Rule, Scene, bindings, collision_world, distance_queries
-from kineverse.model.body import Body, Box, Pose, Shape, Sphere
+from kineverse.model.body import Body, Box, Mesh, Pose, Shape, Sphere
 
 
 @pytest.fixture(scope="module")
@@ -92,6 +92,33 @@ def test_per_shape_returns_every_pair_of_shapes(either_search):
     np.testing.assert_allclose(each().distances, 0.08, atol=1e-8)
     np.testing.assert_allclose(sorted(each().points_b[:, 2]), [-0.3, 0.0, 0.3], atol=1e-8)
     assert "each pair of shapes" in repr(each)
+
+
+def test_the_nearest_pairs_of_shapes_are_those_of_the_bodies(model):
+    scene = Scene(model)
+    one, each = scene.watch(radius=0.4), scene.watch(radius=0.4, per_shape=True)
+    rng = np.random.default_rng(5)
+    for _ in range(20):
+        scene.update(random_state(model, rng))
+        nearest: dict[tuple[int, int], float] = {}
+        for pair, distance in zip(each().body_indices.tolist(), each().distances, strict=True):
+            nearest.setdefault(tuple(pair), distance)
+        found = one()
+        assert len(each()) >= len(found) == len(nearest)
+        assert nearest == {
+            tuple(p): d for p, d in zip(found.body_indices.tolist(), found.distances, strict=True)
+        }
+
+
+def test_watch_needs_the_files_of_its_own_bodies_only():
+    model = arm_among_boxes()
+    with model.edit() as edit:
+        edit.add_frame("statue", "world", np.eye(4), body(Mesh("/nowhere/statue.stl")))
+    scene = Scene(model)
+    scene.update(model.default_state())
+    assert len(scene.watch("hand", "box*", 5.0)()) == 8
+    with pytest.raises(kv.errors.KineverseError, match="statue"):
+        scene.watch("hand", radius=5.0)()
 
 
 def test_watch_follows_the_model():

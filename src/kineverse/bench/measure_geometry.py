@@ -39,6 +39,10 @@ _EXACT, _CURVED, _MARGINS = 1e-6, 1e-4, 3e-3
 _NEAR, _WHOLE = 0.06, " without rules, within .06 m"
 """Radius [m] of the query without rules, whose results are mostly pairs of the robot's own links."""
 
+_WATCHED = " without rules, within .05 m, what the arm's speeds move"
+_WATCH_RADIUS = 0.05
+"""Radius [m] of the query of a controller, about the pairs that it can move."""
+
 _CHECKED = 20
 
 
@@ -77,6 +81,9 @@ def measure(settings: BenchmarkSettings) -> BenchmarkResult:
             for boxes in sizes
         ]
         participants.contenders += [*_timed(arm, angles), *_timed(many, angles), *_timed(rooms, robot.values)]
+        moving = robot.model.speeds_of(robot.gripper)
+        watch = KineverseSearch(robot.whole_scene(), _WATCH_RADIUS, moving)
+        everything.append(SearchEntry(f"{robot.name}: {OURS}{_WATCHED}", watch, _CURVED))
         participants.contenders += _timed(everything, robot.values)
         measured = time_contenders("geometry", participants.contenders, settings.rounds, settings.progress)
     peers = (SEARCH, PAIRS, BULLET, COAL)
@@ -97,6 +104,7 @@ def measure(settings: BenchmarkSettings) -> BenchmarkResult:
             compare_speed(measured, room[OURS], room[SEARCH]),
             *(compare_speed(measured, room[OURS], room[peer], 1.0) for peer in (BULLET, COAL)),
             bound_median(measured[whole], 150e-6),
+            bound_median(measured[f"{robot.name}: {OURS}{_WATCHED}, {QUERY}"], 130e-6),
             compare_speed(measured, whole, room[OURS]),
             compare_speed(measured, whole, f"{robot.name}: {COAL}{_WHOLE}, {QUERY}", 1.0),
             _growth(measured, sizes),

@@ -216,6 +216,11 @@ class KitchenRobot:
     model: Model
     values: Array
 
+    @property
+    def gripper(self) -> str:
+        """Frame at the end of the robot's right arm."""
+        return f"robot/{GRIPPER}"
+
     def scene(self) -> Scene:
         """Return a scene that checks pairs of a robot's and a kitchen's body only."""
         return _make_scene(self.model)

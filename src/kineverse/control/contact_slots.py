@@ -117,8 +117,8 @@ class ContactSlots:
         groups = self._group[found.body_indices[:used]]
         twists = self._twists.outputs[0]
         n = twists.shape[2]
-        rows = _project(normals, found.points_b[:used], twists[groups[:, 1]])
-        rows -= _project(normals, found.points_a[:used], twists[groups[:, 0]])
+        rows = _project(normals, found.points_b[:used], twists.take(groups[:, 1], axis=0))
+        rows -= _project(normals, found.points_a[:used], twists.take(groups[:, 0], axis=0))
         gap = distances - self.margin
         A[:used, :n] = rows
         lower[:used] = -self.gain * np.maximum(gap, 0.0)

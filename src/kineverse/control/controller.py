@@ -37,6 +37,8 @@ from .velocity_program import VelocityProgram, arrange_inputs
 
 _DT = "control/dt"
 _CONTACT_GAIN = 10.0
+_FEASIBLE = 1e-6
+"""Largest violation of a row, in its unit per second, that counts as none where the solver failed."""
 
 
 class Controller:
@@ -253,7 +255,7 @@ class Controller:
         solved = perf_counter()
         times = StepTimes(read - start, evaluated - read, solved - evaluated, solved - start)
         if found.status != "solved":
-            raise self._infeasible(times)
+            return self._least_violating(times)
         return self._command(found.x, found.multipliers, found.iterations, residuals, times)
 
     def _command(
@@ -311,29 +313,68 @@ class Controller:
             names,
         )
 
-    def _infeasible(self, times: StepTimes) -> InfeasibleError:
-        """Return the error with an irreducible conflict and the least-violating command."""
+    def _least_violating(self, times: StepTimes) -> Command:
+        """Return the least-violating command if it violates nothing, else raise the conflict with it."""
         _, _, A, lower, upper, residuals, _ = self._evaluate.outputs
-        n = len(self.speeds)
-        sides = find_irreducible_conflict(A, lower, upper)
-        grouped: dict[str, Conflict] = {}
-        for k, side in sides:
-            for name in self._names_of_row(k):
-                bounds = (lower[k], math.inf) if side < 0 else (-math.inf, upper[k])
-                if name in grouped:
-                    bounds = (max(bounds[0], grouped[name].lower), min(bounds[1], grouped[name].upper))
-                grouped[name] = Conflict(name, self._operations(name), *map(float, bounds))
-        hard = np.zeros(len(lower), dtype=bool)
-        hard[:n] = True
-        least = find_least_violation(A, lower, upper, hard)
-        command = self._command(least, np.zeros(len(lower)), 0, residuals, times)
-        listed = "; ".join(map(str, grouped.values()))
-        return InfeasibleError(
-            f"No command satisfies all hard rows. These contradict each other: {listed}. "
-            "error.command is the least-violating one.",
-            tuple(grouped.values()),
+        simple = self._simple_rows()
+        n, width = len(self.speeds), A.shape[1]
+        # The model's limits of single speeds stay hard; keeps on single speeds become rows that may give way.
+        low, high, keeps = lower.copy(), upper.copy(), []
+        low[:n], high[:n] = -math.inf, math.inf
+        for name, k, below, above in simple:
+            if name in self._formulation.keeps:
+                keeps.append((np.eye(width)[k], below, above))
+            else:
+                low[k], high[k] = max(low[k], below), min(high[k], above)
+        hard = np.zeros(len(lower) + len(keeps), dtype=bool)
+        hard[:width] = True
+        least = find_least_violation(
+            np.vstack([A, *(row for row, _, _ in keeps)]),
+            np.append(low, [below for _, below, _ in keeps]),
+            np.append(high, [above for _, _, above in keeps]),
+            hard=hard,
+        )
+        command = self._command(least.x, np.zeros(len(lower)), 0, residuals, times)
+        if np.abs(least.violations).max() < _FEASIBLE:
+            return command  # the solver failed, not the problem
+        conflict = self._find_conflict(A, lower, upper, simple)
+        raise InfeasibleError(
+            f"No command satisfies all hard rows. These contradict each other: "
+            f"{'; '.join(map(_describe_conflict, conflict))}. error.command is the least-violating one.",
+            conflict,
             command,
         )
+
+    def _simple_rows(self) -> list[tuple[str, int, float, float]]:
+        """Return name, column, lower and upper bound of each constraint on a single speed at this state."""
+        rows = self._formulation.rows
+        column = {s: k for k, s in enumerate(self.speeds)}
+        ends = compile([rows.lower, rows.upper], self._program.function.inputs, tier="interpreter")
+        found = []
+        for row, low, high in zip(rows.rows, *ends(self._evaluate.input), strict=True):
+            if len(row.weights) == 1:
+                ((speed, weight),) = row.weights.items()
+                if not weight.symbols:
+                    below, above = sorted((low / float(weight), high / float(weight)))
+                    found.append((row.name, column[speed], float(below), float(above)))
+        return found
+
+    def _find_conflict(
+        self, A: Array, lower: Array, upper: Array, simple: list[tuple[str, int, float, float]]
+    ) -> tuple[Conflict, ...]:
+        """Return an irreducible set of contradictory constraints; rows of one name are one member."""
+        found: dict[str, tuple[float, float]] = {}
+        for k, side in find_irreducible_conflict(A, lower, upper):
+            if k < len(self.speeds):
+                # Bounds of several constraints are merged: those count that are as tight.
+                end = lower[k] if side < 0 else upper[k]
+                names = [name for name, c, *ends in simple if c == k and ends[(side + 1) // 2] == end]
+            else:
+                names = list(self._names_of_row(k))
+            for name in names:
+                low, high = found.get(name, (-math.inf, math.inf))
+                found[name] = (max(low, lower[k]), high) if side < 0 else (low, min(high, upper[k]))
+        return tuple(Conflict(name, self._operations(name), *map(float, e)) for name, e in found.items())
 
     def _names_of_row(self, index: int) -> tuple[str, ...]:
         names = self._program.names
@@ -351,3 +392,10 @@ class Controller:
             f"<Controller: {len(self.tasks)} tasks, {len(self.speeds)} speeds, "
             f"{self._program.rows} rows, dt {self.dt:g} s>"
         )
+
+
+def _describe_conflict(conflict: Conflict) -> str:
+    name, operations, lower, upper = conflict
+    low, high = ("" if math.isinf(e) else f"{e:g}" for e in (lower, upper))
+    ends = " <= ".join(part for part in (low, f"'{name}'", high) if part)
+    return ends + (f" (written by {', '.join(map(repr, operations))})" if operations else "")

@@ -32,7 +32,7 @@ from .prepared_query import (
 )
 from .results import DistanceResult, DistanceResults, NearestPoint, RayHit
 
-_MAX_QUERIES = 32
+_MAX_QUERIES, _MAX_PAIR_QUERIES = 32, 256
 
 
 class Scene:
@@ -238,6 +238,8 @@ class Scene:
 
     def _with_poses(self, a: str, b: str) -> tuple[DistanceResult, Floats, Floats]:
         if (a, b) not in self._pair_queries:
+            if len(self._pair_queries) >= _MAX_PAIR_QUERIES:
+                self._pair_queries.clear()
             self._pair_queries[a, b] = PreparedQuery(
                 self._world, lambda: flag_pair(self._world, a, b), math.inf
             )

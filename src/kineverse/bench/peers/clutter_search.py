@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import itertools
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable, Iterator, Sequence
 from typing import Any, Protocol, TypeAlias
 
 import numpy as np
@@ -12,6 +12,7 @@ from kineverse.bench.clutter import BOX_SIZE, CAPSULE_SIZE, CENTRE, LINK_LENGTH,
 from kineverse.geometry import Scene
 from kineverse.geometry.shapes import import_coal
 from kineverse.lie import Array
+from kineverse.symbols import Symbol
 
 PairDistances: TypeAlias = Iterator[tuple[str, str, float]]
 
@@ -30,10 +31,11 @@ class ProximitySearch(Protocol):
 
 
 class KineverseSearch:
-    """Search with Kineverse."""
+    """Search with Kineverse: all checked pairs, or those whose distance depends on some symbols."""
 
-    def __init__(self, scene: Scene, radius: float = RADIUS) -> None:
-        self.scene, self._radius = scene, radius
+    def __init__(self, scene: Scene, radius: float = RADIUS, moving: Sequence[Symbol] | None = None) -> None:
+        self.scene = scene
+        self._query = scene.watch(radius=radius, moving=moving)
         self.results: Any = ()
 
     def update(self, angles: Array) -> None:
@@ -42,7 +44,7 @@ class KineverseSearch:
 
     def query(self) -> object:
         """Search for pairs within the radius."""
-        self.results = self.scene.pairs_within(self._radius)
+        self.results = self._query()
         return self.results
 
     def distances(self) -> PairDistances:

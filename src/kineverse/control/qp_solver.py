@@ -1,0 +1,197 @@
+"""The interface of QP solvers.
+
+The problem is to minimise ``1/2 x'Hx + f'x`` subject to ``lower <= [x; A x] <= upper``. The first n entries
+of the bounds are those of x itself, the other m those of the rows of A. A bound may be infinite, and rows
+whose bounds are equal are equalities.
+"""
+
+from __future__ import annotations
+
+import importlib
+from abc import ABC, abstractmethod
+from types import ModuleType
+from typing import Literal, NamedTuple
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from kineverse._extras import install_command
+from kineverse.errors import InvalidValueError, MissingDependencyError, ShapeError
+
+Vector = NDArray[np.float64]
+Status = Literal["solved", "infeasible", "failed"]
+
+SOFT_WEIGHT = 1e6
+"""The default weight of the squared violation of a soft row."""
+
+
+class QpSolution(NamedTuple):
+    """The outcome of a quadratic program.
+
+    Attributes
+    ----------
+    x
+        The minimiser, of shape (n,); zeros unless solved.
+    multipliers
+        The multipliers of ``[x; A x]``, of shape (n + m,), with ``H x + f + [I; A]' multipliers = 0``:
+        negative at a lower bound, positive at an upper one; zeros unless solved.
+    iterations
+        The number of iterations.
+    status
+        "solved"; "infeasible" (no x satisfies all hard rows, or a lower bound is above its upper one);
+        "failed" (the data are not finite, H is not positive definite, or the solver did not converge).
+    """
+
+    x: Vector
+    multipliers: Vector
+    iterations: int
+    status: Status
+
+
+class QpSolver(ABC):
+    """A solver of quadratic programs of one size, started from its last solution.
+
+    Parameters
+    ----------
+    n
+        The number of unknowns, at least 1.
+    m
+        The number of rows of A, 0 or more.
+    soft
+        The soft entries of ``[x; A x]``: a mask of shape (n + m,), or None. A violation s of a soft entry
+        costs ``soft_linear s + 1/2 soft_weight s^2``.
+    soft_weight
+        The weight of the squared violation, above 0: a number or one per entry.
+    soft_linear
+        The weight of the violation itself, at least 0: a number or one per entry. Above the multiplier of
+        the row it makes the penalty exact: a row that can be satisfied is.
+
+    Raises
+    ------
+    InvalidValueError, ShapeError
+        For sizes, masks or weights outside of these.
+    """
+
+    def __init__(
+        self,
+        n: int,
+        m: int,
+        soft: ArrayLike | None = None,
+        soft_weight: ArrayLike = SOFT_WEIGHT,
+        soft_linear: ArrayLike = 0.0,
+    ) -> None:
+        if n < 1 or m < 0:
+            raise InvalidValueError(
+                f"A quadratic program has n >= 1 unknowns and m >= 0 rows, not {n} and {m}."
+            )
+        self.n, self.m = n, m
+        self.soft = np.zeros(n + m, bool) if soft is None else np.array(soft, bool)
+        if self.soft.shape != (n + m,):
+            raise ShapeError(
+                f"soft has the shape {self.soft.shape}, not ({n + m},): one entry per bound of [x; A x]."
+            )
+        self._weight = np.broadcast_to(np.asarray(soft_weight, float), n + m).copy()
+        self._linear = np.broadcast_to(np.asarray(soft_linear, float), n + m).copy()
+        if not (np.isfinite(self._weight) & (self._weight > 0)).all():
+            raise InvalidValueError("The weights of soft rows are finite and above 0.")
+        if not (np.isfinite(self._linear) & (self._linear >= 0)).all():
+            raise InvalidValueError("The linear weights of soft rows are finite and at least 0.")
+        self._bound: tuple[object, ...] = (None,) * 5
+        self._hard = None if not self.soft.any() else (~self.soft).astype(float)
+        self._values, self._violations = np.zeros(n + m), np.zeros(n + m)
+        self._x, self._rows = self._values[:n], self._values[n:]
+
+    def solve(self, H: Vector, f: Vector, A: Vector, lower: Vector, upper: Vector) -> QpSolution:
+        """Minimise ``1/2 x'Hx + f'x`` subject to ``lower <= [x; A x] <= upper``.
+
+        The arrays are read in place: rewrite the same ones for each solve, since other ones are checked anew.
+        The solution's arrays are its own.
+
+        Parameters
+        ----------
+        H
+            Positive definite and symmetric, of shape (n, n).
+        f
+            Of shape (n,).
+        A
+            Of shape (m, n).
+        lower, upper
+            Of shape (n + m,); infinite where there is no bound, equal for an equality.
+
+        Raises
+        ------
+        ShapeError, InvalidValueError
+            For arrays of another shape, or that are not C-contiguous doubles. Numbers raise nothing, see
+            :class:`QpSolution`.
+        """
+        h, g, a, low, high = self._bound
+        if H is not h or f is not g or A is not a or lower is not low or upper is not high:
+            self._bind(H, f, A, lower, upper)
+        return self._solve(H, f, A, lower, upper)
+
+    @abstractmethod
+    def reset(self) -> None:
+        """Forget the last solution, so that the next solve starts from scratch."""
+
+    @abstractmethod
+    def _solve(self, H: Vector, f: Vector, A: Vector, lower: Vector, upper: Vector) -> QpSolution:
+        """Solve a problem with arrays of the right shapes and any numbers."""
+
+    def _satisfies(self, x: Vector, A: Vector, lower: Vector, upper: Vector) -> bool:
+        """Return whether x satisfies the hard rows; any NaN, in the data or in x, makes that False."""
+        values, violations = self._values, self._violations
+        self._x[:] = x
+        A.dot(x, self._rows)
+        size = values.dot(values)
+        if not size < np.inf:
+            return False
+        np.maximum(values, lower, out=violations)
+        np.minimum(violations, upper, out=violations)
+        np.subtract(values, violations, out=violations)
+        if self._hard is not None:
+            # A NaN is a NaN also in a soft row.
+            np.multiply(violations, self._hard, out=violations)
+        return bool(violations.dot(violations) <= _FEASIBLE * (1.0 + size))
+
+    @staticmethod
+    def _unsolvable(H: Vector, f: Vector, A: Vector, lower: Vector, upper: Vector) -> Status | None:
+        """Return the status of a problem that no solver needs to see; None for any other."""
+        if not all(np.isfinite(array).all() for array in (H, f, A)):
+            return "failed"
+        if np.isnan(lower).any() or np.isnan(upper).any() or (H.diagonal() <= 0.0).any():
+            return "failed"
+        return None if (lower <= upper).all() else "infeasible"
+
+    def _nothing(self, status: Status, iterations: int = 0) -> QpSolution:
+        return QpSolution(np.zeros(self.n), np.zeros(self.n + self.m), iterations, status)
+
+    def _bind(self, H: Vector, f: Vector, A: Vector, lower: Vector, upper: Vector) -> None:
+        n, m = self.n, self.m
+        for name, array, shape in (
+            ("H", H, (n, n)),
+            ("f", f, (n,)),
+            ("A", A, (m, n)),
+            ("lower", lower, (n + m,)),
+            ("upper", upper, (n + m,)),
+        ):
+            if not isinstance(array, np.ndarray) or array.dtype != np.float64 or not array.flags.c_contiguous:
+                raise InvalidValueError(
+                    f"{name} is read in place, so it is a C-contiguous array of doubles: "
+                    f"numpy.ascontiguousarray({name}, float)."
+                )
+            if array.shape != shape:
+                raise ShapeError(f"{name} has the shape {array.shape}, not {shape} (n = {n}, m = {m}).")
+        self._bound = (H, f, A, lower, upper)
+
+
+def import_solver(name: str, extra: str) -> ModuleType:
+    """Import the library of a solver."""
+    try:
+        return importlib.import_module(name)
+    except ImportError as error:
+        raise MissingDependencyError(
+            f"This QP solver needs {name.partition('.')[0]}: {install_command(extra)}"
+        ) from error
+
+
+_FEASIBLE = 1e-8**2

@@ -1,0 +1,165 @@
+"""Conflicts of bounds and points of least violation, against SciPy's linear programs (HiGHS)."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from typing import Any
+
+import numpy as np
+import pytest
+from scipy.optimize import linprog
+
+from kineverse.control.infeasibility import ConflictingBound, find_irreducible_conflict, find_least_violation
+from kineverse.control.quadratic_program import make_solver
+from kineverse.errors import InvalidValueError, ShapeError
+
+System = tuple[Any, Any, Any]
+
+
+def feasible(A: Any, lower: Any, upper: Any) -> bool:
+    n = A.shape[1]
+    if (lower > upper).any():
+        return False
+    rows, right = np.concatenate([A, -A]), np.concatenate([upper[n:], -lower[n:]])
+    finite = np.isfinite(right)
+    bounds = np.stack([lower[:n], upper[:n]], axis=1)
+    return bool(linprog(np.zeros(n), rows[finite], right[finite], bounds=bounds).status == 0)
+
+
+def with_only(system: System, bounds: Iterable[ConflictingBound]) -> System:
+    A, lower, upper = system
+    low, high = np.full(len(lower), -np.inf), np.full(len(upper), np.inf)
+    for bound in bounds:
+        if bound.side < 0:
+            low[bound.row] = lower[bound.row]
+        else:
+            high[bound.row] = upper[bound.row]
+    return A, low, high
+
+
+def is_irreducible(system: System, conflict: tuple[ConflictingBound, ...]) -> bool:
+    without = [[other for other in conflict if other != bound] for bound in conflict]
+    return not feasible(*with_only(system, conflict)) and all(
+        feasible(*with_only(system, w)) for w in without
+    )
+
+
+def random_system(rng: np.random.Generator, n: int, m: int, density: float = 1.0) -> System:
+    """Return ranges around values of one point, of which 30 % are moved away."""
+    A, x = rng.normal(size=(m, n)) * (rng.random((m, n)) < density), rng.normal(size=n)
+    values = np.concatenate([x, A @ x]) + 1.5 * rng.normal(size=n + m) * (rng.random(n + m) < 0.3)
+    return A, values - rng.exponential(size=n + m), values + rng.exponential(size=n + m)
+
+
+@pytest.mark.parametrize(
+    ("n", "m", "density", "count"), [(3, 6, 1.0, 30), (8, 15, 0.3, 15), (60, 200, 0.2, 1)]
+)
+def test_no_member_of_a_conflict_can_be_left_out(n: int, m: int, density: float, count: int) -> None:
+    rng, found = np.random.default_rng(n), 0
+    for _ in range(count):
+        system = random_system(rng, n, m, density)
+        conflict = find_irreducible_conflict(*system)
+        assert bool(conflict) != feasible(*system)
+        if conflict:
+            found += 1
+            assert is_irreducible(system, conflict)
+            assert len(conflict) <= n + 1
+    assert found > count // 3
+
+
+def test_members_of_degenerate_conflicts_are_needed() -> None:
+    """Doubled rows, zero rows and equalities."""
+    rng = np.random.default_rng(1)
+    for _ in range(15):
+        A, lower, upper = random_system(rng, 5, 6, 0.5)
+        A, low, high = np.concatenate([A, A, np.zeros((2, 5)), -3.0 * A]), lower[5:], upper[5:]
+        lower, upper = (
+            np.concatenate([lower, low, [-1.0, 0.0], -3.0 * high]),
+            np.concatenate([upper, high, [1.0, 0.0], -3.0 * low]),
+        )
+        lower[5:8] = upper[5:8]
+        conflict = find_irreducible_conflict(A, lower, upper)
+        assert bool(conflict) != feasible(A, lower, upper)
+        assert not conflict or is_irreducible((A, lower, upper), conflict)
+
+
+def test_a_conflict_among_many_rows_is_found() -> None:
+    """``x + y >= 3`` with ``x, y <= 1``, beside 200 rows that nothing contradicts."""
+    rng = np.random.default_rng(2)
+    A, lower, upper = rng.normal(size=(200, 60)), np.full(260, -1e3), np.full(260, 1e3)
+    A[77], lower[60 + 77], upper[[4, 9]] = 0.0, 3.0, 1.0
+    A[77, [4, 9]] = 1.0
+    assert find_irreducible_conflict(A, lower, upper) == ((4, 1), (9, 1), (137, -1))
+
+
+def test_contradictory_bounds_and_zero_rows_are_conflicts_of_their_own() -> None:
+    A, lower, upper = np.zeros((1, 2)), np.array([-1.0, 1.0, -1.0]), np.array([1.0, 0.0, 1.0])
+    assert find_irreducible_conflict(A, lower, upper) == ((1, -1), (1, 1))
+    lower[1], lower[2] = 0.0, 0.5
+    assert find_irreducible_conflict(A, lower, upper) == ((2, -1),)
+    lower[2] = -0.5
+    assert find_irreducible_conflict(A, lower, upper) == ()
+    assert find_irreducible_conflict(np.zeros((0, 1)), [0.0], [np.inf]) == ()
+    assert find_irreducible_conflict(np.zeros((0, 1)), [2.0], [1.0]) == ((0, -1), (0, 1))
+
+
+def test_units_of_rows_do_not_matter() -> None:
+    """A row in micrometres conflicts as one in metres does."""
+    for scale in (1e-6, 1e-3, 1.0, 1e3, 1e6):
+        A = np.array([[1.0, 1.0], [scale, scale]])
+        conflict = find_irreducible_conflict(A, [-9, -9, 0.3, -np.inf], [9, 9, np.inf, -0.3 * scale])
+        assert conflict == ((2, -1), (3, 1))
+
+
+def test_the_least_violation_is_optimal() -> None:
+    """As another solver finds it, and 0 where the rows are feasible."""
+    pytest.importorskip("osqp")
+    rng = np.random.default_rng(3)
+    for index in range(5):
+        A, lower, upper = random_system(rng, 4, 9)
+        hard = np.arange(13) < 4
+        best = find_least_violation(A, lower, upper, hard=hard)
+        oracle = make_solver("osqp", 4, 9, soft=~hard, soft_weight=1e6)
+        x = oracle.solve(np.eye(4), np.zeros(4), A, lower, upper).x
+        values = np.concatenate([x, A @ x])
+        cost = np.sum(np.maximum(np.maximum(lower - values, values - upper), 0.0) ** 2)
+        assert best.hard_rows_hold
+        assert abs(best.violations[:4]).max() < 1e-7
+        assert np.sum(best.violations**2) == pytest.approx(cost, rel=1e-4, abs=1e-8)
+        assert (np.sum(best.violations**2) < 1e-8) == feasible(A, lower, upper), index
+
+
+def test_violations_have_signs_and_contradictory_bounds_share() -> None:
+    best = find_least_violation(np.ones((1, 1)), [1.0, -np.inf], [np.inf, 0.0])
+    np.testing.assert_allclose(best.x, [0.5], atol=1e-5)
+    np.testing.assert_allclose(best.violations, [-0.5, 0.5], atol=1e-5)
+    best = find_least_violation(np.ones((1, 1)), [1.0, -np.inf], [np.inf, 0.0], hard=[True, False])
+    np.testing.assert_allclose(best.violations, [0.0, 1.0], atol=1e-5)
+    best = find_least_violation(np.zeros((0, 1)), [2.0], [1.0])
+    np.testing.assert_allclose(best.x, [1.5], atol=1e-5)
+    np.testing.assert_allclose(abs(best.violations), [0.5], atol=1e-5)
+
+
+def test_hard_rows_that_contradict_each_other_are_told() -> None:
+    best = find_least_violation(
+        np.ones((2, 1)), [1.0, -np.inf, 7.0], [np.inf, 0.0, 7.0], hard=[True, True, False]
+    )
+    assert not best.hard_rows_hold
+    np.testing.assert_allclose(best.x, [0.5], atol=1e-2)
+
+
+def test_the_point_is_close_to_the_one_given() -> None:
+    best = find_least_violation(np.zeros((0, 2)), [1.0, -np.inf], [1.0, 3.0], near=[5.0, 2.0])
+    np.testing.assert_allclose(best.x, [1.0, 2.0], atol=1e-5)
+    np.testing.assert_allclose(find_least_violation(np.zeros((0, 1)), [-1.0], [1.0]).x, [0.0])
+
+
+def test_bad_input_is_told() -> None:
+    with pytest.raises(ShapeError, match="shape"):
+        find_irreducible_conflict(np.zeros((2, 2)), np.zeros(3), np.zeros(4))
+    with pytest.raises(InvalidValueError, match="NaN"):
+        find_irreducible_conflict(np.zeros((1, 1)), [0.0, np.nan], [1.0, 1.0])
+    with pytest.raises(ShapeError, match="hard"):
+        find_least_violation(np.zeros((0, 1)), [0.0], [1.0], hard=[True, False])
+    with pytest.raises(InvalidValueError, match="near"):
+        find_least_violation(np.zeros((0, 1)), [0.0], [1.0], near=[np.nan])
