@@ -150,7 +150,7 @@ def make_goal(
         target = kv.translation(*numbers[:3]) @ kv.rpy(*(numbers[3:] or (0.0, 0.0, 0.0)))
     free = arguments.position_only or (numbers is not None and len(numbers) == 3)
     error = same_position(target, hand) if free else same_pose(target, hand)
-    if not error.gradient():
+    if not error.gradient() or arguments.pose == [arguments.frame]:
         raise InvalidValueError(
             f"Nothing moves '{arguments.frame}' with respect to the target; its pose is constant."
         )
