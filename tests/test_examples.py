@@ -2,18 +2,27 @@
 
 from __future__ import annotations
 
+import ast
 import importlib.util
 import re
+import runpy
 import subprocess
 import sys
 from pathlib import Path
 
 import pytest
 
+import kineverse as kv
+from kineverse.bench.measure_examples import EXAMPLES
+from kineverse.formats.locate import locate_model
 from markdown_examples import ROOT, agree
 
 FOLDER = ROOT / "examples"
 SCRIPTS = sorted(FOLDER.glob("[0-9][0-9]_*.py"))
+PUBLISHED = [s for library in ("pink", "mink") for s in sorted((FOLDER / f"from_{library}").glob("*.py"))]
+LARGE = ("biped_cassie", "humanoid_g1_teleop")
+"""Examples that take seconds to build; ``kineverse bench examples`` runs them."""
+CONTROL = [script for script in PUBLISHED if script.stem not in LARGE]
 
 EXPECTED = {
     "01_load_and_view": "54 frames, 23 DoF, 46 constraints (version 1)\n...",
@@ -63,6 +72,47 @@ def test_an_example_runs_and_prints_its_result(script, tmp_path):
     assert picture is None or (tmp_path / picture).read_bytes().startswith(b"\x89PNG")
 
 
+@pytest.mark.parametrize("script", CONTROL, ids=lambda path: path.stem)
+def test_an_example_of_another_library_is_controlled(script):
+    _skip_without("daqp")
+    _skip_without_robots()
+    example = runpy.run_path(str(script))
+    if "controller" not in example:
+        solver, target, hand = (example[name] for name in ("solver", "target", "hand"))
+        assert solver.solve(target.values(hand(solver.model.default_state()))).solved
+        return
+    controller, time, state = (example[name] for name in ("controller", "time", "start"))
+    controller.set(time, 2.5)
+    errors = []
+    for _ in range(10):
+        command = controller.step(state)
+        errors.append(command.residuals[controller.tasks[0].name])
+        state = controller.model.integrate(state, command.speeds, controller.dt)
+    assert errors[-1] < 0.99 * errors[0]
+    assert not controller.model.violations(state)
+
+
+def test_an_example_of_another_library_runs_as_a_program(tmp_path):
+    _skip_without("daqp")
+    _skip_without_robots()
+    printed = _run(FOLDER / "from_pink" / "inverse_kinematics_ur10.py", folder=tmp_path)
+    assert agree("20 of 20 poses reached\nlargest error: ...", printed), printed
+
+
+@pytest.mark.parametrize("name", EXAMPLES)
+def test_an_example_is_not_longer_than_the_original(name):
+    (script,) = (script for script in PUBLISHED if script.stem == name)
+    lines = script.read_text(encoding="utf-8").splitlines()
+    skipped = {
+        line
+        for node in ast.parse("\n".join(lines)).body
+        if isinstance(node, ast.Import | ast.ImportFrom) or node.lineno == 1
+        for line in range(node.lineno, (node.end_lineno or 0) + 1)
+    }
+    code = [line for k, line in enumerate(lines, 1) if k not in skipped and line.strip()]
+    assert len([line for line in code if not line.strip().startswith("#")]) <= EXAMPLES[name].lines
+
+
 def test_the_living_kitchen_runs_as_a_program(tmp_path):
     words = ["--headless", "--seconds", "1", "--picture", "end.png"]
     printed = _run(FOLDER / "living_kitchen", *words, folder=tmp_path)
@@ -77,13 +127,25 @@ def test_examples_are_numbered_from_one_without_gaps():
 def test_the_list_of_examples_names_each_once():
     text = (FOLDER / "README.md").read_text(encoding="utf-8")
     listed = re.findall(r"^\| \[(\S+)\]\((\S+)\) \|", text, re.MULTILINE)
-    assert [name for name, _ in listed] == [*(script.name for script in SCRIPTS), "living_kitchen"]
+    published = [script.relative_to(FOLDER).as_posix() for script in PUBLISHED]
+    assert [name for name, _ in listed] == [
+        *(script.name for script in SCRIPTS),
+        "living_kitchen",
+        *published,
+    ]
     assert all(name == target for name, target in listed)
 
 
 def _skip_without(module: str | None) -> None:
     if module is not None and importlib.util.find_spec(module) is None:
         pytest.skip(f"there is no {module}")
+
+
+def _skip_without_robots() -> None:
+    try:
+        locate_model("ur_description/urdf/ur5_robot.urdf")
+    except kv.KineverseError:
+        pytest.skip("there is no example-robot-data")
 
 
 def _run(program: Path, *words: str, folder: Path) -> str:

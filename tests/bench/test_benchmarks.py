@@ -31,6 +31,7 @@ def test_a_benchmark_measures_all_installed_peers(name, tiny):
     if HAS_PEERS:
         # Pinocchio has no closed loops, no search for what is near, and no filters.
         others = {"loop": "casadi", "geometry": "mujoco", "tracking": "numpy,", "identification": "scipy"}
+        others |= {"control": "pink", "examples": "mink", "inverse_kinematics": "pink"}
         others["motion"] = "model.integrate"  # states beside vectors; nobody else has these constraints
         peer = others.get(name, "pinocchio")
         assert any(peer in n or "pin" in n.split() for n in names)
