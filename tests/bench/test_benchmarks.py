@@ -17,7 +17,10 @@ HAS_PEERS = all(importlib.util.find_spec(name) for name in ("pinocchio", "mujoco
 BATCH = pytest.param("batch", marks=pytest.mark.compiler)
 
 
-@pytest.mark.parametrize("name", [BATCH if name == "batch" else name for name in BENCHMARKS])
+# test_control_bench.py runs "control" without its long parts.
+@pytest.mark.parametrize(
+    "name", [BATCH if name == "batch" else name for name in BENCHMARKS if name != "control"]
+)
 def test_a_benchmark_measures_all_installed_peers(name, tiny):
     (result,) = run_benchmarks([name], tiny)
     assert result.name == name
@@ -31,7 +34,7 @@ def test_a_benchmark_measures_all_installed_peers(name, tiny):
     if HAS_PEERS:
         # Pinocchio has no closed loops, no search for what is near, and no filters.
         others = {"loop": "casadi", "geometry": "mujoco", "tracking": "numpy,", "identification": "scipy"}
-        others |= {"control": "pink", "examples": "mink", "inverse_kinematics": "pink"}
+        others |= {"examples": "mink", "inverse_kinematics": "pink"}
         others["motion"] = "model.integrate"  # states beside vectors; nobody else has these constraints
         peer = others.get(name, "pinocchio")
         assert any(peer in n or "pin" in n.split() for n in names)

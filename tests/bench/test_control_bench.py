@@ -9,9 +9,10 @@ import numpy as np
 import pytest
 
 import kineverse as kv
-from kineverse.bench import run_benchmarks
+from kineverse.bench import measure_control, run_benchmarks
 from kineverse.bench.control_workloads import WORKLOADS
 from kineverse.bench.controller_loop import ControllerLoop
+from kineverse.bench.harness import Contender
 from kineverse.bench.measure_examples import EXAMPLES, make_example_loop
 from kineverse.bench.opening import DOOR, OPENING, PERIOD, STEPS, make_opening, peer_workload
 from kineverse.bench.timed_loop import TimedLoop
@@ -107,6 +108,25 @@ def test_our_example_starts_with_the_error_of_the_original():
     assert len(timed.times) == 5
     assert timed.solver_alone() == []  # the first motion is not counted
     assert [c.name for c in timed.bounds(mean=1.0, worst=1.0)] == ["ours, mean", "ours, worst"]
+
+
+def test_control_is_measured_without_contacts_where_coal_is_missing(tiny, monkeypatch):
+    for library in ("pink", "mink"):
+        pytest.importorskip(library)
+
+    def refuse(opening):
+        raise kv.errors.MissingDependencyError("distances need coal")
+
+    monkeypatch.setattr(measure_control, "_near_the_kitchen", refuse)
+    monkeypatch.setattr(measure_control, "STEPS", 20)
+    builds = [Contender(name, lambda: 0.1) for name in (measure_control.BUILD, measure_control.READY)]
+    monkeypatch.setattr(measure_control, "_fresh_builds", lambda: builds)
+    (result,) = run_benchmarks(["control"], tiny)
+    assert result.missing == ("contact slots are left out: distances need coal",)
+    assert all(c.value is not None for c in result.comparisons)
+    errors = [m.median for m in result.measurements if m.name.endswith("mean error")]
+    assert len(errors) == 5
+    assert max(errors) < 1e-3
 
 
 def test_an_unknown_example_is_refused(tiny):

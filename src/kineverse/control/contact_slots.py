@@ -54,6 +54,8 @@ class ContactSlots:
         Symbols of :meth:`update`, in the order of its vector.
     found
         Near pairs of the last update, nearest first, all of them.
+    function
+        Compiled twists of the groups of bodies.
     """
 
     found: DistanceResults
@@ -74,7 +76,9 @@ class ContactSlots:
         self.scene, self.count = scene, count
         self.margin, self.gain = margin, gain
         motion = FrameDependence(model, speeds)
-        moved = [motion.moving_ancestors(body) for body in scene.bodies]
+        self._query = scene.watch(radius=radius, moving=speeds, rules=rules, per_shape=True)
+        watched = set(self._query.pairs.ravel().tolist())
+        moved = [motion.moving_ancestors(b) if k in watched else () for k, b in enumerate(scene.bodies)]
         groups = {group: k for k, group in enumerate(dict.fromkeys(((), *moved)))}
         self._group = np.array([groups[group] for group in moved], dtype=np.intp)
         members = dict(zip(moved, scene.bodies, strict=True))
@@ -83,12 +87,11 @@ class ContactSlots:
         twists += [twist(members[group]) for group in groups if group]
         stacked = array([e for twist in twists for e in twist.ravel()]).reshape(len(twists), 6, len(speeds))
         self.inputs = tuple(sorted({*scene.inputs, *stacked.symbols}, key=lambda s: s.sort_key))
-        self._function = compile([stacked])
-        self._twists = self._function.bind()
+        self.function = compile([stacked])
+        self._twists = self.function.bind()
         place = {s: k for k, s in enumerate(self.inputs)}
         self._scene_values = np.array([place[s] for s in scene.inputs], dtype=np.intp)
-        self._twist_values = np.array([place[s] for s in self._function.inputs], dtype=np.intp)
-        self._query = scene.watch(radius=radius, moving=speeds, rules=rules, per_shape=True)
+        self._twist_values = np.array([place[s] for s in self.function.inputs], dtype=np.intp)
 
     def update(self, values: Array) -> None:
         """Find the near pairs at the values of :attr:`inputs`."""
@@ -122,10 +125,11 @@ class ContactSlots:
         gap = distances - self.margin
         A[:used, :n] = rows
         lower[:used] = -self.gain * np.maximum(gap, 0.0)
-        for k in np.flatnonzero(gap < 0.0).tolist():
-            row = rows[k]
-            H[:n, :n] += RECOVERY_WEIGHT * np.outer(row, row)
-            f[:n] -= RECOVERY_WEIGHT * recovery * (INWARDS - gap[k]) * row
+        near = gap < 0.0
+        if near.any():
+            inside = rows[near]
+            H[:n, :n] += RECOVERY_WEIGHT * (inside.T @ inside)
+            f[:n] -= RECOVERY_WEIGHT * recovery * ((INWARDS - gap[near]) @ inside)
 
     @property
     def omitted(self) -> int:

@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
+from kineverse.compile import CompiledFunction
 from kineverse.errors import (
     InvalidValueError,
     ShapeError,
@@ -154,6 +155,9 @@ class Controller:
             self._relaxed = make_solver(
                 solver, self._program.columns, self._program.rows, soft=self._program.soft
             )
+        self._functions: list[CompiledFunction[Any]] = [self._program.function]
+        if self._contacts is not None:
+            self._functions.append(self._contacts.function)
         self._evaluate = self._program.function.bind()
         n, first = len(self.speeds), len(self._program.inputs)
         program_values = self._evaluate.input[:first]
@@ -184,12 +188,17 @@ class Controller:
 
     @property
     def tier(self) -> str:
-        """Present kind of evaluation: ``"interpreter"``, or ``"c"`` once that is compiled."""
-        return self._program.function.tier
+        """Present kind of evaluation: ``"interpreter"``, or ``"c"`` once everything is compiled."""
+        tiers = [function.tier for function in self._functions]
+        return "interpreter" if "interpreter" in tiers else tiers[0]
 
     def wait(self, timeout: float | None = None) -> bool:
-        """Wait until the program is compiled, at most for a time [s], and return whether it is."""
-        return self._program.function.wait(timeout)
+        """Wait until everything is compiled, at most for a time [s], and return whether it is."""
+        end = None if timeout is None else perf_counter() + timeout
+        return all(
+            function.wait(None if end is None else max(0.0, end - perf_counter()))
+            for function in self._functions
+        )
 
     def reset(self, speeds: StateLike | None = None) -> None:
         """Forget the last commands: the next step starts from given speeds, by default from rest."""
