@@ -70,6 +70,7 @@ def measure(settings: BenchmarkSettings) -> BenchmarkResult:
             *(alone for loop in own for alone in loop.solver_alone()),
             *(loop.p99() for loop in loops),
             *errors,
+            *(loop.slots_in_use(CONTACTS) for loop in close),
         ),
         comparisons=tuple(comparisons),
         missing=tuple(dict.fromkeys(missing)),

@@ -39,8 +39,11 @@ DOOR_GAIN, OPEN = 1.0, 1.5
 PERIOD, STEPS = 0.02, 250
 """Control period [s], and number of steps of an opening."""
 
-CONTACTS, MARGIN = 24, 0.005
-"""Number of contact slots, and the distance that pairs keep [m]."""
+CONTACTS, MARGIN, RADIUS = 24, 0.005, 0.15
+"""Number of contact slots, the distance that pairs keep and the one from which they count [m].
+
+Within this radius there are more pairs than slots, nearly all of the time.
+"""
 
 _STARTS, _SEEDS = 64, 20
 
@@ -71,7 +74,9 @@ class Opening:
 
     def controller(self, scene: Scene | None = None) -> Controller:
         """Return the controller, with contact slots if there is a scene."""
-        return Controller(self.model, self.tasks, dt=PERIOD, scene=scene, contacts=CONTACTS, margin=MARGIN)
+        return Controller(
+            self.model, self.tasks, dt=PERIOD, scene=scene, contacts=CONTACTS, margin=MARGIN, radius=RADIUS
+        )
 
     def find_start(self, controller: Controller, scene: Scene | None = None) -> State:
         """Return a state at the handle, by inverse kinematics, from which the controller opens the door.
@@ -109,7 +114,8 @@ def make_opening(robot: str) -> Opening:
     with model.edit() as edit:
         edit.include("kitchen", "kitchen")
         edit.add_frame(GRASP, "kitchen/fridge_door_handle", grasp)
-    held = Hold(same_pose(model.fk(GRASP), model.fk(GRIPPERS[robot])), name="grasp")
+    grasped = same_pose(model.fk(GRASP), model.fk(GRIPPERS[robot]))
+    held = Hold(grasped, name="grasp", gain=0.5 / PERIOD)  # as of the peers
     return Opening(robot, model, (held, Goal(model.symbol(DOOR), np.pi / 2, name="door", gain=DOOR_GAIN)))
 
 

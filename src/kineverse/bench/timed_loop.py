@@ -71,6 +71,18 @@ class TimedLoop:
             found.append(self.loop.error())
         return Measurement(f"{self.name}, mean error", "m, rad", (float(np.mean(found)),))
 
+    def slots_in_use(self, count: int) -> Measurement:
+        """Run the motion of our controller; return the mean number of contact slots in use."""
+        loop = self.loop
+        assert isinstance(loop, ControllerLoop)
+        loop.reset()
+        used = []
+        for _ in range(self.steps):
+            loop.step()
+            loop.advance()
+            used.append(min(len(loop.command.contacts), count))
+        return Measurement(f"{self.name}, in use", "slots", (float(np.mean(used)),))
+
     def p99(self) -> Measurement:
         """Return the 99th percentile of all steps."""
         return Measurement(f"{self.name}, p99", "s", (float(np.percentile(self.times, 99)),))
