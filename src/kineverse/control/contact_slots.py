@@ -120,8 +120,9 @@ class ContactSlots:
         groups = self._group[found.body_indices[:used]]
         twists = self._twists.outputs[0]
         n = twists.shape[2]
-        rows = _project(normals, found.points_b[:used], twists.take(groups[:, 1], axis=0))
-        rows -= _project(normals, found.points_a[:used], twists.take(groups[:, 0], axis=0))
+        points = np.concatenate([found.points_b[:used], found.points_a[:used]])
+        both = _project(np.concatenate([normals, -normals]), points, twists[groups.T[::-1].ravel()])
+        rows = both[:used] + both[used:]
         gap = distances - self.margin
         A[:used, :n] = rows
         lower[:used] = -self.gain * np.maximum(gap, 0.0)
