@@ -1,4 +1,4 @@
-"""A robot opens a fridge: inverse kinematics for the grasp, then a controller that holds it (extra ``control``).
+"""A robot opens a fridge: inverse kinematics for the grasp, then a controller holds it (extra ``control``).
 
 The page in the browser shows it; with ``--headless`` the picture open.png is written instead.
 ``python examples/19_open_a_door.py fetch`` lets another robot do it.
