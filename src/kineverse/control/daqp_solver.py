@@ -53,7 +53,13 @@ class DaqpSolver(QpSolver):
 
     def _solve_anew(self, H: Vector, f: Vector, A: Vector, lower: Vector, upper: Vector) -> QpSolution:
         first, x, multipliers, iterations = self._start(
-            H, f, A, lower, upper, np.ones(self.n + self.m), _SETTINGS
+            H,
+            f,
+            A,
+            lower,
+            upper,
+            np.ones(self.n + self.m),
+            _SETTINGS if self._hard is None else _SOFT_SETTINGS,
         )
         if first >= 1 and self._satisfies(x, A, lower, upper):
             self._warm = True
@@ -106,5 +112,7 @@ _INFINITY = 1e8
 """Bounds beyond are none in warm starts: far from all speeds and lengths, but near enough for doubles."""
 _INFEASIBLE = {-1, -6}
 _SETTINGS = {"primal_tol": 1e-9}
+_SOFT_SETTINGS = {"primal_tol": 1e-9, "sing_tol": 1e-13}
+"""Pivots of soft rows are as small as the reciprocals of their weights."""
 _SCALED_SETTINGS = ({"primal_tol": 1e-9, "sing_tol": 1e-13}, {"primal_tol": 1e-6, "sing_tol": 1e-13})
 """Rows that are nearly parallel are told apart; a larger tolerance prevents cycles."""
