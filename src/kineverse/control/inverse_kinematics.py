@@ -38,7 +38,9 @@ _PATIENCE = 5
 """Number of steps after which the errors have to be smaller."""
 _PROGRESS = 0.9**2
 _SETTLED, _SHORTEST = 1 - 1e-9, 1e-7
-_HALVINGS = 8
+_HALVINGS, _APPROACHES = 8, 8
+_COLLIDING = 1e9
+"""Smallest penalty of an overlap, beside weighted sums of squares."""
 _EXACT_WEIGHT = 1e4
 """Weight of equalities and violated constraints beside goals that are out of reach."""
 _DIFFERENT = 1e-3
@@ -187,6 +189,7 @@ class InverseKinematics:
         self._iterations = 0
         self._weights[:] = self._program.weights
         found: list[Array] = []
+        obstacles: Counter[str] = Counter()
         best, blocked = _End(home, math.inf), _End(home, math.inf)
         generator: np.random.Generator | None = None
         used = 0
@@ -205,10 +208,13 @@ class InverseKinematics:
             if not self._is_done():
                 continue
             if self._clearance is not None:
-                depth = self._clear()
-                if depth > 0.0:
-                    if depth < blocked.error:
-                        blocked = _End(self._x.copy(), depth)
+                self._clearance.measure(self._x)
+                pairs = self._clearance.near
+                left = self._clear()
+                if left > 0.0:
+                    obstacles.update(f"{pair.a} and {pair.b}" for pair in pairs[:1])
+                    if left < blocked.error:
+                        blocked = _End(self._x.copy(), left)
                     continue
             if all(np.abs(self._x - other).max() > _DIFFERENT for other in found):
                 found.append(self._x.copy())
@@ -220,10 +226,9 @@ class InverseKinematics:
         elif blocked.error < math.inf:
             self._x[:] = blocked.coordinates
         else:
-            self._x[:] = best.coordinates
-            self._approach()
+            self._approach(home, best.coordinates, generator or np.random.default_rng(seed))
             self._program.bring_back(self._x, home)
-        return self._result(state, home, found, used, begin)
+        return self._result(state, found, obstacles, used, begin)
 
     def batch(self, values: Iterable[StateLike], *, starts: int = 16, seed: int = 0) -> list[IkResult]:
         """Return the results of many targets, each as of :meth:`solve`.
@@ -239,7 +244,7 @@ class InverseKinematics:
         """Write the values of all inputs, and return the whole state."""
         state = self._home
         if values is not None:
-            state = State({**state, **self._given(values)})
+            state = state | State(self._given(values))
         try:
             vector = state.vector(self.inputs)
         except UnknownNameError as error:
@@ -332,16 +337,42 @@ class InverseKinematics:
                 return total
         return math.inf
 
-    def _approach(self) -> None:
-        """Continue to the best point, where equalities and constraints are satisfied if that is possible."""
-        for goals, exact in ((1.0, 1.0), (1.0, _EXACT_WEIGHT)):
-            self._weights[:] = np.where(self._exact, exact, goals)
-            self._minimize()
-        self._weights[:] = np.where(self._exact, 1.0, 0.0)
-        self._descend(_STEPS, _PROGRESS)
+    def _approach(self, home: Array, end: Array, generator: np.random.Generator) -> None:
+        """Search the best point: equalities and constraints first, then goals as far as these allow.
+
+        It starts at the given end of a search, at the given state and at random, until two points satisfy
+        the constraints. If none does, all of them have weights at the first start.
+        """
+        x, exact_only = self._x, np.where(self._exact, 1.0, 0.0)
+        best = _End(end, math.inf)
+        satisfied = 0
+        for k in range(_APPROACHES):
+            x[:] = end if k == 0 else home if k == 1 else self._program.draw(generator, home)
+            self._enter_limits()
+            self._weights[:] = exact_only
+            if self._descend(_STEPS, _PROGRESS) > 0.0:
+                continue
+            satisfied += 1
+            self._minimize_within()
+            if self._descend(_STEPS, _PROGRESS) == 0.0:
+                self._weights[:] = 1.0
+                total = self._try()
+                if total < best.error:
+                    best = _End(x.copy(), total)
+            if satisfied == 2:
+                break
+        x[:] = best.coordinates
+        if best.error == math.inf:
+            self._minimize_within()
+        self._weights[:] = 1.0
         if self._clearance is not None:
-            self._weights[:] = 1.0
             self._clear()
+
+    def _minimize_within(self) -> None:
+        """Minimize with large weights of equalities and violations; then leave the weights to these alone."""
+        self._weights[:] = np.where(self._exact, _EXACT_WEIGHT, 1.0)
+        self._minimize()
+        self._weights[:] = np.where(self._exact, 1.0, 0.0)
 
     def _minimize(self) -> None:
         """Take steps that reduce the weighted sum of squares, with as much damping as that needs.
@@ -376,36 +407,37 @@ class InverseKinematics:
         x[:] = best
 
     def _clear(self) -> float:
-        """Leave collisions while the tasks are kept; return what is missing to the margin at the end [m].
+        """Leave collisions while the tasks are kept; return 0 if that succeeds.
 
-        It returns infinity if the bodies are apart and a task is not done any more.
+        Else the weighted sum of squares if the bodies are apart, and more than that if they are not.
         """
-        clearance = self._clearance
+        clearance, x = self._clearance, self._x
         assert clearance is not None
         H, f, A, lower, upper, _, _, excess = self._evaluate.outputs
-        last = x = self._x
-        depth = math.inf
+        last = x.copy()
         for _ in range(_CLEARING_STEPS):
             self._iterations += 1
             if self._try() == math.inf:
-                self._x[:] = last
-                return depth
+                x[:] = last
+                break
             depth = clearance.measure(x)
-            if depth <= 0.0 and excess.item() <= 1.0:
+            if depth == 0.0 and excess.item() <= 1.0:
                 return 0.0
             step = clearance.find_step(H, f, A, lower, upper)
             if step is None:
                 break
-            last = x.copy()
+            last[:] = x
             x += step
             self._program.normalize(x)
-        depth = clearance.measure(x)
-        return depth if depth > 0.0 or not self._is_done() else 0.0
+        depth, total = clearance.measure(x), self._try()
+        if depth == 0.0:
+            return 0.0 if excess.item() <= 1.0 else total
+        return _COLLIDING + depth
 
     # -- results -------------------------------------------------------------------------------------------
 
     def _result(
-        self, state: State, home: Array, found: Sequence[Array], starts: int, begin: float
+        self, state: State, found: Sequence[Array], obstacles: Counter[str], starts: int, begin: float
     ) -> IkResult:
         """Return the result at the present coordinates."""
         residuals = self._residuals()
@@ -427,13 +459,11 @@ class InverseKinematics:
             starts,
             self._iterations,
             perf_counter() - begin,
-            partial(self._explain, best, bool(found), residuals, active, contacts, starts),
+            partial(self._explain, best, bool(found), residuals, active, obstacles, starts),
         )
 
     def _state(self, state: State, x: Array) -> State:
-        return State(
-            {**state, **dict(zip(self.coordinates, x.tolist(), strict=True))}, source="inverse kinematics"
-        )
+        return state | State(dict(zip(self.coordinates, x.tolist(), strict=True)))
 
     def _residuals(self) -> dict[str, float]:
         """Return the norm of the errors of each task and equality, and the violations of keeps."""
@@ -462,7 +492,7 @@ class InverseKinematics:
         solved: bool,
         residuals: Mapping[str, float],
         active: Sequence[str],
-        contacts: Sequence[DistanceResult],
+        obstacles: Counter[str],
         starts: int,
     ) -> str:
         """Return the text of :attr:`.IkResult.why`."""
@@ -480,32 +510,23 @@ class InverseKinematics:
         off += [name for name in self._program.keeps if residuals[name] > TOLERANCE]
         tried = f"in {starts} starts" if starts > 1 else "from the given state"
         lines = []
-        if contacts:
-            pairs = "; ".join(
-                f"{pair.a} and {pair.b} "
-                + (
-                    f"overlap by {-pair.distance:.3g} m"
-                    if pair.distance < 0
-                    else f"are {pair.distance:.3g} m apart"
-                )
-                for pair in contacts[:3]
-            )
-            free = "All tasks are done only in collision" if not off else "At the best point bodies collide"
-            lines.append(f"{free}: {pairs}.")
+        if obstacles:
+            pairs = "; ".join(f"{pair} ({count} times)" for pair, count in obstacles.most_common(3))
+            lines.append(f"Without collisions there are solutions. These bodies are in the way: {pairs}.")
         if off:
             listed = ", ".join(f"'{name}' is off by {residuals[name]:.3g}" for name in off)
             lines.append(f"No solution was found {tried}. At the best point {listed}.")
         alone: list[str] = []
         if len(off) > 1:
             alone = [name for name in off if name in self._rows and self._is_reachable(name, best)]
-            if len(alone) == len(off):
+            if len(alone) == len(off) and not obstacles:
                 lines.append("Each of these can be done alone, so they contradict each other.")
             elif len(alone) < len(off):
                 rest = ", ".join(f"'{name}'" for name in off if name not in alone)
                 lines.append(f"Not even alone can {rest} be done.")
         if active:
             lines.append(f"These limits and constraints stop it: {', '.join(active[:8])}.")
-        elif off and len(alone) < 2:
+        elif off and len(alone) < 2 and not obstacles:
             lines.append(
                 "No limit stops it: no small motion reduces the errors. The target is out of reach, or more "
                 "starts are needed."
