@@ -91,6 +91,9 @@ except kv.errors.UnknownNameError as error:
     base: kv.KineverseError = error
 scene: kv.geometry.Scene
 tracker: kv.estimation.Tracker
+goal = kv.control.Goal(a, 0.5, weight=2.0)
+controller = kv.control.Controller(model, [goal, kv.control.Keep(0, 2 * a, 1)], dt=0.02)
+assert_type(controller.step(home).residuals["goal a"], float)
 found: kv.reasoning.Interlocks
 shower = kv.show
 version: str = kv.__version__

@@ -3,17 +3,15 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from time import perf_counter
+from typing import Any
 
 import numpy as np
 import numpy.typing as npt
 
-from kineverse.compile import compile  # noqa: A004
 from kineverse.errors import (
-    InfeasibleError,
     InvalidValueError,
-    NotFiniteError,
     ShapeError,
     UnknownNameError,
     suggest,
@@ -27,8 +25,9 @@ from kineverse.symbols import Symbol, parameter
 
 from .command import Command, StepTimes
 from .contact_slots import ContactSlots
+from .control_loop import LoopReport, run_control_loop
+from .diagnosis import Diagnosis
 from .formulation import Formulation
-from .infeasibility import Conflict, find_irreducible_conflict, find_least_violation
 from .quadratic_program import make_solver
 from .regularization import Costs, acceleration_limits, check_weight, find_posture, joint_weights
 from .targets import Target
@@ -119,11 +118,9 @@ class Controller:
     ) -> None:
         check_weight("smooth", smooth)
         check_weight("jerk", jerk)
-        if not (isinstance(dt, int | float) and 0 < dt < math.inf):
-            raise InvalidValueError(f"dt= is a positive time in seconds, not {dt!r}.")
+        _check_step(dt)
         self.model = model
-        self.dt = float(dt)
-        step = parameter(_DT, self.dt)
+        step = parameter(_DT, float(dt))
         stated, chosen = acceleration_limits(model, acceleration)
         self._formulation = formulation = Formulation(
             model, tasks, dt=step, still=still, accelerations=chosen
@@ -165,13 +162,25 @@ class Controller:
         self._parameters = {s: k for k, s in enumerate(self.inputs) if s.value is not None}
         self._settings = {s: float(s.value or 0.0) for s in self._parameters}
         self._values[len(self._coordinates) :] = list(self._settings.values())
-        self._evaluate.input[first] = self.dt
+        self._dt = self._evaluate.input[first : first + 1]
+        self._dt[:] = dt
         self._last = self._evaluate.input[first + 1 : first + 1 + n]
         self._before = self._evaluate.input[first + 1 + n :]
+        self._diagnosis = Diagnosis(model, formulation, self._program, self._evaluate, self._contacts)
         equalities = self._program.equalities
         self._row_names = tuple(
             tuple(name for name in names if name not in equalities) for names in self._program.names
         )
+
+    @property
+    def dt(self) -> float:
+        """Time between two steps [s]; it can be set without another compilation."""
+        return float(self._dt[0])
+
+    @dt.setter
+    def dt(self, value: float) -> None:
+        _check_step(value)
+        self._dt[:] = value
 
     @property
     def tier(self) -> str:
@@ -247,7 +256,7 @@ class Controller:
             ends = slice(first + rows.start, first + rows.stop)
             self._contacts.write(H, f, A[rows], lower[ends], upper[ends], self._costs.recovery)
         if not math.isfinite(check[()]):
-            raise self._not_finite()
+            raise self._diagnosis.not_finite()
         evaluated = perf_counter()
         found = self._solver.solve(H, f, A, lower, upper)
         if found.status != "solved" and self._relaxed is not self._solver:
@@ -255,7 +264,11 @@ class Controller:
         solved = perf_counter()
         times = StepTimes(read - start, evaluated - read, solved - evaluated, solved - start)
         if found.status != "solved":
-            return self._least_violating(times)
+            least = self._diagnosis.least_violation()
+            command = self._command(least.x, np.zeros(len(lower)), 0, residuals, times)
+            if np.abs(least.violations).max() < _FEASIBLE:
+                return command  # the solver failed, not the problem
+            raise self._diagnosis.infeasible(command)
         return self._command(found.x, found.multipliers, found.iterations, residuals, times)
 
     def _command(
@@ -296,96 +309,32 @@ class Controller:
             )
         self._values[:] = vector
 
-    def _not_finite(self) -> NotFiniteError:
-        """Return the error that names the tasks and constraints with values that are not finite."""
-        values = self._evaluate.input
-        wrong = [str(s) for s, v in zip(self.inputs, values, strict=False) if not math.isfinite(v)]
-        if wrong:
-            return NotFiniteError(f"The state has no finite value for {', '.join(map(repr, wrong[:6]))}.")
-        parts = self._formulation.parts
-        symbols = self._program.function.inputs
-        found = compile(list(parts.values()), symbols, tier="interpreter")(values)
-        names = [name for name, part in zip(parts, found, strict=True) if not np.isfinite(part).all()]
-        where = ", ".join(map(repr, names[:6])) or "the sum of the terms, which is too large"
-        return NotFiniteError(
-            f"A value or derivative is not finite at this state, in {where}: the state is a singularity of "
-            "the expression, such as the end of a range where a speed becomes infinite. No command was made.",
-            names,
-        )
+    def run(
+        self,
+        *,
+        source: Callable[[], State | None],
+        sink: Callable[[dict[Symbol, float]], object],
+        rate: float | None = None,
+        **options: Any,
+    ) -> LoopReport:
+        """Run the controller at a fixed rate, and return a report; see :func:`.run_control_loop`.
 
-    def _least_violating(self, times: StepTimes) -> Command:
-        """Return the least-violating command if it violates nothing, else raise the conflict with it."""
-        _, _, A, lower, upper, residuals, _ = self._evaluate.outputs
-        simple = self._simple_rows()
-        n, width = len(self.speeds), A.shape[1]
-        # The model's limits of single speeds stay hard; keeps on single speeds become rows that may give way.
-        low, high, keeps = lower.copy(), upper.copy(), []
-        low[:n], high[:n] = -math.inf, math.inf
-        for name, k, below, above in simple:
-            if name in self._formulation.keeps:
-                keeps.append((np.eye(width)[k], below, above))
-            else:
-                low[k], high[k] = max(low[k], below), min(high[k], above)
-        hard = np.zeros(len(lower) + len(keeps), dtype=bool)
-        hard[:width] = True
-        least = find_least_violation(
-            np.vstack([A, *(row for row, _, _ in keeps)]),
-            np.append(low, [below for _, below, _ in keeps]),
-            np.append(high, [above for _, _, above in keeps]),
-            hard=hard,
-        )
-        command = self._command(least.x, np.zeros(len(lower)), 0, residuals, times)
-        if np.abs(least.violations).max() < _FEASIBLE:
-            return command  # the solver failed, not the problem
-        conflict = self._find_conflict(A, lower, upper, simple)
-        raise InfeasibleError(
-            f"No command satisfies all hard rows. These contradict each other: "
-            f"{'; '.join(map(_describe_conflict, conflict))}. error.command is the least-violating one.",
-            conflict,
-            command,
-        )
-
-    def _simple_rows(self) -> list[tuple[str, int, float, float]]:
-        """Return name, column, lower and upper bound of each constraint on a single speed at this state."""
-        rows = self._formulation.rows
-        column = {s: k for k, s in enumerate(self.speeds)}
-        ends = compile([rows.lower, rows.upper], self._program.function.inputs, tier="interpreter")
-        found = []
-        for row, low, high in zip(rows.rows, *ends(self._evaluate.input), strict=True):
-            if len(row.weights) == 1:
-                ((speed, weight),) = row.weights.items()
-                if not weight.symbols:
-                    below, above = sorted((low / float(weight), high / float(weight)))
-                    found.append((row.name, column[speed], float(below), float(above)))
-        return found
-
-    def _find_conflict(
-        self, A: Array, lower: Array, upper: Array, simple: list[tuple[str, int, float, float]]
-    ) -> tuple[Conflict, ...]:
-        """Return an irreducible set of contradictory constraints; rows of one name are one member."""
-        found: dict[str, tuple[float, float]] = {}
-        for k, side in find_irreducible_conflict(A, lower, upper):
-            if k < len(self.speeds):
-                # Bounds of several constraints are merged: those count that are as tight.
-                end = lower[k] if side < 0 else upper[k]
-                names = [name for name, c, *ends in simple if c == k and ends[(side + 1) // 2] == end]
-            else:
-                names = list(self._names_of_row(k))
-            for name in names:
-                low, high = found.get(name, (-math.inf, math.inf))
-                found[name] = (max(low, lower[k]), high) if side < 0 else (low, min(high, upper[k]))
-        return tuple(Conflict(name, self._operations(name), *map(float, e)) for name, e in found.items())
-
-    def _names_of_row(self, index: int) -> tuple[str, ...]:
-        names = self._program.names
-        if index < len(names) or self._contacts is None:
-            return names[index]
-        pair = self._contacts.found[index - len(names)]
-        return (f"contact of {pair.a} and {pair.b}",)
-
-    def _operations(self, name: str) -> tuple[str, ...]:
-        history = getattr(self.model, "history", None)
-        return () if history is None else tuple(history.writers(f"constraints/{name}"))
+        Parameters
+        ----------
+        source
+            Returns the latest state, or None if there is no new one.
+        sink
+            Takes speeds by symbol, in every cycle.
+        rate
+            Cycles per second, by default ``1/dt``; another rate sets :attr:`dt`.
+        options
+            ``stale``, ``acceleration``, ``duration``, ``until``, ``on_error``, ``clock``, ``sleep``.
+        """
+        if rate is not None:
+            if not 0 < rate < math.inf:
+                raise InvalidValueError(f"rate= is a positive number of cycles per second, not {rate!r}.")
+            self.dt = 1 / rate
+        return run_control_loop(self, rate=1 / self.dt, source=source, sink=sink, **options)
 
     def __repr__(self) -> str:
         return (
@@ -394,8 +343,6 @@ class Controller:
         )
 
 
-def _describe_conflict(conflict: Conflict) -> str:
-    name, operations, lower, upper = conflict
-    low, high = ("" if math.isinf(e) else f"{e:g}" for e in (lower, upper))
-    ends = " <= ".join(part for part in (low, f"'{name}'", high) if part)
-    return ends + (f" (written by {', '.join(map(repr, operations))})" if operations else "")
+def _check_step(dt: float) -> None:
+    if not (isinstance(dt, int | float) and 0 < dt < math.inf):
+        raise InvalidValueError(f"dt= is a positive time in seconds, not {dt!r}.")

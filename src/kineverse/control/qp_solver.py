@@ -160,7 +160,8 @@ class QpSolver(ABC):
             return "failed"
         if np.isnan(lower).any() or np.isnan(upper).any() or (H.diagonal() <= 0.0).any():
             return "failed"
-        return None if (lower <= upper).all() else "infeasible"
+        ordered = (lower <= upper) & (lower < np.inf) & (upper > -np.inf)
+        return None if ordered.all() else "infeasible"
 
     def _nothing(self, status: Status, iterations: int = 0) -> QpSolution:
         return QpSolution(np.zeros(self.n), np.zeros(self.n + self.m), iterations, status)
