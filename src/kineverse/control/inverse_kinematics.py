@@ -54,7 +54,8 @@ class InverseKinematics:
         Goals, holds and keeps. Their targets may contain parameters, whose values come with each target.
     scene
         Collision scene of the model; None to ignore collisions. Only pairs that the tasks move relatively
-        to each other count, without those that its rules except and those that always overlap.
+        to each other count, without those that its rules except and those that always overlap. The scene
+        stays at the last configuration that was tried.
     still
         Coordinates that stay still, as symbols or names; a name of an articulation stands for its
         coordinates.
