@@ -9,7 +9,7 @@ import pytest
 from control_models import DT, follow, planar_arm
 
 import kineverse as kv
-from kineverse.control import Controller, Goal, Hold, Keep
+from kineverse.control import Controller, Goal, Hold, Keep, Target, same_pose
 from kineverse.errors import InfeasibleError, InvalidValueError, ShapeError
 from kineverse.geometry import Scene
 from kineverse.model.body import Body, Box, Pose, Shape, Sphere
@@ -249,3 +249,36 @@ def test_numbers_without_sense_are_refused(options: dict, message: str) -> None:
     model = ball_and_wall()
     with pytest.raises(InvalidValueError, match=message):
         Controller(model, [Goal(model.symbol("x"), 2.0)], dt=DT, scene=Scene(model), **options)
+
+
+def test_bodies_are_seen_in_time_at_long_steps() -> None:
+    """1 m/s in steps of 0.25 s: further than the 5 cm from which pairs count at short steps."""
+    model = ball_and_wall()
+    x = model.symbol("x")
+    controller = Controller(model, [Goal(x, 2.0, gain=20.0)], dt=0.02, scene=Scene(model))
+    controller.dt = 0.25
+    state, _ = follow(controller, model.default_state(), 4.0)
+    assert state[x] <= 0.8 - 0.005 + 1e-6
+
+
+def test_posture_does_not_keep_a_goal_from_being_reached() -> None:
+    model = kv.load("fetch")
+    pose = model.fk("fetch/gripper_link")
+    goal = Target("goal", np.eye(4))
+    controller = Controller(
+        model,
+        [Goal(same_pose(pose, goal.expression), name="reach")],
+        dt=DT,
+        still=["fetch/l_wheel_joint", "fetch/r_wheel_joint", "fetch/torso_lift_joint"],
+    )
+    joints = [s.position for s in controller.speeds]
+    limits = [np.clip(model.limits(s), -2.5, 2.5) for s in joints]
+    for seed in (0, 8, 11):
+        generator = np.random.default_rng(seed)
+        ends = [np.array([0.9 * generator.uniform(*each) for each in limits]) for _ in range(2)]
+        wanted = pose(model.default_state().updated(dict(zip(joints, ends[0], strict=True))))
+        controller.set(goal, wanted)
+        start = dict(zip(joints, 0.7 * ends[0] + 0.3 * ends[1], strict=True))
+        controller.reset()
+        _, commands = follow(controller, model.default_state().updated(start), 12.0)
+        assert commands[-1].residuals["reach"] < 1e-3

@@ -56,8 +56,8 @@ class ContactSlots:
         Symbols of :meth:`update`, in the order of its vector.
     found
         Near pairs of the last update, nearest first, all of them.
-    gain
-        Rate γ at which a distance may shrink to the margin [1/s]; it can be changed.
+    gain, radius
+        The parameters of these names, which can be changed.
 
     Raises
     ------
@@ -91,7 +91,7 @@ class ContactSlots:
         model = scene.model
         self._version = model.version
         self.scene, self.count = scene, count
-        self.margin, self.gain = margin, gain
+        self.margin, self.radius, self.gain = margin, radius, gain
         motion = FrameDependence(model, speeds)
         moved = [motion.moving_ancestors(body) for body in scene.bodies]
         groups = {group: k for k, group in enumerate(dict.fromkeys(((), *moved)))}
@@ -123,7 +123,7 @@ class ContactSlots:
                 "Build anew, or with a scene of model.snapshot()."
             )
         self.scene.update(values[self._scene_values])
-        self.found = self._query()
+        self.found = self._query(self.radius)
         self._twists.input[:] = values[self._twist_values]
         self._twists()
 

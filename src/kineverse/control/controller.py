@@ -36,6 +36,8 @@ from .velocity_program import RECOVERY_WEIGHT, VelocityProgram, arrange_inputs
 
 _DT = "control/dt"
 _CONTACT_GAIN = 10.0
+_APPROACH = 2.5
+"""Relative speed of bodies up to which default radii are large enough [m/s]."""
 _FEASIBLE = 1e-6
 """Largest violation of a row, in its unit per second, that counts as none where the solver failed."""
 
@@ -76,7 +78,8 @@ class Controller:
     contacts
         Number of contact slots: rows for the nearest pairs whose distance the speeds change.
     margin, radius
-        Distance that pairs keep, and distance from which they count [m].
+        Distance that pairs keep, and distance from which they count [m]; the latter by default 0.05 m, or how
+        far 2.5 m/s lead in a step if that is more. Bodies that approach faster need a larger one.
     solver
         ``"daqp"``, ``"proxsuite"`` or ``"osqp"``.
 
@@ -114,7 +117,7 @@ class Controller:
         scene: Scene | None = None,
         contacts: int = 24,
         margin: float = 0.005,
-        radius: float = 0.05,
+        radius: float | None = None,
         solver: str = "daqp",
     ) -> None:
         check_weight("smooth", smooth)
@@ -141,9 +144,15 @@ class Controller:
         )
         self.inputs = self._program.inputs
         self._contacts: ContactSlots | None = None
+        self._default_radius = radius is None
         if scene is not None and contacts:
             self._contacts = ContactSlots(
-                scene, self.speeds, contacts, margin=margin, radius=radius, gain=_contact_gain(dt)
+                scene,
+                self.speeds,
+                contacts,
+                margin=margin,
+                radius=_contact_radius(dt) if radius is None else radius,
+                gain=_contact_gain(dt),
             )
             self.inputs = arrange_inputs({*self.inputs, *self._contacts.inputs})
             place = {s: k for k, s in enumerate(self.inputs)}
@@ -184,6 +193,8 @@ class Controller:
         self._dt[:] = value
         if self._contacts is not None:
             self._contacts.gain = _contact_gain(value)
+            if self._default_radius:
+                self._contacts.radius = _contact_radius(value)
 
     @property
     def tier(self) -> str:
@@ -366,6 +377,10 @@ class Controller:
             f"<Controller: {len(self.tasks)} tasks, {len(self.speeds)} speeds, "
             f"{self._program.rows} rows, dt {self.dt:g} s>"
         )
+
+
+def _contact_radius(dt: float) -> float:
+    return max(0.05, _APPROACH * dt)
 
 
 def _contact_gain(dt: float) -> float:

@@ -93,7 +93,7 @@ def joint_weights(
     goals = scales[: len(formulation.goals)]
     levers = np.sqrt(np.maximum(goals, np.finfo(float).tiny))
     longer = np.maximum(levers[:, :, None], levers[:, None, :])
-    curvatures = goals * ((goals > 0)[:, None, :] / longer).sum(axis=2)
+    curvatures = 0.75 * goals * ((goals > 0)[:, None, :] / longer).sum(axis=2)
     return JointWeights(
         tuple(float(scale) * factors[s] for s, scale in zip(speeds, together, strict=True)),
         tuple(
