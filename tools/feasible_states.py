@@ -81,13 +81,14 @@ def main() -> int:
                 except kv.errors.InfeasibleError as error:
                     infeasible += 1
                     print(error, file=sys.stderr)
-            worst, count = 0.0, 0
+            before, worst, count = 0.0, 0.0, 0
             if "hold" not in name:  # from far outside a hold is a contradictory task
                 integrator, checker = model.integrator(controller.speeds), model.constraint_checker()
                 place = [model.symbols.index(s) for s in controller.inputs]
                 for _ in range(given.recoveries // (3 * len(HANDS))):
                     q = random_state(model, symbols, generator, recoverable=True).vector(model.symbols)
                     controller.reset()
+                    before = max(before, checker(q))
                     for _ in range(round(SECONDS / DT)):
                         command = controller.step(q[place])
                         q = integrator(q, list(command.speeds.values()), DT)
@@ -95,7 +96,7 @@ def main() -> int:
             failed += infeasible + (worst > 1e-6)
             print(
                 f"{robot:6} {name:18} infeasible {infeasible} of {given.states // sets}; largest violation "
-                f"after {SECONDS:g} s {worst:.1e} in {count}; {time.time() - start:.0f} s"
+                f"{before:.2f}, after {SECONDS:g} s {worst:.1e} in {count}; {time.time() - start:.0f} s"
             )
     return int(failed > 0)
 

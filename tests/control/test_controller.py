@@ -20,6 +20,7 @@ from kineverse.errors import (
     ShapeError,
     UnknownNameError,
 )
+from kineverse.model.body import Body, Inertia
 
 
 def test_goal_decays_at_its_gain() -> None:
@@ -435,3 +436,57 @@ def test_run_takes_states_and_gives_commands_until_a_condition() -> None:
         controller.run(rate=0, source=source, sink=sink)
     with pytest.raises(InvalidValueError, match="dt"):
         controller.dt = -1.0
+
+
+def test_floating_base_reaches_a_pose() -> None:
+    model = kv.Model()
+    with model.edit() as edit:
+        edit.apply(kv.Floating(name="body", parent="world", child="body"))
+    target = kv.translation(0.5, -0.2, 0.3)() @ kv.axis_angle([1, 2, 3], 2.0)()
+    goal = Goal(same_pose(model.fk("body"), target), gain=3.0, name="pose")
+    controller = Controller(model, [goal], dt=DT)
+    assert len(controller.speeds) == 6
+    end, commands = follow(controller, model.default_state(), 5.0)
+    assert commands[-1].residuals["pose"] < 1e-5
+    assert sum(end[s] ** 2 for s in model.symbols if "/q" in str(s)) == pytest.approx(1.0, abs=1e-12)
+
+
+def test_center_of_mass_stays_while_a_limb_moves() -> None:
+    model = planar_arm(3)
+    with model.edit() as edit:
+        for k in (1, 2, 3):
+            body = Body(inertia=Inertia(1.0, (1, 0, 0, 1, 0, 1)))
+            edit.add_frame(f"middle{k}", f"link{k}", kv.translation(0.5, 0, 0), body)
+    com, q = model.center_of_mass()[:2], model.symbol("joint3")
+    state = model.default_state().updated({"joint1": 0.4, "joint2": 0.9, "joint3": -0.7})
+    controller = Controller(model, [Hold(com[0], float(com[0](state)), name="balance"), Goal(q, 0.2)], dt=DT)
+    end, commands = follow(controller, state, 5.0)
+    assert end[q] == pytest.approx(0.2, abs=1e-2)
+    assert max(c.residuals["balance"] for c in commands) < 1e-3
+
+
+def test_acceleration_that_the_model_states_is_hard() -> None:
+    model = planar_arm(2)
+    q = model.symbol("joint1")
+    with model.edit() as edit:
+        edit.constrain("joint1/acceleration", -1.5, q.derivative().derivative(), 1.5)
+    controller = Controller(model, [Goal(q, 1.5, gain=10.0)], dt=DT, smooth=0)
+    _, commands = follow(controller, model.default_state(), 3.0)
+    speeds = np.array([0.0, *(c.speeds[q.derivative()] for c in commands)])
+    assert np.abs(np.diff(speeds)).max() <= 1.5 * DT + 1e-8
+    assert commands[-1].residuals["goal joint1"] < 1e-2
+
+
+def test_bound_that_moves_is_respected() -> None:
+    """A drawer that must stay behind a door, both moving."""
+    model = planar_arm(2)
+    one, two = model.symbol("joint1"), model.symbol("joint2")
+    with model.edit() as edit:
+        edit.constrain("behind", -math.inf, two, 0.5 * one)
+    controller = Controller(model, [Goal(two, 1.0), Goal(one, 1.0, gain=0.5)], dt=DT)
+    state, worst = model.default_state(), -math.inf
+    for _ in range(200):
+        state = model.integrate(state, controller.step(state).speeds, DT)
+        worst = max(worst, state[two] - 0.5 * state[one])
+    assert worst < 1e-9
+    assert state[two] > 0.3

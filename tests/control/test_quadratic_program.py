@@ -62,6 +62,18 @@ def test_solutions_are_optimal(name: str, equalities: int) -> None:
         assert optimality(problem, solution) < 1e-6
 
 
+def test_bounds_that_become_infinite_do_no_harm() -> None:
+    """A warm start of daqp itself returns wrong solutions as solved when bounds that were active vanish."""
+    rng = np.random.default_rng(4)
+    for n, m in ((2, 0), (4, 1), (6, 3)):
+        solver = make_solver("daqp", n, m)
+        for _ in range(400):
+            problem = random_problem(rng, n, m)
+            solution = solver.solve(*problem)
+            assert solution.status == "solved"
+            assert optimality(problem, solution) < 1e-6
+
+
 def test_solvers_agree() -> None:
     pytest.importorskip("proxsuite"), pytest.importorskip("osqp")
     rng, solvers = np.random.default_rng(5), [make_solver(name, N, M) for name in NAMES]

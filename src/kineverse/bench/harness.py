@@ -208,11 +208,11 @@ def time_contenders(
 
 
 DISTRIBUTIONS: Mapping[str, str] = MappingProxyType(
-    {"pinocchio": "pin", "ripl_articulation": "ripl-articulation"}
+    {"pinocchio": "pin", "pink": "pin-pink", "ripl_articulation": "ripl-articulation"}
 )
 """Distributions of modules with another name."""
 
-BENCH_EXTRA = ("pinocchio", "mujoco", "pybullet")
+BENCH_EXTRA = ("pinocchio", "mujoco", "pybullet", "pink", "mink")
 """Modules that the extra ``bench`` installs."""
 
 

@@ -20,6 +20,7 @@ BENCHMARKS: Mapping[str, str] = MappingProxyType(
         "loop": "a closed loop and its derivative at one configuration",
         "motion": "coordinates after a step, and constraints: a robot in a kitchen, as a control loop asks",
         "geometry": "what is near, and how near: an arm among boxes, a robot in a kitchen",
+        "inverse_kinematics": "joint positions for poses of five arms, with restarts",
         "tracking": "a kitchen's coordinates from noisy poses of its doors and drawers",
         "identification": "the joint between two parts, from twenty poses of both and from one more",
         "import": "importing the library, and how many packages that takes",

@@ -45,8 +45,8 @@ def add_set_option(parser: argparse.ArgumentParser) -> None:
     )
 
 
-def parse_assignments(texts: Iterable[str]) -> dict[str, float]:
-    """Return values by name from texts like ``kitchen/fridge_door=30deg``.
+def parse_assignments(texts: Iterable[str], option: str = "--set") -> dict[str, float]:
+    """Return values by name from texts like ``kitchen/fridge_door=30deg``, given by an option.
 
     Raises
     ------
@@ -60,9 +60,9 @@ def parse_assignments(texts: Iterable[str]) -> dict[str, float]:
         # A name may contain an equals sign, a value does not.
         name, equals, value = text.rpartition("=")
         if not equals or not name.strip():
-            raise InvalidValueError(f"--set {text!r}: write NAME=VALUE, such as kitchen/fridge_door=0.3")
+            raise InvalidValueError(f"{option} {text!r}: write NAME=VALUE, such as kitchen/fridge_door=0.3")
         if name.strip() in values:
-            raise DuplicateNameError(f"--set {name.strip()} is given twice.")
+            raise DuplicateNameError(f"{option} {name.strip()} is given twice.")
         values[name.strip()] = parse_value(value)
     return values
 

@@ -11,13 +11,26 @@ from contextlib import contextmanager
 from typing import TextIO
 
 from kineverse._version import __version__
-from kineverse.cli import bench, convert, decompose, demo, diff, fit, fk, info, reproduce, validate, view
+from kineverse.cli import (
+    bench,
+    convert,
+    decompose,
+    demo,
+    diff,
+    fit,
+    fk,
+    info,
+    reach,
+    reproduce,
+    validate,
+    view,
+)
 from kineverse.cli.output import join_lines
 from kineverse.errors import KineverseError, UnknownNameError, suggest
 
 COMMANDS = {
     module.__name__.rpartition(".")[2]: module
-    for module in (info, fk, view, convert, diff, validate, decompose, fit, demo, bench, reproduce)
+    for module in (info, fk, reach, view, convert, diff, validate, decompose, fit, demo, bench, reproduce)
 }
 
 ERROR, INTERRUPTED, PIPE_CLOSED = 2, 130, 141
@@ -32,6 +45,7 @@ A MODEL is the name of a shipped model (kitchen, pr2, articulations/screw ...) o
 examples:
   kineverse info kitchen                              its frames, degrees of freedom, constraints
   kineverse fk kitchen kitchen/fridge_door_handle --set kitchen/fridge_door=30deg
+  kineverse reach fetch fetch/gripper_link --pose 0.7 0.2 0.9
   kineverse view kitchen                              move it in the browser
   kineverse convert kitchen kitchen.kv.json           write it in another format
   kineverse diff kitchen kitchen.kv.json              differences of two models

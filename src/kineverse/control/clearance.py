@@ -129,5 +129,5 @@ class Clearance:
         home, generator = self._scene.model.default_state(), np.random.default_rng(0)
         start = home.vector(self._program.coordinates)
         for _ in range(_SAMPLES):
-            q = self._program.draw(generator, start)
+            q = self._program.space.draw(generator, start)
             yield home | dict(zip(self._program.coordinates, q.tolist(), strict=True))

@@ -53,30 +53,32 @@ class DaqpSolver(QpSolver):
 
     def _solve_anew(self, H: Vector, f: Vector, A: Vector, lower: Vector, upper: Vector) -> QpSolution:
         one = np.ones(self.n + self.m)
+        usual = _SETTINGS if self._hard is None else _SOFT_SETTINGS
+        flags: set[int] = set()
         # Where equalities are nearly dependent, it succeeds after it has eliminated them.
-        for settings in (_SETTINGS, _REDUCED_SETTINGS):
+        for settings in (usual, _REDUCED_SETTINGS):
             flag, x, multipliers, iterations = self._start(H, f, A, lower, upper, one, settings)
             if flag >= 1 and self._satisfies(x, A, lower, upper):
-                self._warm = settings is _SETTINGS
+                self._warm = settings is usual
                 return QpSolution(x, multipliers, iterations, "solved")
+            flags.add(flag)
         # Its tolerances are absolute: data of many decades are scaled to unknowns and rows of length 1.
         unit = 1.0 / np.sqrt(H.diagonal())
         rows = A * unit
         length = np.sqrt(np.einsum("ij,ij->i", rows, rows))
         scale = np.concatenate([1.0 / unit, 1.0 / np.where(length > 0.0, length, 1.0)])
-        flag, x, multipliers, iterations = self._start(
-            np.ascontiguousarray(H * np.outer(unit, unit)),
-            f * unit,
-            rows * scale[self.n :, None],
-            lower * scale,
-            upper * scale,
-            scale,
-            _SCALED_SETTINGS,
-        )
-        x = x * unit
-        if flag >= 1 and self._satisfies(x, A, lower, upper):
-            return QpSolution(x, multipliers * scale, iterations, "solved")
-        return self._nothing("infeasible" if flag in _INFEASIBLE else "failed", iterations)
+        scaled = np.ascontiguousarray(H * np.outer(unit, unit)), f * unit, rows * scale[self.n :, None]
+        for settings in _SCALED_SETTINGS:
+            flag, x, multipliers, iterations = self._start(
+                *scaled, lower * scale, upper * scale, scale, settings
+            )
+            x = x * unit
+            if flag >= 1 and self._satisfies(x, A, lower, upper):
+                return QpSolution(x, multipliers * scale, iterations, "solved")
+            flags.add(flag)
+            if flags <= _INFEASIBLE:
+                break
+        return self._nothing("infeasible" if flags & _INFEASIBLE else "failed", iterations)
 
     def _start(
         self,
@@ -107,8 +109,10 @@ class DaqpSolver(QpSolver):
 _SOFT, _EQUALITY = 8, 5
 _INFINITY = 1e8
 """Bounds beyond are none in warm starts: far from all speeds and lengths, but near enough for doubles."""
-_INFEASIBLE = (-1, -6)
+_INFEASIBLE = {-1, -6}
 _SETTINGS = {"primal_tol": 1e-9}
 _REDUCED_SETTINGS = {"primal_tol": 1e-9, "eq_reduction": 1}
-_SCALED_SETTINGS = {"primal_tol": 1e-9, "sing_tol": 1e-13}
-"""Rows that are nearly parallel are told apart, at the price of a less stable factorisation."""
+_SOFT_SETTINGS = {"primal_tol": 1e-9, "sing_tol": 1e-13}
+"""Pivots of soft rows are as small as the reciprocals of their weights."""
+_SCALED_SETTINGS = ({"primal_tol": 1e-9, "sing_tol": 1e-13}, {"primal_tol": 1e-6, "sing_tol": 1e-13})
+"""Rows that are nearly parallel are told apart; a larger tolerance prevents cycles."""

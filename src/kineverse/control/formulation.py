@@ -83,8 +83,6 @@ class Formulation:
         Coordinates and speeds that stay still, as symbols or names.
     accelerations
         Limits on the magnitudes of accelerations by speed, beside those of the model; braking respects both.
-    speed_limits
-        False to ignore all constraints on speeds and accelerations, for inverse kinematics.
 
     Attributes
     ----------
@@ -113,7 +111,6 @@ class Formulation:
         dt: ExpressionLike,
         still: Iterable[Symbol | str] = (),
         accelerations: Mapping[Symbol, ExpressionLike] | None = None,
-        speed_limits: bool = True,
     ) -> None:
         self.model = model
         self.tasks = check_tasks(tasks)
@@ -140,8 +137,6 @@ class Formulation:
         relevant = _relevant_constraints(model, subject) | keeps
         equalities = {name: c for name, c in relevant.items() if is_equality(c)}
         ranges = {name: c for name, c in relevant.items() if name not in equalities}
-        if not speed_limits:
-            ranges = {name: c for name, c in ranges.items() if c.order == 0}
         held = {name: rates.carry(c.expression - c.lower) for name, c in equalities.items()}
         gradients = {task: self._speed_gradient(task, error) for task, error in errors.items()}
         closures = {
@@ -154,7 +149,7 @@ class Formulation:
             )
             for speed, limit in (accelerations or {}).items()
         }
-        self._limits = every | brakes if speed_limits else {}
+        self._limits = every | brakes
         found = self._rows(ranges, dt, None)
         columns = (first | set(found.speeds)) - self._still
         self.speeds: tuple[Symbol, ...] = tuple(sorted(columns, key=lambda s: s.sort_key))

@@ -10,14 +10,12 @@ from __future__ import annotations
 import math
 from collections import Counter
 from collections.abc import Iterable, Mapping, Sequence
-from functools import partial
 from time import perf_counter
-from typing import NamedTuple
 
 import numpy as np
 
 from kineverse._checks import as_tolerance
-from kineverse.errors import InvalidValueError, NoSolutionError, NotFiniteError, UnknownNameError
+from kineverse.errors import InvalidValueError, NotFiniteError
 from kineverse.geometry import Scene
 from kineverse.geometry.results import DistanceResult
 from kineverse.lie import Array
@@ -27,30 +25,14 @@ from kineverse.state import State, StateLike, as_state
 from kineverse.symbols import Symbol
 
 from .clearance import Clearance
-from .command import SATURATED
+from .configuration_search import PROGRESS, STEPS, ConfigurationSearch, SearchEnd
 from .ik_result import IkResult
 from .position_program import PositionProgram
-from .quadratic_program import make_solver
 from .tasks import Task
 
-_STEPS, _CLEARING_STEPS, _LAST_STEPS = 40, 60, 200
-_PATIENCE = 5
-"""Number of steps after which the errors have to be smaller."""
-_PROGRESS = 0.9**2
-_SETTLED, _SHORTEST = 1 - 1e-9, 1e-7
-_HALVINGS = 8
-_EXACT_WEIGHT = 1e4
-"""Weight of equalities and violated constraints beside goals that are out of reach."""
 _DIFFERENT = 1e-3
 """Least difference of a coordinate of two solutions [m], [rad]."""
 _EXPLAINING_STARTS = 8
-
-
-class _End(NamedTuple):
-    """End of a search: coordinates, and what is left."""
-
-    coordinates: Array
-    error: float
 
 
 class InverseKinematics:
@@ -72,7 +54,8 @@ class InverseKinematics:
         Goals, holds and keeps. Their targets may contain parameters, whose values come with each target.
     scene
         Collision scene of the model; None to ignore collisions. Only pairs that the tasks move relatively
-        to each other count, without those that its rules except and those that always overlap.
+        to each other count, without those that its rules except and those that always overlap. The scene
+        stays at the last configuration that was tried.
     still
         Coordinates that stay still, as symbols or names; a name of an articulation stands for its
         coordinates.
@@ -118,34 +101,18 @@ class InverseKinematics:
         self.model = model
         self._program = program = PositionProgram(model, tasks, still, as_tolerance(tolerance))
         self.tasks, self.coordinates = program.tasks, program.coordinates
-        self._clearance = None
-        if scene is not None:
-            self._clearance = Clearance(scene, program, as_tolerance(margin))
-        self._home = model.default_state()
-        outside = () if self._clearance is None else self._clearance.inputs
-        extra = sorted({*outside} - {*program.inputs}, key=lambda s: s.sort_key)
+        self._clearance = None if scene is None else Clearance(scene, program, as_tolerance(margin))
+        self._search = ConfigurationSearch(program, self._clearance)
+        others = () if self._clearance is None else self._clearance.inputs
+        extra = sorted({*others} - {*program.inputs}, key=lambda s: s.sort_key)
         self.inputs = (*program.inputs, *extra)
-        self._evaluate = program.function.bind()
-        n, first = len(self.coordinates), len(program.inputs)
-        self._x = self._evaluate.input[:n]
-        self._constants = self._evaluate.input[:first]
-        self._weights = self._evaluate.input[first:]
-        self._solver = make_solver("daqp", n, len(program.names) - n)
+        self._home = model.default_state()
+        self._defaults = self._home.vector(self.inputs)
+        self._place = {s: k for k, s in enumerate(self.inputs)}
         self._known = (*model.symbols, *model.speeds, *self.inputs)
         names = Counter(map(str, {*self._known}))
         self._lookup: dict[object, Symbol] = {s: s for s in self._known}
         self._lookup |= {str(s): s for s in self._known if names[str(s)] == 1}
-        self._rows: dict[str, slice] = {}
-        start = 0
-        for part in program.parts:
-            self._rows[part.name] = slice(start, start + part.error.size)
-            start += part.error.size
-        exact = {part.name for part in program.parts if part.exact}
-        self._exact = np.ones(len(program.weights), dtype=bool)
-        for name, rows in self._rows.items():
-            self._exact[rows] = name in exact
-        self._first_violation = start
-        self._iterations = 0
 
     @property
     def tier(self) -> str:
@@ -182,330 +149,167 @@ class InverseKinematics:
         for name, number in (("starts", starts), ("solutions", solutions)):
             if not isinstance(number, int) or number < 1:
                 raise InvalidValueError(f"{name}= is a number of at least 1, not {number!r}.")
-        state = self._load(values)
-        home = self._x.copy()
-        self._iterations = 0
-        self._weights[:] = self._program.weights
+        given = self._load(values)
+        search, space, clearance = self._search, self._program.space, self._clearance
+        x = search.x
+        home = x.copy()
+        search.iterations = 0
+        search.weights[:] = self._program.weights
         found: list[Array] = []
-        best, blocked = _End(home, math.inf), _End(home, math.inf)
+        obstacles: Counter[str] = Counter()
+        best = blocked = SearchEnd(home, math.inf)
         generator: np.random.Generator | None = None
         used = 0
         for used in range(1, starts + 1):
             if used == 1:
-                self._enter_limits()
+                search.enter_limits()
             else:
                 generator = generator or np.random.default_rng(seed)
-                self._x[:] = self._program.draw(generator, home)
-            error = self._descend(_STEPS, _PROGRESS)
+                x[:] = space.draw(generator, home)
+            error = search.descend(STEPS, PROGRESS)
             if error > 0.0:
                 if error < best.error:
-                    best = _End(self._x.copy(), error)
+                    best = SearchEnd(x.copy(), error)
                 continue
-            self._program.bring_back(self._x, home)
-            if not self._is_done():
+            space.bring_back(x, home)
+            if not search.is_done():
                 continue
-            if self._clearance is not None:
-                depth = self._clear()
-                if depth > 0.0:
-                    if depth < blocked.error:
-                        blocked = _End(self._x.copy(), depth)
+            if clearance is not None:
+                clearance.measure(x)
+                pairs = clearance.near
+                error = search.clear()
+                if error > 0.0:
+                    obstacles.update(f"{pair.a} and {pair.b}" for pair in pairs[:1])
+                    if error < blocked.error:
+                        blocked = SearchEnd(x.copy(), error)
                     continue
-            if all(np.abs(self._x - other).max() > _DIFFERENT for other in found):
-                found.append(self._x.copy())
+            if all(np.abs(x - other).max() > _DIFFERENT for other in found):
+                found.append(x.copy())
             if len(found) == solutions:
                 break
-        found.sort(key=lambda x: float(np.linalg.norm(x - home)))
+        found.sort(key=lambda q: float(np.linalg.norm(q - home)))
         if found:
-            self._x[:] = found[0]
+            x[:] = found[0]
         elif blocked.error < math.inf:
-            self._x[:] = blocked.coordinates
+            x[:] = blocked.coordinates
         else:
-            self._x[:] = best.coordinates
-            self._approach()
-            self._program.bring_back(self._x, home)
-        return self._result(state, home, found, used, begin)
+            search.approach(home, best.coordinates, generator or np.random.default_rng(seed))
+            space.bring_back(x, home)
+        return self._result(given, found, obstacles, used, begin)
 
     def batch(self, values: Iterable[StateLike], *, starts: int = 16, seed: int = 0) -> list[IkResult]:
         """Return the results of many targets, each as of :meth:`solve`.
 
-        Targets are solved one by one: a step of one target takes some microseconds, and targets need very
-        different numbers of steps.
+        Targets are solved one by one. Steps of all targets together, clipped to the limits, are no faster:
+        they solve fewer targets, because active limits need a quadratic program for each of them.
         """
         return [self.solve(target, starts=starts, seed=seed) for target in values]
 
-    # -- search --------------------------------------------------------------------------------------------
-
-    def _load(self, values: StateLike | None) -> State:
-        """Write the values of all inputs, and return the whole state."""
-        state = self._home
-        if values is not None:
-            state = State({**state, **self._given(values)})
-        try:
-            vector = state.vector(self.inputs)
-        except UnknownNameError as error:
-            raise UnknownNameError(f"{error} Give it in values=.") from None
+    def _load(self, values: StateLike | None) -> Mapping[Symbol, float]:
+        """Write the values of all inputs, and return the given values by symbol."""
+        given = {} if values is None else self._given(values)
+        if isinstance(given, State):
+            vector = (self._home | given).vector(self.inputs)
+        else:
+            vector = self._defaults.copy()
+            for symbol, value in given.items():
+                if symbol in self._place:
+                    vector[self._place[symbol]] = value
         if not np.isfinite(vector).all():
             wrong = [str(s) for s, v in zip(self.inputs, vector, strict=True) if not math.isfinite(v)]
             raise NotFiniteError(f"There is no finite value for {', '.join(map(repr, wrong[:6]))}.", wrong)
-        self._constants[:] = vector[: len(self._constants)]
-        self._program.normalize(self._x)
+        self._search.constants[:] = vector[: len(self._program.inputs)]
+        self._program.space.normalize(self._search.x)
         if self._clearance is not None:
             self._clearance.load(dict(zip(self.inputs, vector.tolist(), strict=True)))
-        return state
+        return given
 
     def _given(self, values: StateLike) -> Mapping[Symbol, float]:
-        """Return values by symbol."""
+        """Return values by symbol; a state if they are one, or contain anything unusual."""
         if isinstance(values, State):
             return values
         try:
-            # Most names are those of one symbol, and then this is the fastest way.
-            return {self._lookup[key]: value for key, value in values.items()}
+            # A state takes ten times as long, most of the time of an easy target.
+            given = {self._lookup[key]: value for key, value in values.items()}
+            if len(given) == len(values) and all(map(math.isfinite, given.values())):
+                return given
         except (KeyError, TypeError, AttributeError):
-            return as_state(values, self._known)
-
-    def _try(self) -> float:
-        """Evaluate the program; return the weighted sum of squares, inf where it is undefined."""
-        try:
-            self._evaluate()
-        except NoSolutionError:
-            return math.inf
-        total: float = self._evaluate.outputs[6].item()
-        return total if total < math.inf else math.inf
-
-    def _is_done(self) -> bool:
-        return self._try() < math.inf and self._evaluate.outputs[7].item() <= 1.0
-
-    def _enter_limits(self) -> None:
-        """Bring coordinates that are outside of their limits to the nearest one."""
-        n = len(self._x)
-        if self._try() < math.inf:
-            away = self._evaluate.outputs[5][self._first_violation :][:n]
-            self._x -= away
-        program = self._program
-        np.clip(
-            self._x, program.lower, program.upper, out=self._x, where=program.fixed_limits & ~program.turning
-        )
-
-    def _descend(self, steps: int, ratio: float) -> float:
-        """Take Gauss-Newton steps; return 0 if all tasks are done, else the weighted sum of squares.
-
-        Ends as well when the sum is more than ``ratio`` times that of five steps ago.
-        """
-        x, solve, normalize = self._x, self._solver.solve, self._program.normalize
-        H, f, A, lower, upper, _, _, excess = self._evaluate.outputs
-        quaternions = bool(self._program.quaternions)
-        recent = [math.inf] * _PATIENCE
-        before, step = x.copy(), None
-        total = math.inf
-        for k in range(steps):
-            self._iterations += 1
-            total = self._try()
-            if total == math.inf:
-                if step is None:
-                    return math.inf
-                total = self._halve(before, step)
-                if total == math.inf:
-                    x[:] = before
-                    return recent[(k - 1) % _PATIENCE]
-            if excess.item() <= 1.0:
-                return 0.0
-            if not total <= ratio * recent[k % _PATIENCE]:
-                break
-            recent[k % _PATIENCE] = total
-            found = solve(H, f, A, lower, upper)
-            if found.status != "solved":
-                break
-            before[:] = x
-            step = found.x
-            x += step
-            if quaternions:
-                normalize(x)
-        return total
-
-    def _halve(self, before: Array, step: Array) -> float:
-        """Halve a step that leads out of the domain of a closed loop."""
-        for k in range(1, _HALVINGS + 1):
-            self._x[:] = before + step / 2**k
-            self._program.normalize(self._x)
-            total = self._try()
-            if total < math.inf:
-                return total
-        return math.inf
-
-    def _approach(self) -> None:
-        """Continue to the best point, where equalities and constraints are satisfied if that is possible."""
-        for goals, exact in ((1.0, 1.0), (1.0, _EXACT_WEIGHT)):
-            self._weights[:] = np.where(self._exact, exact, goals)
-            self._minimize()
-        self._weights[:] = np.where(self._exact, 1.0, 0.0)
-        self._descend(_STEPS, _PROGRESS)
-        if self._clearance is not None:
-            self._weights[:] = 1.0
-            self._clear()
-
-    def _minimize(self) -> None:
-        """Take steps that reduce the weighted sum of squares, with as much damping as that needs.
-
-        Far from all solutions, curvature that a Gauss-Newton step leaves out exceeds the damping by the error
-        (Levenberg-Marquardt method).
-        """
-        x = self._x
-        H, f, A, lower, upper, *_ = self._evaluate.outputs
-        best, least, damping = x.copy(), self._try(), 0.0
-        for _ in range(_LAST_STEPS):
-            self._iterations += 1
-            if least == math.inf:
-                return
-            H.reshape(-1)[:: len(x) + 1] += damping
-            found = self._solver.solve(H, f, A, lower, upper)
-            if found.status != "solved":
-                return
-            x += found.x
-            self._program.normalize(x)
-            total = self._try()
-            if total < least:
-                settled = total > _SETTLED * least
-                best[:], least, damping = x, total, damping / 3
-                if settled:
-                    return
-            else:
-                if np.abs(found.x).max() < _SHORTEST:
-                    break
-                x[:], damping = best, max(4 * damping, 0.01 * least)
-                self._try()
-        x[:] = best
-
-    def _clear(self) -> float:
-        """Leave collisions while the tasks are kept; return what is missing to the margin at the end [m].
-
-        It returns infinity if the bodies are apart and a task is not done any more.
-        """
-        clearance = self._clearance
-        assert clearance is not None
-        H, f, A, lower, upper, _, _, excess = self._evaluate.outputs
-        last = x = self._x
-        depth = math.inf
-        for _ in range(_CLEARING_STEPS):
-            self._iterations += 1
-            if self._try() == math.inf:
-                self._x[:] = last
-                return depth
-            depth = clearance.measure(x)
-            if depth <= 0.0 and excess.item() <= 1.0:
-                return 0.0
-            step = clearance.find_step(H, f, A, lower, upper)
-            if step is None:
-                break
-            last = x.copy()
-            x += step
-            self._program.normalize(x)
-        depth = clearance.measure(x)
-        return depth if depth > 0.0 or not self._is_done() else 0.0
-
-    # -- results -------------------------------------------------------------------------------------------
+            pass
+        return as_state(values, self._known)
 
     def _result(
-        self, state: State, home: Array, found: Sequence[Array], starts: int, begin: float
+        self,
+        given: Mapping[Symbol, float],
+        found: Sequence[Array],
+        obstacles: Counter[str],
+        starts: int,
+        begin: float,
     ) -> IkResult:
         """Return the result at the present coordinates."""
-        residuals = self._residuals()
-        best = self._state(state, self._x)
+        search = self._search
+        residuals = search.residuals()
         active: tuple[str, ...] = ()
         contacts: Sequence[DistanceResult] = ()
+        ends = found or [search.x.copy()]
         if not found:
-            active = self._active()
+            active = search.active()
             if self._clearance is not None:
-                self._clearance.measure(self._x)
+                self._clearance.measure(search.x)
                 contacts = self._clearance.near
+
+        def make_states() -> tuple[State, ...]:
+            whole = self._home | State(given)
+            return tuple(
+                whole | State(dict(zip(self.coordinates, end.tolist(), strict=True))) for end in ends
+            )
+
         return IkResult(
-            best,
             bool(found),
-            (best, *(self._state(state, x) for x in found[1:])) if found else (),
             residuals,
             active,
             contacts,
             starts,
-            self._iterations,
+            search.iterations,
             perf_counter() - begin,
-            partial(self._explain, best, bool(found), residuals, active, contacts, starts),
+            make_states,
+            self._explain,
+            obstacles,
         )
 
-    def _state(self, state: State, x: Array) -> State:
-        return State(
-            {**state, **dict(zip(self.coordinates, x.tolist(), strict=True))}, source="inverse kinematics"
-        )
-
-    def _residuals(self) -> dict[str, float]:
-        """Return the norm of the errors of each task and equality, and the violations of keeps."""
-        self._try()
-        values = self._evaluate.outputs[5]
-        found = {name: float(np.linalg.norm(values[rows])) for name, rows in self._rows.items()}
-        violations = values[self._first_violation :]
-        for keep in self._program.keeps:
-            rows = [k for k, names in enumerate(self._program.names) if keep in names]
-            found[keep] = max((abs(float(violations[k])) for k in rows), default=0.0)
-        return found
-
-    def _active(self) -> tuple[str, ...]:
-        """Return the names of the constraints whose multipliers are not 0 at the present coordinates."""
-        self._weights[:] = np.where(self._exact, _EXACT_WEIGHT, 1.0)
-        if self._try() == math.inf:
-            return ()
-        found = self._solver.solve(*self._evaluate.outputs[:5])
-        sizes = np.abs(found.multipliers)
-        order = sorted(np.flatnonzero(sizes > SATURATED).tolist(), key=lambda k: -float(sizes[k]))
-        return tuple(dict.fromkeys(name for k in order for name in self._program.names[k]))
-
-    def _explain(
-        self,
-        best: State,
-        solved: bool,
-        residuals: Mapping[str, float],
-        active: Sequence[str],
-        contacts: Sequence[DistanceResult],
-        starts: int,
-    ) -> str:
+    def _explain(self, result: IkResult) -> str:
         """Return the text of :attr:`.IkResult.why`."""
-        if solved:
-            return f"All tasks are done, after {starts} starts."
-        self._load(best)
-        self._weights[:] = 1.0
-        self._try()
-        values = np.abs(self._evaluate.outputs[5])
+        if result.solved:
+            return f"All tasks are done, after {result.starts} starts."
+        self._load(result.best)
+        search, program = self._search, self._program
+        search.weights[:] = 1.0
+        search.evaluate()
+        values = np.abs(search.outputs[5])
         off = [
             part.name
-            for part in self._program.parts
-            if not (values[self._rows[part.name]] <= part.tolerance).all()
+            for part in program.parts
+            if not (values[search.rows[part.name]] <= part.tolerance).all()
         ]
-        off += [name for name in self._program.keeps if residuals[name] > TOLERANCE]
-        tried = f"in {starts} starts" if starts > 1 else "from the given state"
+        off += [name for name in program.keeps if result.residuals[name] > TOLERANCE]
+        tried = f"in {result.starts} starts" if result.starts > 1 else "from the given state"
         lines = []
-        if contacts:
-            pairs = "; ".join(
-                f"{pair.a} and {pair.b} "
-                + (
-                    f"overlap by {-pair.distance:.3g} m"
-                    if pair.distance < 0
-                    else f"are {pair.distance:.3g} m apart"
-                )
-                for pair in contacts[:3]
-            )
-            free = "All tasks are done only in collision" if not off else "At the best point bodies collide"
-            lines.append(f"{free}: {pairs}.")
+        if result.obstacles:
+            pairs = "; ".join(f"{pair} ({n} times)" for pair, n in result.obstacles.most_common(3))
+            lines.append(f"Without collisions there are solutions. These bodies are in the way: {pairs}.")
         if off:
-            listed = ", ".join(f"'{name}' is off by {residuals[name]:.3g}" for name in off)
+            listed = ", ".join(f"'{name}' is off by {result.residuals[name]:.3g}" for name in off)
             lines.append(f"No solution was found {tried}. At the best point {listed}.")
         alone: list[str] = []
-        if len(off) > 1:
-            alone = [name for name in off if name in self._rows and self._is_reachable(name, best)]
+        if len(off) > 1 and not result.obstacles:
+            alone = [name for name in off if name in search.rows and self._is_reachable(name, result.best)]
             if len(alone) == len(off):
                 lines.append("Each of these can be done alone, so they contradict each other.")
-            elif len(alone) < len(off):
+            else:
                 rest = ", ".join(f"'{name}'" for name in off if name not in alone)
                 lines.append(f"Not even alone can {rest} be done.")
-        if active:
-            lines.append(f"These limits and constraints stop it: {', '.join(active[:8])}.")
-        elif off and len(alone) < 2:
+        if result.active:
+            lines.append(f"These limits and constraints stop it: {', '.join(result.active[:8])}.")
+        elif off and len(alone) < 2 and not result.obstacles:
             lines.append(
                 "No limit stops it: no small motion reduces the errors. The target is out of reach, or more "
                 "starts are needed."
@@ -513,19 +317,19 @@ class InverseKinematics:
         return " ".join(lines)
 
     def _is_reachable(self, name: str, state: State) -> bool:
-        """Return whether a search for one task alone succeeds."""
+        """Return whether a search for one task alone succeeds, with the constraints of the model."""
         self._load(state)
-        home, generator = self._x.copy(), np.random.default_rng(0)
-        alone = np.zeros(len(self._weights), dtype=bool)
-        alone[self._rows[name]] = alone[self._first_violation :] = True
+        search = self._search
+        alone = np.zeros(len(search.weights), dtype=bool)
+        alone[search.first_violation :] = True
         for part in self._program.parts:
-            if part.name in self.model.constraints:
-                alone[self._rows[part.name]] = True
-        self._weights[:] = np.where(alone, self._program.weights, 0.0)
+            alone[search.rows[part.name]] = part.name == name or part.name in self.model.constraints
+        search.weights[:] = np.where(alone, self._program.weights, 0.0)
+        home, generator = search.x.copy(), np.random.default_rng(0)
         for start in range(_EXPLAINING_STARTS):
             if start:
-                self._x[:] = self._program.draw(generator, home)
-            if self._descend(_STEPS, _PROGRESS) == 0.0:
+                search.x[:] = self._program.space.draw(generator, home)
+            if search.descend(STEPS, PROGRESS) == 0.0:
                 return True
         return False
 

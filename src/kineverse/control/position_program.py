@@ -20,12 +20,10 @@ from functools import reduce
 
 import casadi as ca
 import numpy as np
-import numpy.typing as npt
 
 from kineverse.compile import compile  # noqa: A004
 from kineverse.errors import (
     DuplicateNameError,
-    ExpressionError,
     InvalidValueError,
     NoSolutionError,
     UnknownNameError,
@@ -42,12 +40,12 @@ from kineverse.model.speed_limits import INFINITE, ZERO, raw_max
 from kineverse.model.velocity_rows import velocity_rows
 from kineverse.symbols import Symbol, parameter
 
+from .configuration_space import ConfigurationSpace, find_coordinates
 from .formulation import check_tasks, name_tasks
 from .tasks import Hold, Keep, Task
 
 _DAMPING, _LEAST_DAMPING = 0.03, 1e-6
 _SAMPLES = 12
-_QUATERNION = ("qx", "qy", "qz", "qw")
 _SAME = 1e-9
 
 
@@ -105,14 +103,8 @@ class PositionProgram:
         Names of the constraints of the n bounds and the general rows.
     keeps
         Names of the keeps that are ranges.
-    lower, upper
-        (n,) limits of the coordinates, ±inf for none, at the default values of parameters.
-    fixed_limits
-        (n,) flags of coordinates whose limits are numbers.
-    turning
-        (n,) flags of coordinates q for which q + 2π is the same. They have no bounds in the program.
-    quaternions
-        Indices of the four coordinates of each quaternion.
+    space
+        Limits and periods of the coordinates.
     function
         Function with the outputs H, f, A, lower, upper, the k errors and violations, the weighted sum of
         their squares, and the largest of them as a multiple of its tolerance.
@@ -131,31 +123,8 @@ class PositionProgram:
         moving = {s.position for e in subjects for s in e.gradient(heuristic=False)} - fixed
         self._check_moved(fixed)
         self.coordinates = tuple(sorted(moving, key=lambda s: s.sort_key))
-        place = {s: k for k, s in enumerate(self.coordinates)}
-        self.quaternions = [
-            [place[s] for s in four]
-            for record in model.articulations.values()
-            for four in [[s for s in record.coordinates if s.path.rpartition("/")[2] in _QUATERNION]]
-            if len(four) == 4 and all(s in place for s in four)
-        ]
-        self.turning = np.zeros(len(self.coordinates), dtype=bool)
-        self._find_limits(ranges)
+        self.space = ConfigurationSpace(model, self.coordinates, ranges)
         self._compile(errors, ranges)
-
-    def _find_limits(self, ranges: Mapping[str, Constraint]) -> None:
-        """Set the limits of the coordinates by the model and by keeps."""
-        limits = np.array([self.model.limits(s) for s in self.coordinates], dtype=float).reshape(-1, 2)
-        self.lower, self.upper = limits[:, 0].copy(), limits[:, 1].copy()
-        self.fixed_limits = np.ones(len(self.coordinates), dtype=bool)
-        for i, symbol in enumerate(self.coordinates):
-            for c in ranges.values():
-                if symbol in c.expression.symbols and (c.lower.symbols or c.upper.symbols):
-                    self.fixed_limits[i] = False
-                elif c.expression == symbol:
-                    self.lower[i] = max(self.lower[i], float(c.lower))
-                    self.upper[i] = min(self.upper[i], float(c.upper))
-        # A range that is empty is an error of the program, not of the limits.
-        self.upper = np.maximum(self.lower, self.upper)
 
     def make_plain(self, expression: ExpressionLike) -> Expression:
         """Return an expression in independent plain coordinates."""
@@ -261,9 +230,9 @@ class PositionProgram:
         )
         bounds, general = table.bounds, table.general
         count = len(general.names)
-        scales, self.turning = self._sample(errors, jacobian, ranges)
+        scales = self._sample(errors, jacobian, ranges)
         self.names = (*bounds.names, *((name,) for name in general.names))
-        free = self.turning
+        free = self.space.turning
         lower = [-INFINITE if free[i] else bounds.lower[i] for i in range(n)]
         upper = [INFINITE if free[i] else bounds.upper[i] for i in range(n)]
         away = [ZERO if free[i] else bounds.violation[i] for i in range(n)]
@@ -302,10 +271,8 @@ class PositionProgram:
         self.inputs = (*self.coordinates, *sorted(used, key=lambda s: s.sort_key))
         self.function = compile(outputs, (*self.inputs, *numbers))
 
-    def _sample(
-        self, errors: Expression, jacobian: Expression, ranges: Mapping[str, Constraint]
-    ) -> tuple[Array, npt.NDArray[np.bool_]]:
-        """Return the weight of each error row, and the flags of coordinates with the period 2π.
+    def _sample(self, errors: Expression, jacobian: Expression, ranges: Mapping[str, Constraint]) -> Array:
+        """Return the weight of each error row, and flag the coordinates with the period 2π.
 
         The weight is the inverse mean square of the row's derivatives over random states, within one task at
         most that of a row with 5 % of the largest derivatives.
@@ -321,12 +288,7 @@ class PositionProgram:
         home = self.model.default_state()
         function.input[n:] = home.vector(others)
         start = home.vector(self.coordinates)
-        turning = self.upper - self.lower >= math.tau - _SAME
-        for four in self.quaternions:
-            turning[four] = False
-        bound = {c.expression for c in ranges.values() if c.lower.symbols or c.upper.symbols}
-        for i, symbol in enumerate(self.coordinates):
-            turning[i] &= symbol not in bound
+        turning = self.space.find_turning_candidates(ranges)
 
         def evaluate(q: Array) -> Array | None:
             function.input[:n] = q
@@ -340,7 +302,7 @@ class PositionProgram:
         squares: list[Array] = []
         generator = np.random.default_rng(0)
         for _ in range(_SAMPLES):
-            q = self.draw(generator, start)
+            q = self.space.draw(generator, start)
             value = evaluate(q)
             if value is None:
                 continue
@@ -351,73 +313,11 @@ class PositionProgram:
                 turning[i] = other is not None and np.allclose(other, value, rtol=_SAME, atol=_SAME)
             squares.append((value[: jacobian.size].reshape(-1, n) ** 2).sum(axis=1))
         if not squares:
-            return np.ones(errors.size), np.zeros(n, dtype=bool)
+            return np.ones(errors.size)
+        self.space.turning = turning
         mean, first = np.mean(squares, axis=0), 0
         for part in self.parts:
             rows = slice(first, first + part.error.size)
             mean[rows] = np.maximum(mean[rows], 0.05**2 * mean[rows].max())
             first = rows.stop
-        return 1.0 / np.where(mean > 0, mean, 1.0), turning
-
-    def draw(self, generator: np.random.Generator, start: Array) -> Array:
-        """Return random coordinates (n,): uniform within limits, around given ones where there are none."""
-        width = np.where(self.turning, math.pi, 1.0)
-        low = np.where(np.isfinite(self.lower), self.lower, np.minimum(start, self.upper) - width)
-        high = np.where(np.isfinite(self.upper), self.upper, np.maximum(start, self.lower) + width)
-        q = generator.uniform(low, np.maximum(low, high))
-        for four in self.quaternions:
-            q[four] = start[four] + generator.standard_normal(4) / 2
-        self.normalize(q)
-        return q
-
-    def normalize(self, q: Array) -> None:
-        """Give quaternions their unit length, in place."""
-        for four in self.quaternions:
-            q[four] /= math.sqrt(q[four].dot(q[four]))
-
-    def bring_back(self, q: Array, start: Array) -> None:
-        """Bring coordinates with the period 2π within their limits, as near to given ones as possible."""
-        for i in np.flatnonzero(self.turning):
-            value = q[i] - math.tau * round((q[i] - start[i]) / math.tau)
-            if value > self.upper[i]:
-                value -= math.tau * math.ceil((value - self.upper[i]) / math.tau)
-            elif value < self.lower[i]:
-                value += math.tau * math.ceil((self.lower[i] - value) / math.tau)
-            q[i] = value
-        np.clip(q, self.lower, self.upper, out=q, where=self.fixed_limits)
-
-
-def find_coordinates(model: ModelView, names: Iterable[Symbol | str]) -> frozenset[Symbol]:
-    """Return independent coordinates of a model, given as symbols or names.
-
-    A dependent coordinate stands for those that determine it, an articulation for all of its coordinates, and
-    a speed for the coordinates that it drives.
-
-    Raises
-    ------
-    UnknownNameError
-        For another name, with similar ones.
-    ExpressionError
-        For what is neither a symbol nor a name.
-    """
-    found: set[Symbol] = set()
-    for item in (names,) if isinstance(names, str | Symbol) else names:
-        if isinstance(item, str) and item in model.articulations and item not in map(str, model.symbols):
-            found |= find_coordinates(model, model.articulations[item].coordinates)
-            continue
-        symbol = model.symbol(item) if isinstance(item, str) else item
-        if not isinstance(symbol, Symbol):
-            raise ExpressionError(f"still= takes symbols or their names, not {item!r}.")
-        known = {*model.symbols, *model.rates.dependent, *model.speeds}
-        if symbol not in known and symbol.position not in known:
-            raise UnknownNameError(
-                f"still=: the model has no '{symbol}'. {suggest(str(symbol), map(str, known), 'symbol')}"
-            )
-        dependent = model.rates.dependent.get(symbol.position)
-        if dependent is not None:
-            found |= {s for s in dependent.symbols if s.has_derivative}
-        else:
-            found.add(symbol.position)
-        if symbol.order == 1:
-            found |= {x for x, row in model.rates.items() if symbol in row}
-    return frozenset(found)
+        return np.asarray(1.0 / np.where(mean > 0, mean, 1.0))

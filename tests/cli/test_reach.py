@@ -1,0 +1,122 @@
+"""``kineverse reach``: positions for a pose, as text, JSON and picture."""
+
+from __future__ import annotations
+
+import importlib.util
+import json
+
+import numpy as np
+import pytest
+
+import kineverse as kv
+
+HAND = "fetch/gripper_link"
+
+
+def test_positions_are_printed_and_hold(run, tmp_path):
+    status, out, err = run("reach", "fetch", HAND, "--pose", 0.7, 0.2, 0.9, "--json")
+    assert (status, err) == (0, "")
+    answer = json.loads(out)
+    assert answer["reached"]
+    assert answer["error"] < 1e-4
+    model = kv.load("fetch")
+    state = model.default_state().updated(answer["positions"])
+    assert np.allclose(model.fk(HAND)(state)[:3, 3], [0.7, 0.2, 0.9], atol=1e-4)
+    assert not model.violations(state)
+    status, out, _ = run(
+        "reach", "fetch", HAND, "--pose", "70cm", "0.2", "0.9", "--picture", tmp_path / "a.png"
+    )
+    assert status == 0
+    assert out.startswith(f"{HAND}: reached\n")
+    assert "fetch/elbow_flex_joint" in out
+    assert (tmp_path / "a.png").read_bytes()[:4] == b"\x89PNG"
+
+
+def test_orientation_still_and_first_start(run):
+    words = ["reach", "fetch", HAND, "--pose", 0.7, 0.2, 0.9, 0, "90deg", 0]
+    status, out, _ = run(*words, "--still", "fetch/base", "--from", "fetch/base/x=0.1", "--json")
+    answer = json.loads(out)
+    assert status == 0
+    assert "fetch/base/x" not in answer["positions"]
+    model = kv.load("fetch")
+    state = model.default_state().updated({"fetch/base/x": 0.1, **answer["positions"]})
+    pose = np.array(kv.translation(0.7, 0.2, 0.9)() @ kv.rpy(0, np.pi / 2, 0)())
+    assert np.allclose(model.fk(HAND)(state), pose, atol=1e-4)
+
+
+def test_not_reached_ends_with_status_1_and_the_reason(run):
+    words = ["reach", "fetch", HAND, "--pose", 0.7, 0.2, 4, "--still", "fetch/base"]
+    status, out, _ = run(*words)
+    assert status == 1
+    assert "not reached. No solution was found in 16 starts" in out
+    assert "fetch/torso_lift_joint/position" in out
+    status, out, _ = run(*words, "--starts", 2, "--json")
+    answer = json.loads(out)
+    assert (status, answer["reached"], answer["starts"]) == (1, False, 2)
+    assert "fetch/torso_lift_joint/position" in answer["active"]
+
+
+def test_robot_reaches_a_frame_of_another_model(run):
+    handle = "kitchen/oven_door_handle"
+    words = ["reach", "kitchen", HAND, "--robot", "fetch", "--pose", handle, "--position-only"]
+    status, out, _ = run(*words)
+    assert status == 0
+    assert handle not in out
+    assert "kitchen/oven_door " not in out
+
+
+def test_pose_relative_to_a_frame(run):
+    words = ["reach", "pr2", "pr2/l_gripper_tool_frame", "--pose", 0, 0.3, 0]
+    status, out, _ = run(*words, "--relative-to", "pr2/r_gripper_tool_frame", "--json")
+    assert status == 0
+    model = kv.load("pr2")
+    state = model.default_state().updated(json.loads(out)["positions"])
+    pose = model.fk("pr2/l_gripper_tool_frame", "pr2/r_gripper_tool_frame")(state)
+    assert np.allclose(pose[:3, 3], [0, 0.3, 0], atol=1e-4)
+
+
+@pytest.mark.skipif(importlib.util.find_spec("coal") is None, reason="distances need coal")
+def test_collisions_are_respected(run):
+    words = [
+        "reach",
+        "fetch",
+        HAND,
+        "--pose",
+        0.7,
+        0.2,
+        0.9,
+        "--still",
+        "fetch/base",
+        "--collisions",
+        "--json",
+    ]
+    status, out, _ = run(*words)
+    assert status == 0
+    from kineverse.geometry import Scene
+
+    model = kv.load("fetch")
+    scene = Scene(model)
+    scene.update(model.default_state().updated(json.loads(out)["positions"]))
+    assert not [p for p in scene.pairs_within(0.0) if "gripper_finger" not in p.a + p.b]
+
+
+@pytest.mark.parametrize(
+    ("words", "message"),
+    [
+        (["fetch", HAND, "--pose", "1", "2"], "6 with roll, pitch and yaw"),
+        (["fetch", HAND, "--pose", "1", "2", "x"], "'x' is not a value"),
+        (["fetch", HAND, "--pose", "fetch/grippr_link"], "fetch/gripper_link"),
+        (["fetch", "fetch/grippr_link", "--pose", "1", "2", "3"], "fetch/gripper_link"),
+        (["fetch", HAND, "--pose", HAND], "its pose is constant"),
+        (["kitchen", "kitchen/wall", "--pose", "1", "2", "3"], "its pose is constant"),
+        (["fetch", HAND, "--pose", "1", "2", "3", "--from", "x"], "--from 'x': write NAME=VALUE"),
+        (["fetch", HAND, "--pose", "1", "2", "3", "--from", "x=1"], "Did you mean"),
+        (["fetch", HAND, "--pose", "1", "2", "3", "--still", "base"], "fetch/base"),
+        (["fetch", HAND, "--pose", "1", "2", "3", "--starts", "0"], "starts"),
+    ],
+)
+def test_wrong_words_are_refused(run, words, message):
+    status, out, err = run("reach", *words)
+    assert (status, out) == (2, "")
+    assert message in err
+    assert len(err.splitlines()) == 1
