@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from itertools import pairwise
 
 import numpy as np
 import pytest
@@ -98,7 +99,7 @@ def test_hold_that_is_violated_is_approached_with_progress() -> None:
     controller = Controller(model, [held], dt=DT)
     end, commands = follow(controller, state, 6.0)
     residuals = [c.residuals["pin"] for c in commands]
-    assert all(b <= a + 1e-9 for a, b in zip(residuals, residuals[1:], strict=False))
+    assert all(b <= a + 1e-9 for a, b in pairwise(residuals))
     assert residuals[-1] < 1e-6
     assert 0 < commands[0].progress < 1
     assert not model.violations(end)
@@ -131,7 +132,7 @@ def test_look_at_turns_the_axis_to_the_point() -> None:
     point = np.array([1.0, -2.5, 0.0])
     e = look_at(model.fk("tip"), point)
     controller = Controller(model, [Goal(e, name="look")], dt=DT)
-    state, commands = follow(controller, model.default_state().updated({"joint1": 0.4}), 6.0)
+    state, _ = follow(controller, model.default_state().updated({"joint1": 0.4}), 6.0)
     pose = model.fk("tip")(state)
     ray = point - pose[:3, 3]
     assert pose[:3, 0] @ ray == pytest.approx(np.linalg.norm(ray), abs=1e-6)
@@ -180,7 +181,7 @@ def test_wheels_are_found_from_gradients(name: str) -> None:
     ]
     p = model.fk(frame)[:3, 3]
     start = model.default_state()
-    controller = Controller(model, [Goal(p, p(start) + [0.5, 0.0, 0.0])], dt=DT)
+    controller = Controller(model, [Goal(p, p(start) + np.array([0.5, 0.0, 0.0]))], dt=DT)
     assert set(controller.speeds) <= set(model.speeds)
     assert any("base" in str(s) or "wheel" in str(s) for s in controller.speeds)
     end, commands = follow(controller, start, 8.0)
@@ -294,7 +295,7 @@ def test_coordinate_outside_of_its_limits_comes_back() -> None:
 def test_unreachable_goal_ends_as_near_as_possible() -> None:
     model = planar_arm(2)
     controller = Controller(model, [Goal(model.fk("tip")[:2, 3], [5.0, 0.0], name="far")], dt=DT)
-    state, commands = follow(controller, model.default_state().updated({"joint1": 0.6, "joint2": -0.9}), 15.0)
+    _, commands = follow(controller, model.default_state().updated({"joint1": 0.6, "joint2": -0.9}), 15.0)
     assert commands[-1].residuals["far"] == pytest.approx(3.0, abs=1e-2)
     assert max(abs(v) for v in commands[-1].speeds.values()) < 0.05
 
@@ -328,7 +329,7 @@ def test_contradictory_holds_stop_without_progress() -> None:
     model = planar_arm(1)
     q = model.symbol("joint1")
     controller = Controller(model, [Hold(q, 0.5, name="one"), Hold(q, -0.5, name="other")], dt=DT)
-    state, commands = follow(controller, model.default_state(), 1.0)
+    _, commands = follow(controller, model.default_state(), 1.0)
     assert commands[-1].progress == pytest.approx(0.0, abs=1e-6)
     assert commands[-1].residuals == {"one": pytest.approx(0.5), "other": pytest.approx(0.5)}
 

@@ -11,11 +11,13 @@ bodies may come near without another compilation. Within the margin a soft goal 
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Iterable, Sequence
 
 import numpy as np
 
 from kineverse.compile import compile  # noqa: A004
+from kineverse.errors import InvalidValueError
 from kineverse.expressions.expression import Expression, array, as_expression
 from kineverse.geometry import Rule, Scene
 from kineverse.geometry.results import DistanceResults
@@ -56,6 +58,14 @@ class ContactSlots:
         Near pairs of the last update, nearest first, all of them.
     function
         Compiled twists of the groups of bodies.
+    gain, radius
+        The parameters of these names, which can be changed.
+
+    Raises
+    ------
+    InvalidValueError
+        For a scene that is none, a number of slots that is no natural number, a margin that is not finite, or
+        a radius that is not larger.
     """
 
     found: DistanceResults
@@ -72,9 +82,18 @@ class ContactSlots:
         twist: Callable[[str], Expression] | None = None,
         rules: Iterable[Rule] = (),
     ) -> None:
+        if not isinstance(scene, Scene):
+            raise InvalidValueError(f"scene= is a kineverse.geometry.Scene of the model, not {scene!r}.")
+        check_slots(count)
+        if not (math.isfinite(margin) and margin < radius):
+            raise InvalidValueError(
+                f"Pairs count from a radius on that is larger than their margin, not {radius!r} m beside "
+                f"{margin!r} m."
+            )
         model = scene.model
+        self._version = model.version
         self.scene, self.count = scene, count
-        self.margin, self.gain = margin, gain
+        self.margin, self.radius, self.gain = margin, radius, gain
         motion = FrameDependence(model, speeds)
         self._query = scene.watch(radius=radius, moving=speeds, rules=rules, per_shape=True)
         watched = set(self._query.pairs.ravel().tolist())
@@ -94,13 +113,33 @@ class ContactSlots:
         self._twist_values = np.array([place[s] for s in self.function.inputs], dtype=np.intp)
 
     def update(self, values: Array) -> None:
-        """Find the near pairs at the values of :attr:`inputs`."""
+        """Find the near pairs at the values of :attr:`inputs`.
+
+        Raises
+        ------
+        InvalidValueError
+            For values that are not finite, or after an edit of the scene's model.
+        """
+        if self.scene.model.version != self._version:
+            raise InvalidValueError(
+                "The model of the scene was edited since, so the rows of contacts are not about its bodies. "
+                "Build anew, or with a scene of model.snapshot()."
+            )
         self.scene.update(values[self._scene_values])
-        self.found = self._query()
+        self.found = self._query(self.radius)
         self._twists.input[:] = values[self._twist_values]
         self._twists()
 
-    def write(self, H: Array, f: Array, A: Array, lower: Array, upper: Array, recovery: float) -> None:
+    def write(
+        self,
+        H: Array,
+        f: Array,
+        A: Array,
+        lower: Array,
+        upper: Array,
+        recovery: float,
+        weight: float = RECOVERY_WEIGHT,
+    ) -> None:
         """Write the rows of the nearest pairs into the rows of a program, and the soft goals into its costs.
 
         Parameters
@@ -111,6 +150,8 @@ class ContactSlots:
             The rows of the slots, (count, n) and (count,), all zero and unbounded before.
         recovery
             Rate at which a pair within the margin separates [1/s].
+        weight
+            Weight of the soft goals.
         """
         found = self.found
         used = min(len(found), self.count)
@@ -129,13 +170,19 @@ class ContactSlots:
         near = gap < 0.0
         if near.any():
             inside = rows[near]
-            H[:n, :n] += RECOVERY_WEIGHT * (inside.T @ inside)
-            f[:n] -= RECOVERY_WEIGHT * recovery * ((INWARDS - gap[near]) @ inside)
+            H[:n, :n] += weight * (inside.T @ inside)
+            f[:n] -= weight * recovery * ((INWARDS - gap[near]) @ inside)
 
     @property
     def omitted(self) -> int:
         """Number of near pairs of the last update that have no row."""
         return max(0, len(self.found) - self.count)
+
+
+def check_slots(count: object) -> None:
+    """Raise InvalidValueError for a number of contact slots that is no natural number."""
+    if isinstance(count, bool) or not isinstance(count, int) or count < 0:
+        raise InvalidValueError(f"contacts= is a number of rows, 0 or more, not {count!r}.")
 
 
 def _project(normals: Array, points: Array, twists: Array) -> Array:

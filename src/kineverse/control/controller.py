@@ -25,7 +25,7 @@ from kineverse.state import State, StateLike, as_state
 from kineverse.symbols import Symbol, parameter
 
 from .command import Command, StepTimes
-from .contact_slots import ContactSlots
+from .contact_slots import ContactSlots, check_slots
 from .control_loop import LoopReport, run_control_loop
 from .diagnosis import Diagnosis
 from .formulation import Formulation
@@ -33,10 +33,12 @@ from .quadratic_program import make_solver
 from .regularization import Costs, acceleration_limits, check_weight, find_posture, joint_weights
 from .targets import Target
 from .tasks import Task
-from .velocity_program import VelocityProgram, arrange_inputs
+from .velocity_program import RECOVERY_WEIGHT, VelocityProgram, arrange_inputs
 
 _DT = "control/dt"
 _CONTACT_GAIN = 10.0
+_APPROACH = 2.5
+"""Relative speed of bodies up to which default radii are large enough [m/s]."""
 _FEASIBLE = 1e-6
 """Largest violation of a row, in its unit per second, that counts as none where the solver failed."""
 
@@ -47,7 +49,8 @@ class Controller:
     A step evaluates one compiled function of the state and solves one quadratic program; see
     :mod:`.velocity_program` for the equations. The program starts in CasADi's interpreter and continues in C
     once that is compiled. Without contradictory tasks a step is feasible at every state; outside of its
-    limits a coordinate is led back. The controller is about the version of the model at construction.
+    limits a coordinate is led back. The controller is about the version of the model at construction. It is
+    for one thread, and its scene is for one controller at a time.
 
     Parameters
     ----------
@@ -76,7 +79,8 @@ class Controller:
     contacts
         Number of contact slots: rows for the nearest pairs whose distance the speeds change.
     margin, radius
-        Distance that pairs keep, and distance from which they count [m].
+        Distance that pairs keep, and distance from which they count [m]; the latter by default 0.05 m, or how
+        far 2.5 m/s lead in a step if that is more. Bodies that approach faster need a larger one.
     solver
         ``"daqp"``, ``"proxsuite"`` or ``"osqp"``.
 
@@ -94,7 +98,7 @@ class Controller:
     Raises
     ------
     InvalidValueError, UnknownNameError, DuplicateNameError
-        As :class:`.Formulation`; also for a time step that is not positive.
+        As :class:`.Formulation`; also for a time step or a weight that is not positive.
     MissingDependencyError
         If the solver is not installed.
     """
@@ -114,11 +118,12 @@ class Controller:
         scene: Scene | None = None,
         contacts: int = 24,
         margin: float = 0.005,
-        radius: float = 0.05,
+        radius: float | None = None,
         solver: str = "daqp",
     ) -> None:
         check_weight("smooth", smooth)
         check_weight("jerk", jerk)
+        check_slots(contacts)
         _check_step(dt)
         self.model = model
         step = parameter(_DT, float(dt))
@@ -135,15 +140,20 @@ class Controller:
             joint_weights=joint_weights(formulation, weights),
             posture=find_posture(formulation, posture),
             accelerations=stated | chosen,
-            hard_accelerations=not formulation.holds and not chosen,
             contacts=contacts if scene is not None else 0,
             dt=step,
         )
         self.inputs = self._program.inputs
         self._contacts: ContactSlots | None = None
+        self._default_radius = radius is None
         if scene is not None and contacts:
             self._contacts = ContactSlots(
-                scene, self.speeds, contacts, margin=margin, radius=radius, gain=min(0.5 / dt, _CONTACT_GAIN)
+                scene,
+                self.speeds,
+                contacts,
+                margin=margin,
+                radius=_contact_radius(dt) if radius is None else radius,
+                gain=_contact_gain(dt),
             )
             self.inputs = arrange_inputs({*self.inputs, *self._contacts.inputs})
             place = {s: k for k, s in enumerate(self.inputs)}
@@ -185,6 +195,10 @@ class Controller:
     def dt(self, value: float) -> None:
         _check_step(value)
         self._dt[:] = value
+        if self._contacts is not None:
+            self._contacts.gain = _contact_gain(value)
+            if self._default_radius:
+                self._contacts.radius = _contact_radius(value)
 
     @property
     def tier(self) -> str:
@@ -207,8 +221,10 @@ class Controller:
         if len(self._before):
             self._before[:] = self._last
 
-    def set(self, target: Target | Symbol, value: npt.ArrayLike) -> None:
-        """Set a target, or a parameter, for all further steps; the value in a state has precedence.
+    def set(self, target: Target | Symbol | str, value: npt.ArrayLike) -> None:
+        """Set a target, or a parameter by symbol or name, for all further steps.
+
+        The value in a state has precedence.
 
         Raises
         ------
@@ -217,12 +233,16 @@ class Controller:
         ShapeError, InvalidValueError
             For a value of another shape, or one that is not finite.
         """
+        given: list[tuple[Symbol | str, float]]
         if isinstance(target, Target):
-            values = target.values(value)
+            given = [*target.values(value).items()]
+        elif np.ndim(value):
+            raise ShapeError(f"The parameter '{target}' is a number, not of shape {np.shape(value)}.")
         else:
-            values = {target: float(np.asarray(value, dtype=float))}
-        for symbol, number in values.items():
-            if symbol not in self._parameters:
+            named = {str(s): s for s in self._parameters}
+            given = [(named.get(str(target), target), float(np.asarray(value, dtype=float)))]
+        for symbol, number in given:
+            if not isinstance(symbol, Symbol) or symbol not in self._parameters:
                 if isinstance(target, Target) and any(s in self._parameters for s in target.parameters):
                     continue
                 known = map(str, self._parameters)
@@ -259,11 +279,19 @@ class Controller:
             self._contacts.update(self._values[self._contact_values])
         read = perf_counter()
         self._evaluate()
-        H, f, A, lower, upper, residuals, check = self._evaluate.outputs
+        H, f, A, lower, upper, residuals, check, largest, *_ = self._evaluate.outputs
         if self._contacts is not None:
             rows, first = self._program.contact_rows, self._program.columns
             ends = slice(first + rows.start, first + rows.stop)
-            self._contacts.write(H, f, A[rows], lower[ends], upper[ends], self._costs.recovery)
+            self._contacts.write(
+                H,
+                f,
+                A[rows],
+                lower[ends],
+                upper[ends],
+                self._costs.recovery,
+                RECOVERY_WEIGHT * float(largest[()]),
+            )
         if not math.isfinite(check[()]):
             raise self._diagnosis.not_finite()
         evaluated = perf_counter()
@@ -288,6 +316,11 @@ class Controller:
         if len(self._before):
             self._before[:] = self._last
         self._last[:] = x[:n]
+        if self._program.speed_goals:
+            jacobian, rate = self._evaluate.outputs[-2:]
+            missing = jacobian @ x[:n] - rate
+            for place, rows in self._program.speed_goals:
+                residuals[place] = np.linalg.norm(missing[rows])
         values = x.tolist()
         return Command(
             dict(zip(self.speeds, values, strict=False)),
@@ -310,7 +343,10 @@ class Controller:
                 value = state.given(symbol)
                 self._values[place] = self._settings[symbol] if value is None else value
             return
-        vector = np.asarray(state, dtype=float)
+        try:
+            vector = np.asarray(state, dtype=float)
+        except (TypeError, ValueError):
+            raise InvalidValueError(f"A step takes a state, a mapping or a vector, not {state!r}.") from None
         if vector.shape != self._values.shape:
             raise ShapeError(
                 f"The vector of a state has the {len(self.inputs)} values of controller.inputs, not shape "
@@ -350,6 +386,14 @@ class Controller:
             f"<Controller: {len(self.tasks)} tasks, {len(self.speeds)} speeds, "
             f"{self._program.rows} rows, dt {self.dt:g} s>"
         )
+
+
+def _contact_radius(dt: float) -> float:
+    return max(0.05, _APPROACH * dt)
+
+
+def _contact_gain(dt: float) -> float:
+    return min(0.5 / dt, _CONTACT_GAIN)
 
 
 def _check_step(dt: float) -> None:

@@ -63,7 +63,7 @@ class Diagnosis:
 
     def least_violation(self) -> LeastViolation:
         """Return the speeds that violate the rows least, within the model's limits of single speeds."""
-        _, _, A, lower, upper, _, _ = self._evaluator.outputs
+        _, _, A, lower, upper, *_ = self._evaluator.outputs
         n, width = len(self._program.speeds), A.shape[1]
         # Keeps on single speeds become rows, which may give way.
         low, high, keeps = lower.copy(), upper.copy(), []
@@ -109,7 +109,10 @@ class Diagnosis:
 
     def _find_conflict(self) -> tuple[Conflict, ...]:
         """Return an irreducible set of contradictory constraints; rows of one name are one member."""
-        _, _, A, lower, upper, _, _ = self._evaluator.outputs
+        _, _, A, lower, upper, *_ = self._evaluator.outputs
+        # Soft rows give way, so they take no part.
+        soft = self._program.soft
+        lower, upper = np.where(soft, -math.inf, lower), np.where(soft, math.inf, upper)
         simple = self._simple_rows()
         found: dict[str, tuple[float, float]] = {}
         for k, side in find_irreducible_conflict(A, lower, upper):

@@ -19,12 +19,14 @@ from kineverse.expressions.functions import minimum, norm
 from kineverse.model.constraint import Constraint
 from kineverse.model.model_view import ModelView
 from kineverse.model.projection import is_equality
+from kineverse.model.speed_limits import is_infinite, raw_max
 from kineverse.model.velocity_rows import VelocityRows, velocity_rows
 from kineverse.symbols import Symbol
 
 from .tasks import Goal, Hold, Keep, Task
 
 ZERO = as_expression(0.0)
+_SMALLEST = 1e-300
 
 
 @dataclass(frozen=True)
@@ -43,6 +45,8 @@ class GoalRows:
         (k,) wanted rates by the error alone, and with those of the target.
     weight
         (k,) weights of the squared differences.
+    about_speeds
+        True for a goal about speeds.
     """
 
     name: str
@@ -51,6 +55,7 @@ class GoalRows:
     correction: Expression
     rate: Expression
     weight: Expression
+    about_speeds: bool = False
 
 
 @dataclass(frozen=True)
@@ -93,7 +98,7 @@ class Formulation:
     UnknownNameError
         For a task about a symbol that the model does not have, or an unknown name in ``still``.
     InvalidValueError
-        If there is no task, or one that no speed serves.
+        If there is no task, one that no speed serves, or a keep that cannot be a row.
     DuplicateNameError
         For two tasks of one name.
     """
@@ -110,6 +115,7 @@ class Formulation:
         self.model = model
         self.tasks = check_tasks(tasks)
         self._names = name_tasks(self.tasks)
+        self._most_gain = 1.0 / as_expression(dt)
         self._still = find_speeds(model, still, "still")
         rates = model.rates
         every = dict(model.constraints)
@@ -125,11 +131,10 @@ class Formulation:
         taken = [name for name in keeps if name in every]
         if taken:
             raise DuplicateNameError(f"The model has a constraint '{taken[0]}'; give the Keep another name.")
-        subject = [*errors.values(), *(c.expression for c in keeps.values())]
+        subject = [*errors.values(), *(e for c in keeps.values() for e in _parts(c))]
         for expression in subject:
             self._check_symbols(expression)
-        relevant = model.constraints_for(subject, closure=True)
-        relevant |= keeps
+        relevant = _relevant_constraints(model, subject) | keeps
         equalities = {name: c for name, c in relevant.items() if is_equality(c)}
         ranges = {name: c for name, c in relevant.items() if name not in equalities}
         held = {name: rates.carry(c.expression - c.lower) for name, c in equalities.items()}
@@ -155,20 +160,20 @@ class Formulation:
                 f"{suggest(str(unknown[0]), map(str, model.speeds), 'speed')}"
             )
         self.rows = found if found.speeds == self.speeds else self._rows(ranges, dt, self.speeds)
+        self._check_keeps({name: c for name, c in keeps.items() if name in ranges})
         self.keeps = tuple(name for name in keeps if name not in equalities)
         self.goals = tuple(
             self._goal_rows(task, errors[task], gradients[task])
             for task in self.tasks
             if isinstance(task, Goal)
         )
-        limit = 0.5 / as_expression(dt)
-        default = minimum(limit, 10.0)
+        default = minimum(0.5 / as_expression(dt), 10.0)
         holds = [
             HoldRows(
                 self._names[task],
                 errors[task],
                 self._matrix(task, gradients[task]),
-                default if task.gain is None else minimum(as_expression(task.gain), 2 * limit),
+                default if task.gain is None else self._limit_gain(task.gain),
             )
             for task in self.tasks
             if isinstance(task, Hold)
@@ -225,14 +230,30 @@ class Formulation:
             eliminated = self.model.rates.eliminate(error)
             constant = eliminated.substitute({s: 0.0 for s in eliminated.symbols if s.order})
             none = as_expression(np.zeros(goal.error.size))
-            return GoalRows(self._names[goal], constant, jacobian, none, -constant, weight)
-        rate = correction = -as_expression(goal.gain) * error
+            return GoalRows(self._names[goal], constant, jacobian, none, -constant, weight, True)
+        rate = correction = -self._limit_gain(goal.gain) * error
         if goal.speed is not None:
             speed = as_expression(goal.speed)
-            rate = correction = rate * minimum(1.0, speed / norm(np.concatenate([rate, [speed]])))
+            # A speed of 0, of a parameter, has to be possible where the error is 0.
+            size = raw_max(norm(np.concatenate([rate, [speed]])), as_expression(_SMALLEST))
+            rate = correction = rate * (speed / size)
         if goal.rate is not None:
             rate = rate + (as_expression(goal.rate) + ZERO * goal.expression).ravel()
         return GoalRows(self._names[goal], error, jacobian, correction, rate, weight)
+
+    def _limit_gain(self, gain: ExpressionLike) -> Expression:
+        """Return a gain of at most 1/dt; with a larger one a step goes beyond its target."""
+        return minimum(as_expression(gain), self._most_gain)
+
+    def _check_keeps(self, keeps: Mapping[str, Constraint]) -> None:
+        """Refuse keeps that cannot be rows, and would be ignored."""
+        reasons = dict(self.rows.skipped)
+        for name, constraint in keeps.items():
+            if constraint.order > 1:
+                reasons[name] = "it is about accelerations, whose limits are given by acceleration="
+            bounded = not (is_infinite(constraint.lower) and is_infinite(constraint.upper))
+            if name in reasons and bounded:
+                raise InvalidValueError(f"The Keep '{name}' cannot be kept: {reasons[name]}.")
 
     def _matrix(self, task: Goal | Hold, gradient: dict[Symbol, Expression]) -> Expression:
         """Return the Jacobian over the columns, (k, n)."""
@@ -259,6 +280,29 @@ class Formulation:
                     f"A task is about '{symbol}', which is not in the model. "
                     f"{suggest(symbol.path, known, 'symbol')}"
                 )
+
+
+def _parts(constraint: Constraint) -> tuple[Expression, ...]:
+    """Return the expressions whose coordinates move if a constraint is to hold."""
+    if constraint.order:
+        return (constraint.expression,)
+    return constraint.lower, constraint.expression, constraint.upper
+
+
+def _relevant_constraints(model: ModelView, subject: Sequence[Expression]) -> dict[str, Constraint]:
+    """Return the constraints that share a coordinate with a subject, or with a constraint of the result.
+
+    Coordinates in bounds of positions count: what bounds another coordinate moves it, and the other way
+    round. Those in bounds of speeds, such as the bolt of a lock, do not.
+    """
+    found = model.constraints_for(subject, closure=True)
+    while True:
+        shared = [*subject, *(part for c in found.values() for part in _parts(c))]
+        every = model.constraints_for(shared, bounds=True)
+        more = [c for name, c in every.items() if name not in found and c.order == 0]
+        if not more:
+            return found
+        found = model.constraints_for([*shared, *(part for c in more for part in _parts(c))], closure=True)
 
 
 def find_speeds(model: ModelView, names: Iterable[Symbol | str], argument: str) -> frozenset[Symbol]:

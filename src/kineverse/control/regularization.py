@@ -15,10 +15,10 @@ from kineverse.expressions.graph import dense_column
 from kineverse.lie import Array
 from kineverse.model.frame_dependence import count_moved_bodies
 from kineverse.model.model_view import ModelView
-from kineverse.model.speed_limits import raw_min
+from kineverse.model.speed_limits import is_infinite, raw_min
 from kineverse.symbols import Symbol
 
-from .formulation import Formulation, find_speeds
+from .formulation import Formulation, GoalRows, HoldRows, find_speeds
 from .tasks import Goal
 
 _SAMPLES = 16
@@ -32,33 +32,46 @@ class Costs:
 
     Attributes
     ----------
-    damping, error_damping
-        Weight of squared speeds, and factor of their product with the rates that goals want.
+    damping
+        Weight of squared speeds.
     smooth, jerk
         Weights of the first and second differences of commands.
     progress
-        Weight of the progress of holds.
+        Weight of the progress of holds, as a multiple of the largest one of goals.
     recovery
         Rate at which violations of limits decay [1/s].
     """
 
     damping: float = 1e-4
-    error_damping: float = 1.0
     smooth: float = 1e-2
     jerk: float = 0.0
     progress: float = 10.0
     recovery: float = 5.0
 
 
+@dataclass(frozen=True)
+class JointWeights:
+    """Factors of the speeds in the terms that no task states.
+
+    Attributes
+    ----------
+    shares
+        (n,) factors c_i of damping, smoothness and posture. They are mean squares of the speed's column in
+        the Jacobians of goals and holds over random states, so that units of coordinates do not matter; times
+        the share of bodies that the speed moves, or a given factor.
+    curvatures
+        For each goal (n,) estimates of ``Σ_j |∂²e/∂q_i∂q_j|``: with the root l of the mean square of a column
+        of its Jacobian, for a rotation the lever, ``Σ_j l_i² / max(l_i, l_j)``; times the same shares.
+    """
+
+    shares: tuple[Expression, ...]
+    curvatures: tuple[tuple[Expression, ...], ...]
+
+
 def joint_weights(
     formulation: Formulation, weights: Mapping[Symbol | str, ExpressionLike] | None
-) -> dict[Symbol, Expression]:
-    """Return the factor c_i of damping, smoothness and posture of each speed.
-
-    It is the mean square of the speed's column in the Jacobians of goals and holds over random states, so
-    that units of coordinates do not matter; times the share of bodies that the speed moves, or a given
-    factor.
-    """
+) -> JointWeights:
+    """Return the factors of the speeds, with given ones by coordinate or speed in place of defaults."""
     model, speeds = formulation.model, formulation.speeds
     moved = count_moved_bodies(model, speeds)
     most = max(moved.values(), default=0)
@@ -69,18 +82,34 @@ def joint_weights(
         chosen = find_speeds(model, (key,), "weights")
         if any(s not in factors for s in chosen):
             raise InvalidValueError(f"weights=: no task moves '{key}', so it has no weight.")
-        factors |= dict.fromkeys(chosen, as_expression(weight))
+        given = as_expression(weight)
+        if not given.symbols and not 0 < float(given) < math.inf:
+            raise InvalidValueError(f"weights=: the weight of '{key}' is positive, not {weight!r}.")
+        factors |= dict.fromkeys(chosen, given)
     scales = _column_scales(formulation)
-    return {s: float(scale) * factors[s] for s, scale in zip(speeds, scales, strict=True)}
+    together = scales.sum(axis=0)
+    positive = together[together > 0]
+    together = np.where(together > 0, together, positive.mean() if len(positive) else 1.0)
+    goals = scales[: len(formulation.goals)]
+    levers = np.sqrt(np.maximum(goals, np.finfo(float).tiny))
+    longer = np.maximum(levers[:, :, None], levers[:, None, :])
+    curvatures = 0.75 * goals * ((goals > 0)[:, None, :] / longer).sum(axis=2)
+    return JointWeights(
+        tuple(float(scale) * factors[s] for s, scale in zip(speeds, together, strict=True)),
+        tuple(
+            tuple(float(each) * factors[s] for s, each in zip(speeds, row, strict=True)) for row in curvatures
+        ),
+    )
 
 
 def _column_scales(formulation: Formulation) -> Array:
-    """Return the mean square of each column of the tasks' Jacobians over random states, (n,)."""
+    """Return mean squares over random states of the columns of Jacobians of goals, then holds, (k, n)."""
     model, n = formulation.model, len(formulation.speeds)
-    jacobians = [row.jacobian for row in formulation.goals] + [row.jacobian for row in formulation.holds]
-    if not jacobians:
-        return np.ones(n)
-    stacked = as_expression(np.concatenate(jacobians))
+    tasks: tuple[GoalRows | HoldRows, ...] = (*formulation.goals, *formulation.holds)
+    if not tasks:
+        return np.ones((1, n))
+    stacked = as_expression(np.concatenate([row.jacobian for row in tasks]))
+    first = np.cumsum([0, *(row.error.size for row in tasks[:-1])])
     symbols = stacked.symbols
     # Each state counts once, so common parts are not looked for.
     function = ca.Function("J", [ca.vertcat(*(s.sx for s in symbols))], [dense_column(stacked)])
@@ -94,10 +123,8 @@ def _column_scales(formulation: Formulation) -> Array:
     for _ in range(_SAMPLES):
         J = np.array(function([generator.uniform(low, max(low, high)) for low, high in ranges]))
         if np.isfinite(J).all():  # else outside of the domain of a closed loop
-            squares.append((J.reshape(-1, n) ** 2).sum(axis=0))
-    found = np.mean(squares, axis=0) if squares else np.ones(n)
-    positive = found[found > 0]
-    return np.where(found > 0, found, positive.mean() if len(positive) else 1.0)
+            squares.append(np.add.reduceat(J.reshape(-1, n) ** 2, first, axis=0))
+    return np.asarray(np.mean(squares, axis=0)) if squares else np.ones((len(tasks), n))
 
 
 def check_weight(name: str, value: float) -> None:
@@ -114,6 +141,8 @@ def find_posture(
     By default these are the coordinates that no goal is about directly, such as a door to be opened.
     """
     model = formulation.model
+    for value in posture.values() if isinstance(posture, Mapping) else (posture,):
+        check_weight("posture", value)
     if isinstance(posture, Mapping):
         weights = {s: w for key, w in posture.items() for s in find_speeds(model, (key,), "posture")}
     else:
@@ -121,7 +150,6 @@ def find_posture(
         weights = {s: posture for s in formulation.speeds if s.position not in asked}
     found = {}
     for speed, weight in weights.items():
-        check_weight("posture", weight)
         coordinate = speed.position
         if weight and coordinate in model.degrees_of_freedom and coordinate not in model.rates:
             lower, upper = model.limits(coordinate)
@@ -138,7 +166,9 @@ def acceleration_limits(
     for constraint in model.constraints.values():
         symbol = constraint.expression
         if isinstance(symbol, Symbol) and symbol.order == 2:
-            stated[symbol.integral()] = raw_min(-constraint.lower, constraint.upper)
+            speed, least = symbol.integral(), raw_min(-constraint.lower, constraint.upper)
+            if not is_infinite(least):
+                stated[speed] = raw_min(stated[speed], least) if speed in stated else least
     if chosen is None:
         return stated, {}
     if isinstance(chosen, Mapping):

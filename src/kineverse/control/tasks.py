@@ -28,7 +28,7 @@ class Goal:
     name
         Name in results and messages; by default that of the expression, or its number among the tasks.
     gain
-        Rate at which the error decays [1/s].
+        Rate at which the error decays [1/s], at most 1/dt. Goals about speeds have no use for it.
     speed
         Largest norm of the wanted rate, in the unit of the expression per second; None for no limit.
     rate
@@ -46,7 +46,8 @@ class Goal:
     ShapeError
         For a 4×4 transform, or a target of another shape.
     InvalidValueError
-        For an expression that nothing moves, a gain or speed that is not positive, or a negative weight.
+        For an expression that nothing moves, a gain or speed that is not positive, or a negative weight; for
+        a goal about speeds that has a speed or rate, or entries without a speed.
     """
 
     expression: Expression
@@ -70,6 +71,15 @@ class Goal:
             )
         for weight in weights.ravel():
             _check_number(self, "weight", weight, 0.0)
+        if any(s.order for s in error.symbols):
+            if self.speed is not None or self.rate is not None:
+                raise InvalidValueError(
+                    f"{self!r} is about speeds; speed= and rate= are for goals of positions."
+                )
+            if not all(any(s.order for s in entry.symbols) for entry in error.ravel()):
+                raise InvalidValueError(
+                    f"{self!r} has entries of positions and of speeds; make two goals of it."
+                )
         if self.rate is not None and as_expression(self.rate).shape not in ((), error.shape):
             raise ShapeError(
                 f"{self!r}: the rate has shape {as_expression(self.rate).shape}, not {error.shape}."

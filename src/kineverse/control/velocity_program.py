@@ -4,7 +4,7 @@ Over the speeds v and, if anything is held, the progress s in [0, 1]::
 
     minimise    Σ w |J v - r|²                      goals
               + Σ w_r |a·v + k x|²                  way back of violated rows, x the violation
-              + Σ c_i (d + d_e Δt Σ w|g e|) v_i²    damping, larger where goals are far (Sugihara 2011)
+              + Σ (c_i d + Δt Σ κ_i w|g e|) v_i²    damping, larger where goals are far (Sugihara 2011)
               + Σ c_i (m (v_i - v_i⁻)² + j (v_i - 2 v_i⁻ + v_i⁻⁻)²)      smoothness, jerk
               + Σ c_i p (v_i - g (q_i* - q_i))²     posture, while goals are not reached
               + w_s (1 - s)²                        progress
@@ -12,14 +12,17 @@ Over the speeds v and, if anything is held, the progress s in [0, 1]::
                 lower <= [v; A v] <= upper          velocity rows, keeps, accelerations, contacts
 
 The damping by |g e| bounds the second derivative of the errors, Δt |g e| |∂J/∂q|, which a linear program
-leaves out. So a goal out of reach ends at rest, with a stretched arm. All rows but those of keeps on speeds
-contain 0, so v = 0, s = 0 is feasible.
+leaves out; κ_i estimates it for each goal, so a goal damps only the speeds that serve it. A goal out of reach
+ends at rest, with a stretched arm. w_r and w_s are multiples of the largest diagonal entry of Σ w JᵀJ, so
+that neither weights nor units of goals outweigh limits and holds. All rows but those of keeps on speeds and
+of accelerations contain 0, and accelerations give way. So v = 0, s = 0 is feasible.
 """
 
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping
 from functools import reduce
+from itertools import pairwise
 
 import casadi as ca
 import numpy as np
@@ -32,14 +35,15 @@ from kineverse.model.speed_limits import INFINITE, ZERO, is_infinite, raw_max
 from kineverse.symbols import Symbol, parameter
 
 from .formulation import Formulation, GoalRows, HoldRows
-from .regularization import Costs
+from .regularization import Costs, JointWeights
 
 RECOVERY_WEIGHT = 1e3
+"""Weight of a way back, as a multiple of the largest one of goals."""
 INWARDS = 1e-3
 """Distance inside of a bound at which a way back aims, so that it ends at the bound and not near it."""
 POSTURE_GAIN = 0.5
-REACHED = 1e-2
-"""Wanted rate of goals below which the posture fades [unit/s]."""
+REACHED = 0.1
+"""Speed by which goals are reached below which the posture fades [unit/s]."""
 
 
 class VelocityProgram:
@@ -58,6 +62,9 @@ class VelocityProgram:
         Names of holds, and of the progress.
     soft
         Flags of rows that may be violated: accelerations.
+    speed_goals
+        Goals about speeds, as pairs of their place in the residuals and the slice of their rows. The last two
+        outputs of the function are Jacobian and wanted rates of all of these, if there are any.
     contact_rows
         Slice of the rows of contacts in A, which are zero here.
     """
@@ -67,10 +74,9 @@ class VelocityProgram:
         formulation: Formulation,
         costs: Costs,
         *,
-        joint_weights: Mapping[Symbol, ExpressionLike],
+        joint_weights: JointWeights,
         posture: Mapping[Symbol, tuple[float, float]],
         accelerations: Mapping[Symbol, ExpressionLike],
-        hard_accelerations: bool,
         contacts: int,
         dt: Symbol,
     ) -> None:
@@ -83,34 +89,36 @@ class VelocityProgram:
 
         diagonal, linear = [ZERO] * n, [ZERO] * n
         hessian: Expression = as_expression(np.zeros((n, n)))
-        effort = distance = ZERO
-        for goal in formulation.goals:
+        effort = ZERO
+        for goal, curvatures in zip(formulation.goals, joint_weights.curvatures, strict=True):
             weighted = goal.jacobian * goal.weight.reshape(goal.weight.size, 1)
             hessian = hessian + weighted.T @ goal.jacobian
             pull = weighted.T @ goal.rate
             linear = [linear[i] - pull[i] for i in range(n)]
             effort = effort + (goal.weight * goal.rate) @ goal.rate
-            distance = distance + norm(goal.weight * goal.correction)
+            distance = norm(goal.weight * goal.correction)
+            for i, curvature in enumerate(curvatures):
+                diagonal[i] = diagonal[i] + curvature * dt * distance
+        largest = reduce(raw_max, [hessian[i, i] for i in range(n)], as_expression(1.0))
         rows = formulation.rows
         bounds, general = rows.bounds, rows.general
         for i in range(n):
             violation = bounds.violation[i]
             if violation.symbols:
-                weight, rate = _way_back(violation, costs.recovery)
+                weight, rate = _way_back(violation, costs.recovery, largest)
                 diagonal[i] = diagonal[i] + weight
                 linear[i] = linear[i] - weight * rate
         for k in range(len(general.names)):
             violation = general.violation[k]
             if violation.symbols:
-                weight, rate = _way_back(violation, costs.recovery)
+                weight, rate = _way_back(violation, costs.recovery, largest)
                 row = general.matrix[k]
                 hessian = hessian + weight * (row.reshape(n, 1) @ row.reshape(1, n))
                 linear = [linear[i] - weight * rate * row[i] for i in range(n)]
-        fade = effort / (effort + REACHED**2)
+        fade = effort / (effort + REACHED**2 * largest)
         for i, speed in enumerate(speeds):
-            share = as_expression(joint_weights[speed])
-            steady = share * (costs.smooth + costs.jerk)
-            diagonal[i] = diagonal[i] + steady + share * (costs.damping + costs.error_damping * dt * distance)
+            share = joint_weights.shares[i]
+            diagonal[i] = diagonal[i] + share * (costs.smooth + costs.jerk + costs.damping)
             linear[i] = linear[i] - share * costs.smooth * last[i]
             if before:
                 linear[i] = linear[i] - share * costs.jerk * (2 * last[i] - before[i])
@@ -127,9 +135,10 @@ class VelocityProgram:
         names: list[tuple[str, ...]] = list(bounds.names)
         if held:
             column = as_expression(np.zeros((n, 1)))
-            corner = as_expression([[costs.progress]])
+            progress = costs.progress * largest
+            corner = progress.reshape(1, 1)
             H = as_expression(np.block([[H, column], [column.T, corner]]))
-            linear = [*linear, as_expression(-costs.progress)]
+            linear = [*linear, -progress]
             lower, upper = [*lower, ZERO], [*upper, as_expression(1.0)]
             names.append(("progress",))
         matrix: list[Expression] = []
@@ -154,7 +163,7 @@ class VelocityProgram:
                 lower.append(last[i] - change)
                 upper.append(last[i] + change)
                 names.append((f"acceleration of {speed.position}",))
-                soft.append(not hard_accelerations)
+                soft.append(True)
         first = len(soft)
         self.contact_rows = slice(first, first + contacts)
         for _ in range(contacts):
@@ -179,8 +188,19 @@ class VelocityProgram:
         residuals = {row.name: norm(row.error) for row in tasks}
         residuals |= {name: self._keep_residual(name) for name in formulation.keeps}
         self.residuals = tuple(residuals)
+        about_speeds = [goal for goal in formulation.goals if goal.about_speeds]
+        ends = np.cumsum([0, *(goal.error.size for goal in about_speeds)]).tolist()
+        self.speed_goals = tuple(
+            (self.residuals.index(goal.name), slice(*end))
+            for goal, end in zip(about_speeds, pairwise(ends), strict=True)
+        )
         self.function: CompiledFunction[tuple[Array, ...]]
-        outputs = [H, f, A, array(lower), array(upper), array(list(residuals.values())), check]
+        outputs = [H, f, A, array(lower), array(upper), array(list(residuals.values())), check, largest]
+        if about_speeds:
+            outputs += [
+                as_expression(np.concatenate([g.jacobian for g in about_speeds])),
+                as_expression(np.concatenate([g.rate for g in about_speeds])),
+            ]
         used = {s for output in outputs for s in output.symbols}
         self.inputs = arrange_inputs(used - {dt, *last, *before})
         self.function = compile(outputs, (*self.inputs, dt, *last, *before))
@@ -197,8 +217,8 @@ def arrange_inputs(symbols: Iterable[Symbol]) -> tuple[Symbol, ...]:
     return tuple(sorted(symbols, key=lambda s: (s.value is not None, s.sort_key)))
 
 
-def _way_back(violation: Expression, gain: float) -> tuple[Expression, Expression]:
+def _way_back(violation: Expression, gain: float, largest: Expression) -> tuple[Expression, Expression]:
     """Return weight and wanted rate of a violated row; the weight is 0 inside of the bounds."""
     outside = binary(ca.OP_NE, violation, 0)
     sign = binary(ca.OP_LT, 0, violation) - binary(ca.OP_LT, violation, 0)
-    return RECOVERY_WEIGHT * outside, -gain * (violation + INWARDS * sign)
+    return RECOVERY_WEIGHT * largest * outside, -gain * (violation + INWARDS * sign)
