@@ -35,7 +35,8 @@ class Command:
         Norm of the error of each task at the state, by name, in the unit of its expression; for a goal about
         speeds the norm of what is missing, for a keep its violation.
     progress
-        Share of the wanted correction of holds that is possible, in [0, 1]; 1 if nothing is held.
+        Share of the wanted correction of holds that is possible, in [0, 1]: the least of all holds, 1 if
+        nothing is held.
     times
         Durations of the parts of the step.
     iterations

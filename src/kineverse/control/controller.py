@@ -325,7 +325,7 @@ class Controller:
         return Command(
             dict(zip(self.speeds, values, strict=False)),
             dict(zip(self._program.residuals, residuals.tolist(), strict=True)),
-            values[n] if len(values) > n else 1.0,
+            min(values[n:], default=1.0),
             times,
             iterations,
             multipliers.copy(),

@@ -60,12 +60,16 @@ class GoalRows:
 
 @dataclass(frozen=True)
 class HoldRows:
-    """Equality as rows ``jacobian @ v == -gain·s·error``, s the progress."""
+    """Equality as rows ``jacobian @ v == -gain·s·error``, s the progress.
+
+    ``closure`` is True for an equality of the model, such as the closure of a loop.
+    """
 
     name: str
     error: Expression
     jacobian: Expression
     gain: Expression
+    closure: bool = False
 
 
 class Formulation:
@@ -180,7 +184,7 @@ class Formulation:
         ]
         for name, error in held.items():
             flat = error.ravel()
-            holds.append(HoldRows(name, flat, self._stack(closures[name], 1), default))
+            holds.append(HoldRows(name, flat, self._stack(closures[name], 1), default, True))
         self.holds = tuple(holds)
 
     @property

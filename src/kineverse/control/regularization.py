@@ -22,6 +22,8 @@ from .formulation import Formulation, GoalRows, HoldRows, find_speeds
 from .tasks import Goal
 
 _SAMPLES = 16
+_IMMOVABLE = 1e-5
+"""Root mean square of a gradient, relative to the largest one of equalities, below which it is rounding."""
 _LEAST_SHARE = 0.01
 """Smallest default weight of a speed, so that damping stays positive."""
 
@@ -62,10 +64,14 @@ class JointWeights:
     curvatures
         For each goal (n,) estimates of ``Σ_j |∂²e/∂q_i∂q_j|``: with the root l of the mean square of a column
         of its Jacobian, for a rotation the lever, ``Σ_j l_i² / max(l_i, l_j)``; times the same shares.
+    immovable
+        Names of equalities of the model whose gradient is nothing but rounding, such as the parts of a
+        planar loop's closure that point out of its plane. A row of them would make others dependent.
     """
 
     shares: tuple[Expression, ...]
     curvatures: tuple[tuple[Expression, ...], ...]
+    immovable: frozenset[str]
 
 
 def joint_weights(
@@ -87,6 +93,12 @@ def joint_weights(
             raise InvalidValueError(f"weights=: the weight of '{key}' is positive, not {weight!r}.")
         factors |= dict.fromkeys(chosen, given)
     scales = _column_scales(formulation)
+    sizes = scales[len(formulation.goals) :].sum(axis=1)
+    immovable = frozenset(
+        hold.name
+        for hold, size in zip(formulation.holds, sizes, strict=False)
+        if hold.closure and size <= _IMMOVABLE**2 * sizes.max()
+    )
     together = scales.sum(axis=0)
     positive = together[together > 0]
     together = np.where(together > 0, together, positive.mean() if len(positive) else 1.0)
@@ -99,6 +111,7 @@ def joint_weights(
         tuple(
             tuple(float(each) * factors[s] for s, each in zip(speeds, row, strict=True)) for row in curvatures
         ),
+        immovable,
     )
 
 

@@ -98,7 +98,7 @@ class Goal:
 class Hold:
     """Equality that is kept while anything moves: ``ė = -gain·s·(expression - target)``, s the progress.
 
-    The progress s in [0, 1] is a variable of the controller's quadratic program. So a hold that is not
+    The progress s in [0, 1] of a hold is a variable of the controller's quadratic program. So one that is not
     satisfied yet is approached as fast as the limits allow, and standing still is always allowed.
 
     Parameters

@@ -1,6 +1,6 @@
 """Quadratic program of one control step, as one compiled function of the state.
 
-Over the speeds v and, if anything is held, the progress s in [0, 1]::
+Over the speeds v and the progress s in [0, 1] of each hold::
 
     minimise    Σ w |J v - r|²                      goals
               + Σ w_r |a·v + k x|²                  way back of violated rows, x the violation
@@ -82,7 +82,13 @@ class VelocityProgram:
     ) -> None:
         self.formulation = formulation
         self.speeds = speeds = formulation.speeds
-        n, held = len(speeds), bool(formulation.holds)
+        holds = [hold for hold in formulation.holds if hold.name not in joint_weights.immovable]
+        # Each hold has a progress of its own, so that one which cannot be corrected stops no other. The
+        # equalities of the model share one: they are satisfied together or not at all.
+        progresses: dict[str, int] = {}
+        for hold in holds:
+            progresses.setdefault("" if hold.closure else hold.name, len(progresses))
+        n, held = len(speeds), len(progresses)
         self.columns = n + held
         last = [parameter(f"control/last/{s}", 0.0) for s in speeds]
         before = [parameter(f"control/before/{s}", 0.0) for s in speeds] if costs.jerk else []
@@ -134,18 +140,21 @@ class VelocityProgram:
         lower, upper = [bounds.lower[i] for i in range(n)], [bounds.upper[i] for i in range(n)]
         names: list[tuple[str, ...]] = list(bounds.names)
         if held:
-            column = as_expression(np.zeros((n, 1)))
             progress = costs.progress * largest
-            corner = progress.reshape(1, 1)
+            column = as_expression(np.zeros((n, held)))
+            corner = as_expression(np.eye(held)) * progress
             H = as_expression(np.block([[H, column], [column.T, corner]]))
-            linear = [*linear, -progress]
-            lower, upper = [*lower, ZERO], [*upper, as_expression(1.0)]
-            names.append(("progress",))
+            linear += [-progress] * held
+            lower += [ZERO] * held
+            upper += [as_expression(1.0)] * held
+            names += [("progress",)] * held
         matrix: list[Expression] = []
         soft: list[bool] = []
-        for hold in formulation.holds:
+        for hold in holds:
+            own_progress = progresses["" if hold.closure else hold.name]
             for k in range(hold.error.size):
-                matrix += [*hold.jacobian[k], hold.gain * hold.error[k]]
+                decay = hold.gain * hold.error[k]
+                matrix += [*hold.jacobian[k], *(decay if j == own_progress else ZERO for j in range(held))]
                 lower.append(ZERO)
                 upper.append(ZERO)
                 names.append((hold.name,))
