@@ -191,8 +191,7 @@ class VelocityProgram:
         )
         f = array(linear)
         finite = [b for b in (*lower, *upper) if not is_infinite(b)]
-        parts = [e for part in (H, f, A) for e in part.ravel()] + finite
-        check = sum((part for part in parts if part.symbols), ZERO)
+        check = sum((part.sum() for part in (H, f, A, array([ZERO, *finite])) if part.size), ZERO)
         tasks: tuple[GoalRows | HoldRows, ...] = (*formulation.goals, *formulation.holds)
         residuals = {row.name: norm(row.error) for row in tasks}
         residuals |= {name: self._keep_residual(name) for name in formulation.keeps}
