@@ -282,3 +282,21 @@ def test_posture_does_not_keep_a_goal_from_being_reached() -> None:
         controller.reset()
         _, commands = follow(controller, model.default_state().updated(start), 12.0)
         assert commands[-1].residuals["reach"] < 1e-3
+
+
+def test_units_of_a_coordinate_do_not_matter() -> None:
+    """A slide in meters and in millimeters, and an arm on it."""
+    ends = []
+    for unit in (1.0, 1000.0):
+        model, slide, angle = kv.Model(), kv.position("slide"), kv.position("angle")
+        with model.edit() as edit:
+            pose = kv.translation(slide / unit, 0, 0) @ kv.rotation_z(angle) @ kv.translation(0.5, 0, 0)
+            edit.add_frame("tip", "world", pose)
+            edit.constrain("slide", -unit, slide, unit)
+            edit.constrain("slide/speed", -0.5 * unit, slide.derivative(), 0.5 * unit)
+            edit.constrain("angle/speed", -1, angle.derivative(), 1)
+        goal = Goal(model.fk("tip")[:2, 3], [0.9, 0.3])
+        start = model.default_state().updated({slide: -0.9 * unit, angle: 1.0})
+        end, _ = follow(Controller(model, [goal], dt=DT), start, 1.0)
+        ends.append([end[slide] / unit, end[angle]])
+    assert np.allclose(*ends, atol=1e-3)

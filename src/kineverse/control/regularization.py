@@ -24,6 +24,8 @@ from .tasks import Goal
 _SAMPLES = 16
 _IMMOVABLE = 1e-5
 """Root mean square of a gradient, relative to the largest one of equalities, below which it is rounding."""
+_SHIFT = 1e-6
+"""Step of finite differences, in units of coordinates."""
 _LEAST_SHARE = 0.01
 """Smallest default weight of a speed, so that damping stays positive."""
 
@@ -62,8 +64,9 @@ class JointWeights:
         the Jacobians of goals and holds over random states, so that units of coordinates do not matter; times
         the share of bodies that the speed moves, or a given factor.
     curvatures
-        For each goal (n,) estimates of ``Σ_j |∂²e/∂q_i∂q_j|``: with the root l of the mean square of a column
-        of its Jacobian, for a rotation the lever, ``Σ_j l_i² / max(l_i, l_j)``; times the same shares.
+        For each goal (n,) factors κ_i with which ``Σ κ_i v_i²`` bounds the second derivative of its errors,
+        ``Σ_j |∂²e/∂q_i∂q_j| l_i/l_j``, at random states; l is the root mean square of a column of the
+        Jacobian. Times the same shares.
     immovable
         Names of equalities of the model whose gradient is nothing but rounding, such as the parts of a
         planar loop's closure that point out of its plane. A row of them would make others dependent.
@@ -92,41 +95,40 @@ def joint_weights(
         if not given.symbols and not 0 < float(given) < math.inf:
             raise InvalidValueError(f"weights=: the weight of '{key}' is positive, not {weight!r}.")
         factors |= dict.fromkeys(chosen, given)
-    scales = _column_scales(formulation)
-    sizes = scales[len(formulation.goals) :].sum(axis=1)
+    squares, curvatures = _sample_jacobians(formulation)
+    sizes = squares[len(formulation.goals) :].sum(axis=1)
     immovable = frozenset(
         hold.name
         for hold, size in zip(formulation.holds, sizes, strict=False)
         if hold.closure and size <= _IMMOVABLE**2 * sizes.max()
     )
-    together = scales.sum(axis=0)
+    together = squares.sum(axis=0)
     positive = together[together > 0]
     together = np.where(together > 0, together, positive.mean() if len(positive) else 1.0)
-    goals = scales[: len(formulation.goals)]
-    levers = np.sqrt(np.maximum(goals, np.finfo(float).tiny))
-    longer = np.maximum(levers[:, :, None], levers[:, None, :])
-    curvatures = 0.75 * goals * ((goals > 0)[:, None, :] / longer).sum(axis=2)
     return JointWeights(
-        tuple(float(scale) * factors[s] for s, scale in zip(speeds, together, strict=True)),
+        tuple(float(square) * factors[s] for s, square in zip(speeds, together, strict=True)),
         tuple(
-            tuple(float(each) * factors[s] for s, each in zip(speeds, row, strict=True)) for row in curvatures
+            tuple(float(each) * factors[s] for s, each in zip(speeds, row, strict=True))
+            for row in curvatures[: len(formulation.goals)]
         ),
         immovable,
     )
 
 
-def _column_scales(formulation: Formulation) -> Array:
-    """Return mean squares over random states of the columns of Jacobians of goals, then holds, (k, n)."""
+def _sample_jacobians(formulation: Formulation) -> tuple[Array, Array]:
+    """Return mean squares l² of the columns of Jacobians of goals, then holds, and factors κ, (k, n) each."""
     model, n = formulation.model, len(formulation.speeds)
     tasks: tuple[GoalRows | HoldRows, ...] = (*formulation.goals, *formulation.holds)
     if not tasks:
-        return np.ones((1, n))
+        return np.ones((1, n)), np.zeros((1, n))
     stacked = as_expression(np.concatenate([row.jacobian for row in tasks]))
     first = np.cumsum([0, *(row.error.size for row in tasks[:-1])])
     symbols = stacked.symbols
     # Each state counts once, so common parts are not looked for.
     function = ca.Function("J", [ca.vertcat(*(s.sx for s in symbols))], [dense_column(stacked)])
-    generator, squares = np.random.default_rng(0), []
+    place = {s: k for k, s in enumerate(symbols)}
+    known = [(j, place[s.position]) for j, s in enumerate(formulation.speeds) if s.position in place]
+    generator, squares, slopes = np.random.default_rng(0), [], []
     at = model.default_state()
     ranges = []
     for symbol in symbols:
@@ -134,10 +136,31 @@ def _column_scales(formulation: Formulation) -> Array:
         lower, upper = model.limits(symbol) if symbol in model.degrees_of_freedom else (value, value)
         ranges.append((max(lower, value - math.pi), min(upper, value + math.pi)))
     for _ in range(_SAMPLES):
-        J = np.array(function([generator.uniform(low, max(low, high)) for low, high in ranges]))
-        if np.isfinite(J).all():  # else outside of the domain of a closed loop
-            squares.append(np.add.reduceat(J.reshape(-1, n) ** 2, first, axis=0))
-    return np.asarray(np.mean(squares, axis=0)) if squares else np.ones((len(tasks), n))
+        q = np.array([generator.uniform(low, max(low, high)) for low, high in ranges])
+        J = np.array(function(q)).reshape(-1, n)
+        change = np.zeros((len(J), n, n))
+        for j, k in known:
+            moved = q.copy()
+            moved[k] += _SHIFT
+            change[:, :, j] = (np.array(function(moved)).reshape(-1, n) - J) / _SHIFT
+        if np.isfinite(J).all() and np.isfinite(change).all():  # else outside of the domain of a closed loop
+            squares.append(np.add.reduceat(J**2, first, axis=0))
+            slopes.append(np.sqrt(np.add.reduceat(change**2, first, axis=0)))
+    if not squares:
+        return np.ones((len(tasks), n)), np.ones((len(tasks), n))
+    square = np.mean(squares, axis=0)
+    lever = np.sqrt(np.maximum(square, np.finfo(float).tiny))
+    # The median, since rotation vectors jump.
+    second = np.median(slopes, axis=0)
+    second = np.maximum(second, second.transpose(0, 2, 1))
+    # Speeds that drive other coordinates, such as those of wheels, count as rotations.
+    driving = {s for symbol in symbols for s in model.rates.row(symbol) or ()}
+    other = np.array([s in driving for s in formulation.speeds])
+    product = lever[:, :, None] * lever[:, None, :]
+    usual = product / np.maximum(lever[:, :, None], lever[:, None, :])
+    second = np.where(other[:, None] & other, np.maximum(usual, second), second)
+    ratio = np.where(square[:, None, :] > 0, lever[:, :, None] / lever[:, None, :], 0.0)
+    return square, np.where(square > 0, (second * ratio).sum(axis=2), 0.0)
 
 
 def check_weight(name: str, value: float) -> None:
