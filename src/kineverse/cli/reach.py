@@ -7,6 +7,7 @@ import json
 from typing import TYPE_CHECKING, Any
 
 from kineverse.cli.arguments import add_model_options, load_model, parse_assignments, parse_value
+from kineverse.cli.view import list_mesh_problems, print_mesh_problems
 from kineverse.errors import InvalidValueError
 from kineverse.expressions.printing import format_number
 
@@ -75,6 +76,10 @@ def run(arguments: argparse.Namespace) -> int:
     # Parsed before the model is loaded, so that a typing error is reported at once.
     assigned = parse_assignments(arguments.assignments, "--from")
     numbers = parse_pose(arguments.pose)
+    if arguments.picture is not None:
+        from kineverse.view.pictures import check_png_name
+
+        check_png_name(arguments.picture)
 
     from kineverse.control import InverseKinematics
     from kineverse.geometry import Scene
@@ -90,6 +95,7 @@ def run(arguments: argparse.Namespace) -> int:
     positions = {str(s): result.best[s] for s in solver.coordinates}
     if arguments.picture is not None:
         save_picture(arguments.picture, model, {str(s): result.best[s] for s in model.symbols})
+        print_mesh_problems(list_mesh_problems(model))
     error = result.residuals[goal.name]
     if arguments.json:
         answer: dict[str, Any] = {

@@ -15,7 +15,7 @@ from time import perf_counter
 import numpy as np
 
 from kineverse._checks import as_count, as_tolerance
-from kineverse.errors import InvalidValueError, NotFiniteError
+from kineverse.errors import NotFiniteError
 from kineverse.geometry import Scene
 from kineverse.geometry.results import DistanceResult
 from kineverse.lie import Array
@@ -81,7 +81,8 @@ class InverseKinematics:
     InvalidValueError
         If there is no goal or hold, for a task about speeds, or one that nothing moves.
     UnknownNameError
-        For a task about a symbol that the model does not have, or an unknown name in ``still``.
+        For a task about a symbol that the model does not have, an unknown name in ``still``, or a scene of
+        another model.
     DuplicateNameError
         For two tasks of one name.
     MissingDependencyError
@@ -101,7 +102,9 @@ class InverseKinematics:
         self.model = model
         self._program = program = PositionProgram(model, tasks, still, as_tolerance(tolerance))
         self.tasks, self.coordinates = program.tasks, program.coordinates
-        self._clearance = None if scene is None else Clearance(scene, program, as_tolerance(margin, "The margin"))
+        self._clearance = (
+            None if scene is None else Clearance(scene, program, as_tolerance(margin, "The margin"))
+        )
         self._search = ConfigurationSearch(program, self._clearance)
         others = () if self._clearance is None else self._clearance.inputs
         extra = sorted({*others} - {*program.inputs}, key=lambda s: s.sort_key)
@@ -303,6 +306,9 @@ class InverseKinematics:
         if off:
             listed = ", ".join(f"'{name}' is off by {result.residuals[name]:.3g}" for name in off)
             lines.append(f"No solution was found {tried}. At the best point {listed}.")
+        if result.contacts:
+            touching = "; ".join(f"{pair.a} and {pair.b}" for pair in result.contacts[:3])
+            lines.append(f"Too near to each other there are {touching}.")
         alone: list[str] = []
         if outside:
             listed = ", ".join(f"'{name}'" for name in outside)
