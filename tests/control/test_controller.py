@@ -489,3 +489,12 @@ def test_bound_that_moves_is_respected() -> None:
         worst = max(worst, state[two] - 0.5 * state[one])
     assert worst < 1e-9
     assert state[two] > 0.3
+
+
+def test_articulation_stands_for_its_coordinates() -> None:
+    model = kv.load("fetch")
+    goal = Goal(model.fk("fetch/gripper_link")[:3, 3], [0.8, 0.2, 0.9])
+    arm = Controller(model, [goal], dt=DT, still=["fetch/base"])
+    assert not [s for s in arm.speeds if s.path.startswith("fetch/base")]
+    free = Controller(model, [goal], dt=DT, still="fetch/torso_lift_joint")
+    assert {*map(str, free.speeds)} - {*map(str, arm.speeds)}
