@@ -32,6 +32,8 @@ REACHED, NOT_REACHED = 0, 1
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Declare the options."""
+    # Options that take several words come last, or they would take MODEL and FRAME as well.
+    parser.usage = "%(prog)s MODEL FRAME --pose (X Y Z [ROLL PITCH YAW] | NAME) [options]"
     parser.add_argument("model", metavar="MODEL", help="name of a shipped model, or path of a file")
     parser.add_argument("frame", metavar="FRAME", help="frame that reaches, such as fetch/gripper_link")
     parser.add_argument(
