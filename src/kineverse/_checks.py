@@ -1,8 +1,9 @@
-"""Conversion of scalar arguments to floats."""
+"""Conversion of scalar arguments to floats and integers."""
 
 from __future__ import annotations
 
 import math
+from operator import index
 from typing import Any
 
 import numpy as np
@@ -40,8 +41,8 @@ def finite_number(value: Any) -> float | None:
     return number if math.isfinite(number) else None
 
 
-def as_tolerance(given: float) -> float:
-    """Return a tolerance as a float.
+def as_tolerance(given: float, subject: str = "A tolerance") -> float:
+    """Return a tolerance as a float; messages begin with the subject.
 
     Raises
     ------
@@ -50,8 +51,22 @@ def as_tolerance(given: float) -> float:
     """
     tolerance = finite_number(given)
     if tolerance is None or tolerance < 0:
-        raise InvalidValueError(f"A tolerance is a finite number from 0, not {given!r}.")
+        raise InvalidValueError(f"{subject} is a finite number from 0, not {given!r}.")
     return tolerance
+
+
+def as_count(name: str, given: int, least: int) -> int:
+    """Return a keyword argument as an integer.
+
+    Raises
+    ------
+    InvalidValueError
+        For a number below the least, and what is no integer.
+    """
+    count = None if isinstance(given, bool) or not hasattr(given, "__index__") else index(given)
+    if count is None or count < least:
+        raise InvalidValueError(f"{name}= is an integer of at least {least}, not {given!r}.")
+    return count
 
 
 def check_flag(name: str, given: object) -> None:

@@ -44,6 +44,29 @@ def test_orientation_still_and_first_start(run):
     assert np.allclose(model.fk(HAND)(state), pose, atol=1e-4)
 
 
+def test_values_below_0_have_units(run):
+    model = kv.load("articulations/omni_base")
+    words = ["reach", "articulations/omni_base", "omni_base/base", "--json", "--pose"]
+    status, out, _ = run(*words, "-30cm", "-2e-1", 0, 0, 0, "-90deg")
+    assert status == 0
+    pose = model.fk("omni_base/base")(model.default_state().updated(json.loads(out)["positions"]))
+    assert np.allclose(pose, (kv.translation(-0.3, -0.2, 0) @ kv.rotation_z(-np.pi / 2))(), atol=1e-4)
+    status, out, _ = run(*words, "-1e200", 0, 0)
+    assert status == 1
+    assert json.loads(out)["error"] > 1e199
+
+
+def test_missing_meshes_of_a_picture_are_reported(run, tmp_path):
+    visual = '<visual><geometry><mesh filename="none.obj"/></geometry></visual>'
+    joint = '<joint name="j" type="continuous"><parent link="a"/><child link="b"/></joint>'
+    file = tmp_path / "arm.urdf"
+    file.write_text(f'<robot name="r"><link name="a"/><link name="b">{visual}</link>{joint}</robot>')
+    words = ["reach", file, "b", "--pose", 0, 0, 0, 1, 0, 0, "--picture", tmp_path / "arm.png"]
+    status, _, err = run(*words)
+    assert status == 0
+    assert "shown as placeholders: none.obj" in err
+
+
 def test_not_reached_ends_with_status_1_and_the_reason(run):
     words = ["reach", "fetch", HAND, "--pose", 0.7, 0.2, 4, "--still", "fetch/base"]
     status, out, _ = run(*words)
@@ -105,6 +128,8 @@ def test_collisions_are_respected(run):
     [
         (["fetch", HAND, "--pose", "1", "2"], "6 with roll, pitch and yaw"),
         (["fetch", HAND, "--pose", "1", "2", "x"], "'x' is not a value"),
+        (["fetch", HAND, "--pose", "1", "2", "-nan"], "'-nan' is not a value"),
+        (["fetch", HAND, "--pose", "1", "2", "3", "--picture", "a.jpg"], "written as .png"),
         (["fetch", HAND, "--pose", "fetch/grippr_link"], "fetch/gripper_link"),
         (["fetch", "fetch/grippr_link", "--pose", "1", "2", "3"], "fetch/gripper_link"),
         (["fetch", HAND, "--pose", HAND], "its pose is constant"),

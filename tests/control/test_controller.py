@@ -501,3 +501,12 @@ def test_hold_that_cannot_be_corrected_stops_no_other() -> None:
     assert commands[-1].residuals["free"] < 1e-6
     assert commands[-1].residuals["stuck"] == pytest.approx(1e-6, rel=0.05)
     assert commands[-1].progress < 0.1
+
+
+def test_articulation_stands_for_its_coordinates() -> None:
+    model = kv.load("fetch")
+    goal = Goal(model.fk("fetch/gripper_link")[:3, 3], [0.8, 0.2, 0.9])
+    arm = Controller(model, [goal], dt=DT, still=["fetch/base"])
+    assert not [s for s in arm.speeds if s.path.startswith("fetch/base")]
+    free = Controller(model, [goal], dt=DT, still="fetch/torso_lift_joint")
+    assert {*map(str, free.speeds)} - {*map(str, arm.speeds)}

@@ -163,6 +163,33 @@ def test_unreachable_point_ends_with_a_stretched_arm(distance: float) -> None:
     assert "out of reach" not in repr(result)
 
 
+@pytest.mark.parametrize("distance", [40.0, 1e3, 1e5])
+def test_base_travels_to_distant_targets(distance: float) -> None:
+    model = kv.load("articulations/omni_base")
+    base = model.fk("omni_base/base")
+    pose = kv.translation(distance, -0.5 * distance, 0) @ kv.rotation_z(2.0)
+    result = inverse_kinematics(model, [Goal(same_pose(pose, base))])
+    assert result.solved
+    assert result.starts == 1
+    assert np.allclose(base(result.best), np.array(pose()), atol=TOLERANCE)
+
+
+@pytest.mark.parametrize("weight", [1e-8, 1e-6, 1.0, 1e6])
+def test_goal_without_error_is_solved_whatever_its_weight(weight: float) -> None:
+    model = planar_arm(3)
+    goal = Goal(model.fk("tip")[:2, 3], [1.4, 1.2], name="reach", weight=weight)
+    result = inverse_kinematics(model, [goal])
+    assert result.solved == (result.residuals["reach"] <= TOLERANCE)
+    assert result.solved or result.why
+
+
+def test_errors_of_any_size_are_finite() -> None:
+    model = planar_arm(2)
+    result = inverse_kinematics(model, [Goal(model.fk("tip")[:2, 3], [1e200, 0.0], name="reach")])
+    assert not result.solved
+    assert result.residuals["reach"] == pytest.approx(1e200)
+
+
 def test_goal_outside_of_the_limits_of_a_joint_names_the_limit() -> None:
     model = planar_arm(2)
     result = inverse_kinematics(model, [Goal(model.symbol("joint1"), 3.0)])
@@ -187,6 +214,15 @@ def test_goal_that_is_impossible_alone_is_named() -> None:
     tasks = [Goal(model.symbol("joint1"), 5.0, name="far"), Goal(model.fk("tip")[0, 3], 9.0, name="reach")]
     result = inverse_kinematics(model, tasks)
     assert "Not even alone can 'far', 'reach' be done." in result.why
+
+
+def test_range_that_is_impossible_is_named_and_no_other_task() -> None:
+    model = planar_arm(2)
+    x, y = model.fk("tip")[:2, 3]
+    result = inverse_kinematics(model, [Goal(y, 1.0, name="height"), Keep(5, x, 6, name="wall")])
+    assert not result.solved
+    assert "within the range of 'wall'" in result.why
+    assert "alone" not in result.why
 
 
 def test_start_outside_of_limits_is_allowed() -> None:
@@ -367,6 +403,17 @@ def test_collisions_are_avoided_and_named() -> None:
     assert not scene.in_collision
 
 
+@pytest.mark.skipif(importlib.util.find_spec("coal") is None, reason="distances need coal")
+def test_scene_of_another_model_and_a_margin_below_0_are_refused() -> None:
+    from kineverse.geometry import Scene
+
+    model = arm_with_obstacle(1.0, 0.8)
+    with pytest.raises(UnknownNameError, match=r"scene= is the scene of a model without 'joint1'"):
+        solve(model, scene=Scene(kv.load("articulations/omni_base")))
+    with pytest.raises(InvalidValueError, match="The margin"):
+        solve(model, scene=Scene(model), margin=-0.1)
+
+
 # -- bad input -------------------------------------------------------------------------------------------------
 
 
@@ -396,6 +443,9 @@ def test_collisions_are_avoided_and_named() -> None:
         (lambda m: solve(m, values={"joint1": math.inf}), NotFiniteError, "joint1"),
         (lambda m: solve(m, values={"joint1": math.nan}), InvalidValueError, "joint1"),
         (lambda m: solve(m, starts=0), InvalidValueError, "starts"),
+        (lambda m: solve(m, starts=True), InvalidValueError, "starts"),
+        (lambda m: solve(m, seed=-1), InvalidValueError, "seed"),
+        (lambda m: solve(m, seed=None), InvalidValueError, "seed"),
         (lambda m: solve(m, solutions=0.5), InvalidValueError, "solutions"),
         (lambda m: solve(m, tolerance=-1.0), InvalidValueError, "tolerance"),
         (lambda m: inverse_kinematics(m, [Goal(m.fk("tip"), np.eye(4))]), ShapeError, "same_pose"),
@@ -419,6 +469,29 @@ def test_wrong_input_is_refused(build, error, message) -> None:
         edit.add_frame("rack", parent="world", transform=kv.translation(1, 2, 3))
     with pytest.raises(error, match=message):
         build(model)
+
+
+@pytest.mark.parametrize("matrix", [np.diag([1.0, 1.0, -1.0, 1.0]), 2 * np.eye(4), np.ones((4, 4))])
+def test_target_that_is_no_transform_is_refused(matrix) -> None:
+    with pytest.raises(InvalidValueError, match="transform"):
+        Target("pose", matrix)
+
+
+def test_target_takes_constant_expressions_and_no_other() -> None:
+    pose = kv.translation(1, 2, 3) @ kv.rotation_z(0.5)
+    target = Target("pose", pose)
+    assert list(target.values(pose).values()) == list(np.array(pose()).ravel()[:12])
+    with pytest.raises(InvalidValueError, match="array of numbers"):
+        target.values(kv.translation(kv.position("x"), 0, 0))
+    with pytest.raises(InvalidValueError, match="array of numbers"):
+        Target("point", "abc")
+
+
+def test_messages_stay_short() -> None:
+    hand = kv.load("fetch").fk("fetch/gripper_link")
+    with pytest.raises(ShapeError) as caught:
+        Goal(hand, np.eye(4))
+    assert len(str(caught.value)) < 300
 
 
 def solve(model: kv.Model, **options):

@@ -5,6 +5,7 @@ from __future__ import annotations
 import argparse
 import logging
 import os
+import re
 import sys
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
@@ -35,6 +36,8 @@ COMMANDS = {
 
 ERROR, INTERRUPTED, PIPE_CLOSED = 2, 130, 141
 """Exit statuses: the request failed; Ctrl-C; the output pipe was closed (128 and the signal's number)."""
+
+_NEGATIVE_VALUE = re.compile(r"-\s*(\d|\.\d|(pi|π|inf|nan)\b)")
 
 # The commands report missing meshes themselves; a missing compiler does not change their results.
 QUIET = ("kineverse.view.meshes", "kineverse.compile.toolchain")
@@ -132,6 +135,8 @@ def _parse_arguments(words: Sequence[str]) -> argparse.Namespace:
     name = next((word for word in words if not word.startswith("-")), None)
     if name is not None and name not in COMMANDS:
         raise UnknownNameError(f"There is no command {name!r}. {_suggest_command(name)}")
+    # A leading space tells argparse that -30deg, -pi/2 or -1e-3 is a value and no option.
+    words = [f" {word}" if _NEGATIVE_VALUE.match(word) else word for word in words]
     arguments, unknown = make_parser().parse_known_args(words)
     if unknown:
         sub: argparse.ArgumentParser = arguments.command

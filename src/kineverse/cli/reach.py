@@ -7,6 +7,7 @@ import json
 from typing import TYPE_CHECKING, Any
 
 from kineverse.cli.arguments import add_model_options, load_model, parse_assignments, parse_value
+from kineverse.cli.view import list_mesh_problems, print_mesh_problems
 from kineverse.errors import InvalidValueError
 from kineverse.expressions.printing import format_number
 
@@ -31,6 +32,8 @@ REACHED, NOT_REACHED = 0, 1
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Declare the options."""
+    # Options that take several words come last, or they would take MODEL and FRAME as well.
+    parser.usage = "%(prog)s MODEL FRAME --pose (X Y Z [ROLL PITCH YAW] | NAME) [options]"
     parser.add_argument("model", metavar="MODEL", help="name of a shipped model, or path of a file")
     parser.add_argument("frame", metavar="FRAME", help="frame that reaches, such as fetch/gripper_link")
     parser.add_argument(
@@ -75,6 +78,10 @@ def run(arguments: argparse.Namespace) -> int:
     # Parsed before the model is loaded, so that a typing error is reported at once.
     assigned = parse_assignments(arguments.assignments, "--from")
     numbers = parse_pose(arguments.pose)
+    if arguments.picture is not None:
+        from kineverse.view.pictures import check_png_name
+
+        check_png_name(arguments.picture)
 
     from kineverse.control import InverseKinematics
     from kineverse.geometry import Scene
@@ -90,6 +97,7 @@ def run(arguments: argparse.Namespace) -> int:
     positions = {str(s): result.best[s] for s in solver.coordinates}
     if arguments.picture is not None:
         save_picture(arguments.picture, model, {str(s): result.best[s] for s in model.symbols})
+        print_mesh_problems(list_mesh_problems(model))
     error = result.residuals[goal.name]
     if arguments.json:
         answer: dict[str, Any] = {

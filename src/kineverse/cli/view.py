@@ -132,16 +132,11 @@ def _write_picture(
 ) -> int:
     """Write a picture of the state, and print what it cannot show."""
     from kineverse.geometry.exclusions import find_unusable_shapes, label_unusable_shapes
-    from kineverse.view import meshes, save_picture
+    from kineverse.view import save_picture
 
     options = {"collisions": arguments.collisions, "near": near, "decomposed": arguments.decomposed}
     save_picture(arguments.picture, model, state, **options)
-    problems = [
-        f"{m.uri}: {meshes.load_mesh(m).problem}"
-        for m in meshes.list_visual_meshes(model)
-        if meshes.load_mesh(m).problem
-    ]
-    print_mesh_problems(problems)
+    print_mesh_problems(list_mesh_problems(model))
     left_out = label_unusable_shapes(model, find_unusable_shapes(model)) if near is not None else {}
     if left_out:
         print(f"kineverse: note: no distances to {', '.join(left_out)}", file=sys.stderr)
@@ -163,6 +158,14 @@ def print_address(page: _Page, browser: bool) -> None:
         from kineverse.view.show import open_page
 
         open_page(page.address)
+
+
+def list_mesh_problems(model: kv.Model) -> list[str]:
+    """Return a line for each visual mesh that cannot be read."""
+    from kineverse.view import meshes
+
+    loaded = {mesh.uri: meshes.load_mesh(mesh) for mesh in meshes.list_visual_meshes(model)}
+    return [f"{uri}: {mesh.problem}" for uri, mesh in loaded.items() if mesh.problem]
 
 
 def print_mesh_problems(problems: list[str]) -> None:

@@ -6,7 +6,7 @@ from collections.abc import Iterator, Mapping, Sequence
 
 import numpy as np
 
-from kineverse.errors import NoSolutionError
+from kineverse.errors import NoSolutionError, UnknownNameError
 from kineverse.expressions.expression import Expression, array, as_expression
 from kineverse.geometry import Scene
 from kineverse.geometry.results import DistanceResult
@@ -42,9 +42,20 @@ class Clearance:
     ----------
     inputs
         Symbols of the values of :meth:`load`.
+
+    Raises
+    ------
+    UnknownNameError
+        For a scene of a model that lacks some of the coordinates.
     """
 
     def __init__(self, scene: Scene, program: PositionProgram, margin: float) -> None:
+        missing = sorted(str(s) for s in {*program.coordinates} - {*scene.model.symbols})
+        if missing:
+            raise UnknownNameError(
+                f"scene= is the scene of a model without {', '.join(map(repr, missing[:6]))}. Make the scene "
+                "of the model of the tasks: Scene(model)."
+            )
         self._scene, self._program, self.margin = scene, program, margin
         self._speeds = [s.derivative() for s in program.coordinates]
         try:
@@ -86,10 +97,12 @@ class Clearance:
 
     @property
     def near(self) -> tuple[DistanceResult, ...]:
-        """Pairs of the last measurement that are nearer than the margin, nearest first."""
+        """Pairs of the last measurement that are nearer than the margin, each once, nearest first."""
         found = self._contacts.found
-        count = int(np.count_nonzero(found.distances < self.margin))
-        return tuple(found[k] for k in range(count))
+        near: dict[tuple[str, str], DistanceResult] = {}
+        for k in range(int(np.count_nonzero(found.distances < self.margin))):
+            near.setdefault((found[k].a, found[k].b), found[k])
+        return tuple(near.values())
 
     def find_step(self, H: Array, f: Array, A: Array, lower: Array, upper: Array) -> Array | None:
         """Return the step of the coordinates for the last near pairs, None if there is none.

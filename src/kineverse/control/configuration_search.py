@@ -248,7 +248,8 @@ class ConfigurationSearch:
         """Return the norm of the errors of each task and equality, and the violations of keeps."""
         self.evaluate()
         values = self.outputs[5]
-        found = {name: float(np.linalg.norm(values[rows])) for name, rows in self.rows.items()}
+        # Unlike numpy's norm, hypot does not overflow.
+        found = {name: math.hypot(*values[rows].tolist()) for name, rows in self.rows.items()}
         violations = values[self.first_violation :]
         for keep in self.program.keeps:
             rows = [k for k, names in enumerate(self.program.names) if keep in names]

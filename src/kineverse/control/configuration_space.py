@@ -8,11 +8,13 @@ from collections.abc import Iterable, Mapping, Sequence
 import numpy as np
 import numpy.typing as npt
 
-from kineverse.errors import ExpressionError, UnknownNameError, suggest
+from kineverse.errors import UnknownNameError, suggest
 from kineverse.lie import Array
 from kineverse.model.constraint import Constraint
 from kineverse.model.model_view import ModelView
 from kineverse.symbols import Symbol
+
+from .formulation import find_symbols
 
 _QUATERNION = ("qx", "qy", "qz", "qw")
 _SAME = 1e-9
@@ -122,14 +124,8 @@ def find_coordinates(model: ModelView, names: Iterable[Symbol | str]) -> frozens
         For what is neither a symbol nor a name.
     """
     found: set[Symbol] = set()
-    for item in (names,) if isinstance(names, str | Symbol) else names:
-        if isinstance(item, str) and item in model.articulations and item not in map(str, model.symbols):
-            found |= find_coordinates(model, model.articulations[item].coordinates)
-            continue
-        symbol = model.symbol(item) if isinstance(item, str) else item
-        if not isinstance(symbol, Symbol):
-            raise ExpressionError(f"still= takes symbols or their names, not {item!r}.")
-        known = {*model.symbols, *model.rates.dependent, *model.speeds}
+    known = {*model.symbols, *model.rates.dependent, *model.speeds}
+    for symbol in find_symbols(model, names, "still"):
         if symbol not in known and symbol.position not in known:
             raise UnknownNameError(
                 f"still=: the model has no '{symbol}'. {suggest(str(symbol), map(str, known), 'symbol')}"

@@ -61,7 +61,8 @@ class Controller:
     dt
         Time between two steps [s].
     still
-        Coordinates or speeds that stay still, as symbols or names.
+        Coordinates or speeds that stay still, as symbols or names; a name of an articulation stands for its
+        coordinates.
     weights
         Factor on damping, smoothness and posture by coordinate or speed, as symbol or name. The default is
         the share of the bodies that a speed moves, so that fingers are preferred to bases.

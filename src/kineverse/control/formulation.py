@@ -8,7 +8,7 @@ closures of loops, are holds.
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -84,7 +84,7 @@ class Formulation:
     dt
         Time step [s], a number or a parameter.
     still
-        Coordinates and speeds that stay still, as symbols or names.
+        Coordinates and speeds that stay still, as symbols or names of coordinates, speeds or articulations.
     accelerations
         Limits on the magnitudes of accelerations by speed, beside those of the model; braking respects both.
 
@@ -312,15 +312,11 @@ def _relevant_constraints(model: ModelView, subject: Sequence[Expression]) -> di
 def find_speeds(model: ModelView, names: Iterable[Symbol | str], argument: str) -> frozenset[Symbol]:
     """Return the free speeds that stand for coordinates or speeds, given as symbols or names.
 
-    A driven or dependent coordinate stands for all speeds in its row.
+    A driven or dependent coordinate stands for all speeds in its row, an articulation for all of its
+    coordinates.
     """
-    if isinstance(names, str | Symbol):
-        names = (names,)
     found: set[Symbol] = set()
-    for item in names:
-        symbol = model.symbol(item) if isinstance(item, str) else item
-        if not isinstance(symbol, Symbol):
-            raise ExpressionError(f"{argument}= takes symbols or their names, not {item!r}.")
+    for symbol in find_symbols(model, names, argument):
         row = model.rates.row(symbol.position) if symbol.order <= 1 else None
         speeds = {symbol.derivative() if symbol.order == 0 else symbol} if row is None else set(row)
         unknown = [s for s in speeds if s not in model.speeds]
@@ -331,6 +327,27 @@ def find_speeds(model: ModelView, names: Iterable[Symbol | str], argument: str) 
             )
         found |= speeds
     return frozenset(found)
+
+
+def find_symbols(model: ModelView, names: Iterable[Symbol | str], argument: str) -> Iterator[Symbol]:
+    """Yield symbols that are given as symbols or names; an articulation stands for its coordinates.
+
+    Raises
+    ------
+    UnknownNameError
+        For another name, with similar ones.
+    ExpressionError
+        For what is neither a symbol nor a name.
+    """
+    coordinates = set(map(str, model.symbols))
+    for item in (names,) if isinstance(names, str | Symbol) else names:
+        if isinstance(item, str) and item in model.articulations and item not in coordinates:
+            yield from model.articulations[item].coordinates
+            continue
+        symbol = model.symbol(item) if isinstance(item, str) else item
+        if not isinstance(symbol, Symbol):
+            raise ExpressionError(f"{argument}= takes symbols or their names, not {item!r}.")
+        yield symbol
 
 
 def check_tasks(tasks: Iterable[Task]) -> tuple[Task, ...]:

@@ -14,8 +14,8 @@ from time import perf_counter
 
 import numpy as np
 
-from kineverse._checks import as_tolerance
-from kineverse.errors import InvalidValueError, NotFiniteError
+from kineverse._checks import as_count, as_tolerance
+from kineverse.errors import NotFiniteError
 from kineverse.geometry import Scene
 from kineverse.geometry.results import DistanceResult
 from kineverse.lie import Array
@@ -81,7 +81,8 @@ class InverseKinematics:
     InvalidValueError
         If there is no goal or hold, for a task about speeds, or one that nothing moves.
     UnknownNameError
-        For a task about a symbol that the model does not have, or an unknown name in ``still``.
+        For a task about a symbol that the model does not have, an unknown name in ``still``, or a scene of
+        another model.
     DuplicateNameError
         For two tasks of one name.
     MissingDependencyError
@@ -101,7 +102,9 @@ class InverseKinematics:
         self.model = model
         self._program = program = PositionProgram(model, tasks, still, as_tolerance(tolerance))
         self.tasks, self.coordinates = program.tasks, program.coordinates
-        self._clearance = None if scene is None else Clearance(scene, program, as_tolerance(margin))
+        self._clearance = (
+            None if scene is None else Clearance(scene, program, as_tolerance(margin, "The margin"))
+        )
         self._search = ConfigurationSearch(program, self._clearance)
         others = () if self._clearance is None else self._clearance.inputs
         extra = sorted({*others} - {*program.inputs}, key=lambda s: s.sort_key)
@@ -143,12 +146,12 @@ class InverseKinematics:
         Raises
         ------
         UnknownNameError, InvalidValueError
-            For values of unknown symbols, values that are not finite, or less than one start.
+            For values of unknown symbols, values that are not finite, less than one start, or a negative
+            seed.
         """
         begin = perf_counter()
-        for name, number in (("starts", starts), ("solutions", solutions)):
-            if not isinstance(number, int) or number < 1:
-                raise InvalidValueError(f"{name}= is a number of at least 1, not {number!r}.")
+        starts, solutions = as_count("starts", starts, 1), as_count("solutions", solutions, 1)
+        seed = as_count("seed", seed, 0)
         given = self._load(values)
         search, space, clearance = self._search, self._program.space, self._clearance
         x = search.x
@@ -195,6 +198,9 @@ class InverseKinematics:
         else:
             search.approach(home, best.coordinates, generator or np.random.default_rng(seed))
             space.bring_back(x, home)
+            # Monotone steps converge where full steps were given up, such as on the way to a distant target.
+            if search.is_done() and (clearance is None or clearance.measure(x) == 0.0):
+                found.append(x.copy())
         return self._result(given, found, obstacles, used, begin)
 
     def batch(self, values: Iterable[StateLike], *, starts: int = 16, seed: int = 0) -> list[IkResult]:
@@ -290,7 +296,8 @@ class InverseKinematics:
             for part in program.parts
             if not (values[search.rows[part.name]] <= part.tolerance).all()
         ]
-        off += [name for name in program.keeps if result.residuals[name] > TOLERANCE]
+        outside = [name for name in program.keeps if result.residuals[name] > TOLERANCE]
+        off += outside
         tried = f"in {result.starts} starts" if result.starts > 1 else "from the given state"
         lines = []
         if result.obstacles:
@@ -299,8 +306,14 @@ class InverseKinematics:
         if off:
             listed = ", ".join(f"'{name}' is off by {result.residuals[name]:.3g}" for name in off)
             lines.append(f"No solution was found {tried}. At the best point {listed}.")
+        if result.contacts:
+            touching = "; ".join(f"{pair.a} and {pair.b}" for pair in result.contacts[:3])
+            lines.append(f"Too near to each other there are {touching}.")
         alone: list[str] = []
-        if len(off) > 1 and not result.obstacles:
+        if outside:
+            listed = ", ".join(f"'{name}'" for name in outside)
+            lines.append(f"No configuration within the range of {listed} was found, whatever the goals are.")
+        elif len(off) > 1 and not result.obstacles:
             alone = [name for name in off if name in search.rows and self._is_reachable(name, result.best)]
             if len(alone) == len(off):
                 lines.append("Each of these can be done alone, so they contradict each other.")

@@ -4,7 +4,7 @@ The unknowns are steps δ of the coordinates q themselves, not of speeds: a conf
 rolling, so a differential drive may be placed anywhere. With the errors e of goals, holds and equalities of
 the model, the violations x of other constraints φ on positions, and row weights w::
 
-    minimise    ½ Σ w (e + J δ)² + ½ Σ w (x + A δ)² + ½ λ |δ|²,    λ = 0.03 Σ w (e² + x²) + 1e-6
+    minimise    ½ Σ w (e + J δ)² + ½ Σ w (x + A δ)² + ½ λ |δ|²,    λ = 0.03 min(Σ w (e² + x²), 10) + 1e-6
     subject to  lower - φ <= A δ <= upper - φ,    outside of a bound: not further away
 
 The damping λ is that of Sugihara, Solvability-unconcerned inverse kinematics by the Levenberg-Marquardt
@@ -36,7 +36,7 @@ from kineverse.model.model_view import ModelView
 from kineverse.model.projection import TOLERANCE, is_equality
 from kineverse.model.rate_nodes import to_plain
 from kineverse.model.rates import Rates
-from kineverse.model.speed_limits import INFINITE, ZERO, raw_max
+from kineverse.model.speed_limits import INFINITE, ZERO, raw_max, raw_min
 from kineverse.model.velocity_rows import velocity_rows
 from kineverse.symbols import Symbol, parameter
 
@@ -45,6 +45,8 @@ from .formulation import check_tasks, name_tasks
 from .tasks import Hold, Keep, Task
 
 _DAMPING, _LEAST_DAMPING = 0.03, 1e-6
+_FAR = 10.0
+"""Largest sum of squares that counts for the damping, so that a base takes long steps to a distant target."""
 _SAMPLES = 12
 _SAME = 1e-9
 
@@ -258,7 +260,7 @@ class PositionProgram:
                 f = f + violation * pull
         values = array([*(errors[k] for k in range(errors.size)), *away])
         total = sum((w[k] * values[k] * values[k] for k in range(size)), ZERO)
-        damping = _DAMPING * total + _LEAST_DAMPING
+        damping = _DAMPING * raw_min(total, as_expression(_FAR)) + _LEAST_DAMPING
         H = array([H[i, j] + damping if i == j else H[i, j] for i in range(n) for j in range(n)]).reshape(
             n, n
         )

@@ -23,7 +23,8 @@ class Target:
     name
         Path of the parameters.
     value
-        Initial value: a number, a vector, or a 4×4 transform, whose last row stays (0, 0, 0, 1).
+        Initial value: a number, a vector, or a 4×4 transform, whose last row stays (0, 0, 0, 1). Constant
+        expressions are values, too.
 
     Attributes
     ----------
@@ -36,16 +37,16 @@ class Target:
     expression: Expression
     parameters: tuple[Symbol, ...]
 
-    def __init__(self, name: str, value: npt.ArrayLike) -> None:
+    def __init__(self, name: str, value: npt.ArrayLike | Expression) -> None:
         self.name = name
-        initial = np.asarray(value, dtype=float)
+        initial = self._as_array(value)
         self._transform = initial.shape == (4, 4)
         numbers = self._numbers(initial, initial.shape)
         self.parameters = tuple(parameter(f"{name}/{k}", v) for k, v in enumerate(numbers))
         entries: list[Expression | float] = [*self.parameters, *(_LAST_ROW if self._transform else ())]
         self.expression = array(entries).reshape(*initial.shape) if initial.shape else array(entries)[0]
 
-    def values(self, value: npt.ArrayLike) -> dict[Symbol, float]:
+    def values(self, value: npt.ArrayLike | Expression) -> dict[Symbol, float]:
         """Return the values of the parameters for a value of the target.
 
         Raises
@@ -53,8 +54,18 @@ class Target:
         ShapeError, InvalidValueError
             For a value of another shape, a NaN, or a 4×4 matrix that is no transform.
         """
-        numbers = self._numbers(np.asarray(value, dtype=float), self.expression.shape)
+        numbers = self._numbers(self._as_array(value), self.expression.shape)
         return dict(zip(self.parameters, numbers, strict=True))
+
+    def _as_array(self, value: npt.ArrayLike | Expression) -> npt.NDArray[np.float64]:
+        if isinstance(value, Expression) and not value.symbols:
+            value = value()
+        try:
+            return np.asarray(value, dtype=float)
+        except (TypeError, ValueError) as error:
+            raise InvalidValueError(
+                f"The target '{self.name}' is a number or an array of numbers, not {value!r}."
+            ) from error
 
     def _numbers(self, value: npt.NDArray[np.float64], shape: tuple[int, ...]) -> list[float]:
         if value.shape != shape:
@@ -66,6 +77,7 @@ class Target:
             if not (
                 np.array_equal(value[3], _LAST_ROW)
                 and np.allclose(rotation @ rotation.T, np.eye(3), atol=1e-6)
+                and np.linalg.det(rotation) > 0
             ):
                 raise InvalidValueError(f"The target '{self.name}' is a transform, and this matrix is none.")
             value = value[:3]

@@ -14,6 +14,9 @@ from kineverse.errors import ExpressionError, InvalidValueError, ShapeError
 from kineverse.expressions.expression import Expression, ExpressionLike, as_expression
 from kineverse.model.constraint import Constraint
 
+_LONGEST = 100
+"""Largest number of characters of an expression in a message."""
+
 
 @dataclass(frozen=True, eq=False)
 class Goal:
@@ -181,7 +184,8 @@ Task: TypeAlias = Goal | Hold | Keep
 
 
 def _describe(name: str, expression: object) -> str:
-    return repr(name) if name else repr(expression)
+    text = repr(name or expression)
+    return text if name or len(text) <= _LONGEST else f"{text[: _LONGEST - 3]}..."
 
 
 def _refuse_text(task: object, value: object) -> None:
