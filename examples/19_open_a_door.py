@@ -30,10 +30,12 @@ state = found.best
 controller = Controller(model, [grasp, Goal(door, 1.4)], dt=0.02)
 show = None if "--headless" in sys.argv else kv.show(model, state, block=False)
 worst = 0.0
-while state[door] < 1.39:
+for _ in range(500):
     command = controller.step(state)
     state = model.integrate(state, command.speeds, controller.dt)
     worst = max(worst, command.residuals["grasp"])
+    if state[door] > 1.39:
+        break
     if show:
         show.move(state)
         time.sleep(controller.dt)

@@ -497,7 +497,7 @@ def test_hold_that_cannot_be_corrected_stops_no_other() -> None:
     one, two = model.symbol("joint1"), model.symbol("joint2")
     stuck = Hold(1e-8 * two + 1e-6, name="stuck")
     controller = Controller(model, [Hold(one, 1.0, name="free"), stuck], dt=DT)
-    state, commands = follow(controller, model.default_state(), 4.0)
+    _, commands = follow(controller, model.default_state(), 4.0)
     assert commands[-1].residuals["free"] < 1e-6
     assert commands[-1].residuals["stuck"] == pytest.approx(1e-6, rel=0.05)
     assert commands[-1].progress < 0.1
