@@ -8,6 +8,7 @@ import numpy as np
 
 from kineverse.errors import NoSolutionError, UnknownNameError
 from kineverse.expressions.expression import Expression, array, as_expression
+from kineverse.expressions.gradient import stack_columns
 from kineverse.geometry import Scene
 from kineverse.geometry.results import DistanceResult
 from kineverse.lie import Array
@@ -127,15 +128,15 @@ class Clearance:
         pose = self._program.make_plain(self._scene.model.fk(body))
         gradient = pose.gradient(heuristic=False)
         R, p = pose[:3, :3], pose[:3, 3]
-        columns: list[Expression] = []
+        columns: list[Expression | None] = []
         for speed in self._speeds:
             if speed not in gradient:
-                columns.append(as_expression(np.zeros(6)))
+                columns.append(None)
                 continue
             W = gradient[speed][:3, :3] @ R.T
             w = array([W[2, 1], W[0, 2], W[1, 0]])
             columns.append(as_expression(np.concatenate([gradient[speed][:3, 3] + np.cross(p, w), w])))
-        return array([column[i] for i in range(6) for column in columns]).reshape(6, len(columns))
+        return stack_columns(columns, (6,))
 
     def _sample(self) -> Iterator[State]:
         """Yield random states."""

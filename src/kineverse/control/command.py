@@ -67,4 +67,9 @@ class Command:
         if index < static:
             return self.row_names[index]
         pair = self.contacts[index - static]
-        return (f"contact of {pair.a} and {pair.b}",)
+        return (name_contact(pair),)
+
+
+def name_contact(pair: DistanceResult) -> str:
+    """Return the name of the row of a near pair."""
+    return f"contact of {pair.a} and {pair.b}"

@@ -173,11 +173,6 @@ class ContactSlots:
             H[:n, :n] += weight * (inside.T @ inside)
             f[:n] -= weight * recovery * ((INWARDS - gap[near]) @ inside)
 
-    @property
-    def omitted(self) -> int:
-        """Number of near pairs of the last update that have no row."""
-        return max(0, len(self.found) - self.count)
-
 
 def check_slots(count: object) -> None:
     """Raise InvalidValueError for a number of contact slots that is no natural number."""

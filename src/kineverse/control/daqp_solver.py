@@ -5,9 +5,8 @@ from __future__ import annotations
 from typing import Any
 
 import numpy as np
-from numpy.typing import ArrayLike
 
-from .qp_solver import SOFT_WEIGHT, QpSolution, QpSolver, Vector, import_solver
+from .qp_solver import QpSolution, QpSolver, Vector, import_solver
 
 
 class DaqpSolver(QpSolver):
@@ -16,19 +15,12 @@ class DaqpSolver(QpSolver):
     Its tolerance of violations is 1e-9, in the units of the rows.
     """
 
-    def __init__(
-        self,
-        n: int,
-        m: int,
-        soft: ArrayLike | None = None,
-        soft_weight: ArrayLike = SOFT_WEIGHT,
-        soft_linear: ArrayLike = 0.0,
-    ) -> None:
-        super().__init__(n, m, soft, soft_weight, soft_linear)
+    def _prepare(self) -> None:
+        entries = self.n + self.m
         self._daqp = import_solver("daqp", "control")
         self._model: Any = None
         self._warm = False
-        self._least, self._most = np.full(n + m, -_INFINITY), np.full(n + m, _INFINITY)
+        self._least, self._most = np.full(entries, -_INFINITY), np.full(entries, _INFINITY)
         self._lower, self._upper = self._least.copy(), self._most.copy()
 
     def reset(self) -> None:  # noqa: D102

@@ -11,7 +11,7 @@ from kineverse.compile.evaluator import Evaluator
 from kineverse.errors import InfeasibleError, NotFiniteError
 from kineverse.model.model_view import ModelView
 
-from .command import Command
+from .command import Command, name_contact
 from .contact_slots import ContactSlots
 from .formulation import Formulation
 from .infeasibility import Conflict, LeastViolation, find_irreducible_conflict, find_least_violation
@@ -131,8 +131,7 @@ class Diagnosis:
         names = self._program.names
         if index < len(names) or self._contacts is None:
             return names[index]
-        pair = self._contacts.found[index - len(names)]
-        return (f"contact of {pair.a} and {pair.b}",)
+        return (name_contact(self._contacts.found[index - len(names)]),)
 
     def _operations(self, name: str) -> tuple[str, ...]:
         history = getattr(self._model, "history", None)

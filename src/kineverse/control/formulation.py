@@ -8,7 +8,7 @@ closures of loops, are holds.
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -16,6 +16,7 @@ import numpy as np
 from kineverse.errors import DuplicateNameError, ExpressionError, InvalidValueError, UnknownNameError, suggest
 from kineverse.expressions.expression import Expression, ExpressionLike, array, as_expression
 from kineverse.expressions.functions import minimum, norm
+from kineverse.expressions.gradient import stack_columns
 from kineverse.model.constraint import Constraint
 from kineverse.model.model_view import ModelView
 from kineverse.model.projection import is_equality
@@ -136,8 +137,9 @@ class Formulation:
         if taken:
             raise DuplicateNameError(f"The model has a constraint '{taken[0]}'; give the Keep another name.")
         subject = [*errors.values(), *(e for c in keeps.values() for e in _parts(c))]
+        known = {s.path for s in (*model.symbols, *model.rates.dependent, *model.speeds)}
         for expression in subject:
-            self._check_symbols(expression)
+            refuse_foreign_symbols("A task", expression, known)
         relevant = _relevant_constraints(model, subject) | keeps
         equalities = {name: c for name, c in relevant.items() if is_equality(c)}
         ranges = {name: c for name, c in relevant.items() if name not in equalities}
@@ -269,21 +271,17 @@ class Formulation:
         return self._stack(gradient, task.error.size)
 
     def _stack(self, gradient: dict[Symbol, Expression], count: int) -> Expression:
-        columns = [gradient[s].ravel() if s in gradient else array([ZERO] * count) for s in self.speeds]
-        return array([columns[j][i] for i in range(count) for j in range(len(columns))]).reshape(
-            count, len(columns)
-        )
+        return stack_columns([gradient[s].ravel() if s in gradient else None for s in self.speeds], (count,))
 
-    def _check_symbols(self, expression: Expression) -> None:
-        """Refuse degrees of freedom that the model does not have."""
-        model = self.model
-        known = {s.path for s in (*model.symbols, *model.rates.dependent, *model.speeds)}
-        for symbol in expression.symbols:
-            if symbol.role == "dof" and symbol.path not in known:
-                raise UnknownNameError(
-                    f"A task is about '{symbol}', which is not in the model. "
-                    f"{suggest(symbol.path, known, 'symbol')}"
-                )
+
+def refuse_foreign_symbols(task: str, expression: Expression, known: Collection[str]) -> None:
+    """Raise UnknownNameError for a degree of freedom whose path is not among the known ones."""
+    for symbol in expression.symbols:
+        if symbol.role == "dof" and symbol.path not in known:
+            raise UnknownNameError(
+                f"{task} is about '{symbol}', which is not in the model. "
+                f"{suggest(symbol.path, known, 'symbol')}"
+            )
 
 
 def _parts(constraint: Constraint) -> tuple[Expression, ...]:

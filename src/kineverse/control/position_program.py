@@ -26,10 +26,9 @@ from kineverse.errors import (
     DuplicateNameError,
     InvalidValueError,
     NoSolutionError,
-    UnknownNameError,
-    suggest,
 )
 from kineverse.expressions.expression import Expression, ExpressionLike, array, as_expression, binary
+from kineverse.expressions.gradient import stack_columns
 from kineverse.lie import Array
 from kineverse.model.constraint import Constraint
 from kineverse.model.model_view import ModelView
@@ -41,7 +40,7 @@ from kineverse.model.velocity_rows import velocity_rows
 from kineverse.symbols import Symbol, parameter
 
 from .configuration_space import ConfigurationSpace, find_coordinates
-from .formulation import check_tasks, name_tasks
+from .formulation import check_tasks, name_tasks, refuse_foreign_symbols
 from .tasks import Hold, Keep, Task
 
 _DAMPING, _LEAST_DAMPING = 0.03, 1e-6
@@ -209,20 +208,12 @@ class PositionProgram:
                 f"{task!r} is about speeds, and inverse kinematics about positions. A Controller serves it."
             )
         known = {s.path for s in self.model.symbols}
-        for symbol in expression.symbols:
-            if symbol.role == "dof" and symbol.path not in known:
-                raise UnknownNameError(
-                    f"{task!r} is about '{symbol}', which is not in the model. "
-                    f"{suggest(symbol.path, known, 'symbol')}"
-                )
+        refuse_foreign_symbols(repr(task), expression, known)
 
     def _compile(self, errors: Expression, ranges: dict[str, Constraint]) -> None:
         n = len(self.coordinates)
         gradient = errors.gradient(heuristic=False)
-        none = array([ZERO] * errors.size)
-        columns = [gradient.get(s.derivative(), none) for s in self.coordinates]
-        jacobian = array([column[i] for i in range(errors.size) for column in columns])
-        jacobian = jacobian.reshape(errors.size, n)
+        jacobian = stack_columns([gradient.get(s.derivative()) for s in self.coordinates], errors.shape)
         table = velocity_rows(
             ranges,
             1.0,

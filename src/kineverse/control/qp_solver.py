@@ -100,6 +100,11 @@ class QpSolver(ABC):
         self._hard = None if not self.soft.any() else (~self.soft).astype(float)
         self._values, self._violations = np.zeros(n + m), np.zeros(n + m)
         self._x, self._rows = self._values[:n], self._values[n:]
+        self._prepare()
+
+    @abstractmethod
+    def _prepare(self) -> None:
+        """Import the library and allocate memory, at the end of the construction."""
 
     def solve(self, H: Vector, f: Vector, A: Vector, lower: Vector, upper: Vector) -> QpSolution:
         """Minimise ``1/2 x'Hx + f'x`` subject to ``lower <= [x; A x] <= upper``.

@@ -6,9 +6,8 @@ from abc import abstractmethod
 from typing import Any
 
 import numpy as np
-from numpy.typing import ArrayLike
 
-from .qp_solver import SOFT_WEIGHT, QpSolution, QpSolver, Status, Vector, import_solver
+from .qp_solver import QpSolution, QpSolver, Status, Vector, import_solver
 
 
 class _SlackSolver(QpSolver):
@@ -17,15 +16,8 @@ class _SlackSolver(QpSolver):
     The unknowns are ``[x; above; below]``, the rows ``[[x; A x] - above + below; above; below]``.
     """
 
-    def __init__(
-        self,
-        n: int,
-        m: int,
-        soft: ArrayLike | None = None,
-        soft_weight: ArrayLike = SOFT_WEIGHT,
-        soft_linear: ArrayLike = 0.0,
-    ) -> None:
-        super().__init__(n, m, soft, soft_weight, soft_linear)
+    def _prepare(self) -> None:
+        n, m = self.n, self.m
         rows = np.flatnonzero(self.soft)
         k, size = len(rows), n + 2 * len(rows)
         self._H = np.diag(np.concatenate([np.ones(n), np.tile(self._weight[rows], 2)]))

@@ -180,7 +180,7 @@ def jacobian(expression: Expression, symbols: Sequence[Symbol], heuristic: bool 
     columns = [entries.get(symbol.derivative()) for symbol in wanted]
     if wanted and not any(column is not None for column in columns):
         _refuse_speeds([symbol for symbol in wanted if symbol in entries])
-    return _stack_columns(columns, expression._shape)
+    return stack_columns(columns, expression._shape)
 
 
 def _refuse_speeds(speeds: Sequence[Symbol]) -> None:
@@ -209,7 +209,7 @@ def partial(expression: Expression, symbols: Sequence[Symbol]) -> Expression:
     entries = gradient(rename_symbols(_without_augmentation(expression), moving), False)
     back = {stand_in: s for s, stand_in in moving.items()}
     columns = [entries.get(moving.get(s, s).derivative()) for s in wanted]
-    return _stack_columns(
+    return stack_columns(
         [c if c is None else apply_substitution(c, back) for c in columns], expression._shape
     )
 
@@ -231,7 +231,7 @@ def _without_augmentation(expression: Expression) -> Expression:
     return replace_nodes(expression, plain)
 
 
-def _stack_columns(columns: list[Expression | None], shape: layout.ArrayShape) -> Expression:
+def stack_columns(columns: list[Expression | None], shape: layout.ArrayShape) -> Expression:
     """Return expressions of one shape, None for zero, along a new last axis."""
     size = math.prod(shape)
     stored = [ca.SX.zeros(size, 1) if c is None else layout.column(c._sx, c._shape) for c in columns]
