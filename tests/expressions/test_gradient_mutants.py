@@ -238,15 +238,15 @@ def entries_lie_column_by_column(patch):
 
 @mutant
 def columns_come_in_another_order(patch):
-    original = gradient._stack_columns
-    patch(gradient, "_stack_columns", lambda columns, shape: original(columns[::-1], shape))
+    original = gradient.stack_columns
+    patch(gradient, "stack_columns", lambda columns, shape: original(columns[::-1], shape))
 
 
 @mutant
 def columns_are_one_order_too_low(patch):
     def of(e, symbols, heuristic=True):
         entries = e.gradient(heuristic)
-        return gradient._stack_columns([entries.get(s) for s in symbols], e.shape)
+        return gradient.stack_columns([entries.get(s) for s in symbols], e.shape)
 
     patch(gradient, "jacobian", of)
 
