@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import math
+
 import numpy as np
 
 from kineverse.errors import InvalidValueError
@@ -46,6 +48,8 @@ def inverse_spd(matrix: Array) -> Array:
     InvalidValueError
         If it is numerically singular.
     """
+    if matrix.shape == (1, 1) and 0.0 < matrix[0, 0] < math.inf:
+        return 1.0 / matrix
     try:
         np.linalg.cholesky(matrix)
         return symmetric(np.asarray(np.linalg.inv(matrix), dtype=np.float64))
