@@ -86,12 +86,10 @@ class FixedLag(Generic[State]):
                 f"A measurement at {stamp:g} s is later than the lag of {self.lag:g} s: leave it out, or "
                 "give the tracker a longer lag=."
             )
-        predict = later[0].predict
-        state = predict(later[0].before, stamp)
+        predict, state = later[0].predict, later[0].before
         steps = [one for one in self._steps if one.stamp <= stamp]
-        steps.append(Step(stamp, state, apply, predict))
-        state = apply(state)
-        for one in later:
+        late = Step(stamp, state, lambda before: apply(predict(before, stamp)), predict)
+        for one in (late, *later):
             steps.append(Step(one.stamp, state, one.apply, one.predict))
             state = one.apply(state)
         self._steps = tuple(steps)
