@@ -18,6 +18,11 @@ def invert_matrices(matrices: Array) -> Array:
     return np.asarray(np.linalg.inv(matrices), dtype=np.float64)
 
 
+def transposed(matrices: Array) -> Array:
+    """Transpose each of a stack of matrices."""
+    return np.swapaxes(matrices, -1, -2)
+
+
 def multiply_vectors(matrices: Array, vectors: Array) -> Array:
     """Multiply matrices (..., m, n) by vectors (..., n)."""
     result: Array = (matrices @ vectors[..., None])[..., 0]

@@ -8,6 +8,7 @@ from scipy.linalg import expm
 from synthetic_observations import NoisyObserver
 
 import kineverse as kv
+from kineverse.errors import UnknownNameError
 from kineverse.estimation import ObservedExpression, ObservedPose, Tracker, pose_covariance
 from kineverse.lie import retract
 
@@ -127,5 +128,23 @@ def test_commanded_and_locked_speeds_are_known():
 
 def test_without_a_velocity_process_there_are_no_speeds():
     estimate = Tracker(make_slides(), ["cart"]).estimate
-    assert dict(estimate.speeds) == {} and estimate.speed_covariance.shape == (0, 0)
+    assert dict(estimate.speeds) == {}
+    assert estimate.speed_covariance.shape == (0, 0)
     assert "a:velocity" not in estimate.state
+
+
+def test_initial_speeds_are_given_by_name():
+    options = {"start": {"a": 1.0, "b:velocity": 0.4}, "uncertainty": {"a": 0.1, "a:velocity": 0.2}}
+    tracker = Tracker(make_slides(), ["cart"], process="velocity", **options)
+    estimate = tracker.estimate
+    assert estimate.state["b:velocity"] == 0.4
+    assert estimate.deviation["a"] == pytest.approx(0.1)
+    assert estimate.deviation["a:velocity"] == pytest.approx(0.2)
+    estimate = tracker.reset({"a:velocity": -1.0}, uncertainty={"a:velocity": 0.3})
+    assert estimate.state["a:velocity"] == -1.0
+    assert estimate.deviation["a:velocity"] == pytest.approx(0.3)
+    assert estimate.state["a"] == 1.0
+    assert estimate.deviation["a"] == pytest.approx(0.1)
+    for wrong in ({"start": {"a:velocity": 1.0}}, {"uncertainty": {"a:velocity": 1.0}}):
+        with pytest.raises(UnknownNameError, match="'a:velocity' is not estimated"):
+            Tracker(make_slides(), ["cart"], **wrong)

@@ -16,12 +16,17 @@ for a step ξ in the tangent space. Only the prediction needs the joint Gaussian
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Set
+from collections.abc import Mapping, Sequence, Set
 from dataclasses import dataclass
 
 import numpy as np
 
-from kineverse.estimation.linear_algebra import inverse_spd, symmetric
+from kineverse.estimation.linear_algebra import (
+    invert_matrices,
+    multiply_vectors,
+    symmetric,
+    transposed,
+)
 from kineverse.lie import Array
 from kineverse.symbols import Symbol
 
@@ -68,14 +73,21 @@ class ConstantVelocity:
     def __init__(self, layout: Layout, process_model: ProcessModel) -> None:
         self._layout, self._process_model = layout, process_model
         self.periodic: Set[Symbol] = frozenset()
+        by_size: dict[tuple[int, int], list[int]] = {}
+        for number, group in enumerate(layout.groups):
+            size = len(group.t), len(process_model.speeds_of(number))
+            by_size.setdefault(size, []).append(number)
+        self._batches = list(by_size.values())
 
-    def initialise(self, belief: InformationState, variances: Mapping[Symbol, float]) -> None:
-        """Set the speeds of all groups to 0, with variances by speed [m²/s²], [rad²/s²]; in place."""
+    def initialise(
+        self, belief: InformationState, means: Mapping[Symbol, float], variances: Mapping[Symbol, float]
+    ) -> None:
+        """Set the speeds of all groups, those without a mean to 0, independent of the state; in place."""
         for number, group in enumerate(self._layout.groups):
             speeds = self._process_model.speeds_of(number)
             belief.speeds[number] = ConditionalSpeeds(
                 belief.x[group.x].copy(),
-                np.zeros(len(speeds)),
+                np.array([means.get(v, 0.0) for v in speeds]),
                 np.zeros((len(speeds), len(group.t))),
                 np.diag([variances[v] for v in speeds]),
             )
@@ -119,47 +131,59 @@ class ConstantVelocity:
         noise
             Spectral density q of the acceleration of each other speed [m²/s³], [rad²/s³].
         """
-        for number in range(len(self._layout.groups)):
-            self._predict(number, belief, inputs, dt, commands, noise)
+        for numbers in self._batches:
+            self._predict(numbers, belief, inputs, dt, commands, noise)
 
     def _predict(
         self,
-        number: int,
+        numbers: Sequence[int],
         belief: InformationState,
         inputs: Array,
         dt: float,
         commands: Mapping[Symbol, float],
         noise: Mapping[Symbol, float],
     ) -> None:
-        group, order = self._layout.groups[number], self._process_model.speeds_of(number)
-        block, given = group.block, self.at_state(number, belief, inputs)
-        covariance = inverse_spd(belief.information[block])
-        mean = covariance @ belief.vector[group.t]
-        speed = given.mean + given.gain @ mean
-        cross = given.gain @ covariance
-        spread = given.covariance + cross @ given.gain.T
-        density = np.array([noise.get(v, 0.0) for v in order])
-        for k, v in enumerate(order):
-            if v in commands:
-                speed[k], density[k] = commands[v], 0.0
-                cross[k] = spread[k] = spread[:, k] = 0.0
-        after, slope, gain = self._process_model.transition(number, belief.x[group.x], speed * dt, inputs)
-        # [ξ; u] ← [slope, gain dt; 0, 1] [ξ; u], with the noise of an integrated white acceleration.
-        moved = cross @ slope.T + dt * spread @ gain.T
-        state = slope @ covariance @ slope.T + dt * (gain @ cross @ slope.T + slope @ cross.T @ gain.T)
-        state += dt * dt * gain @ spread @ gain.T + (gain * (density * dt**3 / 3)) @ gain.T
-        moved += (gain * (density * dt**2 / 2)).T
-        information = inverse_spd(symmetric(state))
-        regression = moved @ information
-        mean = slope @ mean
-        belief.x[group.x] = after
-        belief.information[block], belief.vector[group.t] = information, information @ mean
-        belief.speeds[number] = ConditionalSpeeds(
-            after,
-            speed - regression @ mean,
-            regression,
-            symmetric(spread + np.diag(density * dt) - regression @ moved.T),
-        )
+        """Predict groups of equal sizes (g,), all at once."""
+        groups = [self._layout.groups[n] for n in numbers]
+        given = [self.at_state(n, belief, inputs) for n in numbers]
+        t = np.array([group.t for group in groups])
+        rows, columns = t[:, :, None], t[:, None, :]
+        covariance = invert_matrices(belief.information[rows, columns])
+        mean = multiply_vectors(covariance, belief.vector[t])
+        gain = np.array([one.gain for one in given])
+        speed = np.array([one.mean for one in given]) + multiply_vectors(gain, mean)
+        cross = gain @ covariance
+        spread = np.array([one.covariance for one in given]) + cross @ transposed(gain)
+        orders = [self._process_model.speeds_of(n) for n in numbers]
+        density = np.array([[noise.get(v, 0.0) for v in order] for order in orders])
+        for g, order in enumerate(orders):
+            for k, v in enumerate(order):
+                if v in commands:
+                    speed[g, k], density[g, k] = commands[v], 0.0
+                    cross[g, k] = spread[g, k] = spread[g, :, k] = 0.0
+        ends = [
+            self._process_model.transition(n, belief.x[group.x], by, inputs)
+            for n, group, by in zip(numbers, groups, speed * dt, strict=True)
+        ]
+        slope, by_speed = (np.array([end[i] for end in ends]) for i in (1, 2))
+        # [ξ; u] ← [slope, by_speed dt; 0, 1] [ξ; u], with the noise of an integrated white acceleration.
+        moved = cross @ transposed(slope) + dt * spread @ transposed(by_speed)
+        moved += dt**2 / 2 * density[:, :, None] * transposed(by_speed)
+        state = slope @ covariance @ transposed(slope)
+        coupled = dt * by_speed @ cross @ transposed(slope)
+        state += coupled + transposed(coupled)
+        spread_and_noise = dt**2 * spread + dt**3 / 3 * density[:, :, None] * np.eye(density.shape[1])
+        state += by_speed @ spread_and_noise @ transposed(by_speed)
+        information = invert_matrices((state + transposed(state)) / 2)
+        regression, mean = moved @ information, multiply_vectors(slope, mean)
+        left = spread + dt * density[:, :, None] * np.eye(density.shape[1]) - regression @ transposed(moved)
+        belief.information[rows, columns] = information
+        belief.vector[t] = multiply_vectors(information, mean)
+        speed -= multiply_vectors(regression, mean)
+        for g, (number, group) in enumerate(zip(numbers, groups, strict=True)):
+            after = ends[g][0]
+            belief.x[group.x] = after
+            belief.speeds[number] = ConditionalSpeeds(after, speed[g], regression[g], symmetric(left[g]))
 
     def _step_between(
         self, number: int, start: Array, end: Array, inputs: Array

@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
-from dataclasses import dataclass, replace
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass, field
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -20,7 +20,6 @@ from .gaussian_sum import GaussianSum
 from .measurements import require_positive
 from .multi_start import find_periodic_coordinates, spread_starts
 from .step import UpdateStep
-from .tangent import TangentSpace
 
 if TYPE_CHECKING:
     from kineverse.model.model_view import ModelView
@@ -36,13 +35,14 @@ class InitialBelief:
         Coordinates (n,).
     deviations
         Standard deviation of each tangent direction (t,).
-    speed_variances
-        Initial variance of each speed, if speeds are estimated.
+    speeds, speed_variances
+        Mean and variance of each speed, if speeds are estimated.
     """
 
     x: Array
     deviations: Array
-    speed_variances: Mapping[Symbol, float]
+    speeds: Mapping[Symbol, float] = field(default_factory=dict)
+    speed_variances: Mapping[Symbol, float] = field(default_factory=dict)
 
     def spread(self, update_step: UpdateStep, inputs: Array) -> GaussianSum:
         """Return the belief about several initial points, see :mod:`.multi_start`."""
@@ -51,31 +51,98 @@ class InitialBelief:
         belief.x[:] = self.x
         belief.information[:] = np.diag(self.deviations**-2.0)
         if update_step.velocity is not None:
-            update_step.velocity.initialise(belief, self.speed_variances)
+            update_step.velocity.initialise(belief, self.speeds, self.speed_variances)
         return spread_starts(update_step, belief, inputs)
 
-    def with_values(
-        self, tangent_space: TangentSpace, start: StateLike, uncertainty: StateLike
-    ) -> InitialBelief:
-        """Return the belief with other values of some coordinates, and other uncertainties.
+    def with_values(self, update_step: UpdateStep, values: GivenValues) -> InitialBelief:
+        """Return the belief with other values of some coordinates and speeds, and other deviations."""
+        x, deviations = self.x.copy(), self.deviations.copy()
+        for symbol, value in values.coordinates.items():
+            x[update_step.layout.tangent_space.coordinates.index(symbol)] = value
+        for k, value in values.deviations.items():
+            deviations[k] = value
+        variances = {v: deviation**2 for v, deviation in values.speed_deviations.items()}
+        speeds, speed_variances = {**self.speeds, **values.speeds}, {**self.speed_variances, **variances}
+        return InitialBelief(x, deviations, speeds, speed_variances)
+
+
+@dataclass(frozen=True, eq=False)
+class GivenValues:
+    """Checked initial values and standard deviations.
+
+    Attributes
+    ----------
+    coordinates, speeds
+        Values by symbol.
+    deviations
+        Standard deviations by number of the tangent direction.
+    speed_deviations
+        Standard deviations of speeds.
+    """
+
+    coordinates: Mapping[Symbol, float]
+    speeds: Mapping[Symbol, float]
+    deviations: Mapping[int, float]
+    speed_deviations: Mapping[Symbol, float]
+
+    @staticmethod
+    def read(update_step: UpdateStep, start: StateLike, uncertainty: StateLike) -> GivenValues:
+        """Check initial values and standard deviations.
+
+        Parameters
+        ----------
+        update_step
+            Components of the tracker.
+        start
+            Values of coordinates, and of speeds if these are estimated; other values of a state are ignored.
+        uncertainty
+            Standard deviations of coordinates, of tangent directions that are no coordinate's, by speed, and
+            of speeds if these are estimated.
 
         Raises
         ------
         UnknownNameError
             For a name that is not estimated.
         InvalidValueError
-            For a value that is not finite, or an uncertainty that is not positive.
+            For a value that is not finite, or a deviation that is not positive.
         """
-        x, deviations = self.x.copy(), self.deviations.copy()
-        for symbol, value in read_start(tangent_space, start).items():
-            x[tangent_space.coordinates.index(symbol)] = value
-        for k, value in read_uncertainty(tangent_space, uncertainty).items():
-            deviations[k] = value
-        return replace(self, x=x, deviations=deviations)
+        tangent_space = update_step.layout.tangent_space
+        speeds = () if update_step.velocity is None else tuple(update_step.process_model.speeds.values())
+        state = start if isinstance(start, State) else State(start)
+        given = {s: state[s] for s in (*tangent_space.coordinates, *speeds) if s in state}
+        for key in () if isinstance(start, State) else state:
+            if key not in given:
+                raise _unknown_name(key, (*tangent_space.coordinates, *speeds))
+        for symbol, value in given.items():
+            if not math.isfinite(value):
+                raise InvalidValueError(f"start= of '{symbol}' is {value!r}; it must be finite.")
+        names: dict[str, int] = {}
+        for k, v in enumerate(tangent_space.tangent):
+            names[str(v.position) if v.position in tangent_space.coordinates else str(v)] = k
+        speed_names = {str(v): v for v in speeds if str(v) not in names}
+        deviations, speed_deviations = {}, {}
+        for key, value in uncertainty.items():
+            if str(key) in speed_names:
+                speed_deviations[speed_names[str(key)]] = require_positive(key, value)
+            elif str(key) in names:
+                deviations[names[str(key)]] = require_positive(key, value)
+            else:
+                raise _unknown_name(key, (*names, *speed_names))
+        return GivenValues(
+            {s: value for s, value in given.items() if s not in speeds},
+            {s: value for s, value in given.items() if s in speeds},
+            deviations,
+            speed_deviations,
+        )
+
+
+def _unknown_name(key: object, names: Iterable[object]) -> UnknownNameError:
+    hint = suggest(str(key), map(str, names), "coordinate")
+    return UnknownNameError(f"'{key}' is not estimated. {hint}")
 
 
 def make_initial_belief(
-    model: ModelView, update_step: UpdateStep, start: StateLike, uncertainty: StateLike, inputs: Array
+    model: ModelView, update_step: UpdateStep, values: GivenValues, inputs: Array
 ) -> InitialBelief:
     """Return the initial belief, and set the periodic coordinates and initial deviations of a tracker.
 
@@ -85,59 +152,15 @@ def make_initial_belief(
         The model, with default values of coordinates.
     update_step
         Components of the tracker.
-    start, uncertainty
+    values
         Given values and standard deviations.
     inputs
         Values of the inputs.
-
-    Raises
-    ------
-    UnknownNameError, InvalidValueError
-        As :meth:`InitialBelief.with_values`.
     """
     tangent_space, limits = update_step.layout.tangent_space, update_step.limits
-    x = initial_point(model, tangent_space, limits, read_start(tangent_space, start))
+    x = initial_point(model, tangent_space, limits, values.coordinates)
     update_step.periodic = find_periodic_coordinates(update_step, x, inputs)
     usual = initial_deviations(tangent_space, limits, update_step.periodic)
-    belief = InitialBelief(x, usual, {}).with_values(tangent_space, {}, uncertainty)
+    belief = InitialBelief(x, usual).with_values(update_step, values)
     update_step.unobservable.deviations = belief.deviations
     return belief
-
-
-def read_start(tangent_space: TangentSpace, start: StateLike) -> dict[Symbol, float]:
-    """Return the given values of estimated coordinates.
-
-    Raises
-    ------
-    UnknownNameError, InvalidValueError
-        As :meth:`InitialBelief.with_values`.
-    """
-    state = start if isinstance(start, State) else State(start)
-    given = {x: state[x] for x in tangent_space.coordinates if x in state}
-    unknown = [] if isinstance(start, State) else [str(s) for s in state if s not in given]
-    if unknown:
-        hint = suggest(unknown[0], map(str, tangent_space.coordinates), "coordinate")
-        raise UnknownNameError(f"'{unknown[0]}' is not estimated. {hint}")
-    for symbol, value in given.items():
-        if not math.isfinite(value):
-            raise InvalidValueError(f"start= of '{symbol}' is {value!r}; it must be finite.")
-    return given
-
-
-def read_uncertainty(tangent_space: TangentSpace, uncertainty: StateLike) -> dict[int, float]:
-    """Return the given standard deviations by number of the tangent direction.
-
-    Raises
-    ------
-    UnknownNameError, InvalidValueError
-        As :meth:`InitialBelief.with_values`.
-    """
-    names = {str(v): i for i, v in enumerate(tangent_space.tangent)}
-    own = [v for v in tangent_space.tangent if v.position in tangent_space.coordinates]
-    names.update({str(v.position): tangent_space.tangent.index(v) for v in own})
-    result = {}
-    for key, value in uncertainty.items():
-        if str(key) not in names:
-            raise UnknownNameError(f"'{key}' is not estimated. {suggest(str(key), names, 'coordinate')}")
-        result[names[str(key)]] = require_positive(key, value)
-    return result

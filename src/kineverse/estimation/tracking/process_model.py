@@ -137,6 +137,7 @@ class ProcessModel:
             if group.by_speeds:
                 process_model = [tangent_space.rate_row(x) for x in group.coordinates]
                 self._steps[number] = RateFlow(group.coordinates, process_model, group.tangent, layout.inputs)
+        self._identities = [np.eye(len(group.t)) for group in layout.groups]
         self.speeds: Mapping[str, Symbol] = by_name
 
     def speed(self, key: Symbol | str) -> Symbol:
@@ -227,7 +228,8 @@ class ProcessModel:
         """
         flow = self._flows.get(number)
         if flow is None:
-            return x + displacement, np.eye(len(x)), np.eye(len(x))
+            identity = self._identities[number]
+            return x + displacement, identity, identity
         after, slope, gain = flow.integrate(x, displacement, inputs)
         back = np.linalg.pinv(self.basis(number, after, inputs))
         return after, back @ slope @ self.basis(number, x, inputs), back @ gain

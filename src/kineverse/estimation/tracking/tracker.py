@@ -22,7 +22,7 @@ from .bindings import native_library
 from .bounds import SpeedLocks, arrange_state
 from .estimate import Estimate, TrackerState
 from .fixed_lag import FixedLag, Step
-from .initial_belief import make_initial_belief, read_start, read_uncertainty
+from .initial_belief import GivenValues, make_initial_belief
 from .measurements import (
     ObservedLike,
     build_measurement_models,
@@ -56,9 +56,11 @@ class Tracker:
         :class:`.ObservedExpression`.
     start
         Initial values of some coordinates; others start in the middle of the limits, or at the default state.
+        Speeds, if these are estimated, start at 0 unless they are given.
     uncertainty
         Initial standard deviations [m], [rad], by coordinate, or by speed for directions that are no
-        coordinate's; by default half the width of the limits, π for angles, 10 m.
+        coordinate's; by default half the width of the limits, π for angles, 10 m. Those of estimated speeds
+        [m/s], [rad/s] by speed.
     process
         Process model: ``"position"`` for positions that move at random, ``"velocity"`` for speeds that change
         at random and are estimated, ``"static"`` for a state that is constant unless it is commanded.
@@ -128,12 +130,14 @@ class Tracker:
         noise = {process_model.speed(k): require_positive(k, v) for k, v in (process_noise or {}).items()}
         values = np.array([np.nan if s.value is None else s.value for s in layout.inputs])
         known = np.nan_to_num(values)
-        first = make_initial_belief(model, self._update_step, start or {}, uncertainty or {}, known)
+        given_values = GivenValues.read(self._update_step, start or {}, uncertainty or {})
+        first = make_initial_belief(model, self._update_step, given_values, known)
         noise = {**default_process_noise(self._update_step, process, first.x, known), **noise}
         variances = {v: INITIAL_SPEED_TIME * q for v, q in noise.items()}
+        first = replace(first, speed_variances={**variances, **first.speed_variances})
         self._recursion = Recursion(
             self._update_step,
-            replace(first, speed_variances=variances),
+            first,
             noise,
             SpeedLocks(model, layout, process_model) if locks else None,
             lost_after,
@@ -233,11 +237,10 @@ class Tracker:
         Parameters
         ----------
         start
-            Values of some coordinates. Other coordinates keep their estimate. If neither values nor
-            uncertainties are given, all coordinates start as the tracker did.
+            Values of some coordinates, and of speeds if these are estimated. Other coordinates keep their
+            estimate. If neither values nor uncertainties are given, all start as the tracker did.
         uncertainty
-            Standard deviations of some coordinates, or of speeds as at construction; those of other given
-            values are the initial ones.
+            Standard deviations, as at construction; those of other given values are the initial ones.
         at
             Time from now on [s]; it may be earlier than before. The time stays if None.
 
@@ -248,23 +251,23 @@ class Tracker:
         """
         tangent_space, now = self._layout.tangent_space, self._now
         stamp = now.stamp if at is None else _require_time(at)
-        values = read_start(tangent_space, start or {})
-        deviations = read_uncertainty(tangent_space, uncertainty or {})
+        values = GivenValues.read(self._update_step, start or {}, uncertainty or {})
         first, groups = self._recursion.first, list(range(len(self._layout.groups)))
-        if values or deviations:
-            set_directions = {*deviations}
-            for x in values:
-                if x.derivative() in tangent_space.tangent:
-                    set_directions.add(tangent_space.tangent.index(x.derivative()))
+        if start or uncertainty:
+            own = {x.derivative() for x in values.coordinates} & {*tangent_space.tangent}
+            anew = [tangent_space.tangent.index(v) for v in own] + list(values.deviations)
             spread = np.sqrt(np.diag(self.estimate.covariance))
-            spread[list(set_directions)] = first.deviations[list(set_directions)]
+            spread[anew] = first.deviations[anew]
             first = replace(first, x=now.mixture.best.x.copy(), deviations=spread)
-            first = first.with_values(tangent_space, values, uncertainty or {})
-            places = {tangent_space.coordinates.index(x) for x in values}
+            first = first.with_values(self._update_step, values)
+            changed = {*values.coordinates, *values.speeds, *values.speed_deviations}
+            changed |= {tangent_space.tangent[k] for k in values.deviations}
             groups = [
                 n
                 for n, group in enumerate(self._layout.groups)
-                if not places.isdisjoint(group.x.tolist()) or not set_directions.isdisjoint(group.t.tolist())
+                if not changed.isdisjoint(
+                    (*group.coordinates, *group.tangent, *self._update_step.process_model.speeds_of(n))
+                )
             ]
         mixture = now.mixture.replace_groups(
             first.spread(self._update_step, np.nan_to_num(now.inputs)), groups
