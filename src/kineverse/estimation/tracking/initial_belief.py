@@ -110,9 +110,9 @@ class GivenValues:
         speeds = () if update_step.velocity is None else tuple(update_step.process_model.speeds.values())
         state = start if isinstance(start, State) else State(start)
         given = {s: state[s] for s in (*tangent_space.coordinates, *speeds) if s in state}
-        for key in () if isinstance(start, State) else state:
-            if key not in given:
-                raise _unknown_name(key, (*tangent_space.coordinates, *speeds))
+        for name in () if isinstance(start, State) else state:
+            if name not in given:
+                raise _unknown_name(name, (*tangent_space.coordinates, *speeds))
         for symbol, value in given.items():
             if not math.isfinite(value):
                 raise InvalidValueError(f"start= of '{symbol}' is {value!r}; it must be finite.")
