@@ -88,6 +88,31 @@ def test_a_wrong_model_stays_lost():
     assert all(flags[3:])
 
 
+def test_outliers_alone_are_no_track():
+    model, rng = kv.Model(), np.random.default_rng(0)
+    with model.edit() as edit:
+        edit.apply(kv.Floating(name="box", parent="world", child="box"))
+    tracker, lost = Tracker(model, ["box"], outliers=True), []
+    for k in range(40):
+        pose = kv.axis_angle(rng.standard_normal(3), rng.uniform(0, 3))()
+        pose[:3, 3] = rng.uniform(-1, 1, 3)
+        estimate = tracker.update({"box": pose}, at=k / 30)
+        lost.append(estimate.lost)
+        assert not estimate.lost or set(estimate.confidence.values()) == {0.0}
+    assert np.mean(lost[15:]) > 0.9
+
+
+def test_swapped_frames_are_lost():
+    tracker, observer = (
+        Tracker(MODEL, ["hinge", "handle"], outliers=True),
+        NoisyObserver(MODEL, ["hinge", "handle"]),
+    )
+    for k in range(20):
+        seen = observer({"q": 0.4})
+        estimate = tracker.update({"hinge": seen["handle"], "handle": seen["hinge"]}, at=k / 30)
+    assert estimate.lost
+
+
 def test_a_single_gross_error_loses_nothing():
     tracker = Tracker(MODEL, ["hinge", "handle"], outliers=True, lost_after=2)
     observer = NoisyObserver(MODEL, ["hinge", "handle"])

@@ -173,11 +173,12 @@ class Estimate:
 
     @cached_property
     def confidence(self) -> Mapping[tuple[Symbol, ...], float]:
-        """Probability of each group's best component among the components of the Gaussian sum."""
+        """Probability of each group's best component among those of the Gaussian sum; 0 if it is lost."""
         result = {}
         for number, group in enumerate(self._layout.groups):
             evidence = self._mixture.evidence(number)
-            result[group.coordinates] = float(np.exp(evidence[0] - np.logaddexp.reduce(evidence)))
+            best = float(np.exp(evidence[0] - np.logaddexp.reduce(evidence)))
+            result[group.coordinates] = 0.0 if self._loss.is_lost[number] else best
         return MappingProxyType(result)
 
     @cached_property

@@ -40,12 +40,15 @@ class TrackLoss:
         return TrackLoss(np.zeros(count, dtype=np.int64), np.zeros(count, dtype=bool))
 
     def after(self, measured: Groups, refuted: Groups, lost_after: int) -> TrackLoss:
-        """Return the state after an update with masks of measured and of refuted groups (groups,)."""
+        """Return the state after an update with masks of measured and of refuted groups (groups,).
+
+        A group that is lost stays lost until measurements agree with it.
+        """
         count = np.where(measured, np.where(refuted, self.refuted + 1, 0), self.refuted)
-        return TrackLoss(count, count >= lost_after)
+        return TrackLoss(count, (self.is_lost | (count >= lost_after)) & (refuted | ~measured))
 
     def with_restarted(self, groups: Groups) -> TrackLoss:
-        """Return the state after a restart of some groups, which stay lost until the next update."""
+        """Return the state after a restart of some groups; they stay lost."""
         return TrackLoss(np.where(groups, 0, self.refuted), self.is_lost)
 
 
