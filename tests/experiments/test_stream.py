@@ -38,7 +38,8 @@ def test_trackers_follow_the_door_and_are_never_silently_lost(tracked):
     textbook, velocity = summaries["textbook"], summaries["velocity"]
     for name in ("position", "velocity"):
         assert summaries[name].silently_lost < 1.0
-        assert 0.7 < summaries[name].nees < 1.5
+        # Less than 1 while the door is shut, at its limit.
+        assert 0.3 < summaries[name].nees < 1.5
     assert velocity.moving < 1.1 * textbook.moving
     assert velocity.resting < 1.05 * textbook.resting
     assert velocity.moving < 0.9 * summaries["position"].moving
