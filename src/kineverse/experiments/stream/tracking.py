@@ -111,7 +111,7 @@ def make_streams(
     return [simulate_stream(model, angles, np.random.default_rng(seed)) for seed in seeds]
 
 
-def make_tracker(model: Model, process: Process) -> Tracker:
+def make_door_tracker(model: Model, process: Process) -> Tracker:
     """Return a tracker of the door that is told nothing but the noise."""
     noise = pose_covariance(POSITION, ORIENTATION)
     tracker = Tracker(
@@ -142,7 +142,7 @@ def run_trackers(
     """Return the estimates of trackers and of the textbook filter, by name."""
     results: dict[str, list[TrackedStream]] = {}
     for process in PROCESSES:
-        tracker = make_tracker(model, process)
+        tracker = make_door_tracker(model, process)
         results[process] = [
             track_stream(tracker, stream) for stream in progress(streams, f"stream: {process}", "stream")
         ]
