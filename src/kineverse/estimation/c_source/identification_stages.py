@@ -263,7 +263,8 @@ EXPORT void carry_on(const Problem *problem, double *memory, double *answer) {
 }
 
 /* As laplace_evidence in evidence.py, for several sizes of the noise; the rest is for the last. The
-   covariance of the errors is the sum of two parts, times the square of a factor each; without parts it is as it is. */
+   covariance of the errors is the sum of two parts, times the square of a factor each; without parts it is as
+   it is. */
 EXPORT void rate(const Problem *problem, int64_t sizes, const double *factors, const double *parts,
                  double *memory, double *answer, double *logs, double *values, double *covariances,
                  double *information) {

@@ -21,6 +21,7 @@ from .custom_family import Family, family_starts
 from .gauge import fix_gauge
 from .initial_guess import MotionStatistics, initial_guesses
 from .maximum_likelihood import Scored
+from .nested_families import bound_log_evidences
 from .observations import Observations, check_observations
 from .optimise import InitialGuess
 from .outlier_rejection import RowIndices, find_inliers, log_inlier_prior
@@ -401,13 +402,15 @@ def weigh_families(
     weights: Mapping[str | Family, float],
 ) -> IdentificationResult:
     """Return the fits of all families with their posterior probabilities."""
-    total: Array = np.array(
-        [one.log_evidence + one.log_prior + math.log(weights[name]) for name, one in solutions.items()]
+    logs = bound_log_evidences(
+        {name: one.log_evidence + one.log_prior for name, one in solutions.items()},
+        {name: one.scored.solution for name, one in solutions.items()},
     )
+    total: Array = np.array([logs[name] + math.log(weights[name]) for name in solutions])
     probabilities = np.exp(total - np.logaddexp.reduce(total)).tolist()
     lazy_fits = [
-        LazyFit(one.scored.solution.motion.name, p, partial(_fit, data, one, p))
-        for one, p in zip(solutions.values(), probabilities, strict=True)
+        LazyFit(one.scored.solution.motion.name, p, partial(_fit, data, one, logs[name], p))
+        for (name, one), p in zip(solutions.items(), probabilities, strict=True)
     ]
     best = list(solutions.values())[int(np.argmax(total))]
     return IdentificationResult(
@@ -415,11 +418,12 @@ def weigh_families(
     )
 
 
-def _fit(data: IdentificationData, one: FamilySolution, probability: float) -> Fit:
+def _fit(data: IdentificationData, one: FamilySolution, log_evidence: float, probability: float) -> Fit:
     solution = fix_gauge(unwrap_solution(one.scored.solution) if data.sequential else one.scored.solution)
-    log_evidence = one.log_evidence + one.log_prior + log_density(len(data.observations), data.unit)
+    log_evidence += log_density(len(data.observations), data.unit)
     fit = build_fit(solution, solver.evidence(solution), log_evidence, probability)
     observations = scale_noise(data.observations, one.noise.factors)
-    return convert_to_metres(
-        complete_fit(fit, observations, one.inliers, sequential=data.sequential), data.unit
-    )
+    fit = complete_fit(fit, observations, one.inliers, sequential=data.sequential)
+    if data.outliers is not None and fit.motion.joints == fit.rows:
+        fit = replace(fit, is_determined=False, reason="outliers alone would look the same")
+    return convert_to_metres(fit, data.unit)

@@ -34,6 +34,8 @@ _SPREAD = math.log(5.0)
 
 # Factors on the medians for first solutions: ratios of position to orientation noise of 1, 16 and 1/16.
 _STARTS = ((1.0, 1.0), (4.0, 0.25), (0.25, 4.0))
+# Least factor, 5 µm and 0.001°. Without it the likelihood of identical poses has no maximum.
+_ROUNDING = 1e-3
 # Logarithms of the factors of the first search.
 _COARSE = _SPREAD * np.array([-2.0, -1.0, 0.0, 1.0, 2.0])
 # Log density by which another start has to be better.
@@ -256,7 +258,7 @@ def adapt_noise(observations: Observations, near: NoiseSolution) -> NoiseSolutio
 def _factors(logs: Array) -> Array:
     """Return factors on both standard deviations, (M, 2), from logarithms of one or both, (M, d)."""
     factors = np.ones((len(logs), 2))
-    factors[:, : logs.shape[1]] = np.exp(logs)
+    factors[:, : logs.shape[1]] = np.hypot(np.exp(logs), _ROUNDING)
     return factors
 
 
