@@ -260,6 +260,10 @@ class Identifier:
             of_child,
             fewest=1,
         )
+        if len(self._buffer) and stated != self._stated:
+            raise InvalidValueError(
+                "Some poses have a covariance and others have none. Give all one, or noise= for the rest."
+            )
         self._buffer.add(one)
         self._stated = stated
         self._result = None
@@ -274,9 +278,8 @@ class Identifier:
             For fewer than two poses.
         """
         if len(self._buffer) < 2:
-            raise InvalidValueError(
-                f"There are {len(self._buffer)} poses so far. How something moves takes at least two to see."
-            )
+            count = "is one pose" if len(self._buffer) else "are no poses"
+            raise InvalidValueError(f"There {count} so far. How something moves takes at least two to see.")
         if self._result is None:
             self._result = self._identify()
         return self._result
