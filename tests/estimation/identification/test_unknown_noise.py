@@ -12,6 +12,7 @@ from synthetic_recordings import recording
 
 from kineverse.errors import KineverseError
 from kineverse.estimation import Identifier, identify, pose_covariance
+from kineverse.estimation.identification.bindings import library
 from kineverse.estimation.identification.identify import WEIGHTS, prepare_data, solve_with_inliers
 from kineverse.estimation.identification.initial_guess import MotionStatistics, initial_guesses
 from kineverse.estimation.identification.observations import check_observations
@@ -79,6 +80,19 @@ def test_evidence_is_that_of_a_sum_over_noises_with_a_solution_for_each(family: 
         prior = -0.5 * float(logs @ logs) / spread**2 - math.log(math.tau * spread**2)
         total.append(found.log_evidence + prior)
     assert one.log_evidence == pytest.approx(np.logaddexp.reduce(total) + 2 * math.log(step), abs=0.05)
+
+
+@pytest.mark.compiler
+def test_unknown_noise_in_c_agrees_with_numpy(monkeypatch: pytest.MonkeyPatch) -> None:
+    seen = recording("revolute", count=8, position=0.02, orientation=0.3 * DEG, seed=5)
+    families = ["prismatic", "revolute"]
+    fast = identify(seen.parent, seen.child, families=families)
+    monkeypatch.setattr(library, "_code", None)
+    monkeypatch.setattr(library, "_failed", True)
+    slow = identify(seen.parent, seen.child, families=families)
+    assert slow.noise == pytest.approx(fast.noise, rel=1e-3)
+    for fit in slow:
+        assert fit.log_evidence == pytest.approx(fast[fit.family].log_evidence, abs=1e-2)
 
 
 def test_arcs_of_positions_that_look_straight_are_solved_with_long_levers() -> None:

@@ -22,9 +22,8 @@ from .optimise import Solution
 
 Name = TypeVar("Name")
 
-UNSEEN = 1.0 / 3.0
-"""Prior probability of a range of a joint that is too small to be seen. The prior is log-uniform between 10⁻⁵
-and 10 [m], [rad], see :mod:`.range_prior`, so this is the share below 1 mm and below 0.06°."""
+UNSEEN = 0.05
+"""Prior probability that a prismatic or revolute joint hardly moves while it is observed."""
 
 
 def bound_log_evidences(

@@ -24,7 +24,7 @@ _CHUNK = 10
 
 @dataclass(frozen=True)
 class Setting:
-    """What the estimator is given of a case.
+    """Observations and noise that the estimator is given of a case.
 
     Attributes
     ----------
