@@ -55,6 +55,7 @@ EXPERIMENTS: Mapping[str, str] = MappingProxyType(
         "fig4": "a kitchen tracked from poses of its parts (2022 paper, Fig. 4; 2020 paper, IV-A)",
         "sturm": "hinges and sliders learned from recordings of doors and drawers (--data FOLDER)",
         "stream": "a door that a hand opens, tracked and monitored at 30 Hz with correlated errors",
+        "joint-types": "types of random hinges and sliders, with and without stated noise",
         "estimation-grid": "hinges and sliders learned from noisy poses, against the Cramér-Rao bound",
     }
 )

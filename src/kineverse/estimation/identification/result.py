@@ -26,6 +26,22 @@ SURE = 0.95
 """Least probability at which the best family is reported as identified."""
 
 
+class NoiseDeviations(NamedTuple):
+    """Standard deviations of the noise.
+
+    Attributes
+    ----------
+    position
+        Standard deviation of each coordinate of a position [m].
+    orientation
+        Standard deviation of each component of the rotation vector of an orientation [rad]; NaN if no
+        orientation was observed.
+    """
+
+    position: float
+    orientation: float
+
+
 @dataclass(frozen=True)
 class Fit:
     """Most likely member of one joint family.
@@ -196,12 +212,13 @@ class IdentificationResult:
     ----------
     lazy_fits
         Families, their probabilities, and the functions that compute the fits.
-    noise_scale
-        Estimated factor on the standard deviations of the noise; 1 if the noise was stated.
+    noise
+        Estimated standard deviations of the noise under the most probable family; None if the noise was
+        stated.
     """
 
     lazy_fits: tuple[LazyFit, ...]
-    noise_scale: float = 1.0
+    noise: NoiseDeviations | None = None
     _computed: dict[int, Fit] = field(default_factory=dict, repr=False)
 
     @property
