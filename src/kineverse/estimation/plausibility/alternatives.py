@@ -11,7 +11,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from types import MappingProxyType
 
 import numpy as np
@@ -177,6 +177,8 @@ PRIOR: Mapping[str, float] = MappingProxyType({"served": 0.8, "elsewhere": 0.05,
 
 # Least number of observations for a statement about the motion.
 _LEAST_COUNT = 5
+# Least number of observations that are kept of correlated ones, if there are as many.
+_KEPT = 60
 
 
 @dataclass(frozen=True)
@@ -211,6 +213,25 @@ class JointObservations:
             self.times[rows],
         )
 
+    def decorrelate(self, looks: float) -> JointObservations:
+        """Return evenly spaced observations with errors that may be taken as independent.
+
+        If ``looks`` observations tell as much as one with independent errors, N of them tell as much as N /
+        ``looks``. Some more are kept, because they show more of the motion, with accordingly larger
+        covariances.
+        """
+        count = len(self.times)
+        kept = min(max(math.ceil(count / looks), _KEPT), count)
+        factor = max(looks * kept / count, 1.0)
+        result = self if kept == count else self.select(np.linspace(0, count - 1, kept).round().astype(int))
+        if factor == 1.0:
+            return result
+        return replace(
+            result,
+            observations=result.observations.scaled(factor),
+            residuals=result.residuals.scaled(factor),
+        )
+
 
 def judge_joint(
     model: Model,
@@ -218,8 +239,12 @@ def judge_joint(
     implausible_since: int | None,
     families: FamilyChoice,
     outliers: Outliers | None,
+    looks: float = 1.0,
 ) -> JointVerdict:
-    """Compare a joint with its alternatives, given the change point of the sequential test."""
+    """Compare a joint with its alternatives, given the change point of the sequential test.
+
+    ``looks`` observations tell as much as one with independent errors.
+    """
     if implausible_since is None:
         recent = data
         right = reject_outliers(data.residuals, outliers)
@@ -229,13 +254,14 @@ def judge_joint(
         if outliers is not None and len(right) >= 2:
             right = identify_observations(recent.observations, families, outliers).best.inliers
     inliers = recent.select(right)
-    alternative = identify_observations(inliers.observations, families) if len(right) >= 2 else None
-    probabilities = _probabilities(inliers, alternative)
+    independent = inliers.decorrelate(looks)
+    alternative = identify_observations(independent.observations, families) if len(right) >= 2 else None
+    probabilities = _probabilities(independent, alternative)
     operation, reason = None, ""
     if implausible_since is not None:
-        operation, reason = _propose_replacement(model, data, inliers, alternative)
+        operation, reason = _propose_replacement(model, data, independent, alternative)
     else:
-        reason = _ambiguity_reason(probabilities, len(right))
+        reason = _ambiguity_reason(probabilities, len(right), looks)
     squares = np.mean(inliers.residuals.pose_residuals**2, axis=0)
     rms = math.sqrt(float(squares[:3].sum())), math.sqrt(float(squares[3:].sum()))
     outlier_times = tuple(np.setdiff1d(recent.times, inliers.times).tolist())
@@ -272,12 +298,14 @@ def _probabilities(data: JointObservations, alternative: IdentificationResult | 
     return {"free": 0.0, **{name: math.exp(log - total) for name, log in logs.items()}}
 
 
-def _ambiguity_reason(probabilities: Mapping[str, float], count: int) -> str:
+def _ambiguity_reason(probabilities: Mapping[str, float], count: int, looks: float) -> str:
     """Return the reason why a joint that fits is not certain."""
     if probabilities["served"] >= SURE:
         return ""
     if count < _LEAST_COUNT:
         return f"both were seen {count} time{'s' if count > 1 else ''} only"
+    if count < _LEAST_COUNT * looks:
+        return f"as errors are correlated in time, {count} observations tell as much as {count / looks:.1f}"
     other = max((name for name in probabilities if name != "served"), key=lambda name: probabilities[name])
     if other == "elsewhere":
         return "it may sit a bit elsewhere as well"

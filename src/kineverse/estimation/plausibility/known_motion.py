@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from copy import copy
 from dataclasses import dataclass
+from functools import cached_property
 from typing import Self
 
 import numpy as np
@@ -20,6 +21,8 @@ from kineverse.model.constraint import Constraint
 from kineverse.model.model import Model
 from kineverse.model.rate_nodes import to_plain
 from kineverse.symbols import Symbol
+
+from .single_observation import solve_observation
 
 # Number of initial values of a single coordinate, and of several coordinates.
 _GRID_SIZE, _SAMPLE_SIZE = 33, 256
@@ -101,6 +104,18 @@ class KnownJoint:
             twists = twists @ self._rates.batch(self._points(coordinates))
         return LinearisedPoses(poses, np.zeros((len(poses), 6, 0)), twists)
 
+    def evaluate(self, coordinates: Array) -> tuple[Array, Array]:
+        """Return the pose (4, 4) at one set of coordinates (n,), and twists per unit of each (6, n)."""
+        pose, *slopes = self._linear(np.concatenate([coordinates, self._others]))
+        twists = np.empty((6, len(slopes)))
+        for j, slope in enumerate(slopes):
+            turned = (slope[:3, :3] @ pose[:3, :3].T).tolist()
+            twists[:3, j] = slope[:3, 3]
+            twists[3, j] = 0.5 * (turned[2][1] - turned[1][2])
+            twists[4, j] = 0.5 * (turned[0][2] - turned[2][0])
+            twists[5, j] = 0.5 * (turned[1][0] - turned[0][1])
+        return pose, twists
+
     def retract(self, coordinates: Array, change: Array) -> Array:
         """Return coordinates (N, n) after changes of the joint values (N, k), without limits."""
         if self._rates is not None:
@@ -136,6 +151,11 @@ class KnownJoint:
     def solve(self, observations: Observations) -> tuple[Array, Solution[KnownMotion]]:
         """Find the most likely coordinates (N, n) inside the limits, and the solution around them."""
         coordinates = self._initial_coordinates(observations)
+        if len(observations) == 1 and self.is_plain and observations.rows == 6:
+            motion = KnownMotion(self, np.zeros_like(coordinates))
+            single = solve_observation(self, motion, observations, coordinates[0])
+            if single is not None:
+                return single.values, single
         for _ in range(1 if self.is_plain else _ROUNDS):
             values = np.zeros((len(observations), self.joints))
             if self.is_plain:
@@ -150,6 +170,7 @@ class KnownJoint:
         Where the pose is undefined beyond the limits, those inside stay.
         """
         free = copy(self)
+        free.__dict__.pop("_grid_poses", None)
         free.lower, free.upper = np.full(self.joints, -np.inf), np.full(self.joints, np.inf)
         try:
             coordinates, _ = free.solve(observations)
@@ -159,8 +180,7 @@ class KnownJoint:
 
     def _initial_coordinates(self, observations: Observations) -> Array:
         """Return the best coordinates of a grid for each observation."""
-        grid = self._grid()
-        poses = self.linearise(grid).pose
+        grid, poses = self._grid_poses
         observed = observations.relative
         covariance = np.einsum("nii->i", observations.child_covariance) / len(observations)
         place, turn = covariance[:3].sum() / 3.0, covariance[3:].sum() / 3.0
@@ -171,6 +191,12 @@ class KnownJoint:
         off += (np.sum(p**2, axis=1)[:, None] - 2.0 * p @ q.T + np.sum(q**2, axis=1)) / place
         nearest: Array = grid[np.argmin(off, axis=1)]
         return nearest
+
+    @cached_property
+    def _grid_poses(self) -> tuple[Array, Array]:
+        """Initial values to choose from, and their poses."""
+        grid = self._grid()
+        return grid, self.linearise(grid).pose
 
     def _grid(self) -> Array:
         if not self.joints:

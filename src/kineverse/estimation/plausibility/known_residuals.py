@@ -9,7 +9,7 @@ it.
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Self
 
 import numpy as np
@@ -44,6 +44,8 @@ class KnownResiduals:
         Covariances of ``values``, (N, k, k).
     orthogonal
         ρ, the whitened residual orthogonal to the joint directions, (N, 6 - k).
+    whitened
+        The same residual in the axes of the whitened pose, (N, 6). They do not turn with the basis of ρ.
     displacement_jacobian
         Derivative of ρ by a displacement of the joint in the parent and of the child on the joint: per unit
         of a twist of either, in their axes and about the child in the default state, (N, 6 - k, 12).
@@ -68,6 +70,7 @@ class KnownResiduals:
     values: Array
     covariances: Array
     orthogonal: Array
+    whitened: Array
     displacement_jacobian: Array
     bound_excess: Array
     pose_residuals: Array
@@ -90,6 +93,19 @@ class KnownResiduals:
         """Return the residuals of some of the observations."""
         return type(self)(*(getattr(self, name)[rows] for name in self.__dataclass_fields__))
 
+    def scaled(self, factor: float) -> Self:
+        """Return the residuals for covariances of the poses that are larger by a factor."""
+        root = math.sqrt(factor)
+        smaller = (
+            "orthogonal", "whitened", "displacement_jacobian", "bound_excess", "limit_excess", "disagreement",
+        )  # fmt: skip
+        return replace(
+            self,
+            covariances=factor * self.covariances,
+            log_scale=self.log_scale + 0.5 * self.orthogonal.shape[1] * math.log(factor),
+            **{name: getattr(self, name) / root for name in smaller},
+        )
+
 
 def compute_residuals(served: KnownJoint, observations: Observations) -> KnownResiduals:
     """Compute the residuals of observations under a served joint."""
@@ -110,11 +126,13 @@ def compute_residuals(served: KnownJoint, observations: Observations) -> KnownRe
     deviations = np.sqrt(np.einsum("nii->ni", covariances))
     excess = np.concatenate([served.lower - values, values - served.upper], axis=1)
     pose = solution.linear.pose
+    orthogonal = (across @ error[:, :, None])[:, :, 0]
     return KnownResiduals(
         coordinates,
         values,
         covariances,
-        (across @ error[:, :, None])[:, :, 0],
+        orthogonal,
+        (basis[:, :, joints:] @ orthogonal[:, :, None])[:, :, 0],
         across @ whitening @ _displacement_jacobian(pose, served.middle),
         excess / np.tile(deviations, (1, 2)),
         solution.residuals,

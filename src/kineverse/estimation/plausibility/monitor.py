@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections import deque
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field
@@ -9,7 +10,7 @@ from dataclasses import dataclass, field
 import numpy as np
 import numpy.typing as npt
 
-from kineverse.errors import KineverseError, ShapeError, UnknownNameError, suggest
+from kineverse.errors import InvalidValueError, KineverseError, ShapeError, UnknownNameError, suggest
 from kineverse.estimation.identification.kinematic_graph.pairwise import FamilyChoice
 from kineverse.estimation.identification.observations import (
     Observations,
@@ -29,9 +30,17 @@ from .alternatives import JointObservations, judge_joint
 from .consistency import ConsistencyTests, TimedResiduals
 from .known_motion import KnownJoint
 from .known_residuals import KnownResiduals, compute_residuals
-from .plausibility import FALSE_ALARMS, check_false_alarms, undetermined_verdict
+from .plausibility import (
+    FALSE_ALARMS,
+    check_decorrelation_time,
+    check_false_alarms,
+    check_time,
+    new_test,
+    pair_outliers,
+    undetermined_verdict,
+)
 from .report import JointVerdict, Plausibility
-from .sequential_test import SequentialTest
+from .sequential_test import CorrelatedTest
 from .testability import TestableJoint, TestableJoints, find_testable_joints
 
 
@@ -42,13 +51,15 @@ class _MonitoredJoint:
     joint: TestableJoint
     served: KnownJoint | None
     reason: str
-    test: SequentialTest
+    # Begins with the first observation.
+    test: CorrelatedTest | None = None
     # Numbers of the observations in the test.
     numbers: list[int] = field(default_factory=list)
 
     @property
     def implausible_since(self) -> int | None:
-        return None if self.test.implausible_since is None else self.numbers[self.test.implausible_since]
+        since = None if self.test is None else self.test.implausible_since
+        return None if since is None else self.numbers[since]
 
 
 class PlausibilityMonitor:
@@ -63,7 +74,7 @@ class PlausibilityMonitor:
         The served model.
     frames
         Names of the frames that may be observed.
-    noise, relative_to, families, false_alarms, outliers
+    noise, relative_to, families, false_alarms, outliers, decorrelation_time
         As in :func:`~kineverse.estimation.check_plausibility`.
     keep
         Number of recent observations that reports use.
@@ -84,14 +95,19 @@ class PlausibilityMonitor:
         families: FamilyChoice = None,
         false_alarms: float = FALSE_ALARMS,
         outliers: Outliers | bool | None = True,
+        decorrelation_time: float | None = None,
         keep: int = 500,
     ) -> None:
         check_false_alarms(false_alarms)
+        check_decorrelation_time(decorrelation_time)
         self.model = model
         self.frames = tuple(dict.fromkeys(frames))
         self.false_alarms = false_alarms
         self.count = 0
         self._outliers = as_outliers(outliers)
+        self._decorrelation_time = decorrelation_time
+        self._last: float | None = None
+        self._stamped = False
         self._noise, self._relative_to, self._families = noise, relative_to, families
         self._recent: deque[dict[str, PoseTrack]] = deque(maxlen=keep)
         self._monitored: list[_MonitoredJoint] = []
@@ -108,7 +124,7 @@ class PlausibilityMonitor:
                 result[monitored.joint.tag] = min(number, result.get(monitored.joint.tag, number))
         return result
 
-    def update(self, observations: Mapping[str, PosesLike]) -> tuple[str, ...]:
+    def update(self, observations: Mapping[str, PosesLike], at: float | None = None) -> tuple[str, ...]:
         """Add one observation; return the tags of newly rejected joints.
 
         Parameters
@@ -116,11 +132,14 @@ class PlausibilityMonitor:
         observations
             Pose by name of the frame, (4, 4), or pair of a pose and its covariance, (6, 6). Absent names are
             missing.
+        at
+            Time of the observation [s], later than the one before; without times, observations are one step
+            apart.
 
         Raises
         ------
         UnknownNameError, ShapeError, InvalidValueError
-            For invalid frames, poses and covariances; the monitor does not change then.
+            For invalid frames, poses, covariances and times; the monitor does not change then.
         """
         for name in observations:
             if name not in self.frames:
@@ -128,12 +147,14 @@ class PlausibilityMonitor:
                     f"The frame {name!r} is not watched. {suggest(str(name), self.frames, 'frame')}"
                 )
         tracks = check_tracks({name: _one(given, name) for name, given in observations.items()}, self._noise)
+        time = self._check_time(at)
         if self.model.version != self._version:
             self._find_joints()
         if self._relative_to is not None:
             tracks[self._relative_to] = exact_track(1)
         before = set(self.implausible_since)
-        self._add(tracks)
+        self._last, self._stamped = time, at is not None
+        self._add(tracks, time)
         self._recent.append(tracks)
         self.count += 1
         return tuple(tag for tag in self.implausible_since if tag not in before)
@@ -180,12 +201,19 @@ class PlausibilityMonitor:
             ):
                 self._monitored.append(old)
             else:
-                self._monitored.append(_MonitoredJoint(joint, served, reason, self._new_test()))
+                self._monitored.append(_MonitoredJoint(joint, served, reason))
 
-    def _new_test(self) -> SequentialTest:
-        return SequentialTest(self.false_alarms, self._outliers.fraction if self._outliers else 0.0)
+    def _check_time(self, at: float | None) -> float:
+        if self._last is None:
+            return 0.0 if at is None else check_time(at, -math.inf)
+        if (at is not None) != self._stamped:
+            raise InvalidValueError(
+                "Either all observations have a time (at=), or none: the first "
+                f"{'had one' if self._stamped else 'had none'}."
+            )
+        return self._last + 1.0 if at is None else check_time(at, self._last)
 
-    def _add(self, tracks: Mapping[str, PoseTrack]) -> None:
+    def _add(self, tracks: Mapping[str, PoseTrack], at: float) -> None:
         residuals: dict[TestableJoint, TimedResiduals] = {}
         for monitored in self._monitored:
             joint = monitored.joint
@@ -200,13 +228,18 @@ class PlausibilityMonitor:
         tested = self._consistency.apply(residuals)
         for monitored in self._monitored:
             if monitored.joint in tested:
-                joint_residuals = tested[monitored.joint]
                 monitored.numbers.append(self.count)
-                monitored.test.add(
-                    joint_residuals.orthogonal[0],
-                    joint_residuals.displacement_jacobian[0],
-                    joint_residuals.one_sided[0],
-                )
+                if monitored.test is None:
+                    monitored.test = new_test(
+                        self.false_alarms,
+                        self._pair_outliers(monitored.joint),
+                        self._decorrelation_time,
+                        self._stamped,
+                    )
+                monitored.test.observe(tested[monitored.joint], 0, at)
+
+    def _pair_outliers(self, joint: TestableJoint) -> Outliers | None:
+        return pair_outliers(self._outliers, joint, self._relative_to)
 
     def _compute_residuals(self, monitored: _MonitoredJoint, first: int) -> TimedResiduals | None:
         """Return the residuals of a joint in the recent observations; None if there are none."""
@@ -238,7 +271,14 @@ class PlausibilityMonitor:
         data = JointObservations(
             joint, monitored.served, self._poses(joint, times, first), residuals, np.array(times)
         )
-        return judge_joint(self.model, data, monitored.implausible_since, self._families, self._outliers)
+        return judge_joint(
+            self.model,
+            data,
+            monitored.implausible_since,
+            self._families,
+            self._pair_outliers(joint),
+            1.0 if monitored.test is None else monitored.test.looks,
+        )
 
 
 def _one(given: PosesLike, name: str) -> PosesLike:
