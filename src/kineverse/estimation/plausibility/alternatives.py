@@ -25,7 +25,8 @@ from kineverse.estimation.identification.kinematic_graph.pairwise import (
 )
 from kineverse.estimation.identification.observations import Observations
 from kineverse.estimation.identification.outlier_rejection import RowIndices, is_inlier
-from kineverse.estimation.identification.result import SURE, IdentificationResult
+from kineverse.estimation.identification.projection import project_observations
+from kineverse.estimation.identification.result import SURE, Fit, IdentificationResult
 from kineverse.estimation.linear_algebra import (
     invert_matrices,
     log_determinants,
@@ -37,8 +38,9 @@ from kineverse.lie import Array
 from kineverse.model.model import Model
 from kineverse.model.operation import Operation
 
+from .correlation import CorrelationSettings
 from .known_motion import KnownJoint
-from .known_residuals import SIZES, KnownResiduals, compute_residuals
+from .known_residuals import SIZES, KnownResiduals, compute_residuals, orthogonal_residuals
 from .replacement import build_replacement, extend_fit, follows_another
 from .report import JointVerdict
 from .testability import TestableJoint
@@ -179,6 +181,10 @@ PRIOR: Mapping[str, float] = MappingProxyType({"served": 0.8, "elsewhere": 0.05,
 _LEAST_COUNT = 5
 # Least number of observations that are kept of correlated ones, if there are as many.
 _KEPT = 60
+# Number of looks that tell as much as one from which on this is worth saying.
+_CORRELATED = 2.0
+# Factor on covariances that changes no verdict.
+_ALMOST_ONE = 1.1
 
 
 @dataclass(frozen=True)
@@ -195,6 +201,8 @@ class JointObservations:
         Residuals under the served joint.
     times
         Numbers of the observations, (N,).
+    stamps
+        Their times [s], (N,).
     """
 
     joint: TestableJoint
@@ -202,6 +210,7 @@ class JointObservations:
     observations: Observations
     residuals: KnownResiduals
     times: npt.NDArray[np.int_]
+    stamps: Array
 
     def select(self, rows: slice | npt.NDArray[np.int_]) -> JointObservations:
         """Return some of the observations."""
@@ -211,6 +220,7 @@ class JointObservations:
             self.observations.select(rows),
             self.residuals.select(rows),
             self.times[rows],
+            self.stamps[rows],
         )
 
     def decorrelate(self, looks: float) -> JointObservations:
@@ -224,7 +234,7 @@ class JointObservations:
         kept = min(max(math.ceil(count / looks), _KEPT), count)
         factor = max(looks * kept / count, 1.0)
         result = self if kept == count else self.select(np.linspace(0, count - 1, kept).round().astype(int))
-        if factor == 1.0:
+        if factor < _ALMOST_ONE:
             return result
         return replace(
             result,
@@ -239,12 +249,9 @@ def judge_joint(
     implausible_since: int | None,
     families: FamilyChoice,
     outliers: Outliers | None,
-    looks: float = 1.0,
+    correlation: CorrelationSettings,
 ) -> JointVerdict:
-    """Compare a joint with its alternatives, given the change point of the sequential test.
-
-    ``looks`` observations tell as much as one with independent errors.
-    """
+    """Compare a joint with its alternatives, given the change point of the sequential test."""
     if implausible_since is None:
         recent = data
         right = reject_outliers(data.residuals, outliers)
@@ -254,8 +261,17 @@ def judge_joint(
         if outliers is not None and len(right) >= 2:
             right = identify_observations(recent.observations, families, outliers).best.inliers
     inliers = recent.select(right)
+    alternative = None
+    if len(right) >= 2 and implausible_since is not None:
+        # The residuals under the rejected joint are no errors.
+        alternative = identify_observations(inliers.observations, families)
+        looks = _measure_looks(inliers, alternative.best, correlation)
+    else:
+        found = data.residuals
+        looks = correlation.measure(found.whitened, found.orthogonal.shape[1], data.stamps)
     independent = inliers.decorrelate(looks)
-    alternative = identify_observations(independent.observations, families) if len(right) >= 2 else None
+    if len(right) >= 2 and (alternative is None or independent is not inliers):
+        alternative = identify_observations(independent.observations, families)
     probabilities = _probabilities(independent, alternative)
     operation, reason = None, ""
     if implausible_since is not None:
@@ -276,6 +292,13 @@ def judge_joint(
         reason,
         outlier_times,
     )
+
+
+def _measure_looks(data: JointObservations, fit: Fit, correlation: CorrelationSettings) -> float:
+    """Return the number of observations that tell as much as one, from the residuals of a fit."""
+    solution = project_observations(fit.motion, fit.joint_values, data.observations)
+    size = data.observations.rows - fit.joint_values.shape[1]
+    return correlation.measure(orthogonal_residuals(solution), size, data.stamps)
 
 
 def _probabilities(data: JointObservations, alternative: IdentificationResult | None) -> dict[str, float]:
@@ -304,12 +327,13 @@ def _ambiguity_reason(probabilities: Mapping[str, float], count: int, looks: flo
         return ""
     if count < _LEAST_COUNT:
         return f"both were seen {count} time{'s' if count > 1 else ''} only"
-    if count < _LEAST_COUNT * looks:
-        return f"as errors are correlated in time, {count} observations tell as much as {count / looks:.1f}"
     other = max((name for name in probabilities if name != "served"), key=lambda name: probabilities[name])
-    if other == "elsewhere":
-        return "it may sit a bit elsewhere as well"
-    return "it hardly moved" if other == "rigid" else f"it may be {other} as well"
+    reason = f"it may be {other} as well"
+    if other in ("elsewhere", "rigid"):
+        reason = "it may sit a bit elsewhere as well" if other == "elsewhere" else "it hardly moved"
+    if looks >= _CORRELATED:
+        reason += f"; errors are correlated, {count} observations tell as much as {count / looks:.1f}"
+    return reason
 
 
 def _propose_replacement(
@@ -345,7 +369,5 @@ def _explains_alone(model: Model, data: JointObservations, alternative: Identifi
         return False
     served = KnownJoint(model, data.joint.child, data.joint.parent, open_loops=True)
     residuals = compute_residuals(served, data.observations)
-    alone = _probabilities(
-        JointObservations(data.joint, served, data.observations, residuals, data.times), alternative
-    )
+    alone = _probabilities(replace(data, served=served, residuals=residuals), alternative)
     return alone["served"] >= SURE

@@ -14,6 +14,7 @@ counts.
 from __future__ import annotations
 
 import math
+from dataclasses import dataclass
 
 import numpy as np
 
@@ -28,9 +29,32 @@ _FRACTIONS = np.array([1.0 / 30.0, 0.1, 1.0 / 3.0, 1.0])
 # Variance of the offset, and its growth per longest correlation time.
 _OFFSET, _DRIFT = 30.0**2, 0.01
 # Prior probability of independent errors, and the number of looks after which the past is forgotten.
-_INDEPENDENT, _MEMORY = 0.5, 600.0
+_INDEPENDENT, _MEMORY = 0.8, 600.0
 # Successive outliers after which the offset is taken as new.
 _JUMP = 5
+
+
+@dataclass(frozen=True)
+class CorrelationSettings:
+    """What is known of the correlation of errors in time.
+
+    Attributes
+    ----------
+    time
+        Correlation time of the errors [s], or in looks if there are no time stamps; None to measure it.
+    stamped
+        True if the looks have time stamps.
+    """
+
+    time: float | None
+    stamped: bool
+
+    def measure(self, residuals: Array, size: int, stamps: Array) -> float:
+        """Return the number of looks that tell as much as one, from residuals (N, 6) at times (N,)."""
+        correlation = ErrorCorrelation(self)
+        for residual, at in zip(residuals, stamps.tolist(), strict=True):
+            correlation.add(residual, size, at)
+        return correlation.looks
 
 
 class ErrorCorrelation:
@@ -38,10 +62,8 @@ class ErrorCorrelation:
 
     Parameters
     ----------
-    decorrelation_time
-        Correlation time of the errors [s], or in looks if there are no time stamps; None to measure it.
-    stamped
-        True if the looks have time stamps.
+    settings
+        What is known of the correlation.
 
     Attributes
     ----------
@@ -49,9 +71,9 @@ class ErrorCorrelation:
         m, at least 1.
     """
 
-    def __init__(self, decorrelation_time: float | None, stamped: bool) -> None:
-        self._stated = decorrelation_time
-        longest = LONGEST_TIME if stamped else LONGEST_LOOKS
+    def __init__(self, settings: CorrelationSettings) -> None:
+        self._stated = settings.time
+        longest = LONGEST_TIME if settings.stamped else LONGEST_LOOKS
         shares, times = np.meshgrid(_SHARES, longest * _FRACTIONS, indexing="ij")
         self._shares = np.append(shares.ravel(), 0.0)
         self._times = np.append(times.ravel(), longest)
@@ -75,7 +97,7 @@ class ErrorCorrelation:
             # One long gap does not make the looks after it independent.
             self._gap += 0.05 * (min(gap, 2.0 * self._gap + self._longest) - self._gap)
         self._last = at
-        if self._stated is None:
+        if self._stated is None and size:
             self._filter(residual, size, gap)
         self.looks = self._count_looks()
         return self.looks

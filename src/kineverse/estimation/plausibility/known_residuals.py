@@ -10,17 +10,19 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass, replace
-from typing import Self
+from typing import Any, Self
 
 import numpy as np
 import numpy.typing as npt
 
 from kineverse.estimation.identification.motion_model import LinearisedPoses
 from kineverse.estimation.identification.observations import Observations
+from kineverse.estimation.identification.optimise import Solution
 from kineverse.estimation.linear_algebra import invert_matrices, log_determinants
 from kineverse.lie import Array, pose_difference, skew
 
 from .known_motion import KnownJoint
+from .single_observation import complete_basis, displacement_jacobian, solve_observation
 
 SIZES = (0.01, 0.05, 0.3)
 """Standard deviations of a displacement, for each component of a twist [m], [rad]."""
@@ -109,10 +111,12 @@ class KnownResiduals:
 
 def compute_residuals(served: KnownJoint, observations: Observations) -> KnownResiduals:
     """Compute the residuals of observations under a served joint."""
+    if len(observations) == 1 and served.is_plain and observations.rows == 6:
+        single = _compute_one(served, observations)
+        if single is not None:
+            return single
     coordinates, solution = served.solve(observations)
-    whitening = np.linalg.inv(np.linalg.cholesky(solution.covariance))
-    error = (whitening @ solution.residuals[:, :, None])[:, :, 0]
-    directions = whitening @ solution.linear.by_joints
+    whitening, error, directions = _whiten(solution)
     transposed = np.swapaxes(directions, 1, 2)
     joints = served.joints
     covariances = invert_matrices(transposed @ directions + _PRECISION * np.eye(joints))
@@ -139,6 +143,61 @@ def compute_residuals(served: KnownJoint, observations: Observations) -> KnownRe
         0.5 * (log_determinants(math.tau * solution.covariance) - log_determinants(math.tau * covariances)),
         *(np.zeros((len(observations), 0)) for _ in range(3)),
     )
+
+
+def _compute_one(served: KnownJoint, observations: Observations) -> KnownResiduals | None:
+    """Compute the residuals of one observation; None if its joint values are not found."""
+    start = served.initial_coordinates(observations)[0]
+    solution = solve_observation(served, observations, start, _PRECISION)
+    if solution is None:
+        return None
+    values, pose, by_joints, residual, covariance = solution
+    joints = served.joints
+    triangle = np.linalg.cholesky(covariance)
+    whitening = np.linalg.inv(triangle)
+    error, directions = whitening @ residual, whitening @ by_joints
+    log_scale = float(np.log(np.diagonal(triangle)).sum()) + 0.5 * (6 - joints) * math.log(math.tau)
+    covariances: Array = np.zeros((joints, joints))
+    if joints:
+        covariances = np.linalg.inv(directions.T @ directions + _PRECISION * np.eye(joints))
+        log_scale -= 0.5 * float(np.linalg.slogdet(covariances)[1])
+    unbounded = values + covariances @ (directions.T @ error)
+    across = complete_basis(directions)
+    orthogonal = across.T @ error
+    deviations = np.sqrt(np.diagonal(covariances))
+    excess = np.concatenate(
+        [(served.lower - unbounded) / deviations, (unbounded - served.upper) / deviations]
+    )
+    none = np.zeros((1, 0))
+    return KnownResiduals(
+        values[None],
+        unbounded[None],
+        covariances[None],
+        orthogonal[None],
+        (across @ orthogonal)[None],
+        (across.T @ whitening @ displacement_jacobian(pose, served.middle))[None],
+        excess[None],
+        residual[None],
+        np.array([log_scale]),
+        none,
+        none,
+        none,
+    )
+
+
+def orthogonal_residuals(solution: Solution[Any]) -> Array:
+    """Return the whitened residuals without their components along the joint directions, (N, 6)."""
+    _, error, directions = _whiten(solution)
+    basis = np.linalg.qr(directions)[0]
+    along: Array = basis @ (np.swapaxes(basis, 1, 2) @ error[:, :, None])
+    return error - along[:, :, 0]
+
+
+def _whiten(solution: Solution[Any]) -> tuple[Array, Array, Array]:
+    """Return W with W S Wᵀ = I, (N, 6, 6), whitened residuals (N, 6) and joint directions (N, 6, k)."""
+    whitening = np.linalg.inv(np.linalg.cholesky(solution.covariance))
+    error = (whitening @ solution.residuals[:, :, None])[:, :, 0]
+    return whitening, error, whitening @ solution.linear.by_joints
 
 
 def _displacements(linear: LinearisedPoses) -> Array:

@@ -28,6 +28,7 @@ from kineverse.model.model import Model
 
 from .alternatives import JointObservations, judge_joint
 from .consistency import ConsistencyTests, TimedResiduals
+from .correlation import CorrelationSettings
 from .known_motion import KnownJoint
 from .known_residuals import KnownResiduals, compute_residuals
 from .plausibility import (
@@ -35,7 +36,6 @@ from .plausibility import (
     check_decorrelation_time,
     check_false_alarms,
     check_time,
-    new_test,
     pair_outliers,
     undetermined_verdict,
 )
@@ -58,8 +58,7 @@ class _MonitoredJoint:
 
     @property
     def implausible_since(self) -> int | None:
-        since = None if self.test is None else self.test.implausible_since
-        return None if since is None else self.numbers[since]
+        return None if self.test is None else self.test.implausible_since
 
 
 class PlausibilityMonitor:
@@ -108,8 +107,11 @@ class PlausibilityMonitor:
         self._decorrelation_time = decorrelation_time
         self._last: float | None = None
         self._stamped = False
+        # Checked covariance of a pose without its own, (1, 6, 6).
+        self._covariances: Array | None = None
         self._noise, self._relative_to, self._families = noise, relative_to, families
         self._recent: deque[dict[str, PoseTrack]] = deque(maxlen=keep)
+        self._stamps: deque[float] = deque(maxlen=keep)
         self._monitored: list[_MonitoredJoint] = []
         self._testable = TestableJoints((), {})
         self._consistency = ConsistencyTests(model, {}, relative_to)
@@ -146,7 +148,7 @@ class PlausibilityMonitor:
                 raise UnknownNameError(
                     f"The frame {name!r} is not watched. {suggest(str(name), self.frames, 'frame')}"
                 )
-        tracks = check_tracks({name: _one(given, name) for name, given in observations.items()}, self._noise)
+        tracks = {name: self._check(given, name) for name, given in observations.items()}
         time = self._check_time(at)
         if self.model.version != self._version:
             self._find_joints()
@@ -156,6 +158,7 @@ class PlausibilityMonitor:
         self._last, self._stamped = time, at is not None
         self._add(tracks, time)
         self._recent.append(tracks)
+        self._stamps.append(time)
         self.count += 1
         return tuple(tag for tag in self.implausible_since if tag not in before)
 
@@ -203,6 +206,24 @@ class PlausibilityMonitor:
             else:
                 self._monitored.append(_MonitoredJoint(joint, served, reason))
 
+    def _check(self, given: PosesLike, name: str) -> PoseTrack:
+        if not isinstance(given, tuple) and self._covariances is not None:
+            # The usual case in a fraction of the time.
+            try:
+                pose: Array = np.asarray(given, dtype=np.float64)
+            except (TypeError, ValueError):
+                pose = np.zeros(0)
+            if pose.shape == (4, 4) and _is_rigid(pose):
+                return PoseTrack(pose[None].copy(), self._covariances, _SEEN)
+        track = check_tracks({name: _one(given, name)}, self._noise)[name]
+        if not isinstance(given, tuple):
+            self._covariances = track.covariances
+        return track
+
+    @property
+    def _correlation(self) -> CorrelationSettings:
+        return CorrelationSettings(self._decorrelation_time, self._stamped)
+
     def _check_time(self, at: float | None) -> float:
         if self._last is None:
             return 0.0 if at is None else check_time(at, -math.inf)
@@ -230,13 +251,11 @@ class PlausibilityMonitor:
             if monitored.joint in tested:
                 monitored.numbers.append(self.count)
                 if monitored.test is None:
-                    monitored.test = new_test(
-                        self.false_alarms,
-                        self._pair_outliers(monitored.joint),
-                        self._decorrelation_time,
-                        self._stamped,
+                    outliers = self._pair_outliers(monitored.joint)
+                    monitored.test = CorrelatedTest(
+                        self.false_alarms, outliers.fraction if outliers else 0.0, self._correlation
                     )
-                monitored.test.observe(tested[monitored.joint], 0, at)
+                monitored.test.add(tested[monitored.joint], self.count, at)
 
     def _pair_outliers(self, joint: TestableJoint) -> Outliers | None:
         return pair_outliers(self._outliers, joint, self._relative_to)
@@ -269,7 +288,12 @@ class PlausibilityMonitor:
             return undetermined_verdict(joint, 0, monitored.reason or never)
         times = self._times(monitored, first)
         data = JointObservations(
-            joint, monitored.served, self._poses(joint, times, first), residuals, np.array(times)
+            joint,
+            monitored.served,
+            self._poses(joint, times, first),
+            residuals,
+            np.array(times),
+            np.array([self._stamps[number - first] for number in times]),
         )
         return judge_joint(
             self.model,
@@ -277,8 +301,32 @@ class PlausibilityMonitor:
             monitored.implausible_since,
             self._families,
             self._pair_outliers(joint),
-            1.0 if monitored.test is None else monitored.test.looks,
+            self._correlation,
         )
+
+
+_SEEN = np.ones(1, dtype=bool)
+
+
+def _is_rigid(pose: Array) -> bool:
+    """Return True for a pose (4, 4) that is certainly valid."""
+    rotation = pose[:3, :3]
+    off = rotation.T @ rotation
+    off[_DIAGONAL] -= 1.0
+    (a, b, c), (d, e, f), (g, h, i) = rotation.tolist()
+    x, y, z = pose[:3, 3].tolist()
+    determinant = a * (e * i - f * h) - b * (d * i - f * g) + c * (d * h - e * g)
+    return (
+        float(np.abs(off).max()) < _RIGID
+        and determinant > 0.0
+        and pose[3].tolist() == [0.0, 0.0, 0.0, 1.0]
+        and abs(x) + abs(y) + abs(z) < _FAR
+    )
+
+
+_DIAGONAL = np.diag_indices(3)
+# Tolerance of a rotation, and the farthest position, that need no further check.
+_RIGID, _FAR = 1e-6, 1e6
 
 
 def _one(given: PosesLike, name: str) -> PosesLike:

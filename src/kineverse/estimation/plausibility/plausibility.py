@@ -13,17 +13,18 @@ from kineverse.errors import InvalidValueError, KineverseError, ShapeError
 from kineverse.estimation.identification.kinematic_graph.pairwise import FamilyChoice
 from kineverse.estimation.identification.observations import PosesLike, check_tracks, exact_track, pair_tracks
 from kineverse.estimation.robust import Outliers, as_outliers
+from kineverse.lie import Array
 from kineverse.model.frame import WORLD
 from kineverse.model.model import Model, Snapshot
 
 from .alternatives import JointObservations, judge_joint
 from .consistency import ConsistencyTests, TimedResiduals
-from .correlation import ErrorCorrelation
+from .correlation import CorrelationSettings
 from .known_motion import KnownJoint
 from .known_residuals import compute_residuals
 from .recorded_poses import RecordedPoses, recorded_observations
 from .report import JointVerdict, Plausibility
-from .sequential_test import CorrelatedTest, SequentialTest
+from .sequential_test import SequentialTest
 from .testability import TestableJoint, find_testable_joints
 
 FALSE_ALARMS = 1e-3
@@ -97,6 +98,7 @@ def check_plausibility(
     observations = {} if observations is None else observations
     tracks = check_tracks(observations, noise)
     stamps = _check_times(times, max((len(track.poses) for track in tracks.values()), default=0))
+    correlation = CorrelationSettings(decorrelation_time, times is not None)
     testable = find_testable_joints(model, observations, relative_to)
     if relative_to is not None:
         tracks[relative_to] = exact_track(max((len(track.poses) for track in tracks.values()), default=0))
@@ -127,11 +129,11 @@ def check_plausibility(
             continue
         times_of = residuals[joint].times
         poses = pair_tracks(tracks[joint.parent], tracks[joint.child], times_of)
-        data = JointObservations(joint, served_joints[joint], poses, tested[joint], times_of)
+        data = JointObservations(
+            joint, served_joints[joint], poses, tested[joint], times_of, stamps[times_of]
+        )
         fitting = pair_outliers(outlier_model, joint, relative_to)
-        correlation = ErrorCorrelation(decorrelation_time, times is not None)
-        for row, k in enumerate(times_of):
-            correlation.add(data.residuals.whitened[row], data.residuals.orthogonal.shape[1], stamps[k])
+        looks = correlation.measure(data.residuals.whitened, data.residuals.orthogonal.shape[1], data.stamps)
         test = SequentialTest(false_alarms, fitting.fraction if fitting else 0.0)
         for values in zip(
             data.residuals.orthogonal,
@@ -139,9 +141,9 @@ def check_plausibility(
             data.residuals.one_sided,
             strict=True,
         ):
-            test.add(*values, correlation.looks)
+            test.add(*values, looks)
         since = None if test.implausible_since is None else int(times_of[test.implausible_since])
-        verdicts.append(judge_joint(model, data, since, families, fitting, correlation.looks))
+        verdicts.append(judge_joint(model, data, since, families, fitting, correlation))
     result = Plausibility(tuple(verdicts), testable.untested, false_alarms)
     if strict:
         result.raise_if_implausible()
@@ -165,14 +167,6 @@ def check_false_alarms(probability: float) -> None:
 def undetermined_verdict(joint: TestableJoint, count: int, reason: str) -> JointVerdict:
     """Return the verdict on a joint that cannot be tested."""
     return JointVerdict(joint, {}, (math.nan, math.nan), count, reason=reason)
-
-
-def new_test(
-    false_alarms: float, outliers: Outliers | None, decorrelation_time: float | None, stamped: bool
-) -> CorrelatedTest:
-    """Return the sequential test of one joint, before any observation."""
-    correlation = ErrorCorrelation(decorrelation_time, stamped)
-    return CorrelatedTest(false_alarms, outliers.fraction if outliers else 0.0, correlation)
 
 
 def pair_outliers(
@@ -221,9 +215,9 @@ def check_time(at: object, last: float) -> float:
     return time
 
 
-def _check_times(times: npt.ArrayLike | None, count: int) -> list[float]:
+def _check_times(times: npt.ArrayLike | None, count: int) -> Array:
     if times is None:
-        return [float(k) for k in range(count)]
+        return np.arange(float(count))
     try:
         given = list(np.asarray(times, dtype=np.float64))
     except (TypeError, ValueError):
@@ -236,4 +230,4 @@ def _check_times(times: npt.ArrayLike | None, count: int) -> list[float]:
     last = -math.inf
     for k, at in enumerate(given):
         given[k] = last = check_time(at, last)
-    return given
+    return np.array(given)

@@ -32,7 +32,7 @@ import numpy as np
 from kineverse.estimation.robust import CHI_SQUARED_6
 from kineverse.lie import Array
 
-from .correlation import ErrorCorrelation
+from .correlation import CorrelationSettings, ErrorCorrelation
 from .known_residuals import SIZES, KnownResiduals
 
 _DEVIATIONS = np.array([1.0, 3.0, 10.0, 30.0, 100.0])
@@ -45,8 +45,10 @@ _STAKES = np.array([1.0 - 1e-9, 0.1])
 _CUTS = np.array([1.1, 1.5, 4.0, 20.0])
 # Number of change points of a displacement, and of the newest ones, which have little evidence yet. Dropping
 # some only reduces M.
-_CHANGE_POINTS, _NEWEST = 8, 3
+_CHANGE_POINTS, _NEWEST = 6, 2
 _SIZES = np.array(SIZES)
+# Least weight of a tested observation, in independent ones.
+_LEAST_WEIGHT = 0.1
 
 
 class SequentialTest:
@@ -128,32 +130,44 @@ class SequentialTest:
         return ratio
 
 
-class CorrelatedTest(SequentialTest):
+class CorrelatedTest:
     """Sequential test of one joint with errors that are correlated in time.
 
-    Attributes
+    Where many observations tell as much as one, only some of them are tested, with the weight of all.
+
+    Parameters
     ----------
-    looks
-        Number of observations that tell as much as one with independent errors, see
-        :class:`.correlation.ErrorCorrelation`. It stays after a rejection.
+    false_alarms, outlier_fraction
+        As in :class:`SequentialTest`.
+    correlation
+        What is known of the correlation.
     """
 
-    def __init__(self, false_alarms: float, outlier_fraction: float, correlation: ErrorCorrelation) -> None:
-        super().__init__(false_alarms, outlier_fraction)
-        self._correlation = correlation
+    def __init__(
+        self, false_alarms: float, outlier_fraction: float, correlation: CorrelationSettings
+    ) -> None:
+        self._test = SequentialTest(false_alarms, outlier_fraction)
+        self._correlation = ErrorCorrelation(correlation)
+        self._numbers: list[int] = []
+        self._owed = 0.0
 
     @property
-    def looks(self) -> float:
-        """Number of observations that tell as much as one with independent errors."""
-        return self._correlation.looks
+    def implausible_since(self) -> int | None:
+        """Number of the first observation that the joint does not explain; None before rejection."""
+        since = self._test.implausible_since
+        return None if since is None else self._numbers[since]
 
-    def observe(self, residuals: KnownResiduals, row: int, at: float) -> None:
-        """Add one observation at a time; after a rejection nothing changes."""
-        if self.implausible_since is not None:
+    def add(self, residuals: KnownResiduals, number: int, at: float) -> None:
+        """Add one observation with its number at a time; after a rejection nothing changes."""
+        if self._test.implausible_since is not None:
             return
-        orthogonal = residuals.orthogonal[row]
-        looks = self._correlation.add(residuals.whitened[row], len(orthogonal), at)
-        self.add(orthogonal, residuals.displacement_jacobian[row], residuals.one_sided[row], looks)
+        orthogonal = residuals.orthogonal[0]
+        self._owed += 1.0 / self._correlation.add(residuals.whitened[0], len(orthogonal), at)
+        if self._owed >= _LEAST_WEIGHT:
+            self._numbers.append(number)
+            looks = 1.0 / min(self._owed, 1.0)
+            self._test.add(orthogonal, residuals.displacement_jacobian[0], residuals.one_sided[0], looks)
+            self._owed = 0.0
 
 
 class _CensoredBet:
@@ -163,9 +177,11 @@ class _CensoredBet:
         self.robust = outlier_fraction > 0.0
         self._cuts = np.log(_CUTS) if self.robust else np.array([np.inf])
         self._price = np.log1p(outlier_fraction * (_CUTS - 1.0)) if self.robust else np.zeros(1)
-        self._stakes = _STAKES if self.robust else np.ones(1)
+        stakes = _STAKES if self.robust else np.ones(1)
+        with np.errstate(divide="ignore"):
+            self._kept, self._staked = np.log1p(-stakes), np.log(stakes)
         self.cuts = len(self._cuts)
-        self.shape = len(self._stakes), self.cuts
+        self.shape = len(stakes), self.cuts
 
     def gains(self, log: Array) -> Array:
         """Return the log gain for each cut, (..., cuts), of log density ratios."""
@@ -174,9 +190,7 @@ class _CensoredBet:
 
     def stake(self, log: Array) -> Array:
         """Return the log gain for each stake and cut, (..., stakes, cuts)."""
-        with np.errstate(divide="ignore"):
-            kept = np.log1p(-self._stakes)
-        return self.gains(np.logaddexp(kept, np.log(self._stakes) + log[..., None]))
+        return self.gains(np.logaddexp(self._kept, self._staked + log[..., None]))
 
 
 class _ChangePoints:
@@ -196,7 +210,8 @@ class _ChangePoints:
         newer = self._best < weight
         self._start[newer] = index
         self._best = np.maximum(self._best, weight) + gains
-        mean = float(np.logaddexp.reduce(self._logs, axis=None)) - math.log(gains.size)
+        highest = float(self._logs.max())
+        mean = highest + math.log(float(np.exp(self._logs - highest).mean()))
         return mean, int(self._start.flat[np.argmax(self._best)])
 
 
@@ -239,7 +254,8 @@ class _DisplacementTest:
         self._means += (gain @ error[..., None])[..., 0]
         self._covariances -= gain @ np.swapaxes(cross_covariance, 2, 3)
         highest = float(self._logs.max())
-        result = highest + math.log(float(np.exp(self._logs - highest).sum()) / (len(SIZES) * self._bet.cuts))
+        total = float(np.exp(self._logs - highest).sum())
+        result = highest + math.log(total / (len(SIZES) * self._bet.cuts))
         return result, int(self._starts[np.argmax(self._logs.max(axis=(1, 2)))])
 
     def _begin(self, weight: float, index: int) -> None:

@@ -1,116 +1,144 @@
-"""Gauss-Newton solution for one observation of a known joint.
+"""Residuals of one observation under a served joint.
 
-The equations are those of :mod:`kineverse.estimation.identification.optimise` for one observation and no
-parameters. Without the axes of many observations and without damping, a solution takes a tenth of the time.
+The equations are those of :mod:`.known_residuals` and of
+:mod:`kineverse.estimation.identification.optimise`, for one observation of a joint whose values are
+coordinates. Without the axes of many observations, without damping and without parameters they take a tenth of the time.
 """
 
 from __future__ import annotations
 
 import math
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
-from kineverse.estimation.identification.motion_model import LinearisedPoses
 from kineverse.estimation.identification.observations import Observations
-from kineverse.estimation.identification.optimise import CLOSE, JointValuePrior, Solution
+from kineverse.estimation.identification.optimise import CLOSE
 from kineverse.lie import Array, exp_so3, log_so3
 
 if TYPE_CHECKING:
-    from .known_motion import KnownJoint, KnownMotion
+    from .known_motion import KnownJoint
 
-_STEPS = 12
-_STEP = 0.5
-# Square of a residual beyond which the true pose of the parent stays at the observed one.
+# Largest number of steps, and largest step of an angle [rad].
+_STEPS, _STEP = 12, 0.5
+# Squared residual beyond which the true pose of the parent stays at the observed one: the pose that explains a
+# gross error best is many steps away, and of no use.
 _GROSS = 1e3
+_EYE_3, _EYE_6 = np.eye(3), np.eye(6)
+
+
+class PoseSolution(NamedTuple):
+    """Most likely joint values of one observation inside the limits.
+
+    Attributes
+    ----------
+    values
+        Joint values, (k,).
+    pose, by_joints
+        Pose of the joint there, (4, 4), and twists per unit of each joint value, (6, k).
+    residual, covariance
+        Residual of the relative pose in the parent's axes, (6,), and its covariance, (6, 6).
+    """
+
+    values: Array
+    pose: Array
+    by_joints: Array
+    residual: Array
+    covariance: Array
 
 
 def solve_observation(
-    served: KnownJoint, motion: KnownMotion, observations: Observations, start: Array
-) -> Solution[KnownMotion] | None:
+    served: KnownJoint, observations: Observations, start: Array, precision: float
+) -> PoseSolution | None:
     """Return the solution for one observation of a joint; None if the steps do not converge.
 
     Parameters
     ----------
     served
         Joint whose joint values are its coordinates.
-    motion
-        The motion that the solution names.
     observations
         The observation of both poses, (1, ...).
     start
         Initial joint values, (k,).
+    precision
+        Prior information of the joint values, which only keeps unobservable ones finite.
     """
     parent, child = observations.parent[0], observations.child[0]
     of_parent = None if observations.parent_covariance is None else observations.parent_covariance[0]
     of_child = observations.child_covariance[0]
-    prior = JointValuePrior.vague(served.joints)
     low, high = served.inner_limits()
     values, true = np.clip(start, low, high), parent
-    turned = np.zeros((6, 6))
-    for _ in range(_STEPS):
+    turned, error, own = np.zeros((6, 6)), np.empty(6), np.empty(6)
+    covariance = weights = _EYE_6
+    for count in range(_STEPS):
         pose, by_joints = served.evaluate(values)
         rotation = true[:3, :3].T
-        turned[:3, :3] = turned[3:, 3:] = rotation
-        error = np.empty(6)
         error[:3] = rotation @ (child[:3, 3] - true[:3, 3]) - pose[:3, 3]
-        error[3:] = _log(rotation @ child[:3, :3] @ pose[:3, :3].T)
-        covariance = turned @ of_child @ turned.T
-        if of_parent is not None:
-            own = np.empty(6)
-            own[:3] = rotation @ (parent[:3, 3] - true[:3, 3])
-            own[3:] = _log(rotation @ parent[:3, :3])
-            lever = _lever(pose)
-            lifted = turned @ of_parent @ turned.T @ lever.T
-            covariance += lever @ lifted
-            error -= lever @ own
-        try:
+        error[3:] = _rotation_vector(rotation @ child[:3, :3] @ pose[:3, :3].T)
+        if of_parent is not None or not count:
+            turned[:3, :3] = turned[3:, 3:] = rotation
+            covariance = turned @ of_child @ turned.T
+            if of_parent is not None:
+                own[:3] = rotation @ (parent[:3, 3] - true[:3, 3])
+                own[3:] = _rotation_vector(rotation @ parent[:3, :3])
+                lever = _lever(pose)
+                lifted = turned @ of_parent @ turned.T @ lever.T
+                covariance += lever @ lifted
+                error -= lever @ own
             weights = np.linalg.inv(covariance)
-        except np.linalg.LinAlgError:
-            return None
         gain, left, there = 0.0, error, values
         if served.joints:
             weighted = by_joints.T @ weights
-            curvature = weighted @ by_joints + np.diag(prior.precision)
-            slope = weighted @ error - prior.precision * values
-            change = np.linalg.solve(curvature, slope)
-            there = np.clip(
-                values + np.where(served.is_angle, np.clip(change, -_STEP, _STEP), change), low, high
-            )
-            change = there - values
+            curvature = weighted @ by_joints + precision * np.eye(served.joints)
+            change = np.linalg.solve(curvature, weighted @ error - precision * values)
+            bounded = np.where(served.is_angle, np.clip(change, -_STEP, _STEP), change)
+            there = np.clip(values + bounded, low, high)
             # At a limit the step is shorter than the one that the slope asks for.
+            change = there - values
             gain += float(change @ curvature @ change)
             left = error - by_joints @ change
-        square = float(error @ weights @ error)
-        # Which parent would explain a gross error best matters to nobody, and is many steps away.
-        follows = square < _GROSS
-        if of_parent is not None and follows:
+        if of_parent is not None and float(error @ weights @ error) < _GROSS:
             blame = own + lifted @ (weights @ left)
-            gain += float(np.sum(blame**2 / np.diag(of_parent)))
+            gain += float(np.sum(blame**2 / np.diagonal(of_parent)))
+            if gain >= CLOSE:
+                step = np.eye(4)
+                step[:3, :3], step[:3, 3] = exp_so3(blame[3:]), blame[:3]
+                true = true @ step
         if gain < CLOSE:
-            linear = LinearisedPoses(pose[None], np.zeros((1, 6, 0)), by_joints[None])
-            return Solution(
-                motion,
-                values[None],
-                square,
-                error[None],
-                covariance[None],
-                linear,
-                true[None],
-                prior,
-                True,
-            )
+            return PoseSolution(values, pose, by_joints, error, covariance)
         values = there
-        if of_parent is not None and follows:
-            step = np.eye(4)
-            step[:3, :3], step[:3, 3] = exp_so3(blame[3:]), blame[:3]
-            true = true @ step
-        if not (np.isfinite(values).all() and np.isfinite(true).all()):
+        if not math.isfinite(gain):
             return None
     return None
 
 
-def _log(rotation: Array) -> Array:
+def complete_basis(directions: Array) -> Array:
+    """Return an orthonormal basis of the vectors that are orthogonal to k directions (6, k), (6, 6 - k)."""
+    count = directions.shape[1]
+    if not count:
+        return _EYE_6
+    if count > 1:
+        return np.linalg.qr(directions, mode="complete")[0][:, count:]
+    # Householder's reflection of the direction to the first axis.
+    v = directions[:, 0].copy()
+    v[0] += math.copysign(math.sqrt(float(v @ v)), float(v[0]))
+    square = float(v @ v)
+    return _EYE_6[:, 1:] - np.outer(v, (2.0 / square) * v[1:]) if square else _EYE_6[:, 1:]
+
+
+def displacement_jacobian(pose: Array, middle: Array) -> Array:
+    """Return the child's twist per unit twist of the joint in the parent, and of the child on it, (6, 12)."""
+    x, y, z = (pose[:3, 3] - middle).tolist()
+    result = np.zeros((6, 12))
+    result[:3, :3] = result[3:, 3:6] = _EYE_3
+    result[0, 4], result[0, 5] = z, -y
+    result[1, 3], result[1, 5] = -z, x
+    result[2, 3], result[2, 4] = y, -x
+    result[:3, 6:9] = result[3:, 9:] = pose[:3, :3]
+    return result
+
+
+def _rotation_vector(rotation: Array) -> Array:
     """Return the rotation vector of one rotation, as :func:`kineverse.lie.log_so3`."""
     (xx, xy, xz), (yx, yy, yz), (zx, zy, zz) = rotation.tolist()
     cosine = 0.5 * (xx + yy + zz - 1.0)
