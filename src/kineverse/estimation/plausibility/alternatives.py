@@ -181,6 +181,10 @@ PRIOR: Mapping[str, float] = MappingProxyType({"served": 0.8, "elsewhere": 0.05,
 _LEAST_COUNT = 5
 # Least number of observations that are kept of correlated ones, if there are as many.
 _KEPT = 60
+# Ratio of successive to other distances from which on poses are unrelated.
+_UNRELATED = 0.5
+# Least number of independent observations for a certain verdict.
+_LEAST_INDEPENDENT = 1.5
 # Number of looks that tell as much as one from which on this is worth saying.
 _CORRELATED = 2.0
 # Factor on covariances that changes no verdict.
@@ -274,7 +278,10 @@ def judge_joint(
         alternative = identify_observations(independent.observations, families)
     probabilities = _probabilities(independent, alternative)
     operation, reason = None, ""
-    if implausible_since is not None:
+    if implausible_since is not None and _is_unrelated(recent, alternative):
+        alternative, probabilities = None, {}
+        reason = "successive poses are unrelated, as if all were outliers; see how the frames are observed"
+    elif implausible_since is not None:
         operation, reason = _propose_replacement(model, data, independent, alternative)
     else:
         reason = _ambiguity_reason(probabilities, len(right), looks)
@@ -323,8 +330,9 @@ def _probabilities(data: JointObservations, alternative: IdentificationResult | 
 
 def _ambiguity_reason(probabilities: Mapping[str, float], count: int, looks: float) -> str:
     """Return the reason why a joint that fits is not certain."""
-    if probabilities["served"] >= SURE:
-        return ""
+    correlated = f"errors are correlated, {count} observations tell as much as {count / looks:.1f}"
+    if probabilities["served"] >= SURE and count > 1:
+        return "" if count >= _LEAST_INDEPENDENT * looks else correlated
     if count < _LEAST_COUNT:
         return f"both were seen {count} time{'s' if count > 1 else ''} only"
     other = max((name for name in probabilities if name != "served"), key=lambda name: probabilities[name])
@@ -332,7 +340,7 @@ def _ambiguity_reason(probabilities: Mapping[str, float], count: int, looks: flo
     if other in ("elsewhere", "rigid"):
         reason = "it may sit a bit elsewhere as well" if other == "elsewhere" else "it hardly moved"
     if looks >= _CORRELATED:
-        reason += f"; errors are correlated, {count} observations tell as much as {count / looks:.1f}"
+        reason += f"; {correlated}"
     return reason
 
 
@@ -361,6 +369,16 @@ def _propose_replacement(
     except KineverseError as error:
         return None, f"what it is instead cannot take its place. {error}"
     return operation, ""
+
+
+def _is_unrelated(data: JointObservations, alternative: IdentificationResult | None) -> bool:
+    """Return True if nothing connects the poses: neither a joint, nor that successive ones are near."""
+    if alternative is None or alternative.best.family != "free":
+        return False
+    positions = data.observations.relative[:, :3, 3]
+    later = np.roll(positions, len(positions) // 2, axis=0)
+    step = np.median(np.linalg.norm(np.diff(positions, axis=0), axis=1))
+    return bool(step > _UNRELATED * np.median(np.linalg.norm(positions - later, axis=1)))
 
 
 def _explains_alone(model: Model, data: JointObservations, alternative: IdentificationResult) -> bool:

@@ -159,7 +159,7 @@ def _compute_one(served: KnownJoint, observations: Observations) -> KnownResidua
     log_scale = float(np.log(np.diagonal(triangle)).sum()) + 0.5 * (6 - joints) * math.log(math.tau)
     covariances: Array = np.zeros((joints, joints))
     if joints:
-        covariances = np.linalg.inv(directions.T @ directions + _PRECISION * np.eye(joints))
+        covariances = invert_matrices(directions.T @ directions + _PRECISION * np.eye(joints))
         log_scale -= 0.5 * float(np.linalg.slogdet(covariances)[1])
     unbounded = values + covariances @ (directions.T @ error)
     across = complete_basis(directions)

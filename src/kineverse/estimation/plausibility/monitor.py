@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from collections import deque
 from collections.abc import Iterable, Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 import numpy.typing as npt
@@ -29,6 +29,7 @@ from kineverse.model.model import Model
 from .alternatives import JointObservations, judge_joint
 from .consistency import ConsistencyTests, TimedResiduals
 from .correlation import CorrelationSettings
+from .exchanged_frames import find_exchanged_frames
 from .known_motion import KnownJoint
 from .known_residuals import KnownResiduals, compute_residuals
 from .plausibility import (
@@ -173,8 +174,17 @@ class PlausibilityMonitor:
         tested = self._consistency.apply(
             {joint: known for joint, known in residuals.items() if known is not None}
         )
+        since = {m.joint: m.implausible_since for m in self._monitored if m.implausible_since is not None}
+        exchanged = find_exchanged_frames(
+            since,
+            {m.joint: m.served for m in self._monitored if m.served is not None},
+            self._recent_tracks() if since else {},
+            self._relative_to,
+            first,
+        )
         verdicts = [
-            self._verdict(monitored, tested.get(monitored.joint), first) for monitored in self._monitored
+            self._verdict(monitored, tested.get(monitored.joint), first, exchanged.get(monitored.joint, ""))
+            for monitored in self._monitored
         ]
         return Plausibility(tuple(verdicts), self._testable.untested, self.false_alarms)
 
@@ -260,6 +270,16 @@ class PlausibilityMonitor:
     def _pair_outliers(self, joint: TestableJoint) -> Outliers | None:
         return pair_outliers(self._outliers, joint, self._relative_to)
 
+    def _recent_tracks(self) -> dict[str, PoseTrack]:
+        """Return the recent poses by name of the frame, with gaps."""
+        names = {name for tracks in self._recent for name in tracks}
+        return {
+            name: concatenate_tracks(
+                [tracks.get(name, _missing(name, self._recent)) for tracks in self._recent]
+            )
+            for name in names
+        }
+
     def _compute_residuals(self, monitored: _MonitoredJoint, first: int) -> TimedResiduals | None:
         """Return the residuals of a joint in the recent observations; None if there are none."""
         times = self._times(monitored, first)
@@ -280,13 +300,15 @@ class PlausibilityMonitor:
         return pair_tracks(parent, child, np.arange(len(kept)))
 
     def _verdict(
-        self, monitored: _MonitoredJoint, residuals: KnownResiduals | None, first: int
+        self, monitored: _MonitoredJoint, residuals: KnownResiduals | None, first: int, exchanged: str
     ) -> JointVerdict:
         joint = monitored.joint
         if monitored.served is None or residuals is None:
             never = f"'{joint.parent}' and '{joint.child}' were not seen together"
             return undetermined_verdict(joint, 0, monitored.reason or never)
         times = self._times(monitored, first)
+        if exchanged:
+            return undetermined_verdict(joint, len(times), exchanged, monitored.implausible_since)
         data = JointObservations(
             joint,
             monitored.served,
@@ -303,6 +325,12 @@ class PlausibilityMonitor:
             self._pair_outliers(joint),
             self._correlation,
         )
+
+
+def _missing(name: str, recent: Iterable[Mapping[str, PoseTrack]]) -> PoseTrack:
+    """Return a gap in the track of a frame."""
+    like = next(tracks[name] for tracks in recent if name in tracks)
+    return replace(like, seen=np.zeros(1, dtype=bool))
 
 
 _SEEN = np.ones(1, dtype=bool)

@@ -20,6 +20,7 @@ from kineverse.model.model import Model, Snapshot
 from .alternatives import JointObservations, judge_joint
 from .consistency import ConsistencyTests, TimedResiduals
 from .correlation import CorrelationSettings
+from .exchanged_frames import find_exchanged_frames
 from .known_motion import KnownJoint
 from .known_residuals import compute_residuals
 from .recorded_poses import RecordedPoses, recorded_observations
@@ -122,28 +123,29 @@ def check_plausibility(
         except KineverseError as error:
             reasons[joint] = undetermined_verdict(joint, len(seen), f"its pose cannot be computed. {error}")
     tested = ConsistencyTests(model, served_joints, relative_to).apply(residuals)
+    data: dict[TestableJoint, JointObservations] = {}
+    implausible_since: dict[TestableJoint, int] = {}
+    for joint, served in served_joints.items():
+        seen = residuals[joint].times
+        poses = pair_tracks(tracks[joint.parent], tracks[joint.child], seen)
+        data[joint] = JointObservations(joint, served, poses, tested[joint], seen, stamps[seen])
+        since = _test(
+            data[joint], false_alarms, pair_outliers(outlier_model, joint, relative_to), correlation
+        )
+        if since is not None:
+            implausible_since[joint] = since
+    exchanged = find_exchanged_frames(implausible_since, served_joints, tracks, relative_to)
     verdicts = []
     for joint in testable.joints:
         if joint in reasons:
             verdicts.append(reasons[joint])
-            continue
-        times_of = residuals[joint].times
-        poses = pair_tracks(tracks[joint.parent], tracks[joint.child], times_of)
-        data = JointObservations(
-            joint, served_joints[joint], poses, tested[joint], times_of, stamps[times_of]
-        )
-        fitting = pair_outliers(outlier_model, joint, relative_to)
-        looks = correlation.measure(data.residuals.whitened, data.residuals.orthogonal.shape[1], data.stamps)
-        test = SequentialTest(false_alarms, fitting.fraction if fitting else 0.0)
-        for values in zip(
-            data.residuals.orthogonal,
-            data.residuals.displacement_jacobian,
-            data.residuals.one_sided,
-            strict=True,
-        ):
-            test.add(*values, looks)
-        since = None if test.implausible_since is None else int(times_of[test.implausible_since])
-        verdicts.append(judge_joint(model, data, since, families, fitting, correlation))
+        elif joint in exchanged:
+            since, count = implausible_since[joint], len(data[joint].times)
+            verdicts.append(undetermined_verdict(joint, count, exchanged[joint], since))
+        else:
+            fitting = pair_outliers(outlier_model, joint, relative_to)
+            since = implausible_since.get(joint)
+            verdicts.append(judge_joint(model, data[joint], since, families, fitting, correlation))
     result = Plausibility(tuple(verdicts), testable.untested, false_alarms)
     if strict:
         result.raise_if_implausible()
@@ -164,9 +166,23 @@ def check_false_alarms(probability: float) -> None:
         )
 
 
-def undetermined_verdict(joint: TestableJoint, count: int, reason: str) -> JointVerdict:
-    """Return the verdict on a joint that cannot be tested."""
-    return JointVerdict(joint, {}, (math.nan, math.nan), count, reason=reason)
+def undetermined_verdict(
+    joint: TestableJoint, count: int, reason: str, implausible_since: int | None = None
+) -> JointVerdict:
+    """Return the verdict on a joint that cannot be tested, or compared with alternatives."""
+    return JointVerdict(joint, {}, (math.nan, math.nan), count, implausible_since, reason=reason)
+
+
+def _test(
+    data: JointObservations, false_alarms: float, outliers: Outliers | None, correlation: CorrelationSettings
+) -> int | None:
+    """Return the first observation that a joint does not explain; None if it is not rejected."""
+    residuals = data.residuals
+    looks = correlation.measure(residuals.whitened, residuals.orthogonal.shape[1], data.stamps)
+    test = SequentialTest(false_alarms, outliers.fraction if outliers else 0.0)
+    for row in zip(residuals.orthogonal, residuals.displacement_jacobian, residuals.one_sided, strict=True):
+        test.add(*row, looks)
+    return None if test.implausible_since is None else int(data.times[test.implausible_since])
 
 
 def pair_outliers(

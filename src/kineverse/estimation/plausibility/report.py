@@ -67,7 +67,8 @@ class JointVerdict:
         """Result in words: ``explains``, ``stopped explaining at observation k``, or ``cannot tell``."""
         if self.implausible_since is not None:
             return f"stopped explaining at observation {self.implausible_since}"
-        return "explains" if self.probabilities.get("served", 0.0) >= SURE else "cannot tell"
+        certain = self.probabilities.get("served", 0.0) >= SURE and not self.reason
+        return "explains" if certain else "cannot tell"
 
     @property
     def explains(self) -> bool:

@@ -2,7 +2,8 @@
 
 The equations are those of :mod:`.known_residuals` and of
 :mod:`kineverse.estimation.identification.optimise`, for one observation of a joint whose values are
-coordinates. Without the axes of many observations, without damping and without parameters they take a tenth of the time.
+coordinates. Without the axes of many observations, without damping and without parameters they take a tenth
+of the time.
 """
 
 from __future__ import annotations
@@ -21,8 +22,8 @@ if TYPE_CHECKING:
 
 # Largest number of steps, and largest step of an angle [rad].
 _STEPS, _STEP = 12, 0.5
-# Squared residual beyond which the true pose of the parent stays at the observed one: the pose that explains a
-# gross error best is many steps away, and of no use.
+# Squared residual beyond which the true pose of the parent stays at the observed one. The pose that explains
+# a gross error best is many steps away, and of no use.
 _GROSS = 1e3
 _EYE_3, _EYE_6 = np.eye(3), np.eye(6)
 
