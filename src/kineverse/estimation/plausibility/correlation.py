@@ -119,7 +119,8 @@ class ErrorCorrelation:
         variance = a + b + 2.0 * ab + 1.0 - self._shares
         squares = np.einsum("ij,ij->i", error, error) / variance
         self._log *= 1.0 - 1.0 / _MEMORY
-        self._log -= 0.5 * (size * np.log(variance) + np.minimum(squares, CHI_SQUARED_6))
+        # An outlier tells nothing of the correlation.
+        self._log -= 0.5 * np.minimum(size * np.log(variance) + squares, CHI_SQUARED_6)
         inlier = squares < CHI_SQUARED_6
         self._outliers = 0 if inlier.any() else self._outliers + 1
         if self._outliers >= _JUMP:

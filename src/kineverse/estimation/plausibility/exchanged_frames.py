@@ -44,6 +44,7 @@ def find_exchanged_frames(
     first
         Number of the first observation of the tracks.
     """
+    known = [joint for joint in served_joints if {joint.parent, joint.child} <= tracks.keys()]
     frames = dict.fromkeys(
         f for joint in known if joint in implausible_since for f in (joint.parent, joint.child) if f != exact
     )
