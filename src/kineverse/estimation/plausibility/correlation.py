@@ -36,7 +36,7 @@ _JUMP = 5
 
 @dataclass(frozen=True)
 class CorrelationSettings:
-    """What is known of the correlation of errors in time.
+    """Stated or unknown correlation of errors in time.
 
     Attributes
     ----------
@@ -63,7 +63,7 @@ class ErrorCorrelation:
     Parameters
     ----------
     settings
-        What is known of the correlation.
+        The stated correlation, if any.
 
     Attributes
     ----------

@@ -147,7 +147,7 @@ def compute_residuals(served: KnownJoint, observations: Observations) -> KnownRe
 
 def _compute_one(served: KnownJoint, observations: Observations) -> KnownResiduals | None:
     """Compute the residuals of one observation; None if its joint values are not found."""
-    start = served.initial_coordinates(observations)[0]
+    start = served.initial_coordinates(observations)[0] if served.joints else np.zeros(0)
     solution = solve_observation(served, observations, start, _PRECISION)
     if solution is None:
         return None

@@ -21,6 +21,10 @@ alternative by one observation is cut off at some c. For any distribution of the
 and min(L, c) divided by this bound is a fair bet again (Huber's censored ratio). A small c costs little per
 observation and detects small deviations slowly; a large c detects gross ones at once. The capital is split
 among several c.
+
+If errors are correlated and m observations tell as much as an independent one, see :mod:`.correlation`, L is
+replaced by L^(1/m). By Hölder's inequality E[Π L_i^(1/m)] <= Π E[L_i]^(1/m) <= 1 for m observations of any
+dependence. The prior weights of change points then count independent observations.
 """
 
 from __future__ import annotations
@@ -140,7 +144,7 @@ class CorrelatedTest:
     false_alarms, outlier_fraction
         As in :class:`SequentialTest`.
     correlation
-        What is known of the correlation.
+        The stated correlation of the errors, if any.
     """
 
     def __init__(

@@ -15,7 +15,7 @@ import numpy as np
 
 from kineverse.estimation.identification.observations import Observations
 from kineverse.estimation.identification.optimise import CLOSE
-from kineverse.lie import Array, exp_so3, log_so3
+from kineverse.lie import Array, log_so3
 
 if TYPE_CHECKING:
     from .known_motion import KnownJoint
@@ -71,6 +71,7 @@ def solve_observation(
     values, true = np.clip(start, low, high), parent
     turned, error, own = np.zeros((6, 6)), np.empty(6), np.empty(6)
     covariance = weights = _EYE_6
+    curbed = bool(np.any(served.is_angle))
     for count in range(_STEPS):
         pose, by_joints = served.evaluate(values)
         rotation = true[:3, :3].T
@@ -91,9 +92,11 @@ def solve_observation(
         if served.joints:
             weighted = by_joints.T @ weights
             curvature = weighted @ by_joints + precision * np.eye(served.joints)
-            change = np.linalg.solve(curvature, weighted @ error - precision * values)
-            bounded = np.where(served.is_angle, np.clip(change, -_STEP, _STEP), change)
-            there = np.clip(values + bounded, low, high)
+            slope = weighted @ error - precision * values
+            change = slope / curvature[0] if served.joints == 1 else np.linalg.solve(curvature, slope)
+            if curbed and np.abs(change).max() > _STEP:
+                change = np.where(served.is_angle, np.clip(change, -_STEP, _STEP), change)
+            there = np.minimum(np.maximum(values + change, low), high)
             # At a limit the step is shorter than the one that the slope asks for.
             change = there - values
             gain += float(change @ curvature @ change)
@@ -103,7 +106,7 @@ def solve_observation(
             gain += float(np.sum(blame**2 / np.diagonal(of_parent)))
             if gain >= CLOSE:
                 step = np.eye(4)
-                step[:3, :3], step[:3, 3] = exp_so3(blame[3:]), blame[:3]
+                step[:3, :3], step[:3, 3] = _rotation(blame[3:]), blame[:3]
                 true = true @ step
         if gain < CLOSE:
             return PoseSolution(values, pose, by_joints, error, covariance)
@@ -149,6 +152,23 @@ def _rotation_vector(rotation: Array) -> Array:
     sine = math.sqrt(x * x + y * y + z * z)
     factor = 1.0 if sine < 1e-9 else math.atan2(sine, cosine) / sine
     return np.array([factor * x, factor * y, factor * z])
+
+
+def _rotation(v: Array) -> Array:
+    """Return the rotation of one rotation vector, as :func:`kineverse.lie.exp_so3`."""
+    x, y, z = v.tolist()
+    square = x * x + y * y + z * z
+    angle = math.sqrt(square)
+    a, b = 1.0, 0.5
+    if angle > 1e-5:
+        a, b = math.sin(angle) / angle, 2.0 * (math.sin(0.5 * angle) / angle) ** 2
+    return np.array(
+        [
+            [1.0 - b * (y * y + z * z), b * x * y - a * z, b * x * z + a * y],
+            [b * x * y + a * z, 1.0 - b * (x * x + z * z), b * y * z - a * x],
+            [b * x * z - a * y, b * y * z + a * x, 1.0 - b * (x * x + y * y)],
+        ]
+    )
 
 
 def _lever(pose: Array) -> Array:

@@ -78,7 +78,9 @@ class MonitoringRow:
         )
 
 
-def measure_monitoring(model: Model, seeds: int = 20, minutes: float = 6.0) -> list[MonitoringRow]:
+def measure_monitoring(
+    model: Model, seeds: int = 20, minutes: float = 6.0, displacements: tuple[float, ...] = (0.02, 0.01)
+) -> list[MonitoringRow]:
     """Run the monitor over streams of a door as modelled, and of doors with a displaced axis.
 
     Parameters
@@ -89,13 +91,15 @@ def measure_monitoring(model: Model, seeds: int = 20, minutes: float = 6.0) -> l
         Number of streams of each kind.
     minutes
         Length of each stream of the door as modelled.
+    displacements
+        Displacements of the axis [m].
     """
     long, short = 60.0 * minutes, PERIOD
     rows = [
         _measure("as modelled", model, seeds, long, _as_modelled, None),
         _measure("as modelled, white noise", model, seeds, long / 6.0, _as_modelled, WHITE),
     ]
-    for size in (0.02, 0.01):
+    for size in displacements:
         for where, errors in (("", None), (", white noise", WHITE)):
             case = f"axis {100.0 * size:.0f} cm off{where}"
             rows.append(_measure(case, model, seeds, short, _displaced(size, True), errors))
