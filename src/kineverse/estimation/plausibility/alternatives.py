@@ -282,7 +282,9 @@ def judge_joint(
         alternative, probabilities = None, {}
         reason = "successive poses are unrelated, as if all were outliers; see how the frames are observed"
     elif implausible_since is not None:
-        operation, reason = _propose_replacement(model, data, independent, alternative)
+        reason = _indecision_reason(data.joint, probabilities, alternative)
+        if not reason:
+            operation, reason = _propose_replacement(model, data, independent, alternative)
     else:
         reason = _ambiguity_reason(probabilities, len(right), looks)
     squares = np.mean(inliers.residuals.pose_residuals**2, axis=0)
@@ -342,6 +344,16 @@ def _ambiguity_reason(probabilities: Mapping[str, float], count: int, looks: flo
     if looks >= _CORRELATED:
         reason += f"; {correlated}"
     return reason
+
+
+def _indecision_reason(
+    joint: TestableJoint, probabilities: Mapping[str, float], alternative: IdentificationResult | None
+) -> str:
+    """Return the reason why the observations since a rejection tell nothing of a replacement."""
+    static = alternative is not None and alternative.best.family == "rigid"
+    if joint.moves and static and probabilities["rigid"] < SURE:
+        return "it hardly moved since, so what it is instead is not known yet"
+    return ""
 
 
 def _propose_replacement(
