@@ -69,6 +69,7 @@ def identify(
     noise: npt.ArrayLike | None = None,
     outliers: Outliers | bool | None = None,
     sequential: bool = False,
+    correlation_time: float = 1.0,
 ) -> IdentificationResult:
     """Identify the joint between a parent and a child from noisy poses of both.
 
@@ -93,6 +94,9 @@ def identify(
     sequential
         True if the observations are in temporal order, with less than half a revolution from one to the
         next. Revolutions are counted then, see :mod:`.unwrapping`.
+    correlation_time
+        Number of observations τ that are worth one independent observation. The log likelihood is divided
+        by it, and the covariances of parameters are multiplied by it. 1 stands for independent errors.
 
     Returns
     -------
@@ -111,7 +115,13 @@ def identify(
         parent_poses is not None, parent_covariance, child_covariance, noise
     )
     observations = check_observations(parent_poses, child_poses, parent_covariance, child_covariance)
-    data = prepare_data(observations, stated, as_outliers(outliers), sequential)
+    if not 1.0 <= correlation_time < math.inf:
+        raise InvalidValueError(
+            f"The correlation time is a number of observations, at least 1, not {correlation_time!r}."
+        )
+    data = prepare_data(
+        observations, stated, as_outliers(outliers), sequential, observation_weight=1.0 / correlation_time
+    )
     return weigh_families(data, solve_with_inliers(data, weights), weights)
 
 
@@ -187,6 +197,8 @@ class IdentificationData:
         Outlier model, with lengths in the unit; None if all observations are inliers.
     sequential
         True if the observations are in temporal order.
+    observation_weight
+        Factor on the log likelihood of each observation, below 1 for correlated errors.
     """
 
     observations: Observations
@@ -194,6 +206,7 @@ class IdentificationData:
     stated: bool
     outliers: Outliers | None
     sequential: bool
+    observation_weight: float = 1.0
 
 
 @dataclass(frozen=True)
@@ -225,12 +238,14 @@ def prepare_data(
     outliers: Outliers | None,
     sequential: bool,
     unit: float | None = None,
+    observation_weight: float = 1.0,
 ) -> IdentificationData:
     """Return observations in a unit of length [m], by default their own length scale."""
     unit = length_scale(observations) if unit is None else unit
     if outliers is not None and outliers != Outliers():
         outliers = replace(outliers, reach=outliers.reach / unit)
-    return IdentificationData(convert_to_unit(observations, unit), unit, stated, outliers, sequential)
+    scaled = convert_to_unit(observations, unit)
+    return IdentificationData(scaled, unit, stated, outliers, sequential, observation_weight)
 
 
 def solve_with_inliers(
@@ -278,9 +293,9 @@ def score_solutions(
             name: log_priors[name] + log_unwrapping_gain(scored.solution)
             for name, scored in solutions.items()
         }
-    compared = compare_families(
-        observations_of, solutions, {name: math.log(weights[name]) + log_priors[name] for name in solutions}
-    )
+    # The threshold is on evidence in which each observation has its weight.
+    logs = {name: math.log(weights[name]) / data.observation_weight + log_priors[name] for name in solutions}
+    compared = compare_families(observations_of, solutions, logs, data.observation_weight)
     return {
         name: FamilySolution(one, inliers[name], count, log_priors[name]) for name, one in compared.items()
     }
@@ -316,6 +331,7 @@ def compare_families(
     observations: Mapping[str | Family, Observations],
     solutions: Mapping[str | Family, Scored],
     log_priors: Mapping[str | Family, float],
+    observation_weight: float = 1.0,
 ) -> dict[str | Family, Scored]:
     """Return the solutions, those of competitive families with their joint values integrated out.
 
@@ -323,7 +339,9 @@ def compare_families(
     """
     logs = {name: scored.log_evidence + log_priors[name] for name, scored in solutions.items()}
     threshold = (
-        max(logs.values()) - _NEGLIGIBLE - _NEGLIGIBLE_EACH * max(len(some) for some in observations.values())
+        max(logs.values())
+        - _NEGLIGIBLE / observation_weight
+        - _NEGLIGIBLE_EACH * max(len(some) for some in observations.values())
     )
     rough = [name for name, scored in solutions.items() if logs[name] >= threshold and _is_rough(scored)]
     return {
@@ -347,15 +365,16 @@ def weigh_families(
     weights: Mapping[str | Family, float],
 ) -> IdentificationResult:
     """Return the fits of all families with their posterior probabilities."""
-    log_priors = {name: math.log(weights[name]) + one.log_prior for name, one in solutions.items()}
+    weight = data.observation_weight
+    log_priors = {name: math.log(weights[name]) + weight * one.log_prior for name, one in solutions.items()}
     if data.stated:
-        logs = {name: one.scored.log_evidence for name, one in solutions.items()}
+        logs = {name: _weighted_log_evidence(one.scored, weight) for name, one in solutions.items()}
         scale = 1.0
     else:
         spread = -0.5 * (np.log(_SCALES) / _SCALE_SPREAD) ** 2
         spread -= np.logaddexp.reduce(spread)
         joint = {
-            name: spread + solver.log_evidences(one.scored.solution, _SCALES)
+            name: spread + solver.log_evidences(one.scored.solution, _SCALES, weight)
             for name, one in solutions.items()
         }
         logs = {name: float(np.logaddexp.reduce(j)) for name, j in joint.items()}
@@ -365,16 +384,25 @@ def weigh_families(
     probabilities = np.exp(total - np.logaddexp.reduce(total)).tolist()
     lazy_fits = []
     for (name, one), p in zip(solutions.items(), probabilities, strict=True):
-        log = logs[name] + one.log_prior + log_density(len(data.observations), data.unit)
+        log = logs[name] + weight * one.log_prior + log_density(weight * len(data.observations), data.unit)
         lazy_fits.append(LazyFit(one.scored.solution.motion.name, p, partial(_fit, data, one, scale, log, p)))
     return IdentificationResult(tuple(sorted(lazy_fits, key=lambda lazy_fit: -lazy_fit.probability)), scale)
+
+
+def _weighted_log_evidence(scored: Scored, weight: float) -> float:
+    """Return the log evidence if each observation's log likelihood counts with a weight."""
+    if weight == 1.0:
+        return scored.log_evidence
+    predicted, weighted = (solver.log_evidences(scored.solution, np.ones(1), w)[0] for w in (1.0, weight))
+    # Steps that did not converge reach less than the quadratic approximation predicts.
+    return float(weighted + weight * (scored.log_evidence - predicted))
 
 
 def _fit(
     data: IdentificationData, one: FamilySolution, scale: float, log_evidence: float, probability: float
 ) -> Fit:
     solution = fix_gauge(unwrap_solution(one.scored.solution) if data.sequential else one.scored.solution)
-    fit = build_fit(solution, solver.evidence(solution, scale), log_evidence, probability)
+    fit = build_fit(solution, solver.evidence(solution, scale, data.observation_weight), log_evidence, probability)
     return convert_to_metres(
         complete_fit(fit, data.observations, one.inliers, scale, sequential=data.sequential), data.unit
     )

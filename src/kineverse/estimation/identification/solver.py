@@ -119,6 +119,7 @@ _CONSTANTS = {
     "narrowest": maximum_likelihood.NARROWEST,
     "settled": maximum_likelihood.SETTLED,
     "turns": maximum_likelihood.TURNS,
+    "weight": 1.0,
 }
 # Largest number of doubles of a work memory that is kept between stages.
 _KEPT = 4_000_000
@@ -205,21 +206,25 @@ class IdentificationSolver:
         _run(library.code.carry_on, problem, buffer)
         return Scored(buffer.solution, buffer.log_evidence)
 
-    def evidence(self, solution: Solution[FamilyMember], scale: float = 1.0) -> Evidence:
+    def evidence(
+        self, solution: Solution[FamilyMember], scale: float = 1.0, weight: float = 1.0
+    ) -> Evidence:
         """Run :func:`.evidence.laplace_evidence`, for noise that is larger by a factor."""
         if not _is_kernel_solution(solution):
-            return laplace_evidence(solution.scaled(scale))
-        logs, *rest = _evaluate_evidence(solution, np.array([scale]))
+            return laplace_evidence(solution.scaled(scale), weight)
+        logs, *rest = _evaluate_evidence(solution, np.array([scale]), weight)
         values, covariances, information = rest
         return Evidence.from_information(
             float(logs[0]), information, solution.motion.size, values, covariances
         )
 
-    def log_evidences(self, solution: Solution[FamilyMember], scales: Array) -> Array:
+    def log_evidences(
+        self, solution: Solution[FamilyMember], scales: Array, weight: float = 1.0
+    ) -> Array:
         """Return the log evidence for noise that is larger by each of several factors."""
         if not _is_kernel_solution(solution):
-            return np.array([laplace_evidence(solution.scaled(c)).log_evidence for c in scales])
-        return _evaluate_evidence(solution, scales)[0]
+            return np.array([laplace_evidence(solution.scaled(c), weight).log_evidence for c in scales])
+        return _evaluate_evidence(solution, scales, weight)[0]
 
 
 solver = IdentificationSolver()
@@ -247,11 +252,13 @@ def _run(
     stage(where, *given, *addresses)
 
 
-def _evaluate_evidence(solution: Solution[GroupMotion], scales: Array) -> tuple[Array, ...]:
+def _evaluate_evidence(
+    solution: Solution[GroupMotion], scales: Array, weight: float
+) -> tuple[Array, ...]:
     """Return the log evidence for each scale, and joint values, covariances and information of the last."""
     motion, (count, joints) = solution.motion, solution.values.shape
     problem = Problem.from_buffer_copy(_family(motion.group, motion.rows))
-    problem.given.count = count
+    problem.given.count, problem.weight = count, weight
     unknowns = motion.size + joints + motion.slides
     shapes = (len(scales),), (count, joints), (count, joints, joints), (unknowns, unknowns)
     results = tuple(np.empty(shape) for shape in shapes)
