@@ -402,7 +402,9 @@ def _fit(
     data: IdentificationData, one: FamilySolution, scale: float, log_evidence: float, probability: float
 ) -> Fit:
     solution = fix_gauge(unwrap_solution(one.scored.solution) if data.sequential else one.scored.solution)
-    fit = build_fit(solution, solver.evidence(solution, scale, data.observation_weight), log_evidence, probability)
+    fit = build_fit(
+        solution, solver.evidence(solution, scale, data.observation_weight), log_evidence, probability
+    )
     return convert_to_metres(
         complete_fit(fit, data.observations, one.inliers, scale, sequential=data.sequential), data.unit
     )

@@ -206,9 +206,7 @@ class IdentificationSolver:
         _run(library.code.carry_on, problem, buffer)
         return Scored(buffer.solution, buffer.log_evidence)
 
-    def evidence(
-        self, solution: Solution[FamilyMember], scale: float = 1.0, weight: float = 1.0
-    ) -> Evidence:
+    def evidence(self, solution: Solution[FamilyMember], scale: float = 1.0, weight: float = 1.0) -> Evidence:
         """Run :func:`.evidence.laplace_evidence`, for noise that is larger by a factor."""
         if not _is_kernel_solution(solution):
             return laplace_evidence(solution.scaled(scale), weight)
@@ -218,9 +216,7 @@ class IdentificationSolver:
             float(logs[0]), information, solution.motion.size, values, covariances
         )
 
-    def log_evidences(
-        self, solution: Solution[FamilyMember], scales: Array, weight: float = 1.0
-    ) -> Array:
+    def log_evidences(self, solution: Solution[FamilyMember], scales: Array, weight: float = 1.0) -> Array:
         """Return the log evidence for noise that is larger by each of several factors."""
         if not _is_kernel_solution(solution):
             return np.array([laplace_evidence(solution.scaled(c), weight).log_evidence for c in scales])
@@ -252,9 +248,7 @@ def _run(
     stage(where, *given, *addresses)
 
 
-def _evaluate_evidence(
-    solution: Solution[GroupMotion], scales: Array, weight: float
-) -> tuple[Array, ...]:
+def _evaluate_evidence(solution: Solution[GroupMotion], scales: Array, weight: float) -> tuple[Array, ...]:
     """Return the log evidence for each scale, and joint values, covariances and information of the last."""
     motion, (count, joints) = solution.motion, solution.values.shape
     problem = Problem.from_buffer_copy(_family(motion.group, motion.rows))

@@ -1,0 +1,282 @@
+"""Identification of the joint of a recorded pair, and of what the answer depends on.
+
+Errors of neighbouring rows are correlated. N rows with an autocorrelation time τ count as N / τ, see
+:mod:`.correlation`. The residuals of each family have a time of their own, because they contain the misfit of
+the family. The time of the most probable family is used, and the comparison is repeated until it agrees with
+the family that it makes most probable.
+
+The answer is compared with those under other assumptions: the times of other families, half and twice the
+noise, and the noise of the residuals if another one is stated. An assumption about the noise counts if the
+observations are not much less probable under it than under the best of these.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator
+from dataclasses import dataclass
+
+import numpy as np
+
+from kineverse.errors import InvalidValueError
+from kineverse.estimation.identification import Fit, IdentificationResult, identify
+from kineverse.estimation.identification.identify import UNKNOWN_NOISE, WEIGHTS
+from kineverse.estimation.identification.observations import check_observations
+from kineverse.estimation.identification.projection import complete_fit
+from kineverse.estimation.noise import pose_covariance
+from kineverse.estimation.robust import Outliers
+from kineverse.lie import Array
+
+from .correlation import LEAST_EFFECTIVE, correlation_time
+from .recording import Indices, RecordedPair, spaced_indices
+
+MAX_ROTATION_STEP = 2.0
+"""Largest rotation between successive poses for which revolutions are counted reliably [rad]."""
+
+# Standard deviations of the autocorrelation time that are added to its estimate.
+_CAUTION = 1.0
+# Rows within one autocorrelation time, and in total, that suffice.
+_ROWS_PER_TIME, _ENOUGH_ROWS = 8, 100
+# Log ratio of the probability of the observations at which one noise is refuted by another.
+_REFUTED = math.log(20.0)
+# Relative difference of autocorrelation times that matters.
+_LONGER = 1.1
+
+
+@dataclass(frozen=True)
+class ObservationNoise:
+    """Assumed noise of the observations.
+
+    Attributes
+    ----------
+    position, orientation
+        Standard deviations of each coordinate [m] and about each axis [rad]; orientation is None if only
+        positions are observed.
+    given
+        True if they were given, False if estimated.
+    """
+
+    position: float
+    orientation: float | None
+    given: bool
+
+    def scaled(self, factor: float) -> ObservationNoise:
+        """Return the noise with standard deviations that are larger by a factor."""
+        orientation = None if self.orientation is None else factor * self.orientation
+        return ObservationNoise(factor * self.position, orientation, self.given)
+
+    @property
+    def covariance(self) -> Array:
+        """Covariance of poses, (6, 6); for positions alone its orientation block is unused."""
+        return pose_covariance(self.position, self.orientation or 1.0)
+
+
+@dataclass(frozen=True, eq=False)
+class Assumption:
+    """Noise and autocorrelation time of the errors, and the joint that is identified with these.
+
+    Attributes
+    ----------
+    noise
+        Noise of single observations.
+    correlation_time
+        Autocorrelation time of their errors, in rows.
+    found
+        All families, with their probabilities.
+    """
+
+    noise: ObservationNoise
+    correlation_time: float
+    found: IdentificationResult
+
+
+@dataclass(frozen=True, eq=False)
+class RecordedJoint:
+    """Joint identified from a recorded pair.
+
+    Attributes
+    ----------
+    found
+        All families, with their probabilities.
+    noise
+        Noise of single observations.
+    correlation_time
+        Autocorrelation time of their errors, in rows.
+    repeated
+        Number of rows that equal the one before. They do not count.
+    judged
+        Effective sample size by which the families were compared.
+    fit
+        Fit of the most probable family to all poses, outliers marked.
+    objections
+        Assumptions as good as the one made, under which the joint is another or ambiguous.
+    """
+
+    found: IdentificationResult
+    noise: ObservationNoise
+    correlation_time: float
+    repeated: int
+    judged: int
+    fit: Fit
+    objections: tuple[Assumption, ...] = ()
+
+    @property
+    def is_ambiguous(self) -> bool:
+        """True if the data do not determine the joint, or only under some of the assumptions."""
+        return self.found.is_ambiguous or bool(self.objections)
+
+
+def identify_recorded_joint(
+    pair: RecordedPair,
+    noise: ObservationNoise | None = None,
+    families: list[str] | None = None,
+    independent: bool = False,
+) -> RecordedJoint:
+    """Identify the joint of a recorded pair.
+
+    Parameters
+    ----------
+    pair
+        Poses in their order.
+    noise
+        Noise of single observations; None if it is to be estimated.
+    families
+        Names of families; None for all.
+    independent
+        True if all errors are independent. Else their autocorrelation is estimated.
+
+    Raises
+    ------
+    InvalidValueError
+        If all poses are equal, or do not allow an identification.
+    UnknownNameError
+        For an unknown family.
+    """
+    comparison = _Comparison(pair, families, independent)
+    first = comparison.assume(noise, 1.0, comparison.distinct)
+    times = {} if independent else comparison.correlation_times(noise, first)
+    best, rows = first, comparison.distinct
+    for _ in times:
+        name = best.found.best.family
+        if times.get(name, 1.0) <= _LONGER * best.correlation_time:
+            break
+        rows = comparison.sufficient_rows(times[name], first.found[name])
+        best = comparison.assume(noise, times[name], rows)
+    objections = tuple(
+        other
+        for other in comparison.alternatives(noise, best, times, rows)
+        if other.found.best.family != best.found.best.family
+        or (other.correlation_time == best.correlation_time and other.found.is_ambiguous)
+    )
+    return RecordedJoint(
+        best.found,
+        best.noise,
+        best.correlation_time,
+        len(pair.lines) - len(comparison.distinct),
+        max(1, round(len(comparison.distinct) / best.correlation_time)),
+        comparison.complete(best, rows),
+        objections,
+    )
+
+
+class _Comparison:
+    """Comparison of families under several assumptions."""
+
+    def __init__(self, pair: RecordedPair, families: list[str] | None, independent: bool) -> None:
+        self.pair, self.families = pair, families
+        repeats = pair.repeats
+        self.distinct: Indices = np.flatnonzero(~repeats)
+        if len(self.distinct) == 1 < len(repeats):
+            raise InvalidValueError(
+                f"All {len(repeats)} poses are the same in every digit. How something moves cannot be seen "
+                "while it stands still."
+            )
+        if independent:
+            self.distinct = np.arange(len(repeats))
+
+    def assume(self, noise: ObservationNoise | None, time: float, rows: Indices) -> Assumption:
+        """Identify the joint from some rows, which stand for all distinct rows with a correlation time."""
+        some = self.pair.select(rows)
+        found = identify(
+            some.parent_poses,
+            some.child_poses,
+            noise=None if noise is None else noise.covariance,
+            families=self.families,
+            outliers=True,
+            sequential=self.pair.is_timed,
+            correlation_time=max(1.0, time * len(rows) / len(self.distinct)),
+        )
+        return Assumption(noise or estimated_noise(found, self.pair), time, found)
+
+    def correlation_times(self, noise: ObservationNoise | None, first: Assumption) -> dict[str, float]:
+        """Return the autocorrelation time of the residuals of each family that has any, in rows."""
+        # If the stated noise is too small, most observations are outliers.
+        found = first.found if noise is None else self.assume(None, 1.0, self.distinct).found
+        most = max(1.0, len(self.distinct) / LEAST_EFFECTIVE)
+        return {
+            fit.family: min(most, correlation_time(fit.residuals[fit.inliers], _CAUTION))
+            for fit in found
+            if fit.family != "free"
+        }
+
+    def sufficient_rows(self, time: float, fit: Fit) -> Indices:
+        """Return evenly spaced rows; more of them hold little more about errors with this time."""
+        count = len(self.distinct)
+        size = min(count, max(_ENOUGH_ROWS, math.ceil(_ROWS_PER_TIME * count / time)))
+        # The subset must be dense enough to count revolutions.
+        while (
+            self.pair.is_timed
+            and size < count
+            and fit.select(spaced_indices(count, size)).largest_turn > MAX_ROTATION_STEP
+        ):
+            size += 1
+        return self.distinct[spaced_indices(count, size)]
+
+    def alternatives(
+        self, stated: ObservationNoise | None, best: Assumption, times: dict[str, float], rows: Indices
+    ) -> Iterator[Assumption]:
+        """Yield the joints under other assumptions that the observations allow."""
+        for time in sorted(set(times.values())):
+            if time > _LONGER * best.correlation_time:
+                other = self.assume(stated, time, rows)
+                # Only a family whose own residuals have this time explains it.
+                if times.get(other.found.best.family, 0.0) == time:
+                    yield other
+        noises = [best.noise.scaled(0.5), best.noise.scaled(2.0)]
+        if stated is not None:
+            noises.append(self.assume(None, best.correlation_time, rows).noise)
+        others = [self.assume(noise, best.correlation_time, rows) for noise in noises]
+        known = self.assume(best.noise, best.correlation_time, rows) if stated is None else best
+        most = max(log_probability(one.found) for one in (known, *others))
+        for other in others:
+            if log_probability(other.found) > most - _REFUTED:
+                yield other
+
+    def complete(self, best: Assumption, rows: Indices) -> Fit:
+        """Return the fit of the most probable family, extended to all rows."""
+        pair, noise = self.pair, best.noise
+        if len(rows) == len(pair.lines):
+            return best.found.best
+        observations = check_observations(
+            pair.parent_poses, pair.child_poses, noise.covariance, noise.covariance
+        )
+        return complete_fit(
+            best.found.best,
+            observations,
+            rows,
+            outliers=Outliers(),
+            stated=noise.given,
+            sequential=pair.is_timed,
+        )
+
+
+def estimated_noise(found: IdentificationResult, pair: RecordedPair) -> ObservationNoise:
+    """Return the noise that an identification without stated noise estimated."""
+    position, orientation = (found.noise_scale * deviation for deviation in UNKNOWN_NOISE)
+    return ObservationNoise(position, orientation if pair.has_orientation else None, False)
+
+
+def log_probability(found: IdentificationResult) -> float:
+    """Return the log probability density of the observations, families weighed by their priors."""
+    best = found.best
+    return best.log_evidence + math.log(WEIGHTS[best.family] / best.probability)
