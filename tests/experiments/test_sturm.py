@@ -120,10 +120,14 @@ def test_the_command_takes_the_folder(folder, capsys):
         "models_data/door",
     ]
     assert answer["recordings"][0]["radius"] == pytest.approx(0.4, abs=0.02)
+    for counts in answer["all_poses"].values():
+        assert counts["right"] + counts["wrong"] + counts["cannot_tell"] == 3
+        assert counts["wrong"] == 0
+    assert answer["all_poses"]["residuals"]["right"] >= 2
 
 
 @pytest.mark.skipif(not TRACKS.exists(), reason=f"no {TRACKS}")
 def test_at_least_95_percent_of_the_published_recordings_are_right():
-    found = reproduce("sturm", options=Options(data=TRACKS))
+    found = reproduce("sturm", options=Options(quick=True, data=TRACKS))
     assert len(found.numbers["recordings"]) == 60
     assert found.numbers["right"] >= 0.95

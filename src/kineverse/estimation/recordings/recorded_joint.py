@@ -8,6 +8,10 @@ the family that it makes most probable.
 The answer is compared with those under other assumptions: the times of other families, half and twice the
 noise, and the noise of the residuals if another one is stated. An assumption about the noise counts if the
 observations are not much less probable under it than under the best of these.
+
+A joint with several joint values explains noise that is larger in one direction, such as a camera's depth,
+as motion. But the motion of parts is smooth, and noise is not. If the residuals of a family with fewer joint
+values are no smoother than noise, the noise may be as large as these.
 """
 
 from __future__ import annotations
@@ -41,6 +45,9 @@ _ROWS_PER_TIME, _ENOUGH_ROWS = 8, 100
 _REFUTED = math.log(20.0)
 # Relative difference of autocorrelation times that matters.
 _LONGER = 1.1
+# Ratio of autocorrelation times below which residuals are as smooth as others, and above which motion is not
+# noise.
+_AS_SMOOTH, _SMOOTHER = 1.5, 3.0
 
 
 @dataclass(frozen=True)
@@ -109,7 +116,7 @@ class RecordedJoint:
     fit
         Fit of the most probable family to all poses, outliers marked.
     objections
-        Assumptions as good as the one made, under which the joint is another or ambiguous.
+        Assumptions that the observations allow as well, under which the answer is another one.
     """
 
     found: IdentificationResult
@@ -154,7 +161,8 @@ def identify_recorded_joint(
     """
     comparison = _Comparison(pair, families, independent)
     first = comparison.assume(noise, 1.0, comparison.distinct)
-    times = {} if independent else comparison.correlation_times(noise, first)
+    fits = {} if independent else comparison.fits_of_estimated_noise(noise, first)
+    times = {name: comparison.correlation_time(fit) for name, fit in fits.items()}
     best, rows = first, comparison.distinct
     for _ in times:
         name = best.found.best.family
@@ -163,10 +171,7 @@ def identify_recorded_joint(
         rows = comparison.sufficient_rows(times[name], first.found[name])
         best = comparison.assume(noise, times[name], rows)
     objections = tuple(
-        other
-        for other in comparison.alternatives(noise, best, times, rows)
-        if other.found.best.family != best.found.best.family
-        or (other.correlation_time == best.correlation_time and other.found.is_ambiguous)
+        other for other in comparison.alternatives(noise, best, fits, times, rows) if objects(other, best)
     )
     return RecordedJoint(
         best.found,
@@ -177,6 +182,15 @@ def identify_recorded_joint(
         comparison.complete(best, rows),
         objections,
     )
+
+
+def objects(other: Assumption, made: Assumption) -> bool:
+    """Return True if the answer under another assumption is not the one under the assumption made."""
+    sure = [None if one.found.is_ambiguous else one.found.best.family for one in (other, made)]
+    if other.correlation_time == made.correlation_time:
+        return sure[0] != sure[1]
+    # A longer correlation time always tells less.
+    return sure[0] != sure[1] and other.found.best.family != made.found.best.family
 
 
 class _Comparison:
@@ -208,16 +222,16 @@ class _Comparison:
         )
         return Assumption(noise or estimated_noise(found, self.pair), time, found)
 
-    def correlation_times(self, noise: ObservationNoise | None, first: Assumption) -> dict[str, float]:
-        """Return the autocorrelation time of the residuals of each family that has any, in rows."""
+    def fits_of_estimated_noise(self, noise: ObservationNoise | None, first: Assumption) -> dict[str, Fit]:
+        """Return the fits of families that have residuals to all distinct rows."""
         # If the stated noise is too small, most observations are outliers.
         found = first.found if noise is None else self.assume(None, 1.0, self.distinct).found
+        return {fit.family: fit for fit in found if fit.family != "free"}
+
+    def correlation_time(self, fit: Fit) -> float:
+        """Return the autocorrelation time of the residuals of a fit to all distinct rows."""
         most = max(1.0, len(self.distinct) / LEAST_EFFECTIVE)
-        return {
-            fit.family: min(most, correlation_time(fit.residuals[fit.inliers], _CAUTION))
-            for fit in found
-            if fit.family != "free"
-        }
+        return min(most, correlation_time(fit.residuals[fit.inliers], _CAUTION))
 
     def sufficient_rows(self, time: float, fit: Fit) -> Indices:
         """Return evenly spaced rows; more of them hold little more about errors with this time."""
@@ -233,7 +247,12 @@ class _Comparison:
         return self.distinct[spaced_indices(count, size)]
 
     def alternatives(
-        self, stated: ObservationNoise | None, best: Assumption, times: dict[str, float], rows: Indices
+        self,
+        stated: ObservationNoise | None,
+        best: Assumption,
+        fits: dict[str, Fit],
+        times: dict[str, float],
+        rows: Indices,
     ) -> Iterator[Assumption]:
         """Yield the joints under other assumptions that the observations allow."""
         for time in sorted(set(times.values())):
@@ -241,6 +260,12 @@ class _Comparison:
                 other = self.assume(stated, time, rows)
                 # Only a family whose own residuals have this time explains it.
                 if times.get(other.found.best.family, 0.0) == time:
+                    yield other
+        family = best.found.best.family
+        for name, fit in fits.items():
+            if family in fits and _is_noise(fit, fits[family], times[name], times[family]):
+                other = self.assume(residual_noise(fit), best.correlation_time, rows)
+                if other.found.best.family == name:
                     yield other
         noises = [best.noise.scaled(0.5), best.noise.scaled(2.0)]
         if stated is not None:
@@ -268,6 +293,26 @@ class _Comparison:
             stated=noise.given,
             sequential=pair.is_timed,
         )
+
+
+def _is_noise(fit: Fit, best: Fit, time: float, best_time: float) -> bool:
+    """Return True if the best fit may be that of a family with fewer joint values whose residuals are noise.
+
+    Its residuals are then no smoother than those of the best fit, while the motion is.
+    """
+    if fit.motion.joints >= best.motion.joints or time > _AS_SMOOTH * best_time:
+        return False
+    values = best.joint_values[best.inliers]
+    return correlation_time(values - values.mean(axis=0)) > _SMOOTHER * time
+
+
+def residual_noise(fit: Fit) -> ObservationNoise:
+    """Return noise of the size of the residuals. Directions of joint values have none."""
+    (position, orientation), joints = fit.rms, fit.motion.joints
+    if fit.rows == 3:
+        return ObservationNoise(position / math.sqrt(max(1.0, 3.0 - joints)), None, True)
+    root = math.sqrt(max(0.5, 3.0 - 0.5 * joints))
+    return ObservationNoise(position / root, orientation / root, True)
 
 
 def estimated_noise(found: IdentificationResult, pair: RecordedPair) -> ObservationNoise:
