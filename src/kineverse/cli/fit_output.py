@@ -88,7 +88,7 @@ def format_doubt(learned: RecordedJoint) -> str:
     """Return the reason why a joint is ambiguous: the result itself, or what it depends on."""
     found = learned.found
     if not learned.objections:
-        return str(found)
+        return "no joint explains these poses" if learned.is_free else str(found)
     answers = [] if found.is_ambiguous else [f"{found.best.family} if {_format_assumption(learned, learned)}"]
     for other in learned.objections:
         result = other.found

@@ -5,7 +5,7 @@ integrated autocorrelation time
 
     τ = 1 + 2 Σ ρ_k
 
-N observations are worth N / τ independent ones. The sum is cut off at a lag of 5 τ (Sokal 1997), because
+N observations are worth N / τ independent ones. The sum is cut off at a lag of 3 τ (Sokal 1997), because
 correlations at larger lags are noise. With M lags, τ has a relative standard deviation of √((4 M + 2) / N).
 """
 
@@ -23,9 +23,9 @@ LEAST_EFFECTIVE = 8
 # Least number of rows to estimate a correlation from.
 _LEAST_COUNT = 20
 # Cut-off of the sum, in autocorrelation times.
-_WINDOW = 5
-# Mean correlation over the first lags, in standard deviations, below which errors count as independent.
-_CHANCE = 2.5
+_WINDOW = 3
+# Number of first lags, and their mean correlation in standard deviations, below which errors are independent.
+_FIRST, _CHANCE = 5, 2.5
 
 
 def effective_sample_size(residuals: Array) -> int:
@@ -64,7 +64,7 @@ def _component_time(errors: Array, deviations: float) -> float:
     spectrum = np.fft.rfft(np.clip(errors, -4.5 * middle, 4.5 * middle), 2 * count)
     correlations = np.fft.irfft(np.abs(spectrum) ** 2)[: count // 2]
     correlations /= correlations[0]
-    if correlations[1 : 1 + _WINDOW].mean() < _CHANCE / math.sqrt(_WINDOW * count):
+    if correlations[1 : 1 + _FIRST].mean() < _CHANCE / math.sqrt(_FIRST * count):
         return 1.0
     times = 1.0 + 2.0 * np.cumsum(correlations[1:])
     lags = np.arange(1, len(correlations))

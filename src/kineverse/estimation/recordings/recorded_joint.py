@@ -43,6 +43,8 @@ _CAUTION = 1.0
 _ROWS_PER_TIME, _ENOUGH_ROWS = 8, 100
 # Log ratio of the probability of the observations at which one noise is refuted by another.
 _REFUTED = math.log(20.0)
+# Factor on the size of residuals at which the noise explains them amply.
+_AMPLE = 1.5
 # Relative difference of autocorrelation times that matters.
 _LONGER = 1.1
 # Ratio of autocorrelation times below which residuals are as smooth as others, and above which motion is not
@@ -129,8 +131,13 @@ class RecordedJoint:
 
     @property
     def is_ambiguous(self) -> bool:
-        """True if the data do not determine the joint, or only under some of the assumptions."""
-        return self.found.is_ambiguous or bool(self.objections)
+        """True if the data do not determine a joint, or only under some of the assumptions."""
+        return self.found.is_ambiguous or self.is_free or bool(self.objections)
+
+    @property
+    def is_free(self) -> bool:
+        """True if no joint explains the motion."""
+        return self.found.best.family == "free"
 
 
 def identify_recorded_joint(
@@ -264,7 +271,7 @@ class _Comparison:
         family = best.found.best.family
         for name, fit in fits.items():
             if family in fits and _is_noise(fit, fits[family], times[name], times[family]):
-                other = self.assume(residual_noise(fit), best.correlation_time, rows)
+                other = self.assume(_largest_noise(fit).scaled(_AMPLE), best.correlation_time, rows)
                 if other.found.best.family == name:
                     yield other
         noises = [best.noise.scaled(0.5), best.noise.scaled(2.0)]
@@ -303,7 +310,16 @@ def _is_noise(fit: Fit, best: Fit, time: float, best_time: float) -> bool:
     if fit.motion.joints >= best.motion.joints or time > _AS_SMOOTH * best_time:
         return False
     values = best.joint_values[best.inliers]
+    if LEAST_EFFECTIVE * time >= len(values):
+        return False  # the time is at its bound, and may be longer
     return correlation_time(values - values.mean(axis=0)) > _SMOOTHER * time
+
+
+def _largest_noise(fit: Fit) -> ObservationNoise:
+    """Return noise as large in all directions as the residuals are in the worst one."""
+    deviations = np.sqrt(np.mean(fit.residuals[fit.inliers] ** 2, axis=0))
+    orientation = float(deviations[3:].max()) if fit.rows == 6 else None
+    return ObservationNoise(float(deviations[:3].max()), orientation, True)
 
 
 def residual_noise(fit: Fit) -> ObservationNoise:
