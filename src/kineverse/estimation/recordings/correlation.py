@@ -22,6 +22,8 @@ LEAST_EFFECTIVE = 8
 
 # Least number of rows to estimate a correlation from.
 _LEAST_COUNT = 20
+# Least size of a component relative to the largest.
+_SHARE = 0.2
 # Cut-off of the sum, in autocorrelation times.
 _WINDOW = 3
 # Number of first lags, and their mean correlation in standard deviations, below which errors are independent.
@@ -40,26 +42,33 @@ def effective_sample_size(residuals: Array) -> int:
 def correlation_time(residuals: Array, deviations: float = 0.0) -> float:
     """Return the autocorrelation time of residuals (N, m) in order, in rows.
 
-    The component with the largest one counts. Outliers are clipped. Twenty rows or fewer cannot show a
-    correlation, and have the time 1.
+    The component with the largest one counts, among those that are not small beside the others of positions
+    or orientations.
+    Outliers are clipped. Twenty rows or fewer cannot show a correlation, and have the time 1.
 
     Parameters
     ----------
     residuals
-        Residuals of neighbours next to each other.
+        Residuals of neighbours next to each other, the three of positions first.
     deviations
         Number of standard deviations that are added to each estimate, for an upper confidence bound.
     """
     if len(residuals) <= _LEAST_COUNT:
         return 1.0
-    return max(_component_time(column, deviations) for column in residuals.T)
+    sizes = np.median(np.abs(residuals), axis=0)
+    kept = [
+        residuals[:, k]
+        for block in (range(3), range(3, residuals.shape[1]))
+        for k in block
+        if k < len(sizes)
+        and sizes[k] > 0.0
+        and sizes[k] >= _SHARE * max(sizes[i] for i in block if i < len(sizes))
+    ]
+    return max((_component_time(column, deviations) for column in kept), default=1.0)
 
 
 def _component_time(errors: Array, deviations: float) -> float:
-    middle = float(np.median(np.abs(errors)))
-    if middle == 0.0:
-        return 1.0
-    count = len(errors)
+    middle, count = float(np.median(np.abs(errors))), len(errors)
     # Clip at three standard deviations.
     spectrum = np.fft.rfft(np.clip(errors, -4.5 * middle, 4.5 * middle), 2 * count)
     correlations = np.fft.irfft(np.abs(spectrum) ** 2)[: count // 2]

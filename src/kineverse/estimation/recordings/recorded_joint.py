@@ -43,6 +43,8 @@ _CAUTION = 1.0
 _ROWS_PER_TIME, _ENOUGH_ROWS = 8, 100
 # Log ratio of the probability of the observations at which one noise is refuted by another.
 _REFUTED = math.log(20.0)
+# Size of residuals that avoids a division by zero [m], [rad].
+_TINY = 1e-12
 # Factor on the size of residuals at which the noise explains them amply.
 _AMPLE = 1.5
 # Relative difference of autocorrelation times that matters.
@@ -238,7 +240,7 @@ class _Comparison:
     def correlation_time(self, fit: Fit) -> float:
         """Return the autocorrelation time of the residuals of a fit to all distinct rows."""
         most = max(1.0, len(self.distinct) / LEAST_EFFECTIVE)
-        return min(most, correlation_time(fit.residuals[fit.inliers], _CAUTION))
+        return min(most, correlation_time(_residuals_across_motion(fit), _CAUTION))
 
     def sufficient_rows(self, time: float, fit: Fit) -> Indices:
         """Return evenly spaced rows; more of them hold little more about errors with this time."""
@@ -300,6 +302,20 @@ class _Comparison:
             stated=noise.given,
             sequential=pair.is_timed,
         )
+
+
+def _residuals_across_motion(fit: Fit) -> Array:
+    """Return the residuals of inliers without the part along the motion of the joint.
+
+    Joint values follow the observations. What they leave over is no error, but follows the motion slowly.
+    """
+    residuals = fit.residuals[fit.inliers]
+    by_joints = fit.motion.linearise(fit.joint_values[fit.inliers]).by_joints[:, : fit.rows]
+    squares = np.mean(residuals**2, axis=0)
+    sizes = np.sqrt([squares[:3].mean()] * 3 + [squares[3:].mean()] * (fit.rows - 3)) + _TINY
+    across, along = residuals / sizes, np.linalg.qr(by_joints / sizes[:, None])[0]
+    result: Array = across - np.einsum("nik,njk,nj->ni", along, along, across)
+    return result * sizes
 
 
 def _is_noise(fit: Fit, best: Fit, time: float, best_time: float) -> bool:
