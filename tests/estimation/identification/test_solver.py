@@ -192,10 +192,12 @@ def test_c_stays_within_its_work_memory(family: str, how: str, monkeypatch: pyte
 def test_evidence_in_c_agrees_with_numpy(family: str, how: str) -> None:
     seen = seen_as(how, family)
     solution = solver.maximum_likelihood(seen, [*initial_guesses(family, MotionStatistics(seen))]).solution
-    for scale in (1.0, 3.0):
-        slow, fast = laplace_evidence(solution.scaled(scale)), solver.evidence(solution, scale)
+    for scale, weight in ((1.0, 1.0), (3.0, 1.0), (2.0, 0.1)):
+        slow = laplace_evidence(solution.scaled(scale), weight)
+        fast = solver.evidence(solution, scale, weight)
         assert fast.log_evidence == pytest.approx(slow.log_evidence, rel=1e-9)
-        assert solver.log_evidences(solution, np.array([scale])) == pytest.approx(slow.log_evidence, rel=1e-9)
+        logs = solver.log_evidences(solution, np.array([scale]), weight)
+        assert logs == pytest.approx(slow.log_evidence, rel=1e-9)
         np.testing.assert_allclose(slow.covariance, fast.covariance, rtol=1e-6, atol=1e-12)
         np.testing.assert_allclose(slow.joint_values, fast.joint_values, atol=1e-9)
         np.testing.assert_allclose(slow.joint_covariances, fast.joint_covariances, atol=1e-12)

@@ -311,8 +311,7 @@ def _residuals_across_motion(fit: Fit) -> Array:
     """
     residuals = fit.residuals[fit.inliers]
     by_joints = fit.motion.linearise(fit.joint_values[fit.inliers]).by_joints[:, : fit.rows]
-    squares = np.mean(residuals**2, axis=0)
-    sizes = np.sqrt([squares[:3].mean()] * 3 + [squares[3:].mean()] * (fit.rows - 3)) + _TINY
+    sizes = np.repeat(fit.rms, 3)[: fit.rows] + _TINY
     across, along = residuals / sizes, np.linalg.qr(by_joints / sizes[:, None])[0]
     result: Array = across - np.einsum("nik,njk,nj->ni", along, along, across)
     return result * sizes
