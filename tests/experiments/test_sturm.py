@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -10,12 +11,19 @@ import pytest
 
 from kineverse.cli import main
 from kineverse.errors import FormatError
+from kineverse.estimation.recordings import RecordedPair
 from kineverse.experiments import Options, reproduce
 from kineverse.experiments.sturm.classify import (
     classify_recording,
     draw_recordings,
     figure_size,
     report_recordings,
+)
+from kineverse.experiments.sturm.noise_statements import (
+    STATEMENTS,
+    answer_statements,
+    statement_numbers,
+    statement_table,
 )
 from kineverse.experiments.sturm.recordings import (
     POSITION,
@@ -112,7 +120,7 @@ def test_missing_recordings_are_an_error_with_their_place(tmp_path, monkeypatch)
 
 
 def test_the_command_takes_the_folder(folder, capsys):
-    assert main(["reproduce", "sturm", "--data", str(folder), "--json", "--no-figure"]) == 0
+    assert main(["reproduce", "sturm", "--data", str(folder), "--quick", "--json", "--no-figure"]) == 0
     answer = json.loads(capsys.readouterr().out)
     assert [r["name"] for r in answer["recordings"]] == [
         "cabinet_one/001",
@@ -120,10 +128,23 @@ def test_the_command_takes_the_folder(folder, capsys):
         "models_data/door",
     ]
     assert answer["recordings"][0]["radius"] == pytest.approx(0.4, abs=0.02)
+    assert "all_poses" not in answer
+
+
+def test_all_poses_are_judged_under_each_statement_of_the_noise():
+    points = arc(0.4, 1.5)
+    pair = RecordedPair("world", "door", None, points, np.arange(len(points)))
+    answers = answer_statements("an arc", "revolute", pair)
+    assert [one.statement for one in answers] == [*STATEMENTS]
+    assert not [one for one in answers if one.verdict == "wrong"]
+    table = statement_table(answers)
+    assert table.rows[1] == ("stated, as large as the residuals of the labelled joint", 1.0, 0.0, 0.0)
+    wrong = [replace(one, family="prismatic", is_sure=True) for one in answers]
+    assert statement_numbers(wrong)["half"]["not_right"] == {"an arc": "prismatic, wrong"}
 
 
 @pytest.mark.skipif(not TRACKS.exists(), reason=f"no {TRACKS}")
 def test_at_least_95_percent_of_the_published_recordings_are_right():
-    found = reproduce("sturm", options=Options(data=TRACKS))
+    found = reproduce("sturm", options=Options(quick=True, data=TRACKS))
     assert len(found.numbers["recordings"]) == 60
     assert found.numbers["right"] >= 0.95

@@ -5,17 +5,14 @@ from __future__ import annotations
 import argparse
 import json
 import sys
-from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
 from kineverse.cli.arguments import parse_length, parse_value
 from kineverse.cli.output import show_activity
 from kineverse.errors import InvalidValueError
-from kineverse.lie import Array
 
 if TYPE_CHECKING:
-    from kineverse.estimation import Fit, IdentificationResult
-    from kineverse.estimation.recordings import RecordedPair
+    from kineverse.estimation.recordings import ObservationNoise, RecordedJoint, RecordedPair
 
 
 HELP = """identify the joint of a part from a table of its poses
@@ -25,9 +22,12 @@ pitch, yaw, or rx, ry, rz, a rotation vector), in m, rad and s unless a unit fol
 a part in each row, or all parts are in one row, and then columns are called door.x. Without a head, 3 columns
 are positions and 7 are poses.
 
-Errors of observations are assumed to be independent. Those of a camera at 30 Hz are not. If the residuals of
-neighbours are correlated, families are compared by a subset of the poses, evenly over the recording, as large
-as the effective sample size. --thin N sets another size.
+Errors of a camera at 30 Hz are alike in neighbouring rows. The time over which the residuals are correlated
+is estimated, and the poses count for as many independent ones as they are worth. --thin N takes N poses,
+evenly over the recording, as independent.
+
+The answer is compared with those for half and twice the noise, and for the noise of the residuals. If it
+depends on these, it is ambiguous, and the other answers are printed.
 
 Joints of all kinds are tried: rigid, prismatic, revolute, screw, cylindrical, spherical, planar, free. Each
 gets its probability, given the observations.
@@ -41,27 +41,6 @@ examples:
   kineverse fit poses.csv --child door --document door.kv.json     then: kineverse view door.kv.json"""
 
 AMBIGUOUS = 1
-
-MAX_ROTATION_STEP = 2.0
-"""Largest rotation between successive poses for which revolutions are counted reliably [rad]."""
-
-
-@dataclass(frozen=True)
-class ObservationNoise:
-    """Assumed noise of the observations.
-
-    Attributes
-    ----------
-    position, orientation
-        Standard deviations of each coordinate [m] and about each axis [rad]; orientation is None if only
-        positions are observed.
-    given
-        True if they were given, False if estimated.
-    """
-
-    position: float
-    orientation: float | None
-    given: bool
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -86,7 +65,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "--thin",
         metavar="N",
         type=int,
-        help="number of poses to use, evenly spaced (the effective sample size)",
+        help="number of poses to use, evenly spaced, with independent errors (all, by their correlation)",
     )
     parser.add_argument("--families", metavar="NAMES", help="joint families to try: prismatic,revolute (all)")
     parser.add_argument("--picture", metavar="FILE", help="draw the observations and the joint (.png, .svg)")
@@ -97,7 +76,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 def run(arguments: argparse.Namespace) -> int:
     """Read the table, identify the joint, and print, draw and save it."""
     from kineverse.cli.fit_output import fit_to_json, format_fit
-    from kineverse.estimation.recordings import read_recording
+    from kineverse.estimation.recordings import identify_recorded_joint, read_recording
 
     if arguments.document and not arguments.document.endswith(".kv.json"):
         raise InvalidValueError(
@@ -114,8 +93,10 @@ def run(arguments: argparse.Namespace) -> int:
         print(f"kineverse: note: {pair.unpaired} poses of one part without the other", file=sys.stderr)
     if arguments.thin is not None:
         pair = pair.thin(arguments.thin)
+    noise = None if stated is None else check_noise(stated, pair)
+    families = None if arguments.families is None else [n.strip() for n in arguments.families.split(",")]
     with show_activity(f"learning from {len(pair.lines)} poses"):
-        learned = fit_joint(pair, stated, arguments.families, arguments.thin is None)
+        learned = identify_recorded_joint(pair, noise, families, independent=arguments.thin is not None)
     written = write_results(arguments, pair, learned)
     if arguments.json:
         answer = {"poses": arguments.poses, **fit_to_json(pair, learned), **written}
@@ -125,7 +106,7 @@ def run(arguments: argparse.Namespace) -> int:
         for what, path in written.items():
             if path:
                 print(f"{what}: {path}")
-    return AMBIGUOUS if learned.found.is_ambiguous else 0
+    return AMBIGUOUS if learned.is_ambiguous else 0
 
 
 def parse_noise(text: str) -> tuple[float, float | None]:
@@ -150,121 +131,25 @@ def parse_noise(text: str) -> tuple[float, float | None]:
     return position, orientation
 
 
-@dataclass(frozen=True)
-class LearnedJoint:
-    """Joint identified from poses.
-
-    Attributes
-    ----------
-    found
-        All families, with their probabilities.
-    noise
-        Noise of the observations.
-    judged
-        Number of poses that the families were compared by.
-    fit
-        Fit of the most probable family to all poses, outliers marked.
-    """
-
-    found: IdentificationResult
-    noise: ObservationNoise
-    judged: int
-    fit: Fit
-
-
-def fit_joint(
-    pair: RecordedPair, stated: tuple[float, float | None] | None, families: str | None, thins: bool
-) -> LearnedJoint:
-    """Identify a joint; if ``thins``, from as many poses as the effective sample size.
-
-    Raises
-    ------
-    InvalidValueError, UnknownNameError
-        See :func:`identify_joint`.
-    """
-    from kineverse.estimation import Outliers
-    from kineverse.estimation.identification.observations import check_observations
-    from kineverse.estimation.identification.projection import complete_fit
-    from kineverse.estimation.recordings import spaced_indices
-
-    found, noise = identify_joint(pair, stated, families)
-    count = count_independent(found, pair) if thins else len(pair.lines)
-    if count == len(pair.lines):
-        return LearnedJoint(found, noise, count, found.best)
-    judged = spaced_indices(len(pair.lines), count)
-    found, noise = identify_joint(pair.select(judged), stated, families)
-    covariance = make_covariance(noise.position, noise.orientation)
-    observations = check_observations(pair.parent_poses, pair.child_poses, covariance, covariance)
-    fit = complete_fit(
-        found.best, observations, judged, outliers=Outliers(), stated=noise.given, sequential=pair.is_timed
-    )
-    return LearnedJoint(found, noise, count, fit)
-
-
-def identify_joint(
-    pair: RecordedPair, stated: tuple[float, float | None] | None, families: str | None
-) -> tuple[IdentificationResult, ObservationNoise]:
-    """Identify a joint from all poses, and return it with the noise of the observations.
+def check_noise(stated: tuple[float, float | None], pair: RecordedPair) -> ObservationNoise:
+    """Return the stated noise of the observations of a pair.
 
     Raises
     ------
     InvalidValueError
-        If the noise of orientations is missing, or the poses do not allow an identification.
-    UnknownNameError
-        For a family that does not exist.
+        If the noise of orientations is missing.
     """
-    from kineverse.estimation import identify
+    from kineverse.estimation.recordings import ObservationNoise
 
-    if stated is not None and stated[1] is None and pair.has_orientation:
+    position, orientation = stated
+    if orientation is None and pair.has_orientation:
         raise InvalidValueError("--noise: poses have two, of positions and orientations: 3mm,1deg")
-    chosen = None if families is None else [name.strip() for name in families.split(",")]
-    covariance = None if stated is None else make_covariance(*stated)
-    found = identify(
-        pair.parent_poses,
-        pair.child_poses,
-        noise=covariance,
-        families=chosen,
-        outliers=True,
-        sequential=pair.is_timed,
-    )
-    noise = found.noise if stated is None else stated
-    assert noise is not None  # it is estimated if it is not stated
-    position, orientation = noise
-    return found, ObservationNoise(
-        position, orientation if pair.has_orientation else None, stated is not None
-    )
+    return ObservationNoise(position, orientation if pair.has_orientation else None, True)
 
 
-def make_covariance(position: float, orientation: float | None) -> Array:
-    """Return the covariance of poses (6, 6); for positions alone its orientation block is unused."""
-    from kineverse.estimation import pose_covariance
-
-    return pose_covariance(position, orientation or 1.0)
-
-
-def count_independent(found: IdentificationResult, pair: RecordedPair) -> int:
-    """Return the effective sample size of the poses, by the residuals of the most probable joint."""
-    from kineverse.estimation.recordings import effective_sample_size, spaced_indices
-
-    count = len(pair.lines)
-    # The free family has no residuals.
-    fit = next((fit for fit in found if fit.family != "free"), None)
-    if fit is None:
-        return count
-    # Outliers carry no information: the share of inliers in the subset is that in the recording.
-    inliers = len(fit.inliers)
-    size = min(count, round(effective_sample_size(fit.residuals[fit.inliers]) * count / inliers))
-    # The subset must be dense enough to count revolutions.
-    while (
-        pair.is_timed
-        and size < count
-        and fit.select(spaced_indices(count, size)).largest_turn > MAX_ROTATION_STEP
-    ):
-        size += 1
-    return size
-
-
-def write_results(arguments: argparse.Namespace, pair: RecordedPair, learned: LearnedJoint) -> dict[str, Any]:
+def write_results(
+    arguments: argparse.Namespace, pair: RecordedPair, learned: RecordedJoint
+) -> dict[str, Any]:
     """Write the requested picture and document, and return their paths."""
     fit = learned.fit
     if arguments.picture:

@@ -23,9 +23,8 @@ from kineverse.model.operations import SetBody
 from kineverse.spatial import translation
 
 if TYPE_CHECKING:
-    from kineverse.cli.fit import LearnedJoint, ObservationNoise
     from kineverse.estimation import Fit, IdentificationResult
-    from kineverse.estimation.recordings import RecordedPair
+    from kineverse.estimation.recordings import Assumption, ObservationNoise, RecordedJoint, RecordedPair
 
 _LEAST_PROBABILITY = 1e-4
 """Less probable families are named without numbers."""
@@ -34,16 +33,16 @@ _MOST_LISTED = 10
 """Number of outliers listed."""
 
 
-def format_fit(source: str, pair: RecordedPair, learned: LearnedJoint) -> str:
+def format_fit(source: str, pair: RecordedPair, learned: RecordedJoint) -> str:
     """Return the joint as text, with its uncertainty and the alternatives."""
     found, best, count = learned.found, learned.fit, len(pair.child_poses)
     verdict = f"{best.family}, {_format_percent(best.probability)}"
-    if found.is_ambiguous:
-        verdict = f"{found}\nThe most probable one: {verdict}"
+    if learned.is_ambiguous:
+        verdict = f"{format_doubt(learned)}\nThe most probable one: {verdict}"
     what = "poses" if pair.child_poses.ndim == 3 else "positions"
     lines = [
         f"{pair.child} in {pair.parent}: {count} {what} ({source})",
-        *_format_subset(learned.judged, count),
+        *_format_correlation(learned, count),
         f"noise: {_format_noise(learned.noise)}",
         "",
         verdict,
@@ -56,7 +55,7 @@ def format_fit(source: str, pair: RecordedPair, learned: LearnedJoint) -> str:
     return "\n".join(lines)
 
 
-def fit_to_json(pair: RecordedPair, learned: LearnedJoint) -> dict[str, Any]:
+def fit_to_json(pair: RecordedPair, learned: RecordedJoint) -> dict[str, Any]:
     """Return the identified joints as JSON data."""
     found, noise = learned.found, learned.noise
     return {
@@ -66,26 +65,70 @@ def fit_to_json(pair: RecordedPair, learned: LearnedJoint) -> dict[str, Any]:
         "judged": learned.judged,
         "orientations": pair.child_poses.ndim == 3,
         "noise": {"position": noise.position, "orientation": noise.orientation, "given": noise.given},
-        "told": not found.is_ambiguous,
+        "correlation_time": learned.correlation_time,
+        "repeated": learned.repeated,
+        "told": not learned.is_ambiguous,
         "family": found.best.family,
-        "says": str(found),
+        "says": format_doubt(learned) if learned.is_ambiguous else str(found),
+        "objections": [
+            {
+                "family": other.found.best.family,
+                "probability": other.found.best.probability,
+                "noise": {"position": other.noise.position, "orientation": other.noise.orientation},
+                "correlation_time": other.correlation_time,
+            }
+            for other in learned.objections
+        ],
         "outliers": list(learned.fit.outliers),
         "fits": [_fit_to_json(fit) for fit in (learned.fit, *found.fits[1:])],
     }
 
 
-def _format_subset(judged: int, count: int) -> list[str]:
-    if judged == count:
-        return []
-    return [f"judged by {judged} of them, as errors of neighbours are alike (--thin {count} takes all)"]
+def format_doubt(learned: RecordedJoint) -> str:
+    """Return the reason why a joint is ambiguous: the result itself, or what it depends on."""
+    found = learned.found
+    if not learned.objections:
+        return "no joint explains these poses" if learned.is_free else str(found)
+    answers = [] if found.is_ambiguous else [f"{found.best.family} if {_format_assumption(learned, learned)}"]
+    for other in learned.objections:
+        result = other.found
+        answer = "nothing is sure" if result.is_ambiguous else result.best.family
+        answers.append(f"{answer} if {_format_assumption(other, learned)}")
+    first = f"{found}; " if found.is_ambiguous else "cannot tell: "
+    return first + ", ".join(answers)
+
+
+def _format_assumption(assumed: RecordedJoint | Assumption, made: RecordedJoint) -> str:
+    """Return the noise, or the correlation time if that is what differs from the assumption made."""
+    if assumed.correlation_time != made.correlation_time:
+        return f"errors are alike over {format_number(assumed.correlation_time, 2)} rows"
+    return f"the noise is {_format_deviations(assumed.noise)}"
+
+
+def _format_correlation(learned: RecordedJoint, count: int) -> list[str]:
+    """Return lines on repeated rows and on correlated errors."""
+    lines = []
+    if learned.repeated:
+        do = "row repeats" if learned.repeated == 1 else "rows repeat"
+        lines.append(f"{learned.repeated} {do} the one before in every digit, and count as not there")
+    if learned.judged < count - learned.repeated:
+        time = format_number(learned.correlation_time, 2)
+        lines.append(
+            f"errors are alike over {time} rows, so these are worth {learned.judged} independent ones "
+            f"(--thin {count} takes all as independent)"
+        )
+    return lines
 
 
 def _format_noise(noise: ObservationNoise) -> str:
-    angle = (
-        "" if noise.orientation is None else f" and {format_number(math.degrees(noise.orientation), 3)} deg"
-    )
-    how = "as given" if noise.given else "estimated"
-    return f"{format_number(1e3 * noise.position, 3)} mm{angle}, {how}"
+    return f"{_format_deviations(noise)}, {'as given' if noise.given else 'estimated'}"
+
+
+def _format_deviations(noise: ObservationNoise) -> str:
+    position = f"{format_number(1e3 * noise.position, 3)} mm"
+    if noise.orientation is None:
+        return position
+    return f"{position} and {format_number(math.degrees(noise.orientation), 3)} deg"
 
 
 def _format_parameters(fit: Fit) -> list[tuple[str, str]]:
@@ -126,7 +169,7 @@ def _format_outliers(outliers: Sequence[int], count: int, what: str) -> list[str
 
 def _revolution_warning(fit: Fit, pair: RecordedPair) -> list[str]:
     """Return a warning if revolutions may be miscounted."""
-    from kineverse.cli.fit import MAX_ROTATION_STEP
+    from kineverse.estimation.recordings.recorded_joint import MAX_ROTATION_STEP
 
     if not pair.is_timed or fit.largest_turn < MAX_ROTATION_STEP:
         return []

@@ -116,3 +116,25 @@ def test_a_fit_with_as_many_unknowns_as_measurements_is_not_determined(count: in
     found = identify(None, seen.true_relative[:, :3, 3], noise=seen.covariance)
     assert found.is_ambiguous
     assert not found["prismatic" if count == 2 else "revolute"].is_determined
+
+
+@pytest.mark.parametrize("stated", [True, False])
+def test_repeated_observations_count_once_with_their_correlation_time(stated: bool) -> None:
+    """Each observation five times, with a correlation time of five, is as good as each once."""
+    seen = recording("revolute", count=20, position=0.005, orientation=0.01, seed=6)
+    noise = seen.covariance if stated else None
+    once = identify(seen.parent, seen.child, noise=noise)
+    parents, children = np.repeat(seen.parent, 5, axis=0), np.repeat(seen.child, 5, axis=0)
+    five = identify(parents, children, noise=noise, correlation_time=5.0)
+    sure = identify(parents, children, noise=noise)
+    if not stated:
+        np.testing.assert_allclose(five.noise, once.noise, rtol=0.02)
+    for name, probability in once.probabilities.items():
+        assert five.probabilities[name] == pytest.approx(probability, rel=0.1, abs=1e-6)
+    np.testing.assert_allclose(five.best.covariance, once.best.covariance, rtol=0.05, atol=1e-9)
+    np.testing.assert_allclose(
+        5.0 * sure.best.deviation("axis.x") ** 2, once.best.deviation("axis.x") ** 2, rtol=0.1
+    )
+    for wrong in (0.5, np.nan, np.inf):
+        with pytest.raises(kv.errors.InvalidValueError, match="at least 1"):
+            identify(parents, children, noise=noise, correlation_time=wrong)

@@ -6,7 +6,7 @@ typedef struct {
   double *values, *covariances, log_likelihood, deviations[6], mean[6], log_density;
 } Apart;
 
-/* As solve_per_observation in range_prior.py. */
+/* As solve_per_observation in range_prior.py. The log likelihood is times the weight of observations. */
 static void alone(const Problem *p, const Answer *a, Apart *apart) {
   int m = (int)p->rows, n = (int)p->joints;
   double log_likelihood = 0.0, *values = apart->values, *covariances = apart->covariances;
@@ -41,7 +41,7 @@ static void alone(const Problem *p, const Answer *a, Apart *apart) {
     /* |C| is one over the square of the root that is known. */
     log_likelihood -= 0.5 * squared(left, W, m) + log(root * known) + 0.5 * (m - n) * log(TAU);
   }
-  apart->log_likelihood = log_likelihood;
+  apart->log_likelihood = p->weight * log_likelihood;
 }
 
 /* Fold products of at most eight weights into a logarithm: so many are far from what a double can hold. */
@@ -53,7 +53,8 @@ static double logs_of(double *product) {
 }
 
 /* The log of the density of values around 0 at a width, with their mean integrated out; eight at once. */
-static double density(int64_t count, const double *values, const double *variances, double width) {
+static double density(int64_t count, const double *values, const double *variances, double width,
+                      double weight) {
   double s0[8] = {0}, s1[8] = {0}, s2[8] = {0}, product[8] = {1, 1, 1, 1, 1, 1, 1, 1};
   double square = width * width, logs = 0.0;
   int64_t whole = count - count % 8;
@@ -80,7 +81,7 @@ static double density(int64_t count, const double *values, const double *varianc
     s1[0] += s1[l];
     s2[0] += s2[l];
   }
-  return 0.5 * (logs - log(s0[0]) - (s2[0] - s1[0] * s1[0] / s0[0]));
+  return 0.5 * (weight * (logs - (s2[0] - s1[0] * s1[0] / s0[0])) - log(s0[0]));
 }
 
 /* The best width of several columns of values, and the logarithm of the mean over all of them relative to the
@@ -92,7 +93,7 @@ static double widest(const Problem *p, int64_t columns, const double *values, co
   for (int64_t g = 0; g < p->widths; g++) {
     logs[g] = 0.0;
     for (int64_t c = 0; c < columns; c++)
-      logs[g] += density(count, values + count * c, variances + count * c, p->grid[g]);
+      logs[g] += density(count, values + count * c, variances + count * c, p->grid[g], p->weight);
     if (logs[g] > logs[top]) top = g;
   }
   best = log(p->grid[top]);
@@ -154,7 +155,7 @@ static void widths(const Problem *p, Apart *apart, double *memory) {
   for (int64_t k = 0; k < count; k++) {
     double off[6], root = widened(covariances + n * n * k, n, deviations, W);
     for (int i = 0; i < n; i++) off[i] = values[n * k + i] - mean[i];
-    result -= 0.5 * squared(off, W, n) + log(root) + 0.5 * n * log(TAU);
+    result -= p->weight * (0.5 * squared(off, W, n) + log(root) + 0.5 * n * log(TAU));
   }
   apart->log_density = result;
 }

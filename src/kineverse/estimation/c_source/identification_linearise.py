@@ -31,6 +31,7 @@ typedef struct {
   const double *parent, *child, *parent_covariance, *child_covariance, *softness;
   /* Constants of the modules that say the same in numpy. */
   double reach_scale, pitch_scale, close, little, narrowest, settled, better, slid;
+  double weight; /* of each observation in the evidence */
   int64_t steps, first_steps, turns, sliding_turns, mirrored_turns, mirrored_steps, widths;
   const double *grid;
   /* What a stage works with at the moment. */

@@ -62,7 +62,8 @@ static void informed(const Problem *p, const Answer *a, const Apart *apart, doub
         for (int j = 0; j < UNKNOWNS; j++)
           total[UNKNOWNS * i + j] += both[UNKNOWNS * r + i] * weighted[UNKNOWNS * r + j];
   }
-  for (int i = 0; i < n; i++) memcpy(information + n * i, total + UNKNOWNS * i, n * sizeof(double));
+  for (int i = 0; i < n; i++)
+    for (int j = 0; j < n; j++) information[n * i + j] = p->weight * total[UNKNOWNS * i + j];
 }
 
 static int has(const int64_t *components, int64_t count, int64_t component) {

@@ -55,22 +55,25 @@ class Evidence:
         return Evidence(log, invert_matrices(information)[:size, :size], values, covariances)
 
 
-def laplace_evidence(solution: Solution[FamilyMember]) -> Evidence:
-    """Return the evidence of a family, by the quadratic approximation around its most likely member."""
+def laplace_evidence(solution: Solution[FamilyMember], weight: float = 1.0) -> Evidence:
+    """Return the evidence of a family, by the quadratic approximation around its most likely member.
+
+    Each observation's log likelihood counts with the weight. It is below 1 if errors are correlated.
+    """
     motion, size = solution.motion, solution.motion.size
     per_observation = solve_per_observation(solution)
     ranges = (
-        fit_joint_ranges(motion, per_observation)
+        fit_joint_ranges(motion, per_observation, weight)
         if motion.joints
         else JointRanges(np.zeros(0), np.zeros(0), 0.0)
     )
     values, covariances = _posterior_joint_values(per_observation, ranges)
-    information = _information(solution, ranges, values)
+    information = weight * _information(solution, ranges, values)
     prior = motion.prior().by_parameters
     information[:size, :size] += prior.T @ prior
     log_prior, precision = motion.log_prior(ranges.mean)
     information[np.diag_indices_from(information)] += precision
-    log = per_observation.log_likelihood + ranges.log_density + log_prior
+    log = weight * per_observation.log_likelihood + ranges.log_density + log_prior
     log += 0.5 * len(information) * math.log(math.tau) - 0.5 * float(np.linalg.slogdet(information)[1])
     return Evidence.from_information(log, information, size, values, covariances)
 

@@ -37,6 +37,7 @@ from .unknown_noise import (
     adapt_noise,
     scale_noise,
     solve_unknown_noise,
+    weigh_observations,
 )
 from .unwrapping import log_unwrapping_gain, unwrap_screw, unwrap_solution
 
@@ -75,6 +76,7 @@ def identify(
     noise: npt.ArrayLike | None = None,
     outliers: Outliers | bool | None = None,
     sequential: bool = False,
+    correlation_time: float = 1.0,
 ) -> IdentificationResult:
     """Identify the joint between a parent and a child from noisy poses of both.
 
@@ -99,6 +101,9 @@ def identify(
     sequential
         True if the observations are in temporal order, with less than half a revolution from one to the
         next. Revolutions are counted then, see :mod:`.unwrapping`.
+    correlation_time
+        Number of observations τ that are worth one independent observation. The log likelihood is divided
+        by it, and the covariances of parameters are multiplied by it. 1 stands for independent errors.
 
     Returns
     -------
@@ -117,7 +122,13 @@ def identify(
         parent_poses is not None, parent_covariance, child_covariance, noise
     )
     observations = check_observations(parent_poses, child_poses, parent_covariance, child_covariance)
-    data = prepare_data(observations, stated, as_outliers(outliers), sequential)
+    if not 1.0 <= correlation_time < math.inf:
+        raise InvalidValueError(
+            f"The correlation time is a number of observations, at least 1, not {correlation_time!r}."
+        )
+    data = prepare_data(
+        observations, stated, as_outliers(outliers), sequential, observation_weight=1.0 / correlation_time
+    )
     return weigh_families(data, solve_with_inliers(data, weights), weights)
 
 
@@ -193,6 +204,8 @@ class IdentificationData:
         Outlier model, with lengths in the unit; None if all observations are inliers.
     sequential
         True if the observations are in temporal order.
+    observation_weight
+        Factor on the log likelihood of each observation, below 1 for correlated errors.
     """
 
     observations: Observations
@@ -200,6 +213,7 @@ class IdentificationData:
     stated: bool
     outliers: Outliers | None
     sequential: bool
+    observation_weight: float = 1.0
 
 
 @dataclass(frozen=True)
@@ -239,12 +253,14 @@ def prepare_data(
     outliers: Outliers | None,
     sequential: bool,
     unit: float | None = None,
+    observation_weight: float = 1.0,
 ) -> IdentificationData:
     """Return observations in a unit of length [m], by default their own length scale."""
     unit = length_scale(observations) if unit is None else unit
     if outliers is not None and outliers != Outliers():
         outliers = replace(outliers, reach=outliers.reach / unit)
-    return IdentificationData(convert_to_unit(observations, unit), unit, stated, outliers, sequential)
+    scaled = convert_to_unit(observations, unit)
+    return IdentificationData(scaled, unit, stated, outliers, sequential, observation_weight)
 
 
 def solve_with_inliers(
@@ -334,8 +350,9 @@ def score_solutions(
             for name, one in solutions.items()
         }
     refine = adapt_noise if renew and not data.stated else _integrate_joint_values
-    weighted = {name: math.log(weights[name]) + log_priors[name] for name in solutions}
-    compared = compare_families(observations_of, solutions, weighted, refine)
+    # The threshold is on evidence in which each observation has its weight.
+    logs = {name: math.log(weights[name]) / data.observation_weight + log_priors[name] for name in solutions}
+    compared = compare_families(observations_of, solutions, logs, refine, data.observation_weight)
     return {
         name: FamilySolution(*one, inliers[name], count, log_priors[name]) for name, one in compared.items()
     }
@@ -372,6 +389,7 @@ def compare_families(
     solutions: Mapping[str | Family, NoiseSolution],
     log_priors: Mapping[str | Family, float],
     refine: Callable[[Observations, NoiseSolution], NoiseSolution],
+    observation_weight: float = 1.0,
 ) -> dict[str | Family, NoiseSolution]:
     """Return the solutions, those of competitive families refined.
 
@@ -379,7 +397,9 @@ def compare_families(
     """
     logs = {name: one.log_evidence + log_priors[name] for name, one in solutions.items()}
     threshold = (
-        max(logs.values()) - _NEGLIGIBLE - _NEGLIGIBLE_EACH * max(len(some) for some in observations.values())
+        max(logs.values())
+        - _NEGLIGIBLE / observation_weight
+        - _NEGLIGIBLE_EACH * max(len(some) for some in observations.values())
     )
     return {
         name: refine(observations[name], one) if logs[name] >= threshold else one
@@ -402,6 +422,7 @@ def weigh_families(
     weights: Mapping[str | Family, float],
 ) -> IdentificationResult:
     """Return the fits of all families with their posterior probabilities."""
+    solutions = {name: _weigh_observations(data, one) for name, one in solutions.items()}
     logs = bound_log_evidences(
         {name: one.log_evidence + one.log_prior for name, one in solutions.items()},
         {name: one.scored.solution for name, one in solutions.items()},
@@ -418,10 +439,22 @@ def weigh_families(
     )
 
 
+def _weigh_observations(data: IdentificationData, one: FamilySolution) -> FamilySolution:
+    """Return a solution in which each observation has its weight."""
+    if data.observation_weight == 1.0:
+        return one
+    observations = data.observations.select(one.inliers)
+    scored, noise = weigh_observations(
+        observations, NoiseSolution(one.scored, one.noise), data.observation_weight
+    )
+    return replace(one, scored=scored, noise=noise, log_prior=data.observation_weight * one.log_prior)
+
+
 def _fit(data: IdentificationData, one: FamilySolution, log_evidence: float, probability: float) -> Fit:
     solution = fix_gauge(unwrap_solution(one.scored.solution) if data.sequential else one.scored.solution)
-    log_evidence += log_density(len(data.observations), data.unit)
-    fit = build_fit(solution, solver.evidence(solution), log_evidence, probability)
+    weight = data.observation_weight
+    log_evidence += log_density(weight * len(data.observations), data.unit)
+    fit = build_fit(solution, solver.evidence(solution, weight), log_evidence, probability)
     observations = scale_noise(data.observations, one.noise.factors)
     fit = complete_fit(fit, observations, one.inliers, sequential=data.sequential)
     if data.outliers is not None and fit.motion.joints == fit.rows:

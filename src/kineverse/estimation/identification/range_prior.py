@@ -78,14 +78,19 @@ class JointRanges:
     log_density: float
 
 
-def fit_joint_ranges(motion: FamilyMember, per_observation: PerObservation) -> JointRanges:
-    """Return the most likely widths and means of the joint values."""
+def fit_joint_ranges(
+    motion: FamilyMember, per_observation: PerObservation, weight: float = 1.0
+) -> JointRanges:
+    """Return the most likely widths and means of the joint values.
+
+    Each observation's log likelihood counts with the weight.
+    """
     kinds = np.array(motion.kinds)
     deviations, occam = np.zeros(len(kinds)), 0.0
     variances = np.einsum("nii->ni", per_observation.covariances)
     for kind in sorted(set(motion.kinds)):
         block = kinds == kind
-        deviations[block], part = _width(per_observation.values[:, block], variances[:, block])
+        deviations[block], part = _width(per_observation.values[:, block], variances[:, block], weight)
         occam += part
     total = per_observation.covariances + np.diag(deviations**2)
     weights = invert_matrices(total)
@@ -96,17 +101,18 @@ def fit_joint_ranges(motion: FamilyMember, per_observation: PerObservation) -> J
     log = -0.5 * float(np.sum(off * multiply_vectors(weights, off))) - 0.5 * sum_log_determinants(
         math.tau * total
     )
-    return JointRanges(deviations, mean, log + occam)
+    return JointRanges(deviations, mean, weight * log + occam)
 
 
-def _width(values: Array, variances: Array) -> tuple[float, float]:
+def _width(values: Array, variances: Array, weight: float) -> tuple[float, float]:
     """Return the best s, and the log of the mean likelihood over all s relative to the best."""
     total = variances + GRID[:, None, None] ** 2
     weights = 1.0 / total
     mean = (weights * values).sum(axis=1) / weights.sum(axis=1)
     squares = (values - mean[:, None, :]) ** 2 * weights
     # The mean is integrated out. Else the width of a few values would be biased towards zero.
-    logs = -0.5 * (np.log(total) + squares).sum(axis=(1, 2)) - 0.5 * np.log(weights.sum(axis=1)).sum(axis=1)
+    logs = -0.5 * weight * (np.log(total) + squares).sum(axis=(1, 2))
+    logs -= 0.5 * np.log(weights.sum(axis=1)).sum(axis=1)
     top = int(np.argmax(logs))
     best = math.log(float(GRID[top]))
     if 0 < top < len(logs) - 1:

@@ -46,7 +46,7 @@ def convert_to_unit(observations: Observations, unit: float) -> Observations:
     )
 
 
-def log_density(count: int, unit: float) -> float:
+def log_density(count: float, unit: float) -> float:
     """Return the log ratio of densities of ``count`` poses, given a mean pose, in metres and in units."""
     return 3.0 * (1 - count) * math.log(unit)
 

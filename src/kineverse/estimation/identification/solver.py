@@ -120,6 +120,7 @@ _CONSTANTS = {
     "narrowest": maximum_likelihood.NARROWEST,
     "settled": maximum_likelihood.SETTLED,
     "turns": maximum_likelihood.TURNS,
+    "weight": 1.0,
 }
 # Largest number of doubles of a work memory that is kept between stages.
 _KEPT = 4_000_000
@@ -206,17 +207,19 @@ class IdentificationSolver:
         _run(library.code.carry_on, problem, buffer)
         return Scored(buffer.solution, buffer.log_evidence)
 
-    def evidence(self, solution: Solution[FamilyMember]) -> Evidence:
+    def evidence(self, solution: Solution[FamilyMember], weight: float = 1.0) -> Evidence:
         """Run :func:`.evidence.laplace_evidence`."""
         if not _is_kernel_solution(solution):
-            return laplace_evidence(solution)
-        logs, *rest = _evaluate_evidence(solution, np.ones((1, 2)))
+            return laplace_evidence(solution, weight)
+        logs, *rest = _evaluate_evidence(solution, np.ones((1, 2)), weight=weight)
         values, covariances, information = rest
         return Evidence.from_information(
             float(logs[0]), information, solution.motion.size, values, covariances
         )
 
-    def log_evidences(self, solution: Solution[FamilyMember], factors: Array, parts: Array) -> Array:
+    def log_evidences(
+        self, solution: Solution[FamilyMember], factors: Array, parts: Array, weight: float = 1.0
+    ) -> Array:
         """Return the log evidence for each of several sizes of the noise.
 
         Parameters
@@ -228,17 +231,19 @@ class IdentificationSolver:
         parts
             Covariances of the residuals by errors of positions, and by those of orientations,
             (2, N, m, m).
+        weight
+            Weight of the log likelihood of each observation.
         """
         if not _is_kernel_solution(solution):
             return np.array(
                 [
                     laplace_evidence(
-                        replace(solution, covariance=np.tensordot(each**2, parts, axes=1))
+                        replace(solution, covariance=np.tensordot(each**2, parts, axes=1)), weight
                     ).log_evidence
                     for each in factors
                 ]
             )
-        return _evaluate_evidence(solution, factors, parts)[0]
+        return _evaluate_evidence(solution, factors, parts, weight)[0]
 
 
 solver = IdentificationSolver()
@@ -267,12 +272,12 @@ def _run(
 
 
 def _evaluate_evidence(
-    solution: Solution[GroupMotion], factors: Array, parts: Array | None = None
+    solution: Solution[GroupMotion], factors: Array, parts: Array | None = None, weight: float = 1.0
 ) -> tuple[Array, ...]:
     """Return the log evidence by size of the noise; joint values, covariances, information of the last."""
     motion, (count, joints) = solution.motion, solution.values.shape
     problem = Problem.from_buffer_copy(_family(motion.group, motion.rows))
-    problem.given.count = count
+    problem.given.count, problem.weight = count, weight
     unknowns = motion.size + joints + motion.slides
     shapes = (len(factors),), (count, joints), (count, joints, joints), (unknowns, unknowns)
     results = tuple(np.empty(shape) for shape in shapes)

@@ -138,17 +138,21 @@ class _NoiseSearch:
         The observations, with the medians of the noise.
     solution
         Solution of a family at any size of the noise.
+    weight
+        Weight of the log likelihood of each observation.
     """
 
-    def __init__(self, observations: Observations, solution: Solution[FamilyMember]) -> None:
-        self.solution = solution
+    def __init__(
+        self, observations: Observations, solution: Solution[FamilyMember], weight: float = 1.0
+    ) -> None:
+        self.solution, self.weight = solution, weight
         self.parts = _covariance_parts(observations, solution)
         # Without any orientation there is one size only.
         self.dimensions = 2 if self.parts[1].any() else 1
 
     def log_evidences(self, logs: Array) -> Array:
         """Return the log evidence at logarithms of the factors, (M, d)."""
-        return solver.log_evidences(self.solution, _factors(logs), self.parts)
+        return solver.log_evidences(self.solution, _factors(logs), self.parts, self.weight)
 
     def log_density(self, logs: Array) -> Array:
         """Return the log evidence and prior at logarithms of the factors, (M, d)."""
@@ -253,6 +257,32 @@ def adapt_noise(observations: Observations, near: NoiseSolution) -> NoiseSolutio
             break
     weight = search.integrate(mode) - float(search.log_evidences(used[None])[0])
     return NoiseSolution(scored, NoisePosterior(used, root, weight))
+
+
+def weigh_observations(observations: Observations, one: NoiseSolution, weight: float) -> NoiseSolution:
+    """Return a solution with the evidence and the noise for a weight of each observation's log likelihood.
+
+    Parameters
+    ----------
+    observations
+        The observations, with the medians of the noise if it is unknown.
+    one
+        Their solution. Its motion is kept.
+    weight
+        The weight, below 1 if errors are correlated.
+    """
+    (solution, reached), noise = one
+    if not len(noise.logs):
+        predicted, weighted = (solver.evidence(solution, w).log_evidence for w in (1.0, weight))
+        return NoiseSolution(Scored(solution, weighted + weight * (reached - predicted)), noise)
+    search = _NoiseSearch(observations, solution, weight)
+    # Steps that did not converge reach less than the quadratic approximation predicts.
+    missing = reached - float(_NoiseSearch(observations, solution).log_evidences(noise.logs[None])[0])
+    mode = search.maximise(noise.logs, noise.root / math.sqrt(weight))
+    predicted = float(search.log_evidences(mode.logs[None])[0])
+    covariance = np.tensordot(_factors(mode.logs[None])[0] ** 2, search.parts, axes=1)
+    scored = Scored(replace(solution, covariance=covariance), predicted + weight * missing)
+    return NoiseSolution(scored, NoisePosterior(mode.logs, mode.root, search.integrate(mode) - predicted))
 
 
 def _factors(logs: Array) -> Array:

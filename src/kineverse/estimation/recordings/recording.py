@@ -1,8 +1,7 @@
-"""Recorded tracks, synchronised pairs and effective sample size."""
+"""Recorded tracks and synchronised pairs."""
 
 from __future__ import annotations
 
-import math
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
 
@@ -93,6 +92,18 @@ class RecordedPair:
             return np.asarray(np.linalg.solve(self.parent_poses, self.child_poses))
         offsets = self.child_poses - self.parent_poses[:, :3, 3]
         return np.asarray(np.einsum("nji,nj->ni", self.parent_poses[:, :3, :3], offsets))
+
+    @property
+    def repeats(self) -> npt.NDArray[np.bool_]:
+        """Mask of the observations that equal the one before in all numbers, (N,).
+
+        A table has these if it was written more often than the parts were observed.
+        """
+        result = np.zeros(len(self.lines), dtype=bool)
+        parts = [self.child_poses] if self.parent_poses is None else [self.child_poses, self.parent_poses]
+        numbers = np.concatenate([part.reshape(len(self.lines), -1) for part in parts], axis=1)
+        result[1:] = (numbers[1:] == numbers[:-1]).all(axis=1)
+        return result
 
     def thin(self, count: int) -> RecordedPair:
         """Return at most ``count`` evenly spaced observations.
@@ -201,40 +212,3 @@ class Recording:
 
 def _format_list(names: list[str]) -> str:
     return ", ".join(f"'{name}'" for name in names[:12]) or "none"
-
-
-# Least number of rows to estimate a correlation from, and least effective sample size.
-_LEAST_COUNT, _LEAST_EFFECTIVE = 20, 8
-
-
-def effective_sample_size(residuals: Array) -> int:
-    """Return the effective sample size of residuals (N, m) in order.
-
-    Successive errors of poses are often correlated: cameras are filtered, markers are bent. With the
-    integrated autocorrelation time τ = 1 + 2 Σ ρ_k, N observations are worth N / τ independent ones. The sum
-    ends where ρ_k falls to the level of chance. The component with the largest τ counts.
-    """
-    count = len(residuals)
-    if count <= _LEAST_COUNT:
-        return count
-    slowest = max(_correlation_time(column) for column in residuals.T)
-    return min(count, max(_LEAST_EFFECTIVE, round(count / slowest)))
-
-
-def _correlation_time(errors: Array) -> float:
-    middle = float(np.median(np.abs(errors)))
-    if middle == 0.0:
-        return 1.0
-    # Clip at three standard deviations, so that outliers do not count.
-    kept = np.clip(errors, -4.5 * middle, 4.5 * middle)
-    kept = kept - kept.mean()
-    variance = float(kept @ kept)
-    if variance == 0.0:
-        return 1.0
-    time, chance = 1.0, 3.0 / math.sqrt(len(kept))
-    for k in range(1, len(kept) // 3):
-        correlation = float(kept[:-k] @ kept[k:]) / variance
-        if correlation < chance:
-            break
-        time += 2.0 * correlation
-    return time

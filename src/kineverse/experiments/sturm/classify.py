@@ -14,12 +14,19 @@ from kineverse.estimation.identification.result import Fit, IdentificationResult
 from kineverse.experiments.plots import FitProjection, draw_axial_view, draw_side_view
 from kineverse.experiments.registry import Options, Progress
 from kineverse.experiments.report import Figure, Report, ReportTable
+from kineverse.experiments.sturm.noise_statements import (
+    StatementAnswer,
+    answer_statements,
+    statement_numbers,
+    statement_table,
+)
 from kineverse.experiments.sturm.recordings import (
     ORIENTATION,
     POSITION,
     SOURCE,
     THINNED,
     LabelledRecording,
+    read_labelled_pairs,
     read_labelled_recordings,
 )
 
@@ -116,22 +123,30 @@ def _draw_recording(axes: Axes, item: Classification) -> None:
         spine.set_color(color)
 
 
-OPTIONS = ("data",)
+OPTIONS = ("quick", "data")
 
 LEAST_RIGHT = 0.95
 LABEL_NAMES = {"revolute": "hinge", "prismatic": "drawer"}
 
 
 def run(progress: Progress, options: Options) -> Report:
-    """Identify the joint of each recording, with fixed noise for its kind of sensor."""
+    """Identify the joint of each recording, with fixed noise, and with all of its poses.
+
+    ``quick`` leaves out the second part.
+    """
     recordings = list(read_labelled_recordings(options.data))
-    return report_recordings(
-        [classify_recording(recording) for recording in progress(recordings, "sturm", "recording")]
-    )
+    classified = [classify_recording(recording) for recording in progress(recordings, "sturm", "recording")]
+    if options.quick:
+        return report_recordings(classified)
+    pairs = list(read_labelled_pairs(options.data))
+    answers = [answer_statements(*one) for one in progress(pairs, "sturm, all poses", "recording")]
+    return report_recordings(classified, [answer for some in answers for answer in some])
 
 
-def report_recordings(classified: Sequence[Classification]) -> Report:
-    """Return the report on the classified recordings."""
+def report_recordings(
+    classified: Sequence[Classification], answers: Sequence[StatementAnswer] = ()
+) -> Report:
+    """Return the report on the classified recordings, and on the answers by all poses if there are any."""
     right = sum(j.is_correct for j in classified)
     misclassified = [j for j in classified if not j.is_correct]
     share = right / len(classified)
@@ -174,6 +189,7 @@ def report_recordings(classified: Sequence[Classification]) -> Report:
                     for j in misclassified
                 ),
             ),
+            *([statement_table(answers)] if answers else []),
         ),
         numbers={
             "constants": {
@@ -185,6 +201,7 @@ def report_recordings(classified: Sequence[Classification]) -> Report:
             "asked": LEAST_RIGHT,
             "missed": [j.recording.name for j in misclassified],
             "recordings": [_numbers(j) for j in classified],
+            **({"all_poses": statement_numbers(answers)} if answers else {}),
         },
         figure=Figure(lambda canvas: draw_recordings(canvas, classified), figure_size(classified)),
     )

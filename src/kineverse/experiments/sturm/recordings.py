@@ -15,7 +15,7 @@ from typing import Literal
 
 from kineverse.errors import FormatError
 from kineverse.estimation.noise import pose_covariance
-from kineverse.estimation.recordings import read_recording
+from kineverse.estimation.recordings import RecordedPair, read_recording
 from kineverse.lie import Array
 
 Label = Literal["revolute", "prismatic"]
@@ -85,7 +85,18 @@ class LabelledRecording:
 
 
 def read_labelled_recordings(folder: Path | None) -> Iterator[LabelledRecording]:
-    """Return the recordings in a folder, sorted by name.
+    """Return the recordings in a folder, sorted by name, reduced to some poses each.
+
+    See :func:`read_labelled_pairs`.
+    """
+    return (
+        LabelledRecording(name, label, pair.thin(THINNED).child_poses)
+        for name, label, pair in read_labelled_pairs(folder)
+    )
+
+
+def read_labelled_pairs(folder: Path | None) -> Iterator[tuple[str, Label, RecordedPair]]:
+    """Return names, labels and all poses of the recordings in a folder, sorted by name.
 
     Parameters
     ----------
@@ -108,7 +119,6 @@ def read_labelled_recordings(folder: Path | None) -> Iterator[LabelledRecording]
     return (_read_labelled(file, file.relative_to(place), label) for file, label in found)
 
 
-def _read_labelled(file: Path, name: Path, label: Label) -> LabelledRecording:
+def _read_labelled(file: Path, name: Path, label: Label) -> tuple[str, Label, RecordedPair]:
     recording = read_recording(file, COLUMNS.get(name.as_posix()))
-    poses = recording.pair().thin(THINNED).child_poses
-    return LabelledRecording(name.with_suffix("").as_posix(), label, poses)
+    return name.with_suffix("").as_posix(), label, recording.pair()

@@ -1,0 +1,359 @@
+"""Identification of the joint of a recorded pair, and of what the answer depends on.
+
+Errors of neighbouring rows are correlated. N rows with an autocorrelation time τ count as N / τ, see
+:mod:`.correlation`. The residuals of each family have a time of their own, because they contain the misfit of
+the family. The time of the most probable family is used, and the comparison is repeated until it agrees with
+the family that it makes most probable.
+
+The answer is compared with those under other assumptions: the times of other families, half and twice the
+noise, and the noise of the residuals if another one is stated. An assumption about the noise counts if the
+observations are not much less probable under it than under the best of these.
+
+A joint with several joint values explains noise that is larger in one direction, such as a camera's depth,
+as motion. But the motion of parts is smooth, and noise is not. If the residuals of a family with fewer joint
+values are no smoother than noise, the noise may be as large as these.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator
+from dataclasses import dataclass
+
+import numpy as np
+
+from kineverse.errors import InvalidValueError
+from kineverse.estimation.identification import Fit, IdentificationResult, identify
+from kineverse.estimation.identification.identify import WEIGHTS
+from kineverse.estimation.identification.observations import check_observations
+from kineverse.estimation.identification.projection import complete_fit
+from kineverse.estimation.noise import pose_covariance
+from kineverse.estimation.robust import Outliers
+from kineverse.lie import Array
+
+from .correlation import LEAST_EFFECTIVE, correlation_time
+from .recording import Indices, RecordedPair, spaced_indices
+
+MAX_ROTATION_STEP = 2.0
+"""Largest rotation between successive poses for which revolutions are counted reliably [rad]."""
+
+# Standard deviations of the autocorrelation time that are added to its estimate.
+_CAUTION = 1.0
+# Rows within one autocorrelation time, and in total, that suffice.
+_ROWS_PER_TIME, _ENOUGH_ROWS = 8, 100
+# Log ratio of the probability of the observations at which one noise is refuted by another.
+_REFUTED = math.log(20.0)
+# Size of residuals that avoids a division by zero [m], [rad].
+_TINY = 1e-12
+# Factor on the size of residuals at which the noise explains them amply.
+_AMPLE = 1.5
+# Relative difference of autocorrelation times that matters.
+_LONGER = 1.1
+# Ratio of autocorrelation times below which residuals are as smooth as others, and above which motion is not
+# noise.
+_AS_SMOOTH, _SMOOTHER = 1.5, 3.0
+
+
+@dataclass(frozen=True)
+class ObservationNoise:
+    """Assumed noise of the observations.
+
+    Attributes
+    ----------
+    position, orientation
+        Standard deviations of each coordinate [m] and about each axis [rad]; orientation is None if only
+        positions are observed.
+    given
+        True if they were given, False if estimated.
+    """
+
+    position: float
+    orientation: float | None
+    given: bool
+
+    def scaled(self, factor: float) -> ObservationNoise:
+        """Return the noise with standard deviations that are larger by a factor."""
+        orientation = None if self.orientation is None else factor * self.orientation
+        return ObservationNoise(factor * self.position, orientation, self.given)
+
+    @property
+    def covariance(self) -> Array:
+        """Covariance of poses, (6, 6); for positions alone its orientation block is unused."""
+        return pose_covariance(self.position, self.orientation or 1.0)
+
+
+@dataclass(frozen=True, eq=False)
+class Assumption:
+    """Noise and autocorrelation time of the errors, and the joint that is identified with these.
+
+    Attributes
+    ----------
+    noise
+        Noise of single observations.
+    correlation_time
+        Autocorrelation time of their errors, in rows.
+    found
+        All families, with their probabilities.
+    """
+
+    noise: ObservationNoise
+    correlation_time: float
+    found: IdentificationResult
+
+
+@dataclass(frozen=True, eq=False)
+class RecordedJoint:
+    """Joint identified from a recorded pair.
+
+    Attributes
+    ----------
+    found
+        All families, with their probabilities.
+    noise
+        Noise of single observations.
+    correlation_time
+        Autocorrelation time of their errors, in rows.
+    repeated
+        Number of rows that equal the one before. They do not count.
+    judged
+        Effective sample size by which the families were compared.
+    fit
+        Fit of the most probable family to all poses, outliers marked.
+    objections
+        Assumptions that the observations allow as well, under which the answer is another one.
+    """
+
+    found: IdentificationResult
+    noise: ObservationNoise
+    correlation_time: float
+    repeated: int
+    judged: int
+    fit: Fit
+    objections: tuple[Assumption, ...] = ()
+
+    @property
+    def is_ambiguous(self) -> bool:
+        """True if the data do not determine a joint, or only under some of the assumptions."""
+        return self.found.is_ambiguous or self.is_free or bool(self.objections)
+
+    @property
+    def is_free(self) -> bool:
+        """True if no joint explains the motion."""
+        return self.found.best.family == "free"
+
+
+def identify_recorded_joint(
+    pair: RecordedPair,
+    noise: ObservationNoise | None = None,
+    families: list[str] | None = None,
+    independent: bool = False,
+) -> RecordedJoint:
+    """Identify the joint of a recorded pair.
+
+    Parameters
+    ----------
+    pair
+        Poses in their order.
+    noise
+        Noise of single observations; None if it is to be estimated.
+    families
+        Names of families; None for all.
+    independent
+        True if all errors are independent. Else their autocorrelation is estimated.
+
+    Raises
+    ------
+    InvalidValueError
+        If all poses are equal, or do not allow an identification.
+    UnknownNameError
+        For an unknown family.
+    """
+    comparison = _Comparison(pair, families, independent)
+    first = comparison.assume(noise, 1.0, comparison.distinct)
+    fits = {} if independent else comparison.fits_of_estimated_noise(noise, first)
+    times = {name: comparison.correlation_time(fit) for name, fit in fits.items()}
+    best, rows = first, comparison.distinct
+    for _ in times:
+        name = best.found.best.family
+        if times.get(name, 1.0) <= _LONGER * best.correlation_time:
+            break
+        rows = comparison.sufficient_rows(times[name], first.found[name])
+        best = comparison.assume(noise, times[name], rows)
+    objections = tuple(
+        other for other in comparison.alternatives(noise, best, fits, times, rows) if objects(other, best)
+    )
+    return RecordedJoint(
+        best.found,
+        best.noise,
+        best.correlation_time,
+        len(pair.lines) - len(comparison.distinct),
+        max(1, round(len(comparison.distinct) / best.correlation_time)),
+        comparison.complete(best, rows),
+        objections,
+    )
+
+
+def objects(other: Assumption, made: Assumption) -> bool:
+    """Return True if the answer under another assumption is not the one under the assumption made."""
+    sure = [None if one.found.is_ambiguous else one.found.best.family for one in (other, made)]
+    if other.correlation_time == made.correlation_time:
+        return sure[0] != sure[1]
+    # A longer correlation time always tells less.
+    return sure[0] != sure[1] and other.found.best.family != made.found.best.family
+
+
+class _Comparison:
+    """Comparison of families under several assumptions."""
+
+    def __init__(self, pair: RecordedPair, families: list[str] | None, independent: bool) -> None:
+        self.pair, self.families = pair, families
+        repeats = pair.repeats
+        self.distinct: Indices = np.flatnonzero(~repeats)
+        if len(self.distinct) == 1 < len(repeats):
+            raise InvalidValueError(
+                f"All {len(repeats)} poses are the same in every digit. How something moves cannot be seen "
+                "while it stands still."
+            )
+        if independent:
+            self.distinct = np.arange(len(repeats))
+
+    def assume(self, noise: ObservationNoise | None, time: float, rows: Indices) -> Assumption:
+        """Identify the joint from some rows, which stand for all distinct rows with a correlation time."""
+        some = self.pair.select(rows)
+        found = identify(
+            some.parent_poses,
+            some.child_poses,
+            noise=None if noise is None else noise.covariance,
+            families=self.families,
+            outliers=True,
+            sequential=self.pair.is_timed,
+            correlation_time=max(1.0, time * len(rows) / len(self.distinct)),
+        )
+        return Assumption(noise or estimated_noise(found, self.pair), time, found)
+
+    def fits_of_estimated_noise(self, noise: ObservationNoise | None, first: Assumption) -> dict[str, Fit]:
+        """Return the fits of families that have residuals to all distinct rows."""
+        # If the stated noise is too small, most observations are outliers.
+        found = first.found if noise is None else self.assume(None, 1.0, self.distinct).found
+        return {fit.family: fit for fit in found if fit.family != "free"}
+
+    def correlation_time(self, fit: Fit) -> float:
+        """Return the autocorrelation time of the residuals of a fit to all distinct rows."""
+        most = max(1.0, len(self.distinct) / LEAST_EFFECTIVE)
+        return min(most, correlation_time(_residuals_across_motion(fit), _CAUTION))
+
+    def sufficient_rows(self, time: float, fit: Fit) -> Indices:
+        """Return evenly spaced rows; more of them hold little more about errors with this time."""
+        count = len(self.distinct)
+        size = min(count, max(_ENOUGH_ROWS, math.ceil(_ROWS_PER_TIME * count / time)))
+        # The subset must be dense enough to count revolutions.
+        while (
+            self.pair.is_timed
+            and size < count
+            and fit.select(spaced_indices(count, size)).largest_turn > MAX_ROTATION_STEP
+        ):
+            size += 1
+        return self.distinct[spaced_indices(count, size)]
+
+    def alternatives(
+        self,
+        stated: ObservationNoise | None,
+        best: Assumption,
+        fits: dict[str, Fit],
+        times: dict[str, float],
+        rows: Indices,
+    ) -> Iterator[Assumption]:
+        """Yield the joints under other assumptions that the observations allow."""
+        for time in sorted(set(times.values())):
+            if time > _LONGER * best.correlation_time:
+                other = self.assume(stated, time, rows)
+                # Only a family whose own residuals have this time explains it.
+                if times.get(other.found.best.family, 0.0) == time:
+                    yield other
+        family = best.found.best.family
+        for name, fit in fits.items():
+            if family in fits and _is_noise(fit, fits[family], times[name], times[family]):
+                other = self.assume(_largest_noise(fit).scaled(_AMPLE), best.correlation_time, rows)
+                if other.found.best.family == name:
+                    yield other
+        noises = [best.noise.scaled(0.5), best.noise.scaled(2.0)]
+        if stated is not None:
+            noises.append(self.assume(None, best.correlation_time, rows).noise)
+        others = [self.assume(noise, best.correlation_time, rows) for noise in noises]
+        known = self.assume(best.noise, best.correlation_time, rows) if stated is None else best
+        most = max(log_probability(one.found) for one in (known, *others))
+        for other in others:
+            if log_probability(other.found) > most - _REFUTED:
+                yield other
+
+    def complete(self, best: Assumption, rows: Indices) -> Fit:
+        """Return the fit of the most probable family, extended to all rows."""
+        pair, noise = self.pair, best.noise
+        if len(rows) == len(pair.lines):
+            return best.found.best
+        observations = check_observations(
+            pair.parent_poses, pair.child_poses, noise.covariance, noise.covariance
+        )
+        return complete_fit(
+            best.found.best,
+            observations,
+            rows,
+            outliers=Outliers(),
+            stated=noise.given,
+            sequential=pair.is_timed,
+        )
+
+
+def _residuals_across_motion(fit: Fit) -> Array:
+    """Return the residuals of inliers without the part along the motion of the joint.
+
+    Joint values follow the observations. What they leave over is no error, but follows the motion slowly.
+    """
+    residuals = fit.residuals[fit.inliers]
+    by_joints = fit.motion.linearise(fit.joint_values[fit.inliers]).by_joints[:, : fit.rows]
+    sizes = np.repeat(fit.rms, 3)[: fit.rows] + _TINY
+    across, along = residuals / sizes, np.linalg.qr(by_joints / sizes[:, None])[0]
+    result: Array = across - np.einsum("nik,njk,nj->ni", along, along, across)
+    return result * sizes
+
+
+def _is_noise(fit: Fit, best: Fit, time: float, best_time: float) -> bool:
+    """Return True if the best fit may be that of a family with fewer joint values whose residuals are noise.
+
+    Its residuals are then no smoother than those of the best fit, while the motion is.
+    """
+    if fit.motion.joints >= best.motion.joints or time > _AS_SMOOTH * best_time:
+        return False
+    values = best.joint_values[best.inliers]
+    if LEAST_EFFECTIVE * time >= len(values):
+        return False  # the time is at its bound, and may be longer
+    return correlation_time(values - values.mean(axis=0)) > _SMOOTHER * time
+
+
+def _largest_noise(fit: Fit) -> ObservationNoise:
+    """Return noise as large in all directions as the residuals are in the worst one."""
+    deviations = np.sqrt(np.mean(fit.residuals[fit.inliers] ** 2, axis=0))
+    orientation = float(deviations[3:].max()) if fit.rows == 6 else None
+    return ObservationNoise(float(deviations[:3].max()), orientation, True)
+
+
+def residual_noise(fit: Fit) -> ObservationNoise:
+    """Return noise of the size of the residuals. Directions of joint values have none."""
+    (position, orientation), joints = fit.rms, fit.motion.joints
+    if fit.rows == 3:
+        return ObservationNoise(position / math.sqrt(max(1.0, 3.0 - joints)), None, True)
+    root = math.sqrt(max(0.5, 3.0 - 0.5 * joints))
+    return ObservationNoise(position / root, orientation / root, True)
+
+
+def estimated_noise(found: IdentificationResult, pair: RecordedPair) -> ObservationNoise:
+    """Return the noise that an identification without stated noise estimated."""
+    assert found.noise is not None  # it is estimated if it is not stated
+    position, orientation = found.noise
+    return ObservationNoise(position, orientation if pair.has_orientation else None, False)
+
+
+def log_probability(found: IdentificationResult) -> float:
+    """Return the log probability density of the observations, families weighed by their priors."""
+    best = found.best
+    return best.log_evidence + math.log(WEIGHTS[best.family] / best.probability)
