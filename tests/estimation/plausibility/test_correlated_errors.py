@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, fields, replace
+from dataclasses import fields, replace
 
 import numpy as np
 import numpy.typing as npt
@@ -10,7 +10,14 @@ import pytest
 from observed_frames import NOISE, observe_frames, shift_origin
 
 import kineverse as kv
-from kineverse.estimation import ImplausibleError, PlausibilityMonitor, check_plausibility, pose_covariance
+from kineverse.estimation import (
+    ImplausibleError,
+    ObservedPose,
+    PlausibilityMonitor,
+    Tracker,
+    check_plausibility,
+    pose_covariance,
+)
 from kineverse.estimation.identification.observations import check_observations
 from kineverse.estimation.plausibility.correlation import CorrelationSettings
 from kineverse.estimation.plausibility.known_motion import KnownJoint
@@ -147,14 +154,12 @@ def test_scaled_residuals_are_those_of_scaled_covariances(kitchen: kv.Model) -> 
         assert getattr(scaled, field.name) == pytest.approx(getattr(expected, field.name), abs=1e-4)
 
 
-@dataclass
-class RecordingTracker:
-    """Stand-in for a tracker with a record of poses."""
-
-    model: kv.Model
-    recent: dict[str, Array]
-    recent_covariances: dict[str, Array]
-    recent_times: Array | None = None
+def track(model: kv.Model, poses: Array) -> Tracker:
+    """Return a tracker of a model that has taken poses of the handle (N, 4, 4)."""
+    tracker = Tracker(model, [ObservedPose(HANDLE, covariance=NOISE)], outliers=True)
+    for k, pose in enumerate(poses):
+        tracker.update({} if np.isnan(pose).any() else {HANDLE: pose}, at=0.5 * k)
+    return tracker
 
 
 def test_tracker_is_checked_and_its_model_repaired(kitchen: kv.Model) -> None:
@@ -165,7 +170,7 @@ def test_tracker_is_checked_and_its_model_repaired(kitchen: kv.Model) -> None:
         edit.replace(TAG, replace(joint, origin=shift_origin(joint, y=0.05)))
     poses = observe_frames(truth, [HANDLE], {DOOR: np.linspace(0.0, 1.2, 50)}, 3)
     poses[HANDLE][7] = np.nan
-    tracker = RecordingTracker(model, poses, {HANDLE: NOISE}, 0.5 * np.arange(50))
+    tracker = track(model, poses[HANDLE])
     report = check_plausibility(tracker, families=SOME)
     assert report[TAG].count == 49
     assert report.repair(model) == (TAG,)
@@ -177,7 +182,7 @@ def test_tracker_is_checked_and_its_model_repaired(kitchen: kv.Model) -> None:
     random = np.random.default_rng(0)
     poses[HANDLE][:] = poses[HANDLE][0]
     poses[HANDLE][:, :3, 3] = random.uniform(-1.0, 1.0, (50, 3))
-    lost = check_plausibility(tracker, families=SOME)
+    lost = check_plausibility(track(model, poses[HANDLE]), families=SOME)
     assert lost[TAG].probabilities == {}
     with pytest.raises(ImplausibleError, match="unrelated"):
         lost.repair(model)

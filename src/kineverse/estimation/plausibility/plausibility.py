@@ -13,6 +13,7 @@ from kineverse.errors import InvalidValueError, KineverseError, ShapeError
 from kineverse.estimation.identification.kinematic_graph.pairwise import FamilyChoice
 from kineverse.estimation.identification.observations import PosesLike, check_tracks, exact_track, pair_tracks
 from kineverse.estimation.robust import Outliers, as_outliers
+from kineverse.estimation.tracking import Tracker
 from kineverse.lie import Array
 from kineverse.model.frame import WORLD
 from kineverse.model.model import Model, Snapshot
@@ -23,7 +24,6 @@ from .correlation import CorrelationSettings
 from .exchanged_frames import find_exchanged_frames
 from .known_motion import KnownJoint
 from .known_residuals import compute_residuals
-from .recorded_poses import RecordedPoses, recorded_observations
 from .report import JointVerdict, Plausibility
 from .sequential_test import SequentialTest
 from .testability import TestableJoint, find_testable_joints
@@ -33,7 +33,7 @@ FALSE_ALARMS = 1e-3
 
 
 def check_plausibility(
-    model: Model | Snapshot | RecordedPoses,
+    model: Model | Snapshot | Tracker,
     observations: Mapping[str, PosesLike] | None = None,
     *,
     times: npt.ArrayLike | None = None,
@@ -54,7 +54,7 @@ def check_plausibility(
     Parameters
     ----------
     model
-        The served model; or a tracker, with the model, the recent poses, their times and covariances.
+        The served model; or a tracker, with its model and recent poses.
     observations
         Poses over time by name of the frame, (N, 4, 4), or pairs of poses and covariance, (6, 6) or (N, 6,
         6), in order of time; missing poses are NaN throughout.
@@ -90,17 +90,17 @@ def check_plausibility(
     check_false_alarms(false_alarms)
     check_decorrelation_time(decorrelation_time)
     outlier_model = as_outliers(outliers)
-    if isinstance(model, RecordedPoses):
+    if isinstance(model, Tracker):
         if observations is None:
-            observations, times = recorded_observations(model), model.recent_times
-        model = model.model
-    if isinstance(model, Snapshot):
-        model = model.model()
+            recent = model.recent
+            observations = {name: (poses, recent.covariances[name]) for name, poses in recent.poses.items()}
+            times, relative_to = recent.times, recent.relative_to
+    checked = _checked_model(model)
     observations = {} if observations is None else observations
     tracks = check_tracks(observations, noise)
     stamps = _check_times(times, max((len(track.poses) for track in tracks.values()), default=0))
     correlation = CorrelationSettings(decorrelation_time, times is not None)
-    testable = find_testable_joints(model, observations, relative_to)
+    testable = find_testable_joints(checked, observations, relative_to)
     if relative_to is not None:
         tracks[relative_to] = exact_track(max((len(track.poses) for track in tracks.values()), default=0))
     residuals: dict[TestableJoint, TimedResiduals] = {}
@@ -115,14 +115,14 @@ def check_plausibility(
             )
             continue
         try:
-            served = KnownJoint(model, joint.child, joint.parent)
+            served = KnownJoint(checked, joint.child, joint.parent)
             residuals[joint] = TimedResiduals(
                 seen, compute_residuals(served, pair_tracks(parent, child, seen))
             )
             served_joints[joint] = served
         except KineverseError as error:
             reasons[joint] = undetermined_verdict(joint, len(seen), f"its pose cannot be computed. {error}")
-    tested = ConsistencyTests(model, served_joints, relative_to).apply(residuals)
+    tested = ConsistencyTests(checked, served_joints, relative_to).apply(residuals)
     data: dict[TestableJoint, JointObservations] = {}
     implausible_since: dict[TestableJoint, int] = {}
     for joint, served in served_joints.items():
@@ -145,7 +145,7 @@ def check_plausibility(
         else:
             fitting = pair_outliers(outlier_model, joint, relative_to)
             since = implausible_since.get(joint)
-            verdicts.append(judge_joint(model, data[joint], since, families, fitting, correlation))
+            verdicts.append(judge_joint(checked, data[joint], since, families, fitting, correlation))
     result = Plausibility(tuple(verdicts), testable.untested, false_alarms)
     if strict:
         result.raise_if_implausible()
@@ -229,6 +229,22 @@ def check_time(at: object, last: float) -> float:
             "observations by time, and leave out what comes twice."
         )
     return time
+
+
+def _checked_model(given: Model | Snapshot | Tracker) -> Model:
+    """Return the model to check.
+
+    Raises
+    ------
+    InvalidValueError
+        For anything else.
+    """
+    model = given.model if isinstance(given, Tracker) else given
+    if isinstance(model, Snapshot):
+        model = model.model()
+    if not isinstance(model, Model):
+        raise InvalidValueError(f"A model or a tracker is checked, not {model!r:.80}.")
+    return model
 
 
 def _check_times(times: npt.ArrayLike | None, count: int) -> Array:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection, Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -36,24 +36,24 @@ class RecentPoses:
 
 
 def collect_recent_poses(
-    layout: Layout, readings: Collection[tuple[float | None, Measurements]]
+    layout: Layout, readings: Sequence[tuple[float | None, Measurements]]
 ) -> RecentPoses:
     """Return the poses of readings with their times, of the first observer among the observations."""
     poses = {i: one for i, one in enumerate(layout.observations) if one.is_pose}
     observer = next((one.relative_to for one in poses.values()), "")
-    stamps = [stamp for stamp, _ in readings]
-    order = (
-        np.arange(len(stamps)) if None in stamps else np.argsort(np.array(stamps, dtype=float), kind="stable")
+    has_times = all(stamp is not None for stamp, _ in readings)
+    stamps: Array = np.array(
+        [stamp if has_times else k for k, (stamp, _) in enumerate(readings)], dtype=float
     )
-    measured: dict[str, Array] = {}
+    # Readings of one time are one row.
+    times, rows = np.unique(stamps, return_inverse=True)
+    measured, covariances = {}, {}
     for i, one in poses.items():
         if one.relative_to == observer:
-            where = layout.measurement_slices[i]
-            values = [np.where(each.mask[i], each.values[where], np.nan) for _, each in readings]
-            measured[one.frame] = np.reshape(values, (len(values), 4, 4))[order]
-    return RecentPoses(
-        observer,
-        measured,
-        {one.frame: one.covariance for one in poses.values() if one.relative_to == observer},
-        None if None in stamps else np.array(stamps, dtype=float)[order],
-    )
+            measured[one.frame] = np.full((len(times), 4, 4), np.nan)
+            covariances[one.frame] = one.covariance
+            for row, (_, reading) in zip(rows.tolist(), readings, strict=True):
+                if reading.mask[i]:
+                    pose = reading.values[layout.measurement_slices[i]].reshape(4, 4)
+                    measured[one.frame][row] = pose
+    return RecentPoses(observer, measured, covariances, times if has_times else None)
