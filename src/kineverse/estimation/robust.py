@@ -104,9 +104,26 @@ def cauchy_weight(square: float, size: int) -> float:
     return (1 + size) / (1 + square)
 
 
-def as_outliers(given: Outliers | bool | None) -> Outliers | None:
-    """Convert an argument to an outlier model: True stands for the default, False and None for none."""
+def as_outliers(given: Outliers | bool | None, has_gate: bool = False) -> Outliers | None:
+    """Convert an argument to an outlier model: True stands for the default, False and None for none.
+
+    Parameters
+    ----------
+    given
+        The argument.
+    has_gate
+        True if a gate has a meaning.
+
+    Raises
+    ------
+    InvalidValueError
+        For another argument, and for a gate where it has no meaning.
+    """
     if isinstance(given, Outliers):
+        if given.gate is not None and not has_gate:
+            raise InvalidValueError(
+                "Only a tracker has a gate of outliers. Here the fraction and the reach say what an outlier is."
+            )
         return given
     if given is None or isinstance(given, bool):
         return Outliers() if given else None

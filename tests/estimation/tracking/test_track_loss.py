@@ -207,6 +207,8 @@ def test_gate_is_a_number_of_standard_deviations():
             assert bool(tracker.copy().update(seen).outliers) is is_outlier
     with pytest.raises(InvalidValueError, match="gate"):
         Outliers(gate=0.0)
+    with pytest.raises(InvalidValueError, match="Only a tracker has a gate"):
+        kv.estimation.identify(None, np.stack([np.eye(4)] * 8), outliers=Outliers(gate=3.0))
 
 
 @pytest.mark.parametrize("pair", [tuple, list])

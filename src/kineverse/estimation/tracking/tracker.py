@@ -125,7 +125,9 @@ class Tracker:
         layout, limits = arrange_state(model, build_measurement_models(model, self._observed), given)
         self.model = model
         self._layout = layout
-        self._update_step = UpdateStep(layout, limits, as_outliers(outliers), process == "velocity")
+        self._update_step = UpdateStep(
+            layout, limits, as_outliers(outliers, has_gate=True), process == "velocity"
+        )
         process_model = self._update_step.process_model
         noise = {process_model.speed(k): require_positive(k, v) for k, v in (process_noise or {}).items()}
         values = np.array([np.nan if s.value is None else s.value for s in layout.inputs])
