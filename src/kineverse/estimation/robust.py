@@ -122,7 +122,7 @@ def as_outliers(given: Outliers | bool | None, has_gate: bool = False) -> Outlie
     if isinstance(given, Outliers):
         if given.gate is not None and not has_gate:
             raise InvalidValueError(
-                "Only a tracker has a gate of outliers. Here the fraction and the reach say what an outlier is."
+                "Only a tracker has a gate of outliers. Here an outlier is defined by fraction and reach."
             )
         return given
     if given is None or isinstance(given, bool):
