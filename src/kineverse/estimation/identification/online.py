@@ -16,18 +16,16 @@ from kineverse.estimation.linear_algebra import squared_errors
 from kineverse.estimation.robust import Outliers, as_outliers
 from kineverse.lie import Array
 
-from .custom_family import Family
-from .identify import (
-    Families,
+from .comparison import (
     FamilySolution,
     IdentificationData,
-    family_weights,
     prepare_data,
-    resolve_noise,
     score_solutions,
     solve_with_inliers,
     weigh_families,
 )
+from .custom_family import Family
+from .identify import Families, family_weights, resolve_noise
 from .kinematic_graph.pairwise import SURPRISE_DEVIATIONS
 from .maximum_likelihood import Scored
 from .motion_model import FamilyMember

@@ -1,0 +1,105 @@
+"""Goodness of fit: residuals of a family against the noise.
+
+Let e be the residuals with the joint values of each observation by itself, W the inverse of their covariance, and
+ν the number of residuals less the numbers of joint values and of determined parameters. If the family and the
+noise are right, χ² = Σ eᵀ W e has the mean ν, and √(χ²/ν) estimates the noise relative to the stated one.
+
+A joint of the wrong kind leaves residuals that vary slowly along its joint value. Projected onto slow cosines of
+the rank of the joint value, white residuals have the variance 1 in each.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+
+from kineverse.estimation.linear_algebra import invert_matrices, multiply_vectors
+from kineverse.lie import Array
+
+from .motion_model import FamilyMember
+from .optimise import Solution
+from .range_prior import LITTLE
+
+# Slowest cosines along a joint value, and the log likelihood that a parameter of another model would cost.
+_COSINES, _COST = 6, 2.0
+
+
+@dataclass(frozen=True)
+class GoodnessOfFit:
+    """Residuals of a family against the noise.
+
+    Attributes
+    ----------
+    factor
+        Size of the residuals relative to the noise; NaN if the family leaves none.
+    p_value
+        Probability of a χ² at least as large if family and noise are right; 1 if there are no residuals.
+    systematic_gain
+        Log likelihood that a model with slow corrections along the joint value would gain, less their cost; 0
+        without one joint value.
+    systematic_share
+        Share of the slow corrections in χ².
+    """
+
+    factor: float
+    p_value: float
+    systematic_gain: float
+    systematic_share: float
+
+
+def measure_fit(solution: Solution[FamilyMember], covariance: Array | None = None) -> GoodnessOfFit:
+    """Return the goodness of fit of a solution.
+
+    Parameters
+    ----------
+    solution
+        The solution. Its observations are the inliers.
+    covariance
+        Covariances of the residuals, (N, m, m) or (m, m), instead of those of the solution.
+    """
+    motion, by_joints = solution.motion, solution.linear.by_joints
+    weights = invert_matrices(solution.covariance if covariance is None else covariance)
+    weights = np.broadcast_to(weights, solution.covariance.shape)
+    weighted = np.swapaxes(by_joints, 1, 2) @ weights
+    curvature = weighted @ by_joints + LITTLE * np.eye(motion.joints)
+    projected = weights - np.swapaxes(weighted, 1, 2) @ invert_matrices(curvature) @ weighted
+    residuals = solution.residuals
+    left = residuals - multiply_vectors(
+        by_joints, multiply_vectors(invert_matrices(curvature), multiply_vectors(weighted, residuals))
+    )
+    squares = float(np.sum(left * multiply_vectors(weights, left)))
+    free = residuals.size - solution.values.size - _determined_parameters(solution, projected)
+    if free < 0.5:
+        return GoodnessOfFit(math.nan, 1.0, 0.0, 0.0)
+    factor, p_value = math.sqrt(squares / free), chi_squared_tail(squares, free)
+    if motion.joints != 1:
+        return GoodnessOfFit(factor, p_value, 0.0, 0.0)
+    whitened = multiply_vectors(np.swapaxes(np.linalg.cholesky(weights), 1, 2), left)
+    gains = 0.5 * _slow_parts(whitened, solution.values[:, 0]) ** 2
+    share = 2.0 * float(gains.sum()) / max(squares, 1e-300)
+    return GoodnessOfFit(factor, p_value, float(np.maximum(gains - _COST, 0.0).sum()), share)
+
+
+def chi_squared_tail(squares: float, freedom: float) -> float:
+    """Return the probability that χ² with some degrees of freedom is larger (Wilson and Hilferty 1931)."""
+    spread = 2.0 / (9.0 * freedom)
+    return 0.5 * math.erfc(((squares / freedom) ** (1.0 / 3.0) - (1.0 - spread)) / math.sqrt(2.0 * spread))
+
+
+def _determined_parameters(solution: Solution[FamilyMember], projected: Array) -> float:
+    """Return the effective number of parameters that the observations determine rather than the prior."""
+    by_parameters, prior = solution.linear.by_parameters, solution.motion.prior().by_parameters
+    information = (np.swapaxes(by_parameters, 1, 2) @ projected @ by_parameters).sum(axis=0)
+    total = information + prior.T @ prior + LITTLE * np.eye(len(information))
+    return float(np.trace(np.linalg.solve(total, information)))
+
+
+def _slow_parts(whitened: Array, values: Array) -> Array:
+    """Return the projections of residuals (N, m) onto normalised slow cosines of the rank of a value."""
+    count = len(values)
+    rank = np.argsort(np.argsort(values, kind="stable"), kind="stable")
+    phases = math.pi * (rank[:, None] + 0.5) / count * np.arange(1, min(_COSINES, count - 1) + 1)
+    result: Array = math.sqrt(2.0 / count) * np.cos(phases).T @ whitened
+    return result

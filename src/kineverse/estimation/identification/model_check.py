@@ -1,0 +1,332 @@
+"""Check of the most probable family: curves that are no joint, and residuals that refute the noise.
+
+The comparison of families assumes that one of them is right and that the noise is as stated. This module tests
+both. A one-coordinate curve is a family, too. As it takes long to fit, it is fitted only if the best family has
+several joint values, which may lie on one curve, or leaves residuals that the noise does not explain.
+
+**Stated noise.** If χ² of the best family refutes the noise, all families are compared again at the most probable
+larger size. If the best family has several joint values or is a curve, it may only have won because the noise
+is stated too small. So families are also compared for a noise of up to five times that size.
+
+**Unknown noise.** Residuals that vary slowly along the joint value show a joint of the wrong kind.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator, Mapping
+from dataclasses import replace
+from functools import partial
+from typing import NamedTuple
+
+import numpy as np
+
+from kineverse.errors import InvalidValueError
+from kineverse.lie import Array
+
+from .comparison import (
+    FamilySolution,
+    IdentificationData,
+    solve_families,
+    solve_with_inliers,
+    weigh_families,
+)
+from .curve import CURVE
+from .curve_fit import FEWEST_POSES, continue_curve, fit_curve, stated_log_evidence
+from .custom_family import Family, FamilyMotion
+from .goodness_of_fit import GoodnessOfFit, measure_fit
+from .maximum_likelihood import Scored
+from .motion_model import FamilyMember
+from .observations import Observations
+from .optimise import Solution
+from .outlier_rejection import RowIndices, densest_half, log_inlier_prior
+from .projection import classify_inliers, project_observations
+from .result import SURE, Fit, IdentificationResult, LazyFit
+from .solver import solver
+
+REFUTED = 1e-4
+"""Largest probability of χ² at which the noise is refuted."""
+
+CALIBRATED = 1.2
+"""Largest size of the residuals relative to the stated noise that is no misfit, however many they are."""
+
+# Probability of χ², and gain by slow corrections, at which a curve is tried.
+_DOUBTFUL, _GAIN = 2e-3, 6.0
+# Sizes of the noise relative to the stated one, of a noise that is refuted and of one that is not, and the
+# standard deviation of the prior of their logarithms.
+_REFUTED_SCALES, _DOUBTED_SCALES = np.geomspace(1.0, 100.0, 41), np.geomspace(1.0, 5.0, 9)
+_SCALE_SPREAD = math.log(2.0)
+# Size of a simple joint's residuals relative to those of a curve up to which correlated errors may explain them.
+_CORRELATED = 2.0
+# Least probability of χ² of a curve, or its largest size of residuals relative to those of the best family, at
+# which the joint values of that family are said to lie on a curve.
+_FITTING, _FITTING_FACTOR = 1e-3, 1.3
+# Number of observations up to which joint values are judged by the angles between their steps, and the cosine of
+# the largest median angle of a smooth path. That of independent values is beyond a right angle.
+_FEW, _SMOOTH = 20, math.cos(math.radians(45.0))
+# Share of slow corrections in χ², and their gain, that refute a joint of unknown noise.
+_SYSTEMATIC_SHARE, _SYSTEMATIC_GAIN = 0.7, 10.0
+# Largest number of classifications of outliers.
+_ROUNDS = 3
+
+Solutions = Mapping["str | Family", FamilySolution]
+
+
+class CheckedComparison(NamedTuple):
+    """Result of a comparison that is checked, and the solution of the curve if one was fitted."""
+
+    result: IdentificationResult
+    curve: FamilySolution | None
+
+
+def weigh_and_check(
+    data: IdentificationData,
+    solutions: Solutions,
+    weights: Mapping[str | Family, float],
+    before: FamilySolution | None = None,
+) -> CheckedComparison:
+    """Return the fits of all families with their probabilities, and the reason if the best is not sure.
+
+    Parameters
+    ----------
+    data
+        The observations and assumptions.
+    solutions
+        Solutions of all families but the curve.
+    weights
+        Prior weights of all families.
+    before
+        Solution of the curve for fewer observations.
+
+    Raises
+    ------
+    InvalidValueError
+        If the curve is the only family, and the observations are too few for one.
+    """
+    curve = None
+    if CURVE in weights and (not solutions or _is_doubtful(data, solutions, weights)):
+        curve = solve_curve(data, solutions, before)
+        if curve is not None:
+            solutions = {**solutions, CURVE: curve}
+    if not solutions:
+        raise InvalidValueError(
+            f"A curve takes {FEWEST_POSES} poses at least, and there are {len(data.observations)}. Give more "
+            "poses or other families."
+        )
+    found = weigh_families(data, solutions, weights)
+    best = solutions[_best_name(found, solutions)]
+    fit = measure_fit(best.scored.solution)
+    if data.stated and fit.p_value < REFUTED and fit.factor > CALIBRATED:
+        return CheckedComparison(_compare_refuted(data, solutions, weights), curve)
+    found = replace(found, reason=next(_reasons(data, found, solutions, weights), ""))
+    if curve is None and CURVE in weights and len(data.observations) >= FEWEST_POSES:
+        later = LazyFit(CURVE, 0.0, partial(_fit_curve, data, solutions, weights))
+        found = replace(found, lazy_fits=(*found.lazy_fits, later))
+    return CheckedComparison(found, curve)
+
+
+def without_curve(weights: Mapping[str | Family, float]) -> dict[str | Family, float]:
+    """Return the families that are solved in any case."""
+    return {name: weight for name, weight in weights.items() if name != CURVE}
+
+
+def solve_curve(
+    data: IdentificationData, solutions: Solutions, before: FamilySolution | None = None
+) -> FamilySolution | None:
+    """Return the most probable curve by its inliers; None if there are too few for one."""
+    observations, count = data.observations, len(data.observations)
+    everything = np.arange(count)
+    log_evidence = stated_log_evidence if data.stated else _log_evidence_over_all_scales
+    # Only an evidence by the same observations is comparable.
+    competitor = max(
+        (log_evidence(one.scored.solution) for one in solutions.values() if len(one.inliers) == count),
+        default=-math.inf,
+    )
+
+    def solve(rows: RowIndices) -> Scored | None:
+        some = observations if len(rows) == count else observations.select(rows)
+        if before is not None and np.array_equal(before.inliers, rows[: len(before.inliers)]):
+            return continue_curve(some, before.scored.solution)
+        free = solve_families(some, ["free"])["free"].solution
+        orders = [
+            one.scored.solution.values[:, 0]
+            for one in solutions.values()
+            if one.scored.solution.motion.joints == 1 and np.array_equal(one.inliers, rows)
+        ]
+        return fit_curve(some, free.covariance, orders, log_evidence, competitor)
+
+    scored = solve(everything)
+    if scored is None:
+        return None
+    best = FamilySolution(scored, everything, count, 0.0)
+    if data.outliers is None:
+        return best
+    best = replace(best, log_prior=log_inlier_prior(data.outliers, count, count, observations.rows))
+    if len(_classify(data, scored.solution)) == count:
+        return best
+    starts = [one.inliers for one in solutions.values() if len(one.inliers) < count]
+    for rows in (*starts[:1], densest_half(observations)):
+        for _ in range(_ROUNDS):
+            scored = solve(rows)
+            if scored is None:
+                break
+            rows, used = _classify(data, scored.solution), rows
+            if np.array_equal(rows, used):
+                break
+        if scored is not None and 2 * len(used) > count:
+            log_prior = log_inlier_prior(data.outliers, count, len(used), observations.rows)
+            other = FamilySolution(scored, used, count, log_prior)
+            best = max(best, other, key=lambda one: one.scored.log_evidence + one.log_prior)
+    return best
+
+
+def _is_doubtful(
+    data: IdentificationData, solutions: Solutions, weights: Mapping[str | Family, float]
+) -> bool:
+    """Return True if a curve may explain the observations better than the best of other families."""
+    found = weigh_families(data, solutions, weights)
+    solution = solutions[_best_name(found, solutions)].scored.solution
+    if solution.motion.joints > 1:
+        return True
+    fit = measure_fit(solution, _noise_covariance(data, found, solution))
+    return fit.systematic_gain > _GAIN or (data.stated and fit.p_value < _DOUBTFUL)
+
+
+def _compare_refuted(
+    data: IdentificationData, solutions: Solutions, weights: Mapping[str | Family, float]
+) -> IdentificationResult:
+    """Return the comparison at a larger size of the noise, if residuals refute the stated one."""
+    _, factor = _best_scale(solutions, weights, _REFUTED_SCALES)
+    larger = replace(data, observations=_scaled(data.observations, factor), noise_factor=factor)
+    again = solve_with_inliers(larger, without_curve(weights))
+    if CURVE in solutions:
+        curve = solve_curve(larger, again)
+        if curve is not None:
+            again[CURVE] = curve
+    found = weigh_families(larger, again, weights)
+    misfit = factor * measure_fit(again[_best_name(found, again)].scored.solution).factor
+    size = f"{factor if math.isnan(misfit) else misfit:.1f}"
+    reason = f"residuals are {size} times the stated noise: either the noise is larger, or this is none of these joints"
+    return replace(found, reason=reason)
+
+
+def _reasons(
+    data: IdentificationData,
+    found: IdentificationResult,
+    solutions: Solutions,
+    weights: Mapping[str | Family, float],
+) -> Iterator[str]:
+    """Yield the reasons for which the best family is not sure."""
+    name = _best_name(found, solutions)
+    if found.lazy_fits[0].probability < SURE:
+        return
+    solution = solutions[name].scored.solution
+    joints, curve = solution.motion.joints, solutions.get(CURVE)
+    if data.stated and (joints > 1 or name == CURVE):
+        other, factor = _best_scale(solutions, weights, _DOUBTED_SCALES)
+        if other != name and factor > CALIBRATED:
+            family = solutions[other].scored.solution.motion.name
+            yield f"with {factor:.1f} times the stated noise it would be {family}"
+    covariance = _noise_covariance(data, found, solution)
+    if name == CURVE:
+        own = measure_fit(solution, covariance.mean(axis=0))
+        for one in solutions.values():
+            other_solution = one.scored.solution
+            if one is not curve and other_solution.motion.joints <= 1:
+                ratio = measure_fit(other_solution, covariance.mean(axis=0)).factor / own.factor
+                if ratio < _CORRELATED:
+                    yield (
+                        f"residuals of {other_solution.motion.name} are only {ratio:.1f} times as large, which "
+                        "errors that are correlated would explain"
+                    )
+    elif joints > 1 and curve is not None and not isinstance(solution.motion, FamilyMotion):
+        fit = measure_fit(curve.scored.solution, covariance.mean(axis=0))
+        if _explains(fit, data.stated) or _is_smooth(solution.values):
+            yield "its joint values lie on one curve"
+    elif not data.stated and joints == 1:
+        fit = measure_fit(solution, covariance)
+        if fit.systematic_gain > _SYSTEMATIC_GAIN and fit.systematic_share > _SYSTEMATIC_SHARE:
+            yield "its residuals vary with the joint value, so this may be none of these joints"
+
+
+def _explains(fit: GoodnessOfFit, stated: bool) -> bool:
+    """Return True if a curve explains the observations as well as the noise allows."""
+    return fit.p_value > _FITTING if stated else fit.factor < _FITTING_FACTOR
+
+
+def _is_smooth(values: Array) -> bool:
+    """Return True if a few joint values (N, k), in their order, run along a smooth curve.
+
+    They are too few for a curve with as many knots as their path may need.
+    """
+    if len(values) > _FEW:
+        return False
+    steps = np.diff(values / np.maximum(values.std(axis=0), 1e-12), axis=0)
+    lengths = np.maximum(np.linalg.norm(steps, axis=1), 1e-12)
+    cosines = np.sum(steps[1:] * steps[:-1], axis=1) / (lengths[1:] * lengths[:-1])
+    return bool(np.median(cosines) > _SMOOTH)
+
+
+def _best_scale(
+    solutions: Solutions, weights: Mapping[str | Family, float], scales: Array
+) -> tuple[str | Family, float]:
+    """Return the most probable family and its size of the noise relative to the stated one."""
+    prior = -0.5 * (np.log(scales) / _SCALE_SPREAD) ** 2
+    logs = {
+        name: prior
+        + solver.log_evidences(one.scored.solution, scales)
+        + one.log_prior
+        + math.log(weights[name])
+        for name, one in solutions.items()
+    }
+    best = max(logs, key=lambda name: np.logaddexp.reduce(logs[name]))
+    return best, float(scales[int(np.argmax(logs[best]))])
+
+
+def _best_name(found: IdentificationResult, solutions: Solutions) -> str | Family:
+    family = found.lazy_fits[0].family
+    return next(name for name, one in solutions.items() if one.scored.solution.motion.name == family)
+
+
+def _noise_covariance(
+    data: IdentificationData, found: IdentificationResult, solution: Solution[FamilyMember]
+) -> Array:
+    """Return the covariances of residuals for the stated noise, or the noise that was estimated."""
+    return solution.covariance if data.stated else found.noise_scale**2 * solution.covariance
+
+
+def _log_evidence_over_all_scales(solution: Solution[FamilyMember]) -> float:
+    scales = np.geomspace(0.03, 30.0, 13)
+    return float(np.logaddexp.reduce(solver.log_evidences(solution, scales)))
+
+
+def _scaled(observations: Observations, factor: float) -> Observations:
+    """Return observations with standard deviations larger by a factor."""
+    of_parent = observations.parent_covariance
+    return Observations(
+        observations.parent,
+        observations.child,
+        None if of_parent is None else factor**2 * of_parent,
+        factor**2 * observations.child_covariance,
+    )
+
+
+def _classify(data: IdentificationData, solution: Solution[FamilyMember]) -> RowIndices:
+    """Return the indices of the inliers under a curve."""
+    assert data.outliers is not None
+    rows = data.observations.rows
+    projected = project_observations(solution.motion, solution.values, data.observations)
+    covariance = projected.covariance
+    if not data.stated:
+        # The median of χ² is about its degrees of freedom less 2/3, and half of the observations are inliers.
+        weighted = np.linalg.solve(covariance, projected.residuals[:, :, None])[:, :, 0]
+        median = float(np.median(np.sum(projected.residuals * weighted, axis=1)))
+        covariance = covariance * max(median / (rows - 1 - 2.0 / 3.0), 1e-12)
+    return np.flatnonzero(classify_inliers(projected.residuals, covariance, data.outliers, data.stated))
+
+
+def _fit_curve(data: IdentificationData, solutions: Solutions, weights: Mapping[str | Family, float]) -> Fit:
+    """Return the fit of a curve that the other families made improbable."""
+    curve = solve_curve(data, solutions)
+    assert curve is not None  # there are enough observations
+    return replace(weigh_families(data, {CURVE: curve}, weights).best, probability=0.0)
