@@ -89,7 +89,7 @@ class NaturalSpline:
     @property
     def knots(self) -> Array:
         """The knots, (K,)."""
-        return self.first + self.step * np.arange(self.count)
+        return np.asarray(self.first + self.step * np.arange(self.count), dtype=np.float64)
 
     @property
     def last(self) -> float:

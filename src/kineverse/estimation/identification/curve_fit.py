@@ -8,9 +8,9 @@ it is fitted again, and its knots are spread evenly. The most probable number of
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Iterator
-
 import math
+from collections.abc import Callable, Iterable, Iterator
+from typing import NamedTuple
 
 import numpy as np
 
@@ -74,9 +74,9 @@ def fit_curve(
     begun = [(_refine(observations, deviations, motion, 1, even), even) for motion, even in starts]
     start, even = min(begun, key=lambda pair: pair[0].cost)
 
-    def fit(motion: CurveMotion, count: int) -> Scored:
+    def fit(motion: CurveMotion, count: int) -> _FittedCurve:
         solution = _refine(observations, deviations, _with_knots(motion, count, even), _ROUNDS, even)
-        return Scored(solution, score(solution))
+        return _FittedCurve(solution, score(solution))
 
     best = latest = fit(start.motion, possible[middle])
     worse = 0
@@ -84,7 +84,7 @@ def fit_curve(
         missing = competitor - latest.log_evidence
         latest = fit(latest.solution.motion, count)
         worse = 0 if latest.log_evidence > best.log_evidence else worse + 1
-        best = max(best, latest, key=lambda scored: scored.log_evidence)
+        best = max(best, latest, key=lambda fitted: fitted.log_evidence)
         if worse == 2 or competitor - latest.log_evidence > max(_HOPELESS, _LEFT * missing):
             break
     if best.log_evidence > competitor - _HOPELESS:
@@ -96,6 +96,13 @@ def fit_curve(
     return continue_curve(observations, best.solution)
 
 
+class _FittedCurve(NamedTuple):
+    """Solution of a curve with some number of knots, and its log evidence."""
+
+    solution: Solution[CurveMotion]
+    log_evidence: float
+
+
 def continue_curve(observations: Observations, before: Solution[FamilyMember]) -> Scored:
     """Return the curve with the knots of an earlier one, for the same observations or more."""
     motion = before.motion
@@ -105,7 +112,7 @@ def continue_curve(observations: Observations, before: Solution[FamilyMember]) -
         new = observations.select(slice(known, None))
         deviations = np.sqrt(np.einsum("nii->ni", before.covariance).mean(axis=0))
         values = np.concatenate([values, _nearest(new, deviations, motion)])
-    solution = levenberg_marquardt(observations, motion, values)
+    solution = levenberg_marquardt(observations, motion, values, steps=2 * _STEPS)
     return Scored(solution, stated_log_evidence(solution))
 
 

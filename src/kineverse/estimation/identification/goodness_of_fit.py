@@ -4,8 +4,8 @@ Let e be the residuals with the joint values of each observation by itself, W th
 ν the number of residuals less the numbers of joint values and of determined parameters. If the family and the
 noise are right, χ² = Σ eᵀ W e has the mean ν, and √(χ²/ν) estimates the noise relative to the stated one.
 
-A joint of the wrong kind leaves residuals that vary slowly along its joint value. Projected onto slow cosines of
-the rank of the joint value, white residuals have the variance 1 in each.
+A joint of the wrong kind leaves residuals that vary slowly along its joint value. Their projections onto slow
+cosines of the rank of the joint value are compared with the rest by an F-test.
 """
 
 from __future__ import annotations
@@ -22,8 +22,8 @@ from .motion_model import FamilyMember
 from .optimise import Solution
 from .range_prior import LITTLE
 
-# Slowest cosines along a joint value, and the log likelihood that a parameter of another model would cost.
-_COSINES, _COST = 6, 2.0
+# Number of slow cosines along a joint value: at most, and relative to the number of observations.
+_COSINES, _DENSITY = 6, 0.25
 
 
 @dataclass(frozen=True)
@@ -36,17 +36,17 @@ class GoodnessOfFit:
         Size of the residuals relative to the noise; NaN if the family leaves none.
     p_value
         Probability of a χ² at least as large if family and noise are right; 1 if there are no residuals.
-    systematic_gain
-        Log likelihood that a model with slow corrections along the joint value would gain, less their cost; 0
-        without one joint value.
-    systematic_share
-        Share of the slow corrections in χ².
+    slow_p_value
+        Probability of residuals that vary as slowly along the joint value if they are white; 1 unless there is
+        one joint value.
+    slow_share
+        Share of these slow residuals in χ².
     """
 
     factor: float
     p_value: float
-    systematic_gain: float
-    systematic_share: float
+    slow_p_value: float = 1.0
+    slow_share: float = 0.0
 
 
 def measure_fit(solution: Solution[FamilyMember], covariance: Array | None = None) -> GoodnessOfFit:
@@ -72,20 +72,31 @@ def measure_fit(solution: Solution[FamilyMember], covariance: Array | None = Non
     squares = float(np.sum(left * multiply_vectors(weights, left)))
     free = residuals.size - solution.values.size - _determined_parameters(solution, projected)
     if free < 0.5:
-        return GoodnessOfFit(math.nan, 1.0, 0.0, 0.0)
+        return GoodnessOfFit(math.nan, 1.0)
     factor, p_value = math.sqrt(squares / free), chi_squared_tail(squares, free)
-    if motion.joints != 1:
-        return GoodnessOfFit(factor, p_value, 0.0, 0.0)
+    components = residuals.shape[1] - 1
+    cosines = min(_COSINES, int(_DENSITY * len(residuals)))
+    slow_freedom = cosines * components
+    if motion.joints != 1 or not cosines or free < slow_freedom + 0.5:
+        return GoodnessOfFit(factor, p_value)
     whitened = multiply_vectors(np.swapaxes(np.linalg.cholesky(weights), 1, 2), left)
-    gains = 0.5 * _slow_parts(whitened, solution.values[:, 0]) ** 2
-    share = 2.0 * float(gains.sum()) / max(squares, 1e-300)
-    return GoodnessOfFit(factor, p_value, float(np.maximum(gains - _COST, 0.0).sum()), share)
+    slow = float(np.sum(_slow_parts(whitened, solution.values[:, 0], cosines) ** 2))
+    rest = max(squares - slow, 1e-12 * squares, 1e-300)
+    ratio = slow / slow_freedom / (rest / (free - slow_freedom))
+    slow_p_value = f_distribution_tail(ratio, slow_freedom, free - slow_freedom)
+    return GoodnessOfFit(factor, p_value, slow_p_value, slow / max(squares, 1e-300))
 
 
 def chi_squared_tail(squares: float, freedom: float) -> float:
     """Return the probability that χ² with some degrees of freedom is larger (Wilson and Hilferty 1931)."""
     spread = 2.0 / (9.0 * freedom)
     return 0.5 * math.erfc(((squares / freedom) ** (1.0 / 3.0) - (1.0 - spread)) / math.sqrt(2.0 * spread))
+
+
+def f_distribution_tail(ratio: float, above: float, below: float) -> float:
+    """Return the probability that F with some degrees of freedom is larger (Paulson 1942)."""
+    a, b, root = 2.0 / (9.0 * above), 2.0 / (9.0 * below), ratio ** (1.0 / 3.0)
+    return 0.5 * math.erfc(((1.0 - b) * root - (1.0 - a)) / math.sqrt(2.0 * (b * root**2 + a)))
 
 
 def _determined_parameters(solution: Solution[FamilyMember], projected: Array) -> float:
@@ -96,10 +107,10 @@ def _determined_parameters(solution: Solution[FamilyMember], projected: Array) -
     return float(np.trace(np.linalg.solve(total, information)))
 
 
-def _slow_parts(whitened: Array, values: Array) -> Array:
+def _slow_parts(whitened: Array, values: Array, cosines: int) -> Array:
     """Return the projections of residuals (N, m) onto normalised slow cosines of the rank of a value."""
     count = len(values)
     rank = np.argsort(np.argsort(values, kind="stable"), kind="stable")
-    phases = math.pi * (rank[:, None] + 0.5) / count * np.arange(1, min(_COSINES, count - 1) + 1)
+    phases = math.pi * (rank[:, None] + 0.5) / count * np.arange(1, cosines + 1)
     result: Array = math.sqrt(2.0 / count) * np.cos(phases).T @ whitened
     return result

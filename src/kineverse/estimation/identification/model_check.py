@@ -50,22 +50,22 @@ REFUTED = 1e-4
 CALIBRATED = 1.2
 """Largest size of the residuals relative to the stated noise that is no misfit, however many they are."""
 
-# Probability of χ², and gain by slow corrections, at which a curve is tried.
-_DOUBTFUL, _GAIN = 2e-3, 6.0
+# Probability of χ² at a stated noise, and of slow residuals, at which a curve is tried.
+_DOUBTFUL, _SLOW = 2e-3, 5e-3
 # Sizes of the noise relative to the stated one, of a noise that is refuted and of one that is not, and the
 # standard deviation of the prior of their logarithms.
 _REFUTED_SCALES, _DOUBTED_SCALES = np.geomspace(1.0, 100.0, 41), np.geomspace(1.0, 5.0, 9)
 _SCALE_SPREAD = math.log(2.0)
 # Size of a simple joint's residuals relative to those of a curve up to which correlated errors may explain them.
 _CORRELATED = 2.0
-# Least probability of χ² of a curve, or its largest size of residuals relative to those of the best family, at
-# which the joint values of that family are said to lie on a curve.
-_FITTING, _FITTING_FACTOR = 1e-3, 1.3
+# Least probability of χ² of a curve, or its largest size of residuals relative to those of the best family, and
+# least probability of the curve, at which the joint values of that family are said to lie on a curve.
+_FITTING, _FITTING_FACTOR, _COMPETITIVE = 1e-3, 1.3, 1e-6
 # Number of observations up to which joint values are judged by the angles between their steps, and the cosine of
 # the largest median angle of a smooth path. That of independent values is beyond a right angle.
 _FEW, _SMOOTH = 20, math.cos(math.radians(45.0))
-# Share of slow corrections in χ², and their gain, that refute a joint of unknown noise.
-_SYSTEMATIC_SHARE, _SYSTEMATIC_GAIN = 0.7, 10.0
+# Probability of slow residuals, and their share in χ², that refute a joint of unknown noise.
+_SYSTEMATIC, _SYSTEMATIC_SHARE = 1e-3, 0.7
 # Largest number of classifications of outliers.
 _ROUNDS = 3
 
@@ -103,24 +103,26 @@ def weigh_and_check(
     InvalidValueError
         If the curve is the only family, and the observations are too few for one.
     """
+    found = weigh_families(data, solutions, weights) if solutions else None
     curve = None
-    if CURVE in weights and (not solutions or _is_doubtful(data, solutions, weights)):
+    is_sure = found is not None and not is_doubtful(data, found, solutions)
+    if CURVE in weights and not is_sure:
         curve = solve_curve(data, solutions, before)
         if curve is not None:
             solutions = {**solutions, CURVE: curve}
-    if not solutions:
+            found = weigh_families(data, solutions, weights)
+    if found is None:
         raise InvalidValueError(
             f"A curve takes {FEWEST_POSES} poses at least, and there are {len(data.observations)}. Give more "
             "poses or other families."
         )
-    found = weigh_families(data, solutions, weights)
-    best = solutions[_best_name(found, solutions)]
-    fit = measure_fit(best.scored.solution)
-    if data.stated and fit.p_value < REFUTED and fit.factor > CALIBRATED:
-        return CheckedComparison(_compare_refuted(data, solutions, weights), curve)
+    if not is_sure:
+        fit = measure_fit(solutions[_best_name(found, solutions)].scored.solution)
+        if data.stated and fit.p_value < REFUTED and fit.factor > CALIBRATED:
+            return CheckedComparison(_compare_refuted(data, solutions, weights), curve)
     found = replace(found, reason=next(_reasons(data, found, solutions, weights), ""))
     if curve is None and CURVE in weights and len(data.observations) >= FEWEST_POSES:
-        later = LazyFit(CURVE, 0.0, partial(_fit_curve, data, solutions, weights))
+        later = LazyFit(CURVE, 0.0, partial(fit_of_curve, data, solutions, weights))
         found = replace(found, lazy_fits=(*found.lazy_fits, later))
     return CheckedComparison(found, curve)
 
@@ -180,16 +182,13 @@ def solve_curve(
     return best
 
 
-def _is_doubtful(
-    data: IdentificationData, solutions: Solutions, weights: Mapping[str | Family, float]
-) -> bool:
-    """Return True if a curve may explain the observations better than the best of other families."""
-    found = weigh_families(data, solutions, weights)
+def is_doubtful(data: IdentificationData, found: IdentificationResult, solutions: Solutions) -> bool:
+    """Return True if a curve or a larger noise may explain the observations better than the best family."""
     solution = solutions[_best_name(found, solutions)].scored.solution
     if solution.motion.joints > 1:
         return True
     fit = measure_fit(solution, _noise_covariance(data, found, solution))
-    return fit.systematic_gain > _GAIN or (data.stated and fit.p_value < _DOUBTFUL)
+    return fit.slow_p_value < _SLOW or (data.stated and fit.p_value < _DOUBTFUL)
 
 
 def _compare_refuted(
@@ -241,12 +240,13 @@ def _reasons(
                     )
     elif joints > 1 and curve is not None and not isinstance(solution.motion, FamilyMotion):
         fit = measure_fit(curve.scored.solution, covariance.mean(axis=0))
-        if _explains(fit, data.stated) or _is_smooth(solution.values):
+        is_competitive = found.probabilities[CURVE] > _COMPETITIVE and _explains(fit, data.stated)
+        if is_competitive or _is_smooth(solution.values):
             yield "its joint values lie on one curve"
-    elif not data.stated and joints == 1:
+    elif not data.stated and joints == 1 and curve is not None:
         fit = measure_fit(solution, covariance)
-        if fit.systematic_gain > _SYSTEMATIC_GAIN and fit.systematic_share > _SYSTEMATIC_SHARE:
-            yield "its residuals vary with the joint value, so this may be none of these joints"
+        if fit.slow_p_value < _SYSTEMATIC and fit.slow_share > _SYSTEMATIC_SHARE:
+            yield "its residuals depend on the joint value, so this may be none of these joints"
 
 
 def _explains(fit: GoodnessOfFit, stated: bool) -> bool:
@@ -325,8 +325,14 @@ def _classify(data: IdentificationData, solution: Solution[FamilyMember]) -> Row
     return np.flatnonzero(classify_inliers(projected.residuals, covariance, data.outliers, data.stated))
 
 
-def _fit_curve(data: IdentificationData, solutions: Solutions, weights: Mapping[str | Family, float]) -> Fit:
-    """Return the fit of a curve that the other families made improbable."""
-    curve = solve_curve(data, solutions)
+def fit_of_curve(
+    data: IdentificationData,
+    solutions: Solutions,
+    weights: Mapping[str | Family, float],
+    before: FamilySolution | None = None,
+    probability: float = 0.0,
+) -> Fit:
+    """Return the fit of a curve whose probability is known."""
+    curve = solve_curve(data, solutions, before)
     assert curve is not None  # there are enough observations
-    return replace(weigh_families(data, {CURVE: curve}, weights).best, probability=0.0)
+    return replace(weigh_families(data, {CURVE: curve}, weights).best, probability=probability)
