@@ -14,10 +14,10 @@ from kineverse.errors import InvalidValueError, UnknownNameError, suggest
 from kineverse.estimation.noise import pose_covariance
 from kineverse.estimation.robust import Outliers, as_outliers
 
-from .comparison import prepare_data, solve_with_inliers
+from .comparison import prepare_data
 from .curve import CURVE
 from .custom_family import Family
-from .model_check import weigh_and_check, without_curve
+from .model_check import solve_joints, weigh_and_check
 from .observations import check_observations
 from .result import IdentificationResult
 
@@ -97,7 +97,7 @@ def identify(
     )
     observations = check_observations(parent_poses, child_poses, parent_covariance, child_covariance)
     data = prepare_data(observations, stated, as_outliers(outliers), sequential)
-    return weigh_and_check(data, solve_with_inliers(data, without_curve(weights)), weights).result
+    return weigh_and_check(data, solve_joints(data, weights), weights).result
 
 
 def resolve_noise(

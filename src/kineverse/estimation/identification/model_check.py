@@ -44,14 +44,14 @@ from .projection import classify_inliers, project_observations
 from .result import SURE, Fit, IdentificationResult, LazyFit
 from .solver import solver
 
-REFUTED = 1e-4
+REFUTED = 1e-3
 """Largest probability of χ² at which the noise is refuted."""
 
 CALIBRATED = 1.2
 """Largest size of the residuals relative to the stated noise that is no misfit, however many they are."""
 
 # Probability of χ² at a stated noise, and of slow residuals, at which a curve is tried.
-_DOUBTFUL, _SLOW = 2e-3, 5e-3
+_DOUBTFUL, _SLOW = 5e-3, 5e-3
 # Sizes of the noise relative to the stated one, of a noise that is refuted and of one that is not, and the
 # standard deviation of the prior of their logarithms.
 _REFUTED_SCALES, _DOUBTED_SCALES = np.geomspace(1.0, 100.0, 41), np.geomspace(1.0, 5.0, 9)
@@ -116,11 +116,21 @@ def weigh_and_check(
             f"A curve takes {FEWEST_POSES} poses at least, and there are {len(data.observations)}. Give more "
             "poses or other families."
         )
-    if not is_sure:
-        fit = measure_fit(solutions[_best_name(found, solutions)].scored.solution)
-        if data.stated and fit.p_value < REFUTED and fit.factor > CALIBRATED:
-            return CheckedComparison(_compare_refuted(data, solutions, weights), curve)
-    found = replace(found, reason=next(_reasons(data, found, solutions, weights), ""))
+    if not is_sure and data.stated:
+        name = _best_name(found, solutions)
+        fit, joints = (
+            measure_fit(solutions[name].scored.solution),
+            solutions[name].scored.solution.motion.joints,
+        )
+        if fit.p_value < REFUTED and fit.factor > CALIBRATED:
+            _, factor = _best_scale(solutions, weights, _REFUTED_SCALES)
+            return CheckedComparison(_compare_refuted(data, solutions, weights, factor, ""), curve)
+        if joints > 1 or name == CURVE:
+            other, factor = _best_scale(solutions, weights, _DOUBTED_SCALES)
+            if other != name and factor > CALIBRATED:
+                family = found.lazy_fits[0].family
+                return CheckedComparison(_compare_refuted(data, solutions, weights, factor, family), curve)
+    found = replace(found, reason=next(_reasons(data, found, solutions), ""))
     if curve is None and CURVE in weights and len(data.observations) >= FEWEST_POSES:
         later = LazyFit(CURVE, 0.0, partial(fit_of_curve, data, solutions, weights))
         found = replace(found, lazy_fits=(*found.lazy_fits, later))
@@ -130,6 +140,14 @@ def weigh_and_check(
 def without_curve(weights: Mapping[str | Family, float]) -> dict[str | Family, float]:
     """Return the families that are solved in any case."""
     return {name: weight for name, weight in weights.items() if name != CURVE}
+
+
+def solve_joints(
+    data: IdentificationData, weights: Mapping[str | Family, float]
+) -> dict[str | Family, FamilySolution]:
+    """Return the solutions of all families but the curve."""
+    joints = without_curve(weights)
+    return solve_with_inliers(data, joints) if joints else {}
 
 
 def solve_curve(
@@ -192,40 +210,45 @@ def is_doubtful(data: IdentificationData, found: IdentificationResult, solutions
 
 
 def _compare_refuted(
-    data: IdentificationData, solutions: Solutions, weights: Mapping[str | Family, float]
+    data: IdentificationData,
+    solutions: Solutions,
+    weights: Mapping[str | Family, float],
+    factor: float,
+    otherwise: str,
 ) -> IdentificationResult:
-    """Return the comparison at a larger size of the noise, if residuals refute the stated one."""
-    _, factor = _best_scale(solutions, weights, _REFUTED_SCALES)
+    """Return the comparison at a larger size of the noise than was stated.
+
+    Parameters
+    ----------
+    data, solutions, weights
+        As for :func:`weigh_and_check`.
+    factor
+        The size relative to the stated one.
+    otherwise
+        The best family for the stated noise; empty if its residuals refute that noise.
+    """
     larger = replace(data, observations=_scaled(data.observations, factor), noise_factor=factor)
-    again = solve_with_inliers(larger, without_curve(weights))
+    again = solve_joints(larger, weights)
     if CURVE in solutions:
         curve = solve_curve(larger, again)
         if curve is not None:
             again[CURVE] = curve
     found = weigh_families(larger, again, weights)
     misfit = factor * measure_fit(again[_best_name(found, again)].scored.solution).factor
-    size = f"{factor if math.isnan(misfit) else misfit:.1f}"
-    reason = f"residuals are {size} times the stated noise: either the noise is larger, or this is none of these joints"
+    reason = (
+        f"residuals are {factor if math.isnan(misfit) else misfit:.1f} times the stated noise: either the noise "
+        f"is larger, or this is {otherwise or 'none of these joints'}"
+    )
     return replace(found, reason=reason)
 
 
-def _reasons(
-    data: IdentificationData,
-    found: IdentificationResult,
-    solutions: Solutions,
-    weights: Mapping[str | Family, float],
-) -> Iterator[str]:
+def _reasons(data: IdentificationData, found: IdentificationResult, solutions: Solutions) -> Iterator[str]:
     """Yield the reasons for which the best family is not sure."""
     name = _best_name(found, solutions)
     if found.lazy_fits[0].probability < SURE:
         return
     solution = solutions[name].scored.solution
     joints, curve = solution.motion.joints, solutions.get(CURVE)
-    if data.stated and (joints > 1 or name == CURVE):
-        other, factor = _best_scale(solutions, weights, _DOUBTED_SCALES)
-        if other != name and factor > CALIBRATED:
-            family = solutions[other].scored.solution.motion.name
-            yield f"with {factor:.1f} times the stated noise it would be {family}"
     covariance = _noise_covariance(data, found, solution)
     if name == CURVE:
         own = measure_fit(solution, covariance.mean(axis=0))

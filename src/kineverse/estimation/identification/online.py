@@ -21,7 +21,6 @@ from .comparison import (
     IdentificationData,
     prepare_data,
     score_solutions,
-    solve_with_inliers,
     weigh_families,
 )
 from .curve import CURVE
@@ -29,7 +28,7 @@ from .custom_family import Family
 from .identify import Families, family_weights, resolve_noise
 from .kinematic_graph.pairwise import SURPRISE_DEVIATIONS
 from .maximum_likelihood import Scored
-from .model_check import fit_of_curve, is_doubtful, weigh_and_check, without_curve
+from .model_check import fit_of_curve, is_doubtful, solve_joints, weigh_and_check, without_curve
 from .motion_model import FamilyMember
 from .observations import Observations, check_observations
 from .optimise import InitialGuess, Solution
@@ -291,7 +290,7 @@ class Identifier:
             self._full_count = len(observations)
             data = prepare_data(observations, self._stated, self._outliers, self._sequential)
             self._unit = data.unit
-            known = solve_with_inliers(data, self._joint_weights)
+            known = solve_joints(data, self._weights)
             self._check = None
         else:
             data = prepare_data(observations, self._stated, self._outliers, self._sequential, self._unit)
@@ -326,7 +325,7 @@ class Identifier:
                 return found
             if check is not None:
                 # The families below one in a million may be those that a larger noise makes probable.
-                known = solve_with_inliers(data, self._joint_weights)
+                known = solve_joints(data, self._weights)
             return self._check_best(data, known)
         return found if check.curve is None else _with_curve(data, found, check, self._weights)
 
