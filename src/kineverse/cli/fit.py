@@ -246,8 +246,8 @@ def count_independent(found: IdentificationResult, pair: RecordedPair) -> int:
     from kineverse.estimation.recordings import effective_sample_size, spaced_indices
 
     count = len(pair.lines)
-    # The free family has no residuals.
-    fit = next((fit for fit in found if fit.family != "free"), None)
+    # The free family has no residuals, and a curve follows errors that are correlated.
+    fit = next((fit for fit in found if fit.family not in ("free", "curve")), None)
     if fit is None:
         return count
     # Outliers carry no information: the share of inliers in the subset is that in the recording.

@@ -4,17 +4,17 @@ Between its knots u_k, at joint value u,
 
     parent_T_child = translation(p(u)) · rotation(h(u) / |h(u)|)
 
-where p and h are natural cubic splines through the positions p_k and the unit quaternions h_k of the knots. The
-joint value is the length along the curve [m]. A rotation by an angle φ counts as a length ℓ φ. Beyond its ends
-the curve continues straight.
+where p and h are natural cubic splines through the positions p_k and the unit quaternions h_k of the knots.
+The joint value is the length along the curve [m]. A rotation by an angle φ counts as a length ℓ φ. Beyond its
+ends the curve continues straight.
 
 **Parameters.** A knot moves across the curve only, in five directions (two for positions). A move along the
 curve is a change of joint values.
 
-**Prior.** The mean pose has the density that all families share. The differences between the ends and, times a
-curvature, the second differences of the knots are Gaussian. Their widths are those of the observations along the
-principal directions of their positions and of their rotations: a curve in a plane pays little for being in space,
-but it pays for the plane.
+**Prior.** The mean pose has the density that all families share. The differences between the ends and, times
+a curvature, the second differences of the knots are Gaussian. Their widths are those of the observations
+along the principal directions of their positions and of their rotations: a curve in a plane pays little for
+being in space, but it pays for the plane.
 """
 
 from __future__ import annotations

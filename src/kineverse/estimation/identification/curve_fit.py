@@ -1,9 +1,10 @@
 """Fit of a curve to observations: order along the path, spline by least squares, number of knots by evidence.
 
-The observations come in any order. Candidates for their order along the path are that of the recording, of the
-first principal component, of the length of the shortest way through near neighbours, and of the joint values of
-other families. Each gives a coarse curve, and the nearest one continues: all observations are projected onto it,
-it is fitted again, and its knots are spread evenly. The most probable number of knots is chosen.
+The observations come in any order. Candidates for their order along the path are that of the recording, of
+the first principal component, of the length of the shortest way through near neighbours, and of the joint
+values of other families. Each gives a coarse curve, and the nearest one continues: all observations are
+projected onto it, it is fitted again, and its knots are spread evenly. The most probable number of knots is
+chosen.
 """
 
 from __future__ import annotations
@@ -34,8 +35,8 @@ _SAMPLES = 24
 _DENSEST = 0.75
 # Log evidence that a curve may lack, and the part of it that twice as many knots must leave at most.
 _HOPELESS, _LEFT = 30.0, 0.6
-# Largest number of observations among which the shortest ways are searched.
-_MOST = 120
+# Largest number of observations among which the shortest ways are searched, and by which the shape is found.
+_MOST, _MOST_FITTED = 120, 240
 
 
 def fit_curve(
@@ -63,6 +64,12 @@ def fit_curve(
     """
     if len(observations) < FEWEST_POSES:
         return None
+    if len(observations) > _MOST_FITTED:
+        some = np.linspace(0, len(observations) - 1, _MOST_FITTED).round().astype(int)
+        thinned = observations.select(some), covariance[some], [order[some] for order in orders]
+        known = fit_curve(*thinned, log_evidence)
+        assert known is not None  # there are enough observations
+        return project_onto_curve(observations, known.solution)
     score = log_evidence or stated_log_evidence
     deviations = np.sqrt(np.einsum("nii->ni", covariance).mean(axis=0))
     possible = [count for count in KNOTS if count <= _DENSEST * len(observations)]
@@ -105,15 +112,27 @@ class _FittedCurve(NamedTuple):
 
 def continue_curve(observations: Observations, before: Solution[FamilyMember]) -> Scored:
     """Return the curve with the knots of an earlier one, for the same observations or more."""
-    motion = before.motion
-    assert isinstance(motion, CurveMotion)
-    known, values = len(before.values), before.values
+    motion, known, values = _as_curve(before), len(before.values), before.values
     if known < len(observations):
         new = observations.select(slice(known, None))
         deviations = np.sqrt(np.einsum("nii->ni", before.covariance).mean(axis=0))
         values = np.concatenate([values, _nearest(new, deviations, motion)])
     solution = levenberg_marquardt(observations, motion, values, steps=2 * _STEPS)
     return Scored(solution, stated_log_evidence(solution))
+
+
+def project_onto_curve(observations: Observations, before: Solution[FamilyMember]) -> Scored:
+    """Return the curve with the knots of an earlier one, for other observations of the same motion."""
+    motion, deviations = _as_curve(before), np.sqrt(np.einsum("nii->ni", before.covariance).mean(axis=0))
+    values = _nearest(observations, deviations, motion)
+    solution = levenberg_marquardt(observations, motion, values, steps=_STEPS)
+    return Scored(solution, stated_log_evidence(solution))
+
+
+def _as_curve(solution: Solution[FamilyMember]) -> CurveMotion:
+    motion = solution.motion
+    assert isinstance(motion, CurveMotion)
+    return motion
 
 
 def stated_log_evidence(solution: Solution[FamilyMember]) -> float:

@@ -1,8 +1,8 @@
 """Goodness of fit: residuals of a family against the noise.
 
-Let e be the residuals with the joint values of each observation by itself, W the inverse of their covariance, and
-ν the number of residuals less the numbers of joint values and of determined parameters. If the family and the
-noise are right, χ² = Σ eᵀ W e has the mean ν, and √(χ²/ν) estimates the noise relative to the stated one.
+Let e be the residuals with the joint values of each observation by itself, W the inverse of their covariance,
+and ν the number of residuals less the numbers of joint values and of determined parameters. If the family and
+the noise are right, χ² = Σ eᵀ W e has the mean ν, and √(χ²/ν) estimates the noise relative to the stated one.
 
 A joint of the wrong kind leaves residuals that vary slowly along its joint value. Their projections onto slow
 cosines of the rank of the joint value are compared with the rest by an F-test.
@@ -37,8 +37,8 @@ class GoodnessOfFit:
     p_value
         Probability of a χ² at least as large if family and noise are right; 1 if there are no residuals.
     slow_p_value
-        Probability of residuals that vary as slowly along the joint value if they are white; 1 unless there is
-        one joint value.
+        Probability of residuals that vary as slowly along the joint value if they are white; 1 unless there
+        is one joint value.
     slow_share
         Share of these slow residuals in χ².
     """

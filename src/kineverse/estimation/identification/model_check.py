@@ -1,12 +1,13 @@
 """Check of the most probable family: curves that are no joint, and residuals that refute the noise.
 
-The comparison of families assumes that one of them is right and that the noise is as stated. This module tests
-both. A one-coordinate curve is a family, too. As it takes long to fit, it is fitted only if the best family has
-several joint values, which may lie on one curve, or leaves residuals that the noise does not explain.
+The comparison of families assumes that one of them is right and that the noise is as stated. This module
+tests both. A one-coordinate curve is a family, too. As it takes long to fit, it is fitted only if the best
+family has several joint values, which may lie on one curve, or leaves residuals that the noise does not
+explain.
 
-**Stated noise.** If χ² of the best family refutes the noise, all families are compared again at the most probable
-larger size. If the best family has several joint values or is a curve, it may only have won because the noise
-is stated too small. So families are also compared for a noise of up to five times that size.
+**Stated noise.** If χ² of the best family refutes the noise, all families are compared again at the most
+probable larger size. If the best family has several joint values or is a curve, it may only have won because
+the noise is stated too small. So families are also compared for a noise of up to five times that size.
 
 **Unknown noise.** Residuals that vary slowly along the joint value show a joint of the wrong kind.
 """
@@ -56,13 +57,14 @@ _DOUBTFUL, _SLOW = 5e-3, 5e-3
 # standard deviation of the prior of their logarithms.
 _REFUTED_SCALES, _DOUBTED_SCALES = np.geomspace(1.0, 100.0, 41), np.geomspace(1.0, 5.0, 9)
 _SCALE_SPREAD = math.log(2.0)
-# Size of a simple joint's residuals relative to those of a curve up to which correlated errors may explain them.
+# Size of a simple joint's residuals relative to those of a curve up to which correlated errors may explain
+# them.
 _CORRELATED = 2.0
-# Least probability of χ² of a curve, or its largest size of residuals relative to those of the best family, and
-# least probability of the curve, at which the joint values of that family are said to lie on a curve.
+# Least probability of χ² of a curve, or its largest size of residuals relative to those of the best family,
+# and least probability of the curve, at which the joint values of that family are said to lie on a curve.
 _FITTING, _FITTING_FACTOR, _COMPETITIVE = 1e-3, 1.3, 1e-6
-# Number of observations up to which joint values are judged by the angles between their steps, and the cosine of
-# the largest median angle of a smooth path. That of independent values is beyond a right angle.
+# Number of observations up to which joint values are judged by the angles between their steps, and the cosine
+# of the largest median angle of a smooth path. That of independent values is beyond a right angle.
 _FEW, _SMOOTH = 20, math.cos(math.radians(45.0))
 # Probability of slow residuals, and their share in χ², that refute a joint of unknown noise.
 _SYSTEMATIC, _SYSTEMATIC_SHARE = 1e-3, 0.7
@@ -236,8 +238,8 @@ def _compare_refuted(
     found = weigh_families(larger, again, weights)
     misfit = factor * measure_fit(again[_best_name(found, again)].scored.solution).factor
     reason = (
-        f"residuals are {factor if math.isnan(misfit) else misfit:.1f} times the stated noise: either the noise "
-        f"is larger, or this is {otherwise or 'none of these joints'}"
+        f"residuals are {factor if math.isnan(misfit) else misfit:.1f} times the stated noise: either the "
+        f"noise is larger, or this is {otherwise or 'none of these joints'}"
     )
     return replace(found, reason=reason)
 
@@ -258,8 +260,8 @@ def _reasons(data: IdentificationData, found: IdentificationResult, solutions: S
                 ratio = measure_fit(other_solution, covariance.mean(axis=0)).factor / own.factor
                 if ratio < _CORRELATED:
                     yield (
-                        f"residuals of {other_solution.motion.name} are only {ratio:.1f} times as large, which "
-                        "errors that are correlated would explain"
+                        f"residuals of {other_solution.motion.name} are only {ratio:.1f} times as large, "
+                        "which errors that are correlated would explain"
                     )
     elif joints > 1 and curve is not None and not isinstance(solution.motion, FamilyMotion):
         fit = measure_fit(curve.scored.solution, covariance.mean(axis=0))

@@ -172,8 +172,8 @@ def _joint_weights(families: FamilyChoice) -> dict[str | Family, float]:
     weights = family_weights(families)
     if families is not None and CURVE in weights:
         raise InvalidValueError(
-            f"Several joints are compared by families that all of them can have; the family {CURVE!r} is one of "
-            "kv.estimation.identify only."
+            f"Pairs of parts are compared by the joints that they may have, and {CURVE!r} is none. "
+            "kv.estimation.identify takes it for a single pair."
         )
     return without_curve(weights)
 
