@@ -7,7 +7,7 @@ explain.
 
 **Stated noise.** If χ² of the best family refutes the noise, all families are compared again at the most
 probable larger size. If the best family has several joint values or is a curve, it may only have won because
-the noise is stated too small. So families are also compared for a noise of up to five times that size.
+the noise is stated too small. So families are also compared for a noise of up to three times that size.
 
 **Unknown noise.** Residuals that vary slowly along the joint value show a joint of the wrong kind.
 """
@@ -55,8 +55,8 @@ CALIBRATED = 1.2
 _DOUBTFUL, _SLOW = 5e-3, 5e-3
 # Sizes of the noise relative to the stated one, of a noise that is refuted and of one that is not, and the
 # standard deviation of the prior of their logarithms.
-_REFUTED_SCALES, _DOUBTED_SCALES = np.geomspace(1.0, 100.0, 41), np.geomspace(1.0, 5.0, 9)
-_SCALE_SPREAD = math.log(2.0)
+_REFUTED_SCALES, _DOUBTED_SCALES = np.geomspace(1.0, 100.0, 41), np.geomspace(1.0, 3.0, 9)
+_SCALE_SPREAD = math.log(1.6)
 # Size of a simple joint's residuals relative to those of a curve up to which correlated errors may explain
 # them.
 _CORRELATED = 2.0
@@ -118,21 +118,25 @@ def weigh_and_check(
             f"A curve takes {FEWEST_POSES} poses at least, and there are {len(data.observations)}. Give more "
             "poses or other families."
         )
+    reason = ""
     if not is_sure and data.stated:
         name = _best_name(found, solutions)
-        fit, joints = (
-            measure_fit(solutions[name].scored.solution),
-            solutions[name].scored.solution.motion.joints,
-        )
+        solution = solutions[name].scored.solution
+        fit = measure_fit(solution)
         if fit.p_value < REFUTED and fit.factor > CALIBRATED:
-            _, factor = _best_scale(solutions, weights, _REFUTED_SCALES)
+            factor = _best_scale(solutions, weights, _REFUTED_SCALES)[1]
             return CheckedComparison(_compare_refuted(data, solutions, weights, factor, ""), curve)
-        if joints > 1 or name == CURVE:
-            other, factor = _best_scale(solutions, weights, _DOUBTED_SCALES)
+        if solution.motion.joints > 1 or name == CURVE:
+            other, factor, logs = _best_scale(solutions, weights, _DOUBTED_SCALES)
             if other != name and factor > CALIBRATED:
-                family = found.lazy_fits[0].family
-                return CheckedComparison(_compare_refuted(data, solutions, weights, factor, family), curve)
-    found = replace(found, reason=next(_reasons(data, found, solutions), ""))
+                if logs[other] - logs[name] > math.log(SURE / (1.0 - SURE)):
+                    best = solution.motion.name
+                    return CheckedComparison(_compare_refuted(data, solutions, weights, factor, best), curve)
+                reason = (
+                    f"with {factor:.1f} times the stated noise it would be "
+                    f"{solutions[other].scored.solution.motion.name}"
+                )
+    found = replace(found, reason=reason or next(_reasons(data, found, solutions), ""))
     if curve is None and CURVE in weights and len(data.observations) >= FEWEST_POSES:
         later = LazyFit(CURVE, 0.0, partial(fit_of_curve, data, solutions, weights))
         found = replace(found, lazy_fits=(*found.lazy_fits, later))
@@ -294,18 +298,22 @@ def _is_smooth(values: Array) -> bool:
 
 def _best_scale(
     solutions: Solutions, weights: Mapping[str | Family, float], scales: Array
-) -> tuple[str | Family, float]:
-    """Return the most probable family and its size of the noise relative to the stated one."""
+) -> tuple[str | Family, float, dict[str | Family, float]]:
+    """Return the best family, its size of the noise relative to the stated one, and the log evidences.
+
+    They are the evidences of all families with their prior, for a noise of unknown size.
+    """
     prior = -0.5 * (np.log(scales) / _SCALE_SPREAD) ** 2
-    logs = {
+    at_scales = {
         name: prior
         + solver.log_evidences(one.scored.solution, scales)
         + one.log_prior
         + math.log(weights[name])
         for name, one in solutions.items()
     }
-    best = max(logs, key=lambda name: np.logaddexp.reduce(logs[name]))
-    return best, float(scales[int(np.argmax(logs[best]))])
+    logs = {name: float(np.logaddexp.reduce(each)) for name, each in at_scales.items()}
+    best = max(logs, key=logs.__getitem__)
+    return best, float(scales[int(np.argmax(at_scales[best]))]), logs
 
 
 def _best_name(found: IdentificationResult, solutions: Solutions) -> str | Family:
