@@ -106,7 +106,7 @@ def weigh_and_check(
         If the curve is the only family, and the observations are too few for one.
     """
     found = weigh_families(data, solutions, weights) if solutions else None
-    curve = None
+    curve, is_online = None, before is not None
     is_sure = found is not None and not is_doubtful(data, found, solutions)
     if CURVE in weights and not is_sure:
         curve = solve_curve(data, solutions, before)
@@ -125,13 +125,15 @@ def weigh_and_check(
         fit = measure_fit(solution)
         if fit.p_value < REFUTED and fit.factor > CALIBRATED:
             factor = _best_scale(solutions, weights, _REFUTED_SCALES)[1]
-            return CheckedComparison(_compare_refuted(data, solutions, weights, factor, ""), curve)
+            return CheckedComparison(_compare_refuted(data, solutions, weights, factor, "", is_online), curve)
         if solution.motion.joints > 1 or name == CURVE:
             other, factor, logs = _best_scale(solutions, weights, _DOUBTED_SCALES)
             if other != name and factor > CALIBRATED:
                 if logs[other] - logs[name] > math.log(SURE / (1.0 - SURE)):
                     best = solution.motion.name
-                    return CheckedComparison(_compare_refuted(data, solutions, weights, factor, best), curve)
+                    return CheckedComparison(
+                        _compare_refuted(data, solutions, weights, factor, best, is_online), curve
+                    )
                 reason = (
                     f"with {factor:.1f} times the stated noise it would be "
                     f"{solutions[other].scored.solution.motion.name}"
@@ -221,6 +223,7 @@ def _compare_refuted(
     weights: Mapping[str | Family, float],
     factor: float,
     otherwise: str,
+    is_online: bool,
 ) -> IdentificationResult:
     """Return the comparison at a larger size of the noise than was stated.
 
@@ -232,11 +235,13 @@ def _compare_refuted(
         The size relative to the stated one.
     otherwise
         The best family for the stated noise; empty if its residuals refute that noise.
+    is_online
+        True if the curve keeps its number of knots, to save time.
     """
     larger = replace(data, observations=_scaled(data.observations, factor), noise_factor=factor)
     again = solve_joints(larger, weights)
     if CURVE in solutions:
-        curve = solve_curve(larger, again)
+        curve = solve_curve(larger, again, solutions[CURVE] if is_online else None)
         if curve is not None:
             again[CURVE] = curve
     found = weigh_families(larger, again, weights)
