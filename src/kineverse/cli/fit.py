@@ -214,7 +214,6 @@ def identify_joint(
         For a family that does not exist.
     """
     from kineverse.estimation import identify
-    from kineverse.estimation.identification.identify import UNKNOWN_NOISE
 
     if stated is not None and stated[1] is None and pair.has_orientation:
         raise InvalidValueError("--noise: poses have two, of positions and orientations: 3mm,1deg")
@@ -228,7 +227,9 @@ def identify_joint(
         outliers=True,
         sequential=pair.is_timed,
     )
-    position, orientation = stated or (found.noise_scale * deviation for deviation in UNKNOWN_NOISE)
+    noise = found.noise if stated is None else stated
+    assert noise is not None  # it is estimated if it is not stated
+    position, orientation = noise
     return found, ObservationNoise(
         position, orientation if pair.has_orientation else None, stated is not None
     )

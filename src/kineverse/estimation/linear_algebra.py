@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import math
+
 import numpy as np
 
 from kineverse.errors import InvalidValueError
@@ -14,6 +16,11 @@ def invert_matrices(matrices: Array) -> Array:
     if size == 1:
         return 1.0 / matrices
     return np.asarray(np.linalg.inv(matrices), dtype=np.float64)
+
+
+def transposed(matrices: Array) -> Array:
+    """Transpose each of a stack of matrices."""
+    return np.swapaxes(matrices, -1, -2)
 
 
 def multiply_vectors(matrices: Array, vectors: Array) -> Array:
@@ -46,6 +53,8 @@ def inverse_spd(matrix: Array) -> Array:
     InvalidValueError
         If it is numerically singular.
     """
+    if matrix.shape == (1, 1) and 0.0 < matrix[0, 0] < math.inf:
+        return 1.0 / matrix
     try:
         np.linalg.cholesky(matrix)
         return symmetric(np.asarray(np.linalg.inv(matrix), dtype=np.float64))

@@ -38,29 +38,40 @@ class Outliers:
         ε, the expected fraction of outliers.
     reach
         Edge of the cube [m], and for expressions the range of each of their numbers.
+    gate
+        Gate of a tracker, in standard deviations: the norm of the whitened residual at which a measurement
+        has the weight one half. It sets u in place of the reach. None for the density of the reach, whose
+        gate depends on the noise.
 
     Raises
     ------
     InvalidValueError
-        For a fraction that is not between 0 and 1, or a reach that is not positive.
+        For a fraction that is not between 0 and 1, or a reach or gate that is not positive.
     """
 
     fraction: float = 0.05
     reach: float = 2.0
+    gate: float | None = None
 
     def __post_init__(self) -> None:
         if not 0 < self.fraction < 1:
             raise InvalidValueError(f"The fraction of outliers is between 0 and 1, not {self.fraction!r}.")
         if not (math.isfinite(self.reach) and self.reach > 0):
             raise InvalidValueError(f"The reach of outliers is positive and finite, not {self.reach!r}.")
+        if self.gate is not None and not (math.isfinite(self.gate) and self.gate > 0):
+            raise InvalidValueError(
+                f"The gate of outliers is a positive number of standard deviations, not {self.gate!r}."
+            )
 
     @property
     def log_uniform_density(self) -> float:
         """Logarithm of u for a pose."""
         return -3 * math.log(self.reach) - math.log(_ROTATION_VOLUME)
 
-    def log_density(self, observation: MeasurementModel) -> float:
-        """Return log(ε u) of an observation."""
+    def log_density(self, observation: MeasurementModel, log_scale: float) -> float:
+        """Return log(ε u) of a measurement with the noise density exp(-``log_scale``) at its peak."""
+        if self.gate is not None:
+            return math.log(1 - self.fraction) - self.gate**2 / 2 - log_scale
         if observation.is_pose:
             return math.log(self.fraction) + self.log_uniform_density
         return math.log(self.fraction) - observation.size * math.log(self.reach)

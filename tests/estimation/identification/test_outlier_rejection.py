@@ -131,7 +131,7 @@ def test_outliers_are_found_with_unknown_noise(family: str) -> None:
     found = identify(seen.parent, child, outliers=True)
     assert found.best.family == family
     assert found.best.outliers == tuple(wrong)
-    assert found.noise_scale == pytest.approx(2.0, rel=0.5)
+    assert found.noise == pytest.approx((0.01, 0.03), rel=0.5)
 
 
 def test_outliers_are_found_in_millimetres() -> None:

@@ -192,10 +192,14 @@ def test_c_stays_within_its_work_memory(family: str, how: str, monkeypatch: pyte
 def test_evidence_in_c_agrees_with_numpy(family: str, how: str) -> None:
     seen = seen_as(how, family)
     solution = solver.maximum_likelihood(seen, [*initial_guesses(family, MotionStatistics(seen))]).solution
-    for scale in (1.0, 3.0):
-        slow, fast = laplace_evidence(solution.scaled(scale)), solver.evidence(solution, scale)
+    parts = np.stack([0.3 * solution.covariance, 0.7 * solution.covariance])
+    factors = np.array([[1.0, 1.0], [3.0, 3.0], [2.0, 0.5]])
+    logs = solver.log_evidences(solution, factors, parts)
+    for log, size in zip(logs, [1.0, 9.0, 0.3 * 4.0 + 0.7 * 0.25], strict=True):
+        larger = replace(solution, covariance=size * solution.covariance)
+        slow, fast = laplace_evidence(larger), solver.evidence(larger)
         assert fast.log_evidence == pytest.approx(slow.log_evidence, rel=1e-9)
-        assert solver.log_evidences(solution, np.array([scale])) == pytest.approx(slow.log_evidence, rel=1e-9)
+        assert log == pytest.approx(slow.log_evidence, rel=1e-9)
         np.testing.assert_allclose(slow.covariance, fast.covariance, rtol=1e-6, atol=1e-12)
         np.testing.assert_allclose(slow.joint_values, fast.joint_values, atol=1e-9)
         np.testing.assert_allclose(slow.joint_covariances, fast.joint_covariances, atol=1e-12)

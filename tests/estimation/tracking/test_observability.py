@@ -142,7 +142,7 @@ def test_static_updates_equal_one_batch_estimate():
     best = least_squares(residuals, list(estimate.state.values()), xtol=1e-12, ftol=1e-12, gtol=1e-12)
     # Equal up to the mean of rotations, which averages rotation vectors to first order.
     assert np.allclose(list(estimate.state.values()), best.x, rtol=0, atol=2e-4)
-    assert np.linalg.eigvalsh(tracker._mixture.best.information)[0] == pytest.approx(0.3**-2, rel=1e-6)
+    assert np.linalg.eigvalsh(tracker._now.mixture.best.information)[0] == pytest.approx(0.3**-2, rel=1e-6)
 
 
 def test_linear_model_keeps_its_covariance_in_unobservable_directions():

@@ -306,7 +306,7 @@ def test_compiled_and_numpy_updates_agree_on_floating_bodies(place):
     for step in range(5):
         seen = observer(truth)
         native = fast._update_step.native.update(
-            fast._mixture.best, fast._update_step.reader.read(seen), np.empty(0)
+            fast._now.mixture.best, fast._update_step.reader.read(seen), np.empty(0)
         )
         assert native is not None
         for a, b in [
@@ -408,7 +408,7 @@ def test_compiled_and_numpy_agree_about_groups_with_several_active_bounds(seed):
         one, other = fast.update(seen), slow.update(seen)
         assert (
             fast._update_step.native.update(
-                fast._mixture.best, fast._update_step.reader.read(seen), np.empty(0)
+                fast._now.mixture.best, fast._update_step.reader.read(seen), np.empty(0)
             )
             is not None
         )

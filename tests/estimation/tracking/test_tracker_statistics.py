@@ -226,7 +226,7 @@ def test_hypothesis_bank_follows_a_lock_that_opens():
     start = {"start": {"q": 0.0}, "uncertainty": {"q": 0.01}}
     hypotheses = HypothesisBank(
         {
-            "locked": Tracker(model, ["part"], **start),
+            "locked": Tracker(model, ["part"], process="static", **start),
             "free": Tracker(model, ["part"], process_noise={"q:velocity": 0.1}, **start),
         },
         forgetting=1.0,

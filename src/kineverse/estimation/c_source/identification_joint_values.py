@@ -6,17 +6,15 @@ typedef struct {
   double *values, *covariances, log_likelihood, deviations[6], mean[6], log_density;
 } Apart;
 
-/* As solve_per_observation in range_prior.py, for errors whose covariances are larger by a factor. */
-static void alone(const Problem *p, const Answer *a, double factor, Apart *apart) {
+/* As solve_per_observation in range_prior.py. */
+static void alone(const Problem *p, const Answer *a, Apart *apart) {
   int m = (int)p->rows, n = (int)p->joints;
   double log_likelihood = 0.0, *values = apart->values, *covariances = apart->covariances;
   memcpy(values, a->values, p->count * n * sizeof(double));
   for (int64_t k = 0; k < p->count; k++) {
     const double *J = a->by_joints + m * n * k, *e = a->residuals + m * k;
     double W[36], weighted[36], curvature[36], slope[6], left[6], *C = covariances + n * n * k;
-    double S[36], root;
-    for (int i = 0; i < m * m; i++) S[i] = factor * a->covariances[m * m * k + i];
-    root = invert(S, m, W);
+    double root = invert(a->covariances + m * m * k, m, W);
     for (int i = 0; i < n; i++) {
       slope[i] = 0.0;
       for (int r = 0; r < m; r++) {
@@ -162,11 +160,11 @@ static void widths(const Problem *p, Apart *apart, double *memory) {
 }
 
 /* Both of them, in memory of their own; returns what is free behind it. */
-static double *take_apart(const Problem *p, const Answer *a, double factor, Apart *apart, double *memory) {
+static double *take_apart(const Problem *p, const Answer *a, Apart *apart, double *memory) {
   apart->values = memory;
   apart->covariances = memory + p->count * p->joints;
   memory = apart->covariances + p->count * p->joints * p->joints;
-  alone(p, a, factor, apart);
+  alone(p, a, apart);
   apart->log_density = 0.0;
   if (p->joints) widths(p, apart, memory);
   return memory;
@@ -189,7 +187,7 @@ static void slide(const Problem *p, Answer *a, double *memory) {
   for (int64_t turn = 0; turn < p->sliding_turns && most > p->slid; turn++) {
     double normal[81] = {0}, change[9] = {0};
     Apart apart;
-    take_apart(p, a, 1.0, &apart, memory);
+    take_apart(p, a, &apart, memory);
     for (int64_t k = 0; k < p->count; k++) {
       /* What the mean and the point make of joint values. */
       double twist[6] = {0}, W[36], by[54] = {0}, weighted[54], *G = turned + 9 * k;

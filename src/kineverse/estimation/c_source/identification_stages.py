@@ -11,7 +11,7 @@ EVIDENCE = r"""
 #define ATOM 1e-10
 
 /* Joint values, their covariances and the information, as observations and widths tell together. */
-static void informed(const Problem *p, const Answer *a, double factor, const Apart *apart, double *values,
+static void informed(const Problem *p, const Answer *a, const Apart *apart, double *values,
                      double *covariances, double *information) {
   int rows = (int)p->rows, joints = (int)p->joints, slides = (int)p->slides, size = (int)size_of(p);
   int n = size + joints + slides;
@@ -35,7 +35,7 @@ static void informed(const Problem *p, const Answer *a, double factor, const Apa
     place_one(p, m, &o);
     for (int r = 0; r < rows; r++) {
       for (int s = 0; s < rows; s++) {
-        moved[rows * r + s] = factor * S[rows * r + s];
+        moved[rows * r + s] = S[rows * r + s];
         for (int j = 0; j < joints; j++) {
           const double *J = o.by_joints + 6 * j;
           moved[rows * r + s] += apart->deviations[j] * apart->deviations[j] * J[r] * J[s];
@@ -106,12 +106,12 @@ static double beforehand(const Problem *p, const Motion *m, const double *mean, 
   return log_density;
 }
 
-/* As laplace_evidence in evidence.py, for errors whose variances are larger by a factor. */
-static double evidence(const Problem *p, const Answer *a, double factor, const Apart *apart, double *values,
+/* As laplace_evidence in evidence.py. */
+static double evidence(const Problem *p, const Answer *a, const Apart *apart, double *values,
                        double *covariances, double *information) {
   int n = (int)(size_of(p) + p->joints + p->slides);
   double copied[UNKNOWNS * UNKNOWNS], log_density = apart->log_likelihood + apart->log_density;
-  informed(p, a, factor, apart, values, covariances, information);
+  informed(p, a, apart, values, covariances, information);
   log_density += beforehand(p, &a->head->motion, apart->mean, information) + 0.5 * n * log(TAU);
   memcpy(copied, information, n * n * sizeof(double));
   return log_density - 0.5 * log_volume(copied, n);
@@ -120,7 +120,7 @@ static double evidence(const Problem *p, const Answer *a, double factor, const A
 /* Its logarithm alone. */
 static double log_evidence(const Problem *p, const Answer *a, const Apart *apart, double *memory) {
   double information[UNKNOWNS * UNKNOWNS];
-  return evidence(p, a, 1.0, apart, memory, memory + p->count * p->joints, information);
+  return evidence(p, a, apart, memory, memory + p->count * p->joints, information);
 }
 
 /* As evidence_excess in evidence.py. */
@@ -170,7 +170,7 @@ static double *widen_until_settled(Problem *p, Answer *a, Apart *apart, double *
     double most = 0.0, *wide = apart->deviations;
     Belief *belief = &a->head->belief;
     if (turn < p->turns) slide(p, a, memory);
-    rest = take_apart(p, a, 1.0, apart, memory);
+    rest = take_apart(p, a, apart, memory);
     for (int i = 0; i < n; i++) most = fmax(most, fabs(log(fmax(wide[i], p->narrowest) / before[i])));
     if (turn == p->turns || (believed && most < p->settled)) return rest;
     believed = 1;
@@ -190,7 +190,7 @@ static double *refine_from(Problem *p, Answer *a, Apart *apart, double *noise, d
   int narrowing = p->softer && !(a->head->marginal > 0.0);
   Answer other;
   Apart of_other;
-  if (!p->joints || !size_of(p)) return take_apart(p, a, 1.0, apart, memory);
+  if (!p->joints || !size_of(p)) return take_apart(p, a, apart, memory);
   if (narrowing) {
     memory = lay(p, memory, &other);
     copy(p, a, &other);
@@ -234,7 +234,7 @@ EXPORT void likeliest(const Problem *problem, int64_t starts, const Motion *moti
   }
   exchange(&p, &a, memory);
   slide(&p, &a, memory);
-  memory = take_apart(&p, &a, 1.0, &apart, memory);
+  memory = take_apart(&p, &a, &apart, memory);
   judge(&p, &a, &apart, memory);
 }
 
@@ -258,20 +258,26 @@ EXPORT void carry_on(const Problem *problem, double *memory, double *answer) {
   settle_new(&p, &a, memory);
   go_on(&p, &a, memory);
   if (!p.marginal) slide(&p, &a, memory);
-  memory = p.marginal ? widen_until_settled(&p, &a, &apart, memory) : take_apart(&p, &a, 1.0, &apart, memory);
+  memory = p.marginal ? widen_until_settled(&p, &a, &apart, memory) : take_apart(&p, &a, &apart, memory);
   judge(&p, &a, &apart, memory);
 }
 
-/* As laplace_evidence in evidence.py, for errors larger by several factors; the rest is for the last. */
-EXPORT void rate(const Problem *problem, int64_t scales, const double *scale, double *memory,
-                 double *answer, double *logs, double *values, double *covariances, double *information) {
+/* As laplace_evidence in evidence.py, for several sizes of the noise; the rest is for the last. The
+   covariance of the errors is the sum of two parts, times the square of a factor each; without parts it is as
+   it is. */
+EXPORT void rate(const Problem *problem, int64_t sizes, const double *factors, const double *parts,
+                 double *memory, double *answer, double *logs, double *values, double *covariances,
+                 double *information) {
   Answer a;
   Apart apart;
+  int64_t numbers = problem->count * problem->rows * problem->rows;
   lay(problem, answer, &a);
-  for (int64_t i = 0; i < scales; i++) {
-    double factor = scale[i] * scale[i];
-    take_apart(problem, &a, factor, &apart, memory);
-    logs[i] = evidence(problem, &a, factor, &apart, values, covariances, information);
+  for (int64_t i = 0; i < sizes; i++) {
+    double place = factors[2 * i] * factors[2 * i], turn = factors[2 * i + 1] * factors[2 * i + 1];
+    for (int64_t k = 0; parts && k < numbers; k++)
+      a.covariances[k] = place * parts[k] + turn * parts[numbers + k];
+    take_apart(problem, &a, &apart, memory);
+    logs[i] = evidence(problem, &a, &apart, values, covariances, information);
   }
 }
 """

@@ -77,7 +77,7 @@ def _declare(code: Any) -> None:
     code.at.argtypes = (pointer, counter, *(pointer,) * 5)
     code.memory_of.argtypes, code.memory_of.restype = (pointer,), counter
     code.likeliest.argtypes = (pointer, counter, *(pointer,) * 4)
-    code.rate.argtypes = (pointer, counter, *(pointer,) * 7)
+    code.rate.argtypes = (pointer, counter, *(pointer,) * 8)
     for stage in (code.solve, code.refine, code.carry_on):
         stage.argtypes = (pointer,) * 3
     for function in (code.at, code.likeliest, code.rate, code.solve, code.refine, code.carry_on):

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass, replace
 from functools import partial
 
@@ -17,6 +17,7 @@ from .gauge import fix_gauge
 from .goodness_of_fit import measure_fit
 from .initial_guess import MotionStatistics, initial_guesses
 from .maximum_likelihood import Scored
+from .nested_families import bound_log_evidences
 from .observations import Observations
 from .optimise import InitialGuess
 from .outlier_rejection import RowIndices, find_inliers, log_inlier_prior
@@ -24,14 +25,21 @@ from .projection import complete_fit
 from .result import Fit, IdentificationResult, LazyFit, build_fit
 from .scale import convert_to_metres, convert_to_unit, length_scale, log_density
 from .solver import solver
+from .unknown_noise import (
+    STATED_NOISE,
+    NoisePosterior,
+    NoiseSolution,
+    adapt_noise,
+    scale_noise,
+    solve_unknown_noise,
+)
 from .unwrapping import log_unwrapping_gain, unwrap_screw, unwrap_solution
 
 # A family is not refined if its log evidence is below that of the best by more than a constant and a term for
 # each observation. With noise that is large beside the motion, the unrefined evidence is this inaccurate.
 _NEGLIGIBLE, _NEGLIGIBLE_EACH = 15.0, 0.5
-# Candidate scales of the unknown noise, and the standard deviation of their log-normal prior: a factor of 5.
-_SCALES = np.geomspace(0.01, 100.0, 33)
-_SCALE_SPREAD = math.log(5.0)
+SAME_RATIO = 2.0
+"""Factor by which the ratio of an estimated noise may differ from that of a solution that is kept."""
 
 
 @dataclass(frozen=True)
@@ -45,7 +53,7 @@ class IdentificationData:
     unit
         The length scale [m], see :mod:`.scale`.
     stated
-        True if the size of the noise is known.
+        True if the noise is known. Else the observations have the medians of :mod:`.unknown_noise`.
     outliers
         Outlier model, with lengths in the unit; None if all observations are inliers.
     sequential
@@ -70,6 +78,8 @@ class FamilySolution:
     ----------
     scored
         The solution and the logarithm of its evidence.
+    noise
+        Posterior of the noise; :data:`.STATED_NOISE` if it is stated.
     inliers
         Indices of the inliers.
     count
@@ -80,9 +90,15 @@ class FamilySolution:
     """
 
     scored: Scored
+    noise: NoisePosterior
     inliers: RowIndices
     count: int
     log_prior: float
+
+    @property
+    def log_evidence(self) -> float:
+        """Logarithm of the evidence, with an unknown noise integrated out."""
+        return self.scored.log_evidence + self.noise.log_weight
 
 
 def prepare_data(
@@ -103,31 +119,72 @@ def solve_with_inliers(
     data: IdentificationData, weights: Mapping[str | Family, float]
 ) -> dict[str | Family, FamilySolution]:
     """Return the solution of each family by its inliers."""
-    observations, unit, count = data.observations, data.unit, len(data.observations)
-    solutions = solve_families(observations, weights, unit)
-    inliers = dict.fromkeys(solutions, np.arange(count))
+    everything = np.arange(len(data.observations))
+    inliers: Mapping[str | Family, RowIndices] = dict.fromkeys(weights, everything)
     if data.outliers is not None:
-
-        def solve(some: Observations, name: str | Family) -> Scored:
-            return solve_families(some, [name], unit)[name]
-
-        inliers = find_inliers(observations, solutions, data.outliers, data.stated, solve)
-        some = {name: rows for name, rows in inliers.items() if len(rows) < count}
-        solutions |= {name: solve(observations.select(rows), name) for name, rows in some.items()}
-    if data.sequential:
-        solutions = {
-            name: _unwrap(observations.select(inliers[name]), scored) for name, scored in solutions.items()
-        }
+        inliers = _classify(data, weights, data.observations)
+    solutions = _solve_inliers(data, inliers)
+    if data.outliers is not None and not data.stated:
+        # Where the noise is of another ratio, other observations are outliers.
+        best = max(solutions, key=lambda name: solutions[name].log_evidence + math.log(weights[name]))
+        factors = solutions[best].noise.factors
+        if not 1.0 / SAME_RATIO < factors[0] / factors[1] < SAME_RATIO:
+            inliers = _classify(data, weights, scale_noise(data.observations, factors))
+            solutions = _solve_inliers(data, inliers)
     return score_solutions(data, solutions, inliers, weights)
+
+
+def _classify(
+    data: IdentificationData, families: Iterable[str | Family], observations: Observations
+) -> dict[str | Family, RowIndices]:
+    """Return the indices of the inliers under each family, for observations with some noise."""
+    assert data.outliers is not None  # else there is nothing to classify
+
+    def solve(some: Observations, name: str | Family) -> Scored:
+        return solve_families(some, [name], data.unit)[name]
+
+    solutions = solve_families(observations, families, data.unit)
+    return find_inliers(observations, solutions, data.outliers, data.stated, solve)
+
+
+def _solve_inliers(
+    data: IdentificationData, inliers: Mapping[str | Family, RowIndices]
+) -> dict[str | Family, NoiseSolution]:
+    """Return the most likely member of each family by its inliers, at the most probable noise."""
+    found: dict[str | Family, NoiseSolution] = {}
+    for rows in {rows.tobytes(): rows for rows in inliers.values()}.values():
+        observations = data.observations.select(rows)
+        names = [name for name, own in inliers.items() if np.array_equal(own, rows)]
+        found |= _solve_noise(data, observations, names)
+    return {name: found[name] for name in inliers}
+
+
+def _solve_noise(
+    data: IdentificationData, observations: Observations, families: Iterable[str | Family]
+) -> dict[str | Family, NoiseSolution]:
+    statistics = MotionStatistics(observations)
+
+    def solve(name: str | Family, some: Observations) -> Scored:
+        scored = solver.maximum_likelihood(some, _starts(some, name, statistics, data.unit))
+        return _unwrap(some, scored) if data.sequential else scored
+
+    solver.prepare()
+    if data.stated:
+        return {name: NoiseSolution(solve(name, observations), STATED_NOISE) for name in families}
+    return {name: solve_unknown_noise(observations, partial(solve, name)) for name in families}
 
 
 def score_solutions(
     data: IdentificationData,
-    solutions: Mapping[str | Family, Scored],
+    solutions: Mapping[str | Family, NoiseSolution],
     inliers: Mapping[str | Family, RowIndices],
     weights: Mapping[str | Family, float],
+    renew: bool = True,
 ) -> dict[str | Family, FamilySolution]:
-    """Return the solutions of families, scored against each other, from solutions of their inliers."""
+    """Return the solutions of families, scored against each other, from solutions of their inliers.
+
+    An unknown noise is estimated again if ``renew``.
+    """
     observations, outliers, count = data.observations, data.outliers, len(data.observations)
     observations_of = {
         name: observations if len(rows) == count else observations.select(rows)
@@ -141,14 +198,14 @@ def score_solutions(
         }
     if data.sequential:
         log_priors = {
-            name: log_priors[name] + log_unwrapping_gain(scored.solution)
-            for name, scored in solutions.items()
+            name: log_priors[name] + log_unwrapping_gain(one.scored.solution)
+            for name, one in solutions.items()
         }
-    compared = compare_families(
-        observations_of, solutions, {name: math.log(weights[name]) + log_priors[name] for name in solutions}
-    )
+    refine = adapt_noise if renew and not data.stated else _integrate_joint_values
+    weighted = {name: math.log(weights[name]) + log_priors[name] for name in solutions}
+    compared = compare_families(observations_of, solutions, weighted, refine)
     return {
-        name: FamilySolution(one, inliers[name], count, log_priors[name]) for name, one in compared.items()
+        name: FamilySolution(*one, inliers[name], count, log_priors[name]) for name, one in compared.items()
     }
 
 
@@ -180,31 +237,31 @@ def _starts(
 
 def compare_families(
     observations: Mapping[str | Family, Observations],
-    solutions: Mapping[str | Family, Scored],
+    solutions: Mapping[str | Family, NoiseSolution],
     log_priors: Mapping[str | Family, float],
-) -> dict[str | Family, Scored]:
-    """Return the solutions, those of competitive families with their joint values integrated out.
+    refine: Callable[[Observations, NoiseSolution], NoiseSolution],
+) -> dict[str | Family, NoiseSolution]:
+    """Return the solutions, those of competitive families refined.
 
     Each family has its own observations and a log prior.
     """
-    logs = {name: scored.log_evidence + log_priors[name] for name, scored in solutions.items()}
+    logs = {name: one.log_evidence + log_priors[name] for name, one in solutions.items()}
     threshold = (
         max(logs.values()) - _NEGLIGIBLE - _NEGLIGIBLE_EACH * max(len(some) for some in observations.values())
     )
-    rough = [name for name, scored in solutions.items() if logs[name] >= threshold and _is_rough(scored)]
     return {
-        **solutions,
-        **{
-            name: solver.maximise_marginal_likelihood(observations[name], solutions[name].solution)
-            for name in rough
-        },
+        name: refine(observations[name], one) if logs[name] >= threshold else one
+        for name, one in solutions.items()
     }
 
 
-def _is_rough(scored: Scored) -> bool:
-    """Return True if there are joint values that are not integrated out yet."""
-    solution = scored.solution
-    return bool(solution.motion.joints and solution.motion.size) and not solution.joint_prior.marginal
+def _integrate_joint_values(observations: Observations, one: NoiseSolution) -> NoiseSolution:
+    """Return the solution with its joint values integrated out; as it is, if they are."""
+    solution = one.scored.solution
+    if solution.joint_prior.marginal or not (solution.motion.joints and solution.motion.size):
+        return one
+    observations = scale_noise(observations, one.noise.factors)
+    return one._replace(scored=solver.maximise_marginal_likelihood(observations, solution))
 
 
 def weigh_families(
@@ -213,36 +270,29 @@ def weigh_families(
     weights: Mapping[str | Family, float],
 ) -> IdentificationResult:
     """Return the fits of all families with their posterior probabilities."""
-    log_priors = {name: math.log(weights[name]) + one.log_prior for name, one in solutions.items()}
-    if data.stated:
-        logs = {name: one.scored.log_evidence for name, one in solutions.items()}
-        scale = 1.0
-    else:
-        spread = -0.5 * (np.log(_SCALES) / _SCALE_SPREAD) ** 2
-        spread -= np.logaddexp.reduce(spread)
-        joint = {
-            name: spread + solver.log_evidences(one.scored.solution, _SCALES)
-            for name, one in solutions.items()
-        }
-        logs = {name: float(np.logaddexp.reduce(j)) for name, j in joint.items()}
-        best = max(logs, key=lambda name: logs[name] + log_priors[name])
-        scale = float(_SCALES[int(np.argmax(joint[best]))])
-    total: Array = np.array([logs[name] + log_priors[name] for name in solutions])
-    probabilities = np.exp(total - np.logaddexp.reduce(total)).tolist()
-    lazy_fits = []
-    for (name, one), p in zip(solutions.items(), probabilities, strict=True):
-        log = logs[name] + one.log_prior + log_density(len(data.observations), data.unit)
-        lazy_fits.append(LazyFit(one.scored.solution.motion.name, p, partial(_fit, data, one, scale, log, p)))
-    return IdentificationResult(tuple(sorted(lazy_fits, key=lambda lazy_fit: -lazy_fit.probability)), scale)
-
-
-def _fit(
-    data: IdentificationData, one: FamilySolution, scale: float, log_evidence: float, probability: float
-) -> Fit:
-    solution = fix_gauge(unwrap_solution(one.scored.solution) if data.sequential else one.scored.solution)
-    fit = build_fit(solution, solver.evidence(solution, scale), log_evidence, probability)
-    goodness = measure_fit(solution, scale**2 * solution.covariance)
-    fit = replace(fit, misfit=data.noise_factor * goodness.factor)
-    return convert_to_metres(
-        complete_fit(fit, data.observations, one.inliers, scale, sequential=data.sequential), data.unit
+    logs = bound_log_evidences(
+        {name: one.log_evidence + one.log_prior for name, one in solutions.items()},
+        {name: one.scored.solution for name, one in solutions.items()},
     )
+    total: Array = np.array([logs[name] + math.log(weights[name]) for name in solutions])
+    probabilities = np.exp(total - np.logaddexp.reduce(total)).tolist()
+    lazy_fits = [
+        LazyFit(one.scored.solution.motion.name, p, partial(_fit, data, one, logs[name], p))
+        for (name, one), p in zip(solutions.items(), probabilities, strict=True)
+    ]
+    best = list(solutions.values())[int(np.argmax(total))]
+    return IdentificationResult(
+        tuple(sorted(lazy_fits, key=lambda lazy_fit: -lazy_fit.probability)), best.noise.deviations
+    )
+
+
+def _fit(data: IdentificationData, one: FamilySolution, log_evidence: float, probability: float) -> Fit:
+    solution = fix_gauge(unwrap_solution(one.scored.solution) if data.sequential else one.scored.solution)
+    log_evidence += log_density(len(data.observations), data.unit)
+    fit = build_fit(solution, solver.evidence(solution), log_evidence, probability)
+    fit = replace(fit, misfit=data.noise_factor * measure_fit(solution).factor)
+    observations = scale_noise(data.observations, one.noise.factors)
+    fit = complete_fit(fit, observations, one.inliers, sequential=data.sequential)
+    if data.outliers is not None and fit.motion.joints == fit.rows:
+        fit = replace(fit, is_determined=False, reason="outliers alone would look the same")
+    return convert_to_metres(fit, data.unit)

@@ -37,6 +37,14 @@ _DENSEST = 0.75
 _HOPELESS, _LEFT = 30.0, 0.6
 # Largest number of observations among which the shortest ways are searched, and by which the shape is found.
 _MOST, _MOST_FITTED = 120, 240
+# Largest difference of poses that are equal.
+_EQUAL = 1e-9
+
+
+def may_be_curve(observations: Observations) -> bool:
+    """Return True if there are enough observations for a curve, and not all of them are equal."""
+    seen = observations.relative if observations.rows == 6 else observations.relative[:, :3, 3]
+    return len(seen) >= FEWEST_POSES and float(np.ptp(seen, axis=0).max()) > _EQUAL
 
 
 def fit_curve(
@@ -46,7 +54,7 @@ def fit_curve(
     log_evidence: Callable[[Solution[FamilyMember]], float] | None = None,
     competitor: float = -math.inf,
 ) -> Scored | None:
-    """Return the most probable curve through observations; None if they are too few for one.
+    """Return the most probable curve through observations; None if they are too few for one, or equal.
 
     Parameters
     ----------
@@ -62,7 +70,7 @@ def fit_curve(
     competitor
         Log evidence of the best other family. Far below it no further numbers of knots are tried.
     """
-    if len(observations) < FEWEST_POSES:
+    if not may_be_curve(observations):
         return None
     if len(observations) > _MOST_FITTED:
         some = np.linspace(0, len(observations) - 1, _MOST_FITTED).round().astype(int)

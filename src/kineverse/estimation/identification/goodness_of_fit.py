@@ -103,8 +103,9 @@ def _determined_parameters(solution: Solution[FamilyMember], projected: Array) -
     """Return the effective number of parameters that the observations determine rather than the prior."""
     by_parameters, prior = solution.linear.by_parameters, solution.motion.prior().by_parameters
     information = (np.swapaxes(by_parameters, 1, 2) @ projected @ by_parameters).sum(axis=0)
-    total = information + prior.T @ prior + LITTLE * np.eye(len(information))
-    return float(np.trace(np.linalg.solve(total, information)))
+    # The pseudoinverse leaves out directions that neither determines.
+    inverse = np.linalg.pinv(information + prior.T @ prior, hermitian=True)
+    return float(np.sum(inverse * information))
 
 
 def _slow_parts(whitened: Array, values: Array, cosines: int) -> Array:

@@ -20,6 +20,7 @@ from .custom_family import Family
 from .model_check import solve_joints, weigh_and_check
 from .observations import check_observations
 from .result import IdentificationResult
+from .unknown_noise import UNKNOWN_NOISE
 
 Families: TypeAlias = "Iterable[str | Family] | Mapping[str | Family, float] | str | Family | None"
 """Names of families, or custom families. A mapping assigns prior weights."""
@@ -39,9 +40,6 @@ WEIGHTS: Mapping[str, float] = MappingProxyType(
 )
 """Prior weights of the families. A screw, cylindrical, spherical or planar joint contains simpler joints as
 special cases and is rarer, and so is a curve; a free joint is rarer still."""
-
-UNKNOWN_NOISE = (0.005, math.radians(1.0))
-"""Standard deviations of positions [m] and orientations [rad] that are scaled where no noise is stated."""
 
 
 def identify(
@@ -70,8 +68,8 @@ def identify(
     families
         Families to compare; None for all of :data:`WEIGHTS`. A mapping also assigns prior weights.
     noise
-        Covariance of the parts that have none of their own. If no covariance is given at all, the size of
-        the noise is estimated, at a ratio of 5 mm to 1°.
+        Covariance of the parts that have none of their own. If no covariance is given at all, the sizes of
+        position and orientation noise are unknown and integrated out, see :mod:`.unknown_noise`.
     outliers
         Outlier model, or True for the default :class:`.Outliers`. Fewer than half of the observations may be
         outliers.

@@ -16,6 +16,9 @@ from .families import JOINT_FAMILIES, GroupMotion, JointFamily
 from .observations import Observations
 from .optimise import InitialGuess
 
+ARC_RADII = (2.0, 8.0)
+"""Radii of arcs that are tried, in standard deviations along the arc: 90° and 25° evenly observed."""
+
 
 class MotionStatistics:
     """Mean, principal directions and rotations of the observed relative poses."""
@@ -120,16 +123,29 @@ def _find_rotations(statistics: MotionStatistics, frame: Array, places: Array) -
             left = transform(frame, centre + frame[:, :2] @ place)
             yield _AxisRotation(left, inverse(left) @ statistics.mean, angles, along, _slope(angles, along))
         return
-    place = _fit_centre(flat)
-    lever = flat - place
-    # At joint value 0 the child lies on the x axis of L.
-    middle = _mean_direction(lever)
-    turned = np.column_stack([middle, [-middle[1], middle[0]]])
-    x, y = (lever @ turned).T
-    left = transform(np.column_stack([frame[:, :2] @ turned, frame[:, 2]]), centre + frame[:, :2] @ place)
-    right = transform(np.eye(3), np.array([float(np.mean(np.hypot(x, y))), 0.0, 0.0]))
-    angles = np.arctan2(y, x)
-    yield _AxisRotation(left, right, angles, along, _slope(angles, along))
+    for place in (_fit_centre(flat), *_short_arc_centres(flat)):
+        lever = flat - place
+        # At joint value 0 the child lies on the x axis of L.
+        middle = _mean_direction(lever)
+        turned = np.column_stack([middle, [-middle[1], middle[0]]])
+        x, y = (lever @ turned).T
+        left = transform(np.column_stack([frame[:, :2] @ turned, frame[:, 2]]), centre + frame[:, :2] @ place)
+        right = transform(np.eye(3), np.array([float(np.mean(np.hypot(x, y))), 0.0, 0.0]))
+        angles = np.arctan2(y, x)
+        yield _AxisRotation(left, right, angles, along, _slope(angles, along))
+
+
+def _short_arc_centres(flat: Array) -> Iterator[Array]:
+    """Yield centres on both sides of points (N, 2) along an arc.
+
+    The centre of the circle through noisy points is biased towards them. If the arc is no higher than the
+    noise, no step leads from there to the circle on which the points lie.
+    """
+    along, across = _principal_directions(flat)
+    deviation = math.sqrt(float(np.mean((flat @ along) ** 2)))
+    for radius in ARC_RADII:
+        yield radius * deviation * across
+        yield -radius * deviation * across
 
 
 def _slope(angles: Array, along: Array) -> float:

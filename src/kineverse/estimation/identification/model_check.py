@@ -15,7 +15,7 @@ the noise is stated too small. So families are also compared for a noise of up t
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import replace
 from functools import partial
 from typing import NamedTuple
@@ -26,6 +26,7 @@ from kineverse.errors import InvalidValueError
 from kineverse.lie import Array
 
 from .comparison import (
+    SAME_RATIO,
     FamilySolution,
     IdentificationData,
     solve_families,
@@ -33,7 +34,7 @@ from .comparison import (
     weigh_families,
 )
 from .curve import CURVE
-from .curve_fit import FEWEST_POSES, continue_curve, fit_curve, stated_log_evidence
+from .curve_fit import FEWEST_POSES, continue_curve, fit_curve, may_be_curve, stated_log_evidence
 from .custom_family import Family, FamilyMotion
 from .goodness_of_fit import GoodnessOfFit, measure_fit
 from .maximum_likelihood import Scored
@@ -44,6 +45,14 @@ from .outlier_rejection import RowIndices, densest_half, log_inlier_prior
 from .projection import classify_inliers, project_observations
 from .result import SURE, Fit, IdentificationResult, LazyFit
 from .solver import solver
+from .unknown_noise import (
+    STATED_NOISE,
+    NoisePosterior,
+    NoiseSolution,
+    adapt_noise,
+    estimate_noise,
+    scale_noise,
+)
 
 REFUTED = 1e-3
 """Largest probability of χ² at which the noise is refuted."""
@@ -115,8 +124,8 @@ def weigh_and_check(
             found = weigh_families(data, solutions, weights)
     if found is None:
         raise InvalidValueError(
-            f"A curve takes {FEWEST_POSES} poses at least, and there are {len(data.observations)}. Give more "
-            "poses or other families."
+            f"A curve takes {FEWEST_POSES} poses at least that are not equal, and there are "
+            f"{len(data.observations)}. Give more poses or other families."
         )
     reason = ""
     if not is_sure and data.stated:
@@ -139,7 +148,7 @@ def weigh_and_check(
                     f"{solutions[other].scored.solution.motion.name}"
                 )
     found = replace(found, reason=reason or next(_reasons(data, found, solutions), ""))
-    if curve is None and CURVE in weights and len(data.observations) >= FEWEST_POSES:
+    if curve is None and CURVE in weights and may_be_curve(data.observations):
         later = LazyFit(CURVE, 0.0, partial(fit_of_curve, data, solutions, weights))
         found = replace(found, lazy_fits=(*found.lazy_fits, later))
     return CheckedComparison(found, curve)
@@ -161,51 +170,83 @@ def solve_joints(
 def solve_curve(
     data: IdentificationData, solutions: Solutions, before: FamilySolution | None = None
 ) -> FamilySolution | None:
-    """Return the most probable curve by its inliers; None if there are too few for one."""
+    """Return the most probable curve by its inliers; None if there are too few for one, or equal."""
     observations, count = data.observations, len(data.observations)
     everything = np.arange(count)
-    log_evidence = stated_log_evidence if data.stated else _log_evidence_over_all_scales
     # Only an evidence by the same observations is comparable.
-    competitor = max(
-        (log_evidence(one.scored.solution) for one in solutions.values() if len(one.inliers) == count),
-        default=-math.inf,
-    )
+    comparable = [one for one in solutions.values() if len(one.inliers) == count]
+    competitor = max((one.log_evidence for one in comparable), default=-math.inf)
 
-    def solve(rows: RowIndices) -> Scored | None:
+    def solve(rows: RowIndices) -> NoiseSolution | None:
         some = observations if len(rows) == count else observations.select(rows)
+        if not may_be_curve(some):
+            return None
         if before is not None and np.array_equal(before.inliers, rows[: len(before.inliers)]):
-            return continue_curve(some, before.scored.solution)
-        free = solve_families(some, ["free"])["free"].solution
+            known = before.scored.solution
+            if data.stated:
+                return NoiseSolution(continue_curve(some, known), STATED_NOISE)
+            return adapt_noise(some, NoiseSolution(before.scored, before.noise), continue_curve)
         orders = [
             one.scored.solution.values[:, 0]
             for one in solutions.values()
             if one.scored.solution.motion.joints == 1 and np.array_equal(one.inliers, rows)
         ]
-        return fit_curve(some, free.covariance, orders, log_evidence, competitor)
+        return _fit_to_noise(data, some, orders, competitor)
 
-    scored = solve(everything)
-    if scored is None:
+    solution = solve(everything)
+    if solution is None:
         return None
-    best = FamilySolution(scored, everything, count, 0.0)
+    best = FamilySolution(*solution, everything, count, 0.0)
     if data.outliers is None:
         return best
     best = replace(best, log_prior=log_inlier_prior(data.outliers, count, count, observations.rows))
-    if len(_classify(data, scored.solution)) == count:
+    if len(_classify(data, solution)) == count:
         return best
-    starts = [one.inliers for one in solutions.values() if len(one.inliers) < count]
-    for rows in (*starts[:1], densest_half(observations)):
+    some = [one for one in solutions.values() if len(one.inliers) < count]
+    some.sort(key=lambda one: -one.log_evidence - one.log_prior)
+    for rows in (*(one.inliers for one in some[:1]), densest_half(observations)):
         for _ in range(_ROUNDS):
-            scored = solve(rows)
-            if scored is None:
+            solution = solve(rows)
+            if solution is None:
                 break
-            rows, used = _classify(data, scored.solution), rows
+            rows, used = _classify(data, solution), rows
             if np.array_equal(rows, used):
                 break
-        if scored is not None and 2 * len(used) > count:
+        if solution is not None and 2 * len(used) > count:
             log_prior = log_inlier_prior(data.outliers, count, len(used), observations.rows)
-            other = FamilySolution(scored, used, count, log_prior)
-            best = max(best, other, key=lambda one: one.scored.log_evidence + one.log_prior)
+            other = FamilySolution(*solution, used, count, log_prior)
+            best = max(best, other, key=lambda one: one.log_evidence + one.log_prior)
     return best
+
+
+def _fit_to_noise(
+    data: IdentificationData, observations: Observations, orders: Sequence[Array], competitor: float
+) -> NoiseSolution:
+    """Return the most probable curve through observations, at the noise that suits it best."""
+    latest: NoisePosterior | None = None
+
+    def log_evidence(solution: Solution[FamilyMember]) -> float:
+        nonlocal latest
+        if data.stated:
+            return stated_log_evidence(solution)
+        estimated = estimate_noise(observations, solution, latest)
+        latest = estimated.noise
+        return estimated.log_evidence
+
+    def fit(some: Observations) -> Scored:
+        free = solve_families(some, ["free"])["free"].solution
+        fitted = fit_curve(some, free.covariance, orders, log_evidence, competitor)
+        assert fitted is not None  # there are enough observations
+        return fitted
+
+    if data.stated:
+        return NoiseSolution(fit(observations), STATED_NOISE)
+    near = estimate_noise(observations, fit(observations).solution, latest)
+    position, orientation = near.noise.factors.tolist()
+    if not 1.0 / SAME_RATIO < position / orientation < SAME_RATIO:
+        scaled = scale_noise(observations, near.noise.factors)
+        near = estimate_noise(observations, fit(scaled).solution, near.noise)
+    return adapt_noise(observations, near, continue_curve)
 
 
 def is_doubtful(data: IdentificationData, found: IdentificationResult, solutions: Solutions) -> bool:
@@ -213,7 +254,7 @@ def is_doubtful(data: IdentificationData, found: IdentificationResult, solutions
     solution = solutions[_best_name(found, solutions)].scored.solution
     if solution.motion.joints > 1:
         return True
-    fit = measure_fit(solution, _noise_covariance(data, found, solution))
+    fit = measure_fit(solution)
     return fit.slow_p_value < _SLOW or (data.stated and fit.p_value < _DOUBTFUL)
 
 
@@ -238,7 +279,9 @@ def _compare_refuted(
     is_online
         True if the curve keeps its number of knots, to save time.
     """
-    larger = replace(data, observations=_scaled(data.observations, factor), noise_factor=factor)
+    larger = replace(
+        data, observations=scale_noise(data.observations, np.full(2, factor)), noise_factor=factor
+    )
     again = solve_joints(larger, weights)
     if CURVE in solutions:
         curve = solve_curve(larger, again, solutions[CURVE] if is_online else None)
@@ -260,7 +303,7 @@ def _reasons(data: IdentificationData, found: IdentificationResult, solutions: S
         return
     solution = solutions[name].scored.solution
     joints, curve = solution.motion.joints, solutions.get(CURVE)
-    covariance = _noise_covariance(data, found, solution)
+    covariance = solution.covariance
     if name == CURVE:
         own = measure_fit(solution, covariance.mean(axis=0))
         for one in solutions.values():
@@ -278,7 +321,7 @@ def _reasons(data: IdentificationData, found: IdentificationResult, solutions: S
         if is_competitive or _is_smooth(solution.values):
             yield "its joint values lie on one curve"
     elif not data.stated and joints == 1 and curve is not None:
-        fit = measure_fit(solution, covariance)
+        fit = measure_fit(solution)
         if fit.slow_p_value < _SYSTEMATIC and fit.slow_share > _SYSTEMATIC_SHARE:
             yield "its residuals depend on the joint value, so this may be none of these joints"
 
@@ -310,10 +353,7 @@ def _best_scale(
     """
     prior = -0.5 * (np.log(scales) / _SCALE_SPREAD) ** 2
     at_scales = {
-        name: prior
-        + solver.log_evidences(one.scored.solution, scales)
-        + one.log_prior
-        + math.log(weights[name])
+        name: prior + _log_evidences(one.scored.solution, scales) + one.log_prior + math.log(weights[name])
         for name, one in solutions.items()
     }
     logs = {name: float(np.logaddexp.reduce(each)) for name, each in at_scales.items()}
@@ -326,34 +366,19 @@ def _best_name(found: IdentificationResult, solutions: Solutions) -> str | Famil
     return next(name for name, one in solutions.items() if one.scored.solution.motion.name == family)
 
 
-def _noise_covariance(
-    data: IdentificationData, found: IdentificationResult, solution: Solution[FamilyMember]
-) -> Array:
-    """Return the covariances of residuals for the stated noise, or the noise that was estimated."""
-    return solution.covariance if data.stated else found.noise_scale**2 * solution.covariance
+def _log_evidences(solution: Solution[FamilyMember], scales: Array) -> Array:
+    """Return the log evidence for each size of the noise relative to the stated one."""
+    covariance = solution.covariance
+    factors, parts = np.column_stack([scales, scales]), np.stack([covariance, 0.0 * covariance])
+    return solver.log_evidences(solution, factors, parts)
 
 
-def _log_evidence_over_all_scales(solution: Solution[FamilyMember]) -> float:
-    scales = np.geomspace(0.03, 30.0, 13)
-    return float(np.logaddexp.reduce(solver.log_evidences(solution, scales)))
-
-
-def _scaled(observations: Observations, factor: float) -> Observations:
-    """Return observations with standard deviations larger by a factor."""
-    of_parent = observations.parent_covariance
-    return Observations(
-        observations.parent,
-        observations.child,
-        None if of_parent is None else factor**2 * of_parent,
-        factor**2 * observations.child_covariance,
-    )
-
-
-def _classify(data: IdentificationData, solution: Solution[FamilyMember]) -> RowIndices:
+def _classify(data: IdentificationData, one: NoiseSolution) -> RowIndices:
     """Return the indices of the inliers under a curve."""
     assert data.outliers is not None
-    rows = data.observations.rows
-    projected = project_observations(solution.motion, solution.values, data.observations)
+    rows, solution = data.observations.rows, one.scored.solution
+    observations = scale_noise(data.observations, one.noise.factors)
+    projected = project_observations(solution.motion, solution.values, observations)
     covariance = projected.covariance
     if not data.stated:
         # The median of χ² is about its degrees of freedom less 2/3, and half of the observations are inliers.

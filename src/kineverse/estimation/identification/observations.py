@@ -61,6 +61,11 @@ class Observations:
         of_parent = None if self.parent_covariance is None else self.parent_covariance[rows]
         return Observations(self.parent[rows], self.child[rows], of_parent, self.child_covariance[rows])
 
+    def scaled(self, factor: float) -> Observations:
+        """Return the same observations with covariances that are larger by a factor."""
+        of_parent = None if self.parent_covariance is None else factor * self.parent_covariance
+        return Observations(self.parent, self.child, of_parent, factor * self.child_covariance)
+
     def softened(self) -> tuple[Observations, ...]:
         """Return the same observations with less precise positions, the least precise first.
 

@@ -36,6 +36,7 @@ from .outlier_rejection import RowIndices
 from .projection import classify_inliers, project_observations
 from .result import Fit, IdentificationResult, LazyFit
 from .solver import solver
+from .unknown_noise import NoiseSolution, scale_noise
 from .unwrapping import is_screw
 
 
@@ -90,8 +91,8 @@ def _entry_shape(array: Array | None) -> tuple[int, ...] | None:
 def warm_start(
     data: IdentificationData,
     known: Mapping[str | Family, FamilySolution],
-    scale: float,
     weights: Mapping[str | Family, float],
+    renew: bool = False,
 ) -> dict[str | Family, FamilySolution]:
     """Return the solutions of families for all observations, starting from earlier solutions.
 
@@ -101,12 +102,12 @@ def warm_start(
         All observations, the earlier ones first.
     known
         Solutions of the earlier observations.
-    scale
-        Factor on the standard deviations of the noise.
     weights
         Prior weights of the families.
+    renew
+        True to estimate an unknown noise again. Else each family keeps its own.
     """
-    inliers = {name: _predict_inliers(data, one, scale) for name, one in known.items()}
+    inliers = {name: _predict_inliers(data, one) for name, one in known.items()}
     nearest_of = functools.cache(_nearest_observations)  # most families have the same inliers
     found = {}
     for name, one in known.items():
@@ -115,10 +116,11 @@ def warm_start(
             if len(inliers[name]) == len(data.observations)
             else data.observations.select(inliers[name])
         )
-        found[name] = _continue_family(
-            observations, one.scored.solution, nearest_of(observations, len(one.inliers)), data.sequential
-        )
-    return score_solutions(data, found, inliers, weights)
+        nearest = nearest_of(observations, len(one.inliers))
+        scaled = scale_noise(observations, one.noise.factors)
+        scored = _continue_family(scaled, one.scored.solution, nearest, data.sequential)
+        found[name] = NoiseSolution(scored, one.noise)
+    return score_solutions(data, found, inliers, weights, renew)
 
 
 def is_surprised(data: IdentificationData, one: FamilySolution, count: int) -> bool:
@@ -158,17 +160,18 @@ def _nearest_observations(observations: Observations, known: int) -> RowIndices:
     return nearest
 
 
-def _predict_inliers(data: IdentificationData, one: FamilySolution, scale: float) -> RowIndices:
+def _predict_inliers(data: IdentificationData, one: FamilySolution) -> RowIndices:
     """Return the indices of the inliers so far and of the new observations that match the prediction."""
     new, solution = np.arange(one.count, len(data.observations)), one.scored.solution
     if data.outliers is None or solution.motion.joints == data.observations.rows:
         return np.concatenate([one.inliers, new])
-    predicted = project_observations(solution.motion, solution.values, data.observations.select(new))
+    observations = scale_noise(data.observations.select(new), one.noise.factors)
+    predicted = project_observations(solution.motion, solution.values, observations)
     by_parameters = solution.motion.linearise(predicted.values).by_parameters
     # The prediction is uncertain by the parameters, too.
     unknown = solver.evidence(solution).covariance
     covariance = predicted.covariance + by_parameters @ unknown @ np.swapaxes(by_parameters, 1, 2)
-    new_inliers = classify_inliers(predicted.residuals, scale**2 * covariance, data.outliers, data.stated)
+    new_inliers = classify_inliers(predicted.residuals, covariance, data.outliers, data.stated)
     return np.concatenate([one.inliers, new[new_inliers]])
 
 
@@ -223,7 +226,7 @@ class Identifier:
         # Log odds of each family against the best one at its last update.
         self._odds: dict[str | Family, float] = {}
         self._result: IdentificationResult | None = None
-        self._full_count, self._count, self._unit, self._scale = 0, 0, 1.0, 1.0
+        self._full_count, self._noise_count, self._count, self._unit = 0, 0, 0, 1.0
         # Last check of the most probable family, and the solution of the curve at that time.
         self._check: _Check | None = None
 
@@ -259,6 +262,10 @@ class Identifier:
             of_child,
             fewest=1,
         )
+        if len(self._buffer) and stated != self._stated:
+            raise InvalidValueError(
+                "Some poses have a covariance and others have none. Give all one, or noise= for the rest."
+            )
         self._buffer.add(one)
         self._stated = stated
         self._result = None
@@ -273,9 +280,8 @@ class Identifier:
             For fewer than two poses.
         """
         if len(self._buffer) < 2:
-            raise InvalidValueError(
-                f"There are {len(self._buffer)} poses so far. How something moves takes at least two to see."
-            )
+            count = "is one pose" if len(self._buffer) else "are no poses"
+            raise InvalidValueError(f"There {count} so far. How something moves takes at least two to see.")
         if self._result is None:
             self._result = self._identify()
         return self._result
@@ -287,7 +293,7 @@ class Identifier:
             return weigh_and_check(data, {}, self._weights).result
         deferred: dict[str | Family, FamilySolution] = {}
         if len(observations) >= 2 * self._full_count:
-            self._full_count = len(observations)
+            self._full_count = self._noise_count = len(observations)
             data = prepare_data(observations, self._stated, self._outliers, self._sequential)
             self._unit = data.unit
             known = solve_joints(data, self._weights)
@@ -296,7 +302,7 @@ class Identifier:
             data = prepare_data(observations, self._stated, self._outliers, self._sequential, self._unit)
             known, deferred = self._update_families(data)
         found = weigh_families(data, known | deferred, self._weights)
-        self._scale, self._count = found.noise_scale, len(observations)
+        self._count = len(observations)
         likely = {name: p for name, p in found.probabilities.items() if p > _NEGLIGIBLE}
         best = max(likely.values())
         self._solutions, self._odds = {}, {}
@@ -304,9 +310,7 @@ class Identifier:
             if (p := likely.get(one.scored.solution.motion.name)) is not None:
                 self._solutions[name], self._odds[name] = one, math.log(p / best)
         deferred_fits = {
-            one.scored.solution.motion.name: partial(
-                _deferred_fit, data, name, one, self._scale, self._weights
-            )
+            one.scored.solution.motion.name: partial(_deferred_fit, data, name, one, self._weights)
             for name, one in deferred.items()
         }
         found = replace(
@@ -346,14 +350,21 @@ class Identifier:
     ) -> tuple[dict[str | Family, FamilySolution], dict[str | Family, FamilySolution]]:
         """Return the updated solutions, and the older ones of families whose update is deferred."""
         best = max(self._odds, key=self._odds.__getitem__)
+        renew = not data.stated and len(self._buffer) >= (1.0 + _MORE) * self._noise_count
         deferred = {
-            name: one for name, one in self._solutions.items() if data.stated and self._is_deferred(name, one)
+            name: one for name, one in self._solutions.items() if not renew and self._is_deferred(name, one)
         }
         due = {name: one for name, one in self._solutions.items() if name not in deferred}
-        known = warm_start(data, due, self._scale, self._weights)
+        known = warm_start(data, due, self._weights, renew)
+        if renew:
+            self._noise_count = len(self._buffer)
+            return known, {}
         leading = max(known, key=lambda name: self._log_posterior(name, known[name]))
-        if deferred and (leading != best or is_surprised(data, known[best], self._count)):
-            return known | warm_start(data, deferred, self._scale, self._weights), {}
+        if (deferred or not data.stated) and (
+            leading != best or is_surprised(data, known[best], self._count)
+        ):
+            self._noise_count = len(self._buffer)
+            return warm_start(data, self._solutions, self._weights, renew=not data.stated), {}
         # Their odds against the best family stay as they were.
         top = self._log_posterior(leading, known[leading])
         for name, one in deferred.items():
@@ -366,7 +377,7 @@ class Identifier:
         return self._odds[name] < math.log(_UNLIKELY) and len(self._buffer) < (1.0 + _MORE) * one.count
 
     def _log_posterior(self, name: str | Family, one: FamilySolution) -> float:
-        return one.scored.log_evidence + one.log_prior + math.log(self._weights[name])
+        return one.log_evidence + one.log_prior + math.log(self._weights[name])
 
 
 @dataclass(frozen=True)
@@ -427,10 +438,9 @@ def _deferred_fit(
     data: IdentificationData,
     name: str | Family,
     one: FamilySolution,
-    scale: float,
     weights: Mapping[str | Family, float],
     probability: float,
 ) -> Fit:
     """Return the fit of a family whose update was deferred, by all observations."""
-    fit = weigh_families(data, warm_start(data, {name: one}, scale, weights), weights).best
+    fit = weigh_families(data, warm_start(data, {name: one}, weights), weights).best
     return replace(fit, probability=probability)

@@ -13,8 +13,8 @@ linearisation is at the estimate. The result maximises the full likelihood with 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
-from typing import Generic, NamedTuple, Self, TypeVar
+from dataclasses import dataclass
+from typing import Generic, NamedTuple, TypeVar
 
 import numpy as np
 
@@ -107,10 +107,6 @@ class Solution(Generic[M_co]):
     parent: Array
     joint_prior: JointValuePrior
     converged: bool
-
-    def scaled(self, factor: float) -> Self:
-        """Return the solution for noise whose standard deviations are larger by a factor."""
-        return replace(self, covariance=factor**2 * self.covariance, cost=self.cost / factor**2)
 
 
 @dataclass(frozen=True)

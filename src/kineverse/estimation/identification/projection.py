@@ -50,7 +50,6 @@ def complete_fit(
     fit: Fit,
     observations: Observations,
     used: npt.NDArray[np.int_],
-    scale: float = 1.0,
     outliers: Outliers | None = None,
     stated: bool = True,
     sequential: bool = False,
@@ -68,8 +67,6 @@ def complete_fit(
         All observations.
     used
         Indices of the observations of the fit.
-    scale
-        Factor on the standard deviations of the noise.
     outliers
         Outlier model of the other observations. If None, all of them are outliers.
     stated
@@ -88,11 +85,10 @@ def complete_fit(
     information = np.swapaxes(by_joints, 1, 2) @ invert_matrices(solution.covariance) @ by_joints
     # An angle without effect on the pose has a standard deviation of half a revolution at most.
     information += math.pi**-2 * np.eye(fit.motion.joints)
-    deviations = scale * np.sqrt(np.einsum("nii->ni", invert_matrices(information)))
+    deviations = np.sqrt(np.einsum("nii->ni", invert_matrices(information)))
     rejected = others
     if outliers is not None:
-        covariance = scale**2 * solution.covariance
-        rejected = others[~classify_inliers(solution.residuals, covariance, outliers, stated)]
+        rejected = others[~classify_inliers(solution.residuals, solution.covariance, outliers, stated)]
 
     def merge(of_used: Array, of_others: Array) -> Array:
         result = np.empty((len(observations), of_used.shape[1]))

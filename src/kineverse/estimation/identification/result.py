@@ -27,6 +27,22 @@ SURE = 0.95
 """Least probability at which the best family is reported as identified."""
 
 
+class NoiseDeviations(NamedTuple):
+    """Standard deviations of the noise.
+
+    Attributes
+    ----------
+    position
+        Standard deviation of each coordinate of a position [m].
+    orientation
+        Standard deviation of each component of the rotation vector of an orientation [rad]; NaN if no
+        orientation was observed.
+    """
+
+    position: float
+    orientation: float
+
+
 @dataclass(frozen=True)
 class Fit:
     """Most likely member of one joint family.
@@ -216,14 +232,15 @@ class IdentificationResult:
     ----------
     lazy_fits
         Families, their probabilities, and the functions that compute the fits.
-    noise_scale
-        Estimated factor on the standard deviations of the noise; 1 if the noise was stated.
+    noise
+        Estimated standard deviations of the noise under the most probable family; None if the noise was
+        stated.
     reason
         Reason why the best family is not sure although it is probable, see :mod:`.model_check`, else empty.
     """
 
     lazy_fits: tuple[LazyFit, ...]
-    noise_scale: float = 1.0
+    noise: NoiseDeviations | None = None
     reason: str = ""
     _computed: dict[int, Fit] = field(default_factory=dict, repr=False)
 

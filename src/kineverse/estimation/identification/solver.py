@@ -7,6 +7,7 @@ import functools
 import math
 import threading
 from collections.abc import Callable, Sequence
+from dataclasses import replace
 from typing import TypeGuard
 from weakref import WeakKeyDictionary
 
@@ -205,21 +206,39 @@ class IdentificationSolver:
         _run(library.code.carry_on, problem, buffer)
         return Scored(buffer.solution, buffer.log_evidence)
 
-    def evidence(self, solution: Solution[FamilyMember], scale: float = 1.0) -> Evidence:
-        """Run :func:`.evidence.laplace_evidence`, for noise that is larger by a factor."""
+    def evidence(self, solution: Solution[FamilyMember]) -> Evidence:
+        """Run :func:`.evidence.laplace_evidence`."""
         if not _is_kernel_solution(solution):
-            return laplace_evidence(solution.scaled(scale))
-        logs, *rest = _evaluate_evidence(solution, np.array([scale]))
+            return laplace_evidence(solution)
+        logs, *rest = _evaluate_evidence(solution, np.ones((1, 2)))
         values, covariances, information = rest
         return Evidence.from_information(
             float(logs[0]), information, solution.motion.size, values, covariances
         )
 
-    def log_evidences(self, solution: Solution[FamilyMember], scales: Array) -> Array:
-        """Return the log evidence for noise that is larger by each of several factors."""
+    def log_evidences(self, solution: Solution[FamilyMember], factors: Array, parts: Array) -> Array:
+        """Return the log evidence for each of several sizes of the noise.
+
+        Parameters
+        ----------
+        solution
+            The solution. Its motion is kept.
+        factors
+            Factors on the standard deviations of positions and orientations, (M, 2).
+        parts
+            Covariances of the residuals by errors of positions, and by those of orientations,
+            (2, N, m, m).
+        """
         if not _is_kernel_solution(solution):
-            return np.array([laplace_evidence(solution.scaled(c)).log_evidence for c in scales])
-        return _evaluate_evidence(solution, scales)[0]
+            return np.array(
+                [
+                    laplace_evidence(
+                        replace(solution, covariance=np.tensordot(each**2, parts, axes=1))
+                    ).log_evidence
+                    for each in factors
+                ]
+            )
+        return _evaluate_evidence(solution, factors, parts)[0]
 
 
 solver = IdentificationSolver()
@@ -247,21 +266,19 @@ def _run(
     stage(where, *given, *addresses)
 
 
-def _evaluate_evidence(solution: Solution[GroupMotion], scales: Array) -> tuple[Array, ...]:
-    """Return the log evidence for each scale, and joint values, covariances and information of the last."""
+def _evaluate_evidence(
+    solution: Solution[GroupMotion], factors: Array, parts: Array | None = None
+) -> tuple[Array, ...]:
+    """Return the log evidence by size of the noise; joint values, covariances, information of the last."""
     motion, (count, joints) = solution.motion, solution.values.shape
     problem = Problem.from_buffer_copy(_family(motion.group, motion.rows))
     problem.given.count = count
     unknowns = motion.size + joints + motion.slides
-    shapes = (len(scales),), (count, joints), (count, joints, joints), (unknowns, unknowns)
+    shapes = (len(factors),), (count, joints), (count, joints, joints), (unknowns, unknowns)
     results = tuple(np.empty(shape) for shape in shapes)
-    _run(
-        library.code.rate,
-        problem,
-        SolutionBuffer.from_solution(solution),
-        (len(scales), scales.ctypes.data),
-        results,
-    )
+    factors = np.ascontiguousarray(factors)
+    given = len(factors), factors.ctypes.data, 0 if parts is None else parts.ctypes.data
+    _run(library.code.rate, problem, SolutionBuffer.from_solution(solution), given, results)
     return results
 
 

@@ -11,7 +11,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from types import MappingProxyType
 
 import numpy as np
@@ -25,7 +25,8 @@ from kineverse.estimation.identification.kinematic_graph.pairwise import (
 )
 from kineverse.estimation.identification.observations import Observations
 from kineverse.estimation.identification.outlier_rejection import RowIndices, is_inlier
-from kineverse.estimation.identification.result import SURE, IdentificationResult
+from kineverse.estimation.identification.projection import project_observations
+from kineverse.estimation.identification.result import SURE, Fit, IdentificationResult
 from kineverse.estimation.linear_algebra import (
     invert_matrices,
     log_determinants,
@@ -37,8 +38,9 @@ from kineverse.lie import Array
 from kineverse.model.model import Model
 from kineverse.model.operation import Operation
 
+from .correlation import CorrelationSettings
 from .known_motion import KnownJoint
-from .known_residuals import SIZES, KnownResiduals, compute_residuals
+from .known_residuals import SIZES, KnownResiduals, compute_residuals, orthogonal_residuals
 from .replacement import build_replacement, extend_fit, follows_another
 from .report import JointVerdict
 from .testability import TestableJoint
@@ -177,6 +179,16 @@ PRIOR: Mapping[str, float] = MappingProxyType({"served": 0.8, "elsewhere": 0.05,
 
 # Least number of observations for a statement about the motion.
 _LEAST_COUNT = 5
+# Least number of observations that are kept of correlated ones, if there are as many.
+_KEPT = 60
+# Ratio of successive to other distances from which on poses are unrelated.
+_UNRELATED = 0.5
+# Least number of independent observations for a certain verdict.
+_LEAST_INDEPENDENT = 1.5
+# Number of looks that tell as much as one from which on this is worth saying.
+_CORRELATED = 2.0
+# Factor on covariances that changes no verdict.
+_ALMOST_ONE = 1.1
 
 
 @dataclass(frozen=True)
@@ -193,6 +205,8 @@ class JointObservations:
         Residuals under the served joint.
     times
         Numbers of the observations, (N,).
+    stamps
+        Their times [s], (N,).
     """
 
     joint: TestableJoint
@@ -200,6 +214,7 @@ class JointObservations:
     observations: Observations
     residuals: KnownResiduals
     times: npt.NDArray[np.int_]
+    stamps: Array
 
     def select(self, rows: slice | npt.NDArray[np.int_]) -> JointObservations:
         """Return some of the observations."""
@@ -209,6 +224,26 @@ class JointObservations:
             self.observations.select(rows),
             self.residuals.select(rows),
             self.times[rows],
+            self.stamps[rows],
+        )
+
+    def decorrelate(self, looks: float) -> JointObservations:
+        """Return evenly spaced observations with errors that may be taken as independent.
+
+        If ``looks`` observations tell as much as one with independent errors, N of them tell as much as N /
+        ``looks``. Some more are kept, because they show more of the motion, with accordingly larger
+        covariances.
+        """
+        count = len(self.times)
+        kept = min(max(math.ceil(count / looks), _KEPT), count)
+        factor = max(looks * kept / count, 1.0)
+        result = self if kept == count else self.select(np.linspace(0, count - 1, kept).round().astype(int))
+        if factor < _ALMOST_ONE:
+            return result
+        return replace(
+            result,
+            observations=result.observations.scaled(factor),
+            residuals=result.residuals.scaled(factor),
         )
 
 
@@ -218,6 +253,7 @@ def judge_joint(
     implausible_since: int | None,
     families: FamilyChoice,
     outliers: Outliers | None,
+    correlation: CorrelationSettings,
 ) -> JointVerdict:
     """Compare a joint with its alternatives, given the change point of the sequential test."""
     if implausible_since is None:
@@ -229,13 +265,28 @@ def judge_joint(
         if outliers is not None and len(right) >= 2:
             right = identify_observations(recent.observations, families, outliers).best.inliers
     inliers = recent.select(right)
-    alternative = identify_observations(inliers.observations, families) if len(right) >= 2 else None
-    probabilities = _probabilities(inliers, alternative)
-    operation, reason = None, ""
-    if implausible_since is not None:
-        operation, reason = _propose_replacement(model, data, inliers, alternative)
+    alternative = None
+    if len(right) >= 2 and implausible_since is not None:
+        # The residuals under the rejected joint are no errors.
+        alternative = identify_observations(inliers.observations, families)
+        looks = _measure_looks(inliers, alternative.best, correlation)
     else:
-        reason = _ambiguity_reason(probabilities, len(right))
+        found = data.residuals
+        looks = correlation.measure(found.whitened, found.orthogonal.shape[1], data.stamps)
+    independent = inliers.decorrelate(looks)
+    if len(right) >= 2 and (alternative is None or independent is not inliers):
+        alternative = identify_observations(independent.observations, families)
+    probabilities = _probabilities(independent, alternative)
+    operation, reason = None, ""
+    if implausible_since is not None and _is_unrelated(recent, alternative):
+        alternative, probabilities = None, {}
+        reason = "successive poses are unrelated, as if all were outliers; see how the frames are observed"
+    elif implausible_since is not None:
+        reason = _indecision_reason(data.joint, probabilities, alternative)
+        if not reason:
+            operation, reason = _propose_replacement(model, data, independent, alternative)
+    else:
+        reason = _ambiguity_reason(probabilities, len(right), looks)
     squares = np.mean(inliers.residuals.pose_residuals**2, axis=0)
     rms = math.sqrt(float(squares[:3].sum())), math.sqrt(float(squares[3:].sum()))
     outlier_times = tuple(np.setdiff1d(recent.times, inliers.times).tolist())
@@ -250,6 +301,13 @@ def judge_joint(
         reason,
         outlier_times,
     )
+
+
+def _measure_looks(data: JointObservations, fit: Fit, correlation: CorrelationSettings) -> float:
+    """Return the number of observations that tell as much as one, from the residuals of a fit."""
+    solution = project_observations(fit.motion, fit.joint_values, data.observations)
+    size = data.observations.rows - fit.joint_values.shape[1]
+    return correlation.measure(orthogonal_residuals(solution), size, data.stamps)
 
 
 def _probabilities(data: JointObservations, alternative: IdentificationResult | None) -> dict[str, float]:
@@ -272,16 +330,30 @@ def _probabilities(data: JointObservations, alternative: IdentificationResult | 
     return {"free": 0.0, **{name: math.exp(log - total) for name, log in logs.items()}}
 
 
-def _ambiguity_reason(probabilities: Mapping[str, float], count: int) -> str:
+def _ambiguity_reason(probabilities: Mapping[str, float], count: int, looks: float) -> str:
     """Return the reason why a joint that fits is not certain."""
-    if probabilities["served"] >= SURE:
-        return ""
+    correlated = f"errors are correlated, {count} observations tell as much as {count / looks:.1f}"
+    if probabilities["served"] >= SURE and count > 1:
+        return "" if count >= _LEAST_INDEPENDENT * looks else correlated
     if count < _LEAST_COUNT:
         return f"both were seen {count} time{'s' if count > 1 else ''} only"
     other = max((name for name in probabilities if name != "served"), key=lambda name: probabilities[name])
-    if other == "elsewhere":
-        return "it may sit a bit elsewhere as well"
-    return "it hardly moved" if other == "rigid" else f"it may be {other} as well"
+    reason = f"it may be {other} as well"
+    if other in ("elsewhere", "rigid"):
+        reason = "it may sit a bit elsewhere as well" if other == "elsewhere" else "it hardly moved"
+    if looks >= _CORRELATED:
+        reason += f"; {correlated}"
+    return reason
+
+
+def _indecision_reason(
+    joint: TestableJoint, probabilities: Mapping[str, float], alternative: IdentificationResult | None
+) -> str:
+    """Return the reason why the observations since a rejection tell nothing of a replacement."""
+    static = alternative is not None and alternative.best.family == "rigid"
+    if joint.moves and static and probabilities["rigid"] < SURE:
+        return "it hardly moved since, so what it is instead is not known yet"
+    return ""
 
 
 def _propose_replacement(
@@ -311,13 +383,21 @@ def _propose_replacement(
     return operation, ""
 
 
+def _is_unrelated(data: JointObservations, alternative: IdentificationResult | None) -> bool:
+    """Return True if nothing connects the poses: neither a joint, nor that successive ones are near."""
+    if alternative is None or alternative.best.family != "free":
+        return False
+    positions = data.observations.relative[:, :3, 3]
+    later = np.roll(positions, len(positions) // 2, axis=0)
+    step = np.median(np.linalg.norm(np.diff(positions, axis=0), axis=1))
+    return bool(step > _UNRELATED * np.median(np.linalg.norm(positions - later, axis=1)))
+
+
 def _explains_alone(model: Model, data: JointObservations, alternative: IdentificationResult) -> bool:
     """Return True if a joint fits without consistency tests and with loops opened."""
     if not (data.residuals.limit_excess.size or data.residuals.disagreement.size):
         return False
     served = KnownJoint(model, data.joint.child, data.joint.parent, open_loops=True)
     residuals = compute_residuals(served, data.observations)
-    alone = _probabilities(
-        JointObservations(data.joint, served, data.observations, residuals, data.times), alternative
-    )
+    alone = _probabilities(replace(data, served=served, residuals=residuals), alternative)
     return alone["served"] >= SURE

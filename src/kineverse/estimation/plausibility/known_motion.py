@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from copy import copy
 from dataclasses import dataclass
+from functools import cached_property
 from typing import Self
 
 import numpy as np
@@ -101,6 +102,25 @@ class KnownJoint:
             twists = twists @ self._rates.batch(self._points(coordinates))
         return LinearisedPoses(poses, np.zeros((len(poses), 6, 0)), twists)
 
+    def evaluate(self, coordinates: Array) -> tuple[Array, Array]:
+        """Return the pose (4, 4) at one set of coordinates (n,), and twists per unit of each (6, n)."""
+        if not len(coordinates):
+            return self._constant
+        pose, *slopes = self._linear(np.concatenate([coordinates, self._others]))
+        twists = np.empty((6, len(slopes)))
+        for j, slope in enumerate(slopes):
+            turned = (slope[:3, :3] @ pose[:3, :3].T).tolist()
+            twists[:3, j] = slope[:3, 3]
+            twists[3, j] = 0.5 * (turned[2][1] - turned[1][2])
+            twists[4, j] = 0.5 * (turned[0][2] - turned[2][0])
+            twists[5, j] = 0.5 * (turned[1][0] - turned[0][1])
+        return pose, twists
+
+    @cached_property
+    def _constant(self) -> tuple[Array, Array]:
+        (pose,) = self._linear(self._others)
+        return pose, np.zeros((6, 0))
+
     def retract(self, coordinates: Array, change: Array) -> Array:
         """Return coordinates (N, n) after changes of the joint values (N, k), without limits."""
         if self._rates is not None:
@@ -135,7 +155,7 @@ class KnownJoint:
 
     def solve(self, observations: Observations) -> tuple[Array, Solution[KnownMotion]]:
         """Find the most likely coordinates (N, n) inside the limits, and the solution around them."""
-        coordinates = self._initial_coordinates(observations)
+        coordinates = self.initial_coordinates(observations)
         for _ in range(1 if self.is_plain else _ROUNDS):
             values = np.zeros((len(observations), self.joints))
             if self.is_plain:
@@ -150,6 +170,8 @@ class KnownJoint:
         Where the pose is undefined beyond the limits, those inside stay.
         """
         free = copy(self)
+        for name in ("_grid_poses", "_inner_limits"):
+            free.__dict__.pop(name, None)
         free.lower, free.upper = np.full(self.joints, -np.inf), np.full(self.joints, np.inf)
         try:
             coordinates, _ = free.solve(observations)
@@ -157,20 +179,28 @@ class KnownJoint:
             return inside
         return coordinates if np.isfinite(coordinates).all() else inside
 
-    def _initial_coordinates(self, observations: Observations) -> Array:
+    def initial_coordinates(self, observations: Observations) -> Array:
         """Return the best coordinates of a grid for each observation."""
-        grid = self._grid()
-        poses = self.linearise(grid).pose
+        grid, flat, positions, squares = self._grid_poses
         observed = observations.relative
-        covariance = np.einsum("nii->i", observations.child_covariance) / len(observations)
-        place, turn = covariance[:3].sum() / 3.0, covariance[3:].sum() / 3.0
+        covariance = observations.child_covariance
+        covariance = covariance[0] if len(covariance) == 1 else covariance.mean(axis=0)
+        x, y, z, *turns = np.diagonal(covariance).tolist()
         # ‖R - S‖² = 6 - 2 tr(RᵀS) is twice the square of a small angle.
-        flat, tried = observed[:, :3, :3].reshape(-1, 9), poses[:, :3, :3].reshape(-1, 9)
-        off = (3.0 - flat @ tried.T) / turn
-        p, q = observed[:, :3, 3], poses[:, :3, 3]
-        off += (np.sum(p**2, axis=1)[:, None] - 2.0 * p @ q.T + np.sum(q**2, axis=1)) / place
+        off = (3.0 - observed[:, :3, :3].reshape(-1, 9) @ flat) * (3.0 / sum(turns))
+        p = observed[:, :3, 3]
+        off += (squares - 2.0 * p @ positions) * (3.0 / (x + y + z))
         nearest: Array = grid[np.argmin(off, axis=1)]
         return nearest
+
+    @cached_property
+    def _grid_poses(self) -> tuple[Array, Array, Array, Array]:
+        """Initial values (M, n), their rotations (9, M), positions (3, M) and squared norms of these (M,)."""
+        grid = self._grid()
+        poses = self.linearise(grid).pose
+        positions = poses[:, :3, 3]
+        flat = np.ascontiguousarray(poses[:, :3, :3].reshape(-1, 9).T)
+        return grid, flat, np.ascontiguousarray(positions.T), np.sum(positions**2, axis=1)
 
     def _grid(self) -> Array:
         if not self.joints:
@@ -191,6 +221,10 @@ class KnownJoint:
 
     def inner_limits(self) -> tuple[Array, Array]:
         """Return the limits of joint values with a margin."""
+        return self._inner_limits
+
+    @cached_property
+    def _inner_limits(self) -> tuple[Array, Array]:
         width = self.upper - self.lower
         margin = np.where(np.isfinite(width), _MARGIN * width, 0.0)
         return self.lower + margin, self.upper - margin

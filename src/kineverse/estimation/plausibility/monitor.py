@@ -2,14 +2,15 @@
 
 from __future__ import annotations
 
+import math
 from collections import deque
 from collections.abc import Iterable, Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 import numpy.typing as npt
 
-from kineverse.errors import KineverseError, ShapeError, UnknownNameError, suggest
+from kineverse.errors import InvalidValueError, KineverseError, ShapeError, UnknownNameError, suggest
 from kineverse.estimation.identification.kinematic_graph.pairwise import FamilyChoice
 from kineverse.estimation.identification.observations import (
     Observations,
@@ -27,11 +28,20 @@ from kineverse.model.model import Model
 
 from .alternatives import JointObservations, judge_joint
 from .consistency import ConsistencyTests, TimedResiduals
+from .correlation import CorrelationSettings
+from .exchanged_frames import find_exchanged_frames
 from .known_motion import KnownJoint
 from .known_residuals import KnownResiduals, compute_residuals
-from .plausibility import FALSE_ALARMS, check_false_alarms, undetermined_verdict
+from .plausibility import (
+    FALSE_ALARMS,
+    check_decorrelation_time,
+    check_false_alarms,
+    check_time,
+    pair_outliers,
+    undetermined_verdict,
+)
 from .report import JointVerdict, Plausibility
-from .sequential_test import SequentialTest
+from .sequential_test import CorrelatedTest
 from .testability import TestableJoint, TestableJoints, find_testable_joints
 
 
@@ -42,13 +52,14 @@ class _MonitoredJoint:
     joint: TestableJoint
     served: KnownJoint | None
     reason: str
-    test: SequentialTest
+    # Begins with the first observation.
+    test: CorrelatedTest | None = None
     # Numbers of the observations in the test.
     numbers: list[int] = field(default_factory=list)
 
     @property
     def implausible_since(self) -> int | None:
-        return None if self.test.implausible_since is None else self.numbers[self.test.implausible_since]
+        return None if self.test is None else self.test.implausible_since
 
 
 class PlausibilityMonitor:
@@ -63,7 +74,7 @@ class PlausibilityMonitor:
         The served model.
     frames
         Names of the frames that may be observed.
-    noise, relative_to, families, false_alarms, outliers
+    noise, relative_to, families, false_alarms, outliers, decorrelation_time
         As in :func:`~kineverse.estimation.check_plausibility`.
     keep
         Number of recent observations that reports use.
@@ -84,16 +95,24 @@ class PlausibilityMonitor:
         families: FamilyChoice = None,
         false_alarms: float = FALSE_ALARMS,
         outliers: Outliers | bool | None = True,
+        decorrelation_time: float | None = None,
         keep: int = 500,
     ) -> None:
         check_false_alarms(false_alarms)
+        check_decorrelation_time(decorrelation_time)
         self.model = model
         self.frames = tuple(dict.fromkeys(frames))
         self.false_alarms = false_alarms
         self.count = 0
         self._outliers = as_outliers(outliers)
+        self._decorrelation_time = decorrelation_time
+        self._last: float | None = None
+        self._stamped = False
+        # Checked covariance of a pose without its own, (1, 6, 6).
+        self._covariances: Array | None = None
         self._noise, self._relative_to, self._families = noise, relative_to, families
         self._recent: deque[dict[str, PoseTrack]] = deque(maxlen=keep)
+        self._stamps: deque[float] = deque(maxlen=keep)
         self._monitored: list[_MonitoredJoint] = []
         self._testable = TestableJoints((), {})
         self._consistency = ConsistencyTests(model, {}, relative_to)
@@ -108,7 +127,7 @@ class PlausibilityMonitor:
                 result[monitored.joint.tag] = min(number, result.get(monitored.joint.tag, number))
         return result
 
-    def update(self, observations: Mapping[str, PosesLike]) -> tuple[str, ...]:
+    def update(self, observations: Mapping[str, PosesLike], at: float | None = None) -> tuple[str, ...]:
         """Add one observation; return the tags of newly rejected joints.
 
         Parameters
@@ -116,25 +135,31 @@ class PlausibilityMonitor:
         observations
             Pose by name of the frame, (4, 4), or pair of a pose and its covariance, (6, 6). Absent names are
             missing.
+        at
+            Time of the observation [s], later than the one before; without times, observations are one step
+            apart.
 
         Raises
         ------
         UnknownNameError, ShapeError, InvalidValueError
-            For invalid frames, poses and covariances; the monitor does not change then.
+            For invalid frames, poses, covariances and times; the monitor does not change then.
         """
         for name in observations:
             if name not in self.frames:
                 raise UnknownNameError(
                     f"The frame {name!r} is not watched. {suggest(str(name), self.frames, 'frame')}"
                 )
-        tracks = check_tracks({name: _one(given, name) for name, given in observations.items()}, self._noise)
+        tracks = {name: self._check(given, name) for name, given in observations.items()}
+        time = self._check_time(at)
         if self.model.version != self._version:
             self._find_joints()
         if self._relative_to is not None:
             tracks[self._relative_to] = exact_track(1)
         before = set(self.implausible_since)
-        self._add(tracks)
+        self._last, self._stamped = time, at is not None
+        self._add(tracks, time)
         self._recent.append(tracks)
+        self._stamps.append(time)
         self.count += 1
         return tuple(tag for tag in self.implausible_since if tag not in before)
 
@@ -149,8 +174,17 @@ class PlausibilityMonitor:
         tested = self._consistency.apply(
             {joint: known for joint, known in residuals.items() if known is not None}
         )
+        since = {m.joint: m.implausible_since for m in self._monitored if m.implausible_since is not None}
+        exchanged = find_exchanged_frames(
+            since,
+            {m.joint: m.served for m in self._monitored if m.served is not None},
+            self._recent_tracks() if since else {},
+            self._relative_to,
+            first,
+        )
         verdicts = [
-            self._verdict(monitored, tested.get(monitored.joint), first) for monitored in self._monitored
+            self._verdict(monitored, tested.get(monitored.joint), first, exchanged.get(monitored.joint, ""))
+            for monitored in self._monitored
         ]
         return Plausibility(tuple(verdicts), self._testable.untested, self.false_alarms)
 
@@ -180,12 +214,37 @@ class PlausibilityMonitor:
             ):
                 self._monitored.append(old)
             else:
-                self._monitored.append(_MonitoredJoint(joint, served, reason, self._new_test()))
+                self._monitored.append(_MonitoredJoint(joint, served, reason))
 
-    def _new_test(self) -> SequentialTest:
-        return SequentialTest(self.false_alarms, self._outliers.fraction if self._outliers else 0.0)
+    def _check(self, given: PosesLike, name: str) -> PoseTrack:
+        if not isinstance(given, tuple) and self._covariances is not None:
+            # The usual case in a fraction of the time.
+            try:
+                pose: Array = np.asarray(given, dtype=np.float64)
+            except (TypeError, ValueError):
+                pose = np.zeros(0)
+            if pose.shape == (4, 4) and _is_rigid(pose):
+                return PoseTrack(pose[None].copy(), self._covariances, _SEEN)
+        track = check_tracks({name: _one(given, name)}, self._noise)[name]
+        if not isinstance(given, tuple):
+            self._covariances = track.covariances
+        return track
 
-    def _add(self, tracks: Mapping[str, PoseTrack]) -> None:
+    @property
+    def _correlation(self) -> CorrelationSettings:
+        return CorrelationSettings(self._decorrelation_time, self._stamped)
+
+    def _check_time(self, at: float | None) -> float:
+        if self._last is None:
+            return 0.0 if at is None else check_time(at, -math.inf)
+        if (at is not None) != self._stamped:
+            raise InvalidValueError(
+                "Either all observations have a time (at=), or none: the first "
+                f"{'had one' if self._stamped else 'had none'}."
+            )
+        return self._last + 1.0 if at is None else check_time(at, self._last)
+
+    def _add(self, tracks: Mapping[str, PoseTrack], at: float) -> None:
         residuals: dict[TestableJoint, TimedResiduals] = {}
         for monitored in self._monitored:
             joint = monitored.joint
@@ -200,13 +259,26 @@ class PlausibilityMonitor:
         tested = self._consistency.apply(residuals)
         for monitored in self._monitored:
             if monitored.joint in tested:
-                joint_residuals = tested[monitored.joint]
                 monitored.numbers.append(self.count)
-                monitored.test.add(
-                    joint_residuals.orthogonal[0],
-                    joint_residuals.displacement_jacobian[0],
-                    joint_residuals.one_sided[0],
-                )
+                if monitored.test is None:
+                    outliers = self._pair_outliers(monitored.joint)
+                    monitored.test = CorrelatedTest(
+                        self.false_alarms, outliers.fraction if outliers else 0.0, self._correlation
+                    )
+                monitored.test.add(tested[monitored.joint], self.count, at)
+
+    def _pair_outliers(self, joint: TestableJoint) -> Outliers | None:
+        return pair_outliers(self._outliers, joint, self._relative_to)
+
+    def _recent_tracks(self) -> dict[str, PoseTrack]:
+        """Return the recent poses by name of the frame, with gaps."""
+        names = {name for tracks in self._recent for name in tracks}
+        return {
+            name: concatenate_tracks(
+                [tracks.get(name, _missing(name, self._recent)) for tracks in self._recent]
+            )
+            for name in names
+        }
 
     def _compute_residuals(self, monitored: _MonitoredJoint, first: int) -> TimedResiduals | None:
         """Return the residuals of a joint in the recent observations; None if there are none."""
@@ -228,17 +300,61 @@ class PlausibilityMonitor:
         return pair_tracks(parent, child, np.arange(len(kept)))
 
     def _verdict(
-        self, monitored: _MonitoredJoint, residuals: KnownResiduals | None, first: int
+        self, monitored: _MonitoredJoint, residuals: KnownResiduals | None, first: int, exchanged: str
     ) -> JointVerdict:
         joint = monitored.joint
         if monitored.served is None or residuals is None:
             never = f"'{joint.parent}' and '{joint.child}' were not seen together"
             return undetermined_verdict(joint, 0, monitored.reason or never)
         times = self._times(monitored, first)
+        if exchanged:
+            return undetermined_verdict(joint, len(times), exchanged, monitored.implausible_since)
         data = JointObservations(
-            joint, monitored.served, self._poses(joint, times, first), residuals, np.array(times)
+            joint,
+            monitored.served,
+            self._poses(joint, times, first),
+            residuals,
+            np.array(times),
+            np.array([self._stamps[number - first] for number in times]),
         )
-        return judge_joint(self.model, data, monitored.implausible_since, self._families, self._outliers)
+        return judge_joint(
+            self.model,
+            data,
+            monitored.implausible_since,
+            self._families,
+            self._pair_outliers(joint),
+            self._correlation,
+        )
+
+
+def _missing(name: str, recent: Iterable[Mapping[str, PoseTrack]]) -> PoseTrack:
+    """Return a gap in the track of a frame."""
+    like = next(tracks[name] for tracks in recent if name in tracks)
+    return replace(like, seen=np.zeros(1, dtype=bool))
+
+
+_SEEN = np.ones(1, dtype=bool)
+
+
+def _is_rigid(pose: Array) -> bool:
+    """Return True for a pose (4, 4) that is certainly valid."""
+    rotation = pose[:3, :3]
+    off = rotation.T @ rotation
+    off[_DIAGONAL] -= 1.0
+    (a, b, c), (d, e, f), (g, h, i) = rotation.tolist()
+    x, y, z = pose[:3, 3].tolist()
+    determinant = a * (e * i - f * h) - b * (d * i - f * g) + c * (d * h - e * g)
+    return (
+        float(np.abs(off).max()) < _RIGID
+        and determinant > 0.0
+        and pose[3].tolist() == [0.0, 0.0, 0.0, 1.0]
+        and abs(x) + abs(y) + abs(z) < _FAR
+    )
+
+
+_DIAGONAL = np.diag_indices(3)
+# Tolerance of a rotation, and the farthest position, that need no further check.
+_RIGID, _FAR = 1e-6, 1e6
 
 
 def _one(given: PosesLike, name: str) -> PosesLike:

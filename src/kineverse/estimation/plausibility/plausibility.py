@@ -4,21 +4,26 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping
+from dataclasses import replace
 
 import numpy as np
 import numpy.typing as npt
 
-from kineverse.errors import InvalidValueError, KineverseError
+from kineverse.errors import InvalidValueError, KineverseError, ShapeError
 from kineverse.estimation.identification.kinematic_graph.pairwise import FamilyChoice
 from kineverse.estimation.identification.observations import PosesLike, check_tracks, exact_track, pair_tracks
 from kineverse.estimation.robust import Outliers, as_outliers
+from kineverse.lie import Array
 from kineverse.model.frame import WORLD
 from kineverse.model.model import Model, Snapshot
 
 from .alternatives import JointObservations, judge_joint
 from .consistency import ConsistencyTests, TimedResiduals
+from .correlation import CorrelationSettings
+from .exchanged_frames import find_exchanged_frames
 from .known_motion import KnownJoint
 from .known_residuals import compute_residuals
+from .recorded_poses import RecordedPoses, recorded_observations
 from .report import JointVerdict, Plausibility
 from .sequential_test import SequentialTest
 from .testability import TestableJoint, find_testable_joints
@@ -28,14 +33,16 @@ FALSE_ALARMS = 1e-3
 
 
 def check_plausibility(
-    model: Model | Snapshot,
-    observations: Mapping[str, PosesLike],
+    model: Model | Snapshot | RecordedPoses,
+    observations: Mapping[str, PosesLike] | None = None,
     *,
+    times: npt.ArrayLike | None = None,
     noise: npt.ArrayLike | None = None,
     relative_to: str | None = WORLD,
     families: FamilyChoice = None,
     false_alarms: float = FALSE_ALARMS,
     outliers: Outliers | bool | None = True,
+    decorrelation_time: float | None = None,
     strict: bool = False,
 ) -> Plausibility:
     """Test whether the joints of a model explain observations, and propose replacements if not.
@@ -47,10 +54,12 @@ def check_plausibility(
     Parameters
     ----------
     model
-        The served model.
+        The served model; or a tracker, with the model, the recent poses, their times and covariances.
     observations
         Poses over time by name of the frame, (N, 4, 4), or pairs of poses and covariance, (6, 6) or (N, 6,
-        6); missing poses are NaN throughout.
+        6), in order of time; missing poses are NaN throughout.
+    times
+        Times of the observations (N,) [s]; without them, observations are one step apart.
     noise
         Default covariance of a pose, (6, 6), see :mod:`kineverse.estimation.noise`.
     relative_to
@@ -63,6 +72,9 @@ def check_plausibility(
     outliers
         Outlier model, see :class:`~kineverse.estimation.Outliers`; False or None without outliers, which
         detects deviations sooner.
+    decorrelation_time
+        Correlation time of the errors [s], or in steps without times: their correlation falls to 1/e. 0 for
+        independent errors; None to measure it, up to a second or 30 steps.
     strict
         True to raise if a joint is rejected.
 
@@ -71,15 +83,23 @@ def check_plausibility(
     UnknownNameError
         For a frame or a family that does not exist.
     ShapeError, InvalidValueError
-        For invalid poses or covariances, and if a covariance is missing.
+        For invalid poses, covariances or times, and if a covariance is missing.
     ImplausibleError
         If ``strict``, and a joint does not explain the observations.
     """
     check_false_alarms(false_alarms)
+    check_decorrelation_time(decorrelation_time)
     outlier_model = as_outliers(outliers)
+    if isinstance(model, RecordedPoses):
+        if observations is None:
+            observations, times = recorded_observations(model), model.recent_times
+        model = model.model
     if isinstance(model, Snapshot):
         model = model.model()
+    observations = {} if observations is None else observations
     tracks = check_tracks(observations, noise)
+    stamps = _check_times(times, max((len(track.poses) for track in tracks.values()), default=0))
+    correlation = CorrelationSettings(decorrelation_time, times is not None)
     testable = find_testable_joints(model, observations, relative_to)
     if relative_to is not None:
         tracks[relative_to] = exact_track(max((len(track.poses) for track in tracks.values()), default=0))
@@ -88,8 +108,8 @@ def check_plausibility(
     served_joints: dict[TestableJoint, KnownJoint] = {}
     for joint in testable.joints:
         parent, child = tracks[joint.parent], tracks[joint.child]
-        times = np.flatnonzero(parent.seen & child.seen)
-        if not len(times):
+        seen = np.flatnonzero(parent.seen & child.seen)
+        if not len(seen):
             reasons[joint] = undetermined_verdict(
                 joint, 0, f"'{joint.parent}' and '{joint.child}' were never seen together"
             )
@@ -97,28 +117,35 @@ def check_plausibility(
         try:
             served = KnownJoint(model, joint.child, joint.parent)
             residuals[joint] = TimedResiduals(
-                times, compute_residuals(served, pair_tracks(parent, child, times))
+                seen, compute_residuals(served, pair_tracks(parent, child, seen))
             )
             served_joints[joint] = served
         except KineverseError as error:
-            reasons[joint] = undetermined_verdict(joint, len(times), f"its pose cannot be computed. {error}")
+            reasons[joint] = undetermined_verdict(joint, len(seen), f"its pose cannot be computed. {error}")
     tested = ConsistencyTests(model, served_joints, relative_to).apply(residuals)
+    data: dict[TestableJoint, JointObservations] = {}
+    implausible_since: dict[TestableJoint, int] = {}
+    for joint, served in served_joints.items():
+        seen = residuals[joint].times
+        poses = pair_tracks(tracks[joint.parent], tracks[joint.child], seen)
+        data[joint] = JointObservations(joint, served, poses, tested[joint], seen, stamps[seen])
+        since = _test(
+            data[joint], false_alarms, pair_outliers(outlier_model, joint, relative_to), correlation
+        )
+        if since is not None:
+            implausible_since[joint] = since
+    exchanged = find_exchanged_frames(implausible_since, served_joints, tracks, relative_to)
     verdicts = []
     for joint in testable.joints:
         if joint in reasons:
             verdicts.append(reasons[joint])
-            continue
-        times = residuals[joint].times
-        poses = pair_tracks(tracks[joint.parent], tracks[joint.child], times)
-        verdicts.append(
-            _test_joint(
-                model,
-                JointObservations(joint, served_joints[joint], poses, tested[joint], times),
-                families,
-                false_alarms,
-                outlier_model,
-            )
-        )
+        elif joint in exchanged:
+            since, count = implausible_since[joint], len(data[joint].times)
+            verdicts.append(undetermined_verdict(joint, count, exchanged[joint], since))
+        else:
+            fitting = pair_outliers(outlier_model, joint, relative_to)
+            since = implausible_since.get(joint)
+            verdicts.append(judge_joint(model, data[joint], since, families, fitting, correlation))
     result = Plausibility(tuple(verdicts), testable.untested, false_alarms)
     if strict:
         result.raise_if_implausible()
@@ -139,21 +166,84 @@ def check_false_alarms(probability: float) -> None:
         )
 
 
-def undetermined_verdict(joint: TestableJoint, count: int, reason: str) -> JointVerdict:
-    """Return the verdict on a joint that cannot be tested."""
-    return JointVerdict(joint, {}, (math.nan, math.nan), count, reason=reason)
-
-
-def _test_joint(
-    model: Model,
-    data: JointObservations,
-    families: FamilyChoice,
-    false_alarms: float,
-    outliers: Outliers | None,
+def undetermined_verdict(
+    joint: TestableJoint, count: int, reason: str, implausible_since: int | None = None
 ) -> JointVerdict:
-    test = SequentialTest(false_alarms, outliers.fraction if outliers else 0.0)
+    """Return the verdict on a joint that cannot be tested, or compared with alternatives."""
+    return JointVerdict(joint, {}, (math.nan, math.nan), count, implausible_since, reason=reason)
+
+
+def _test(
+    data: JointObservations, false_alarms: float, outliers: Outliers | None, correlation: CorrelationSettings
+) -> int | None:
+    """Return the first observation that a joint does not explain; None if it is not rejected."""
     residuals = data.residuals
+    looks = correlation.measure(residuals.whitened, residuals.orthogonal.shape[1], data.stamps)
+    test = SequentialTest(false_alarms, outliers.fraction if outliers else 0.0)
     for row in zip(residuals.orthogonal, residuals.displacement_jacobian, residuals.one_sided, strict=True):
-        test.add(*row)
-    implausible_since = None if test.implausible_since is None else int(data.times[test.implausible_since])
-    return judge_joint(model, data, implausible_since, families, outliers)
+        test.add(*row, looks)
+    return None if test.implausible_since is None else int(data.times[test.implausible_since])
+
+
+def pair_outliers(
+    outliers: Outliers | None, joint: TestableJoint, relative_to: str | None
+) -> Outliers | None:
+    """Return the outlier model of a pair of poses: an outlier of either is one of the pair."""
+    if outliers is None or joint.parent == relative_to:
+        return outliers
+    return replace(outliers, fraction=1.0 - (1.0 - outliers.fraction) ** 2)
+
+
+def check_decorrelation_time(time: float | None) -> None:
+    """Check a correlation time.
+
+    Raises
+    ------
+    InvalidValueError
+        If it is negative or not finite.
+    """
+    if time is not None and not (math.isfinite(time) and time >= 0.0):
+        raise InvalidValueError(
+            "The decorrelation time is a number of seconds, 0 for independent errors, or None to measure it, "
+            f"not {time!r}."
+        )
+
+
+def check_time(at: object, last: float) -> float:
+    """Return a time stamp as a number.
+
+    Raises
+    ------
+    InvalidValueError
+        If it is no finite number, or not later than the last one.
+    """
+    try:
+        time = float(at)  # type: ignore[arg-type]
+    except (TypeError, ValueError):
+        time = math.nan
+    if not math.isfinite(time):
+        raise InvalidValueError(f"The time of an observation is a finite number of seconds, not {at!r}.")
+    if time <= last:
+        raise InvalidValueError(
+            f"The time {time:.9g} is not later than {last:.9g}, that of the observation before. Sort the "
+            "observations by time, and leave out what comes twice."
+        )
+    return time
+
+
+def _check_times(times: npt.ArrayLike | None, count: int) -> Array:
+    if times is None:
+        return np.arange(float(count))
+    try:
+        given = list(np.asarray(times, dtype=np.float64))
+    except (TypeError, ValueError):
+        raise ShapeError("The times are no array of numbers.") from None
+    if np.shape(given) != (count,):
+        raise ShapeError(
+            f"There are {count} observations, and the times are of shape {np.shape(given)}. Each observation "
+            "has one time."
+        )
+    last = -math.inf
+    for k, at in enumerate(given):
+        given[k] = last = check_time(at, last)
+    return np.array(given)

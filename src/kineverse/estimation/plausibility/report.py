@@ -8,6 +8,7 @@ from dataclasses import dataclass
 
 from kineverse.errors import ModelError, UnknownNameError, suggest
 from kineverse.estimation.identification.result import SURE, IdentificationResult
+from kineverse.model.model import Model
 from kineverse.model.operation import Operation
 
 from .testability import TestableJoint
@@ -66,7 +67,8 @@ class JointVerdict:
         """Result in words: ``explains``, ``stopped explaining at observation k``, or ``cannot tell``."""
         if self.implausible_since is not None:
             return f"stopped explaining at observation {self.implausible_since}"
-        return "explains" if self.probabilities.get("served", 0.0) >= SURE else "cannot tell"
+        certain = self.probabilities.get("served", 0.0) >= SURE and not self.reason
+        return "explains" if certain else "cannot tell"
 
     @property
     def explains(self) -> bool:
@@ -114,6 +116,26 @@ class Plausibility:
     def replacements(self) -> dict[str, Operation]:
         """Operations for ``edit.replace(tag, operation)``, by tag."""
         return {r.tag: r.replacement for r in reversed(self.verdicts) if r.replacement is not None}
+
+    def repair(self, model: Model) -> tuple[str, ...]:
+        """Replace the rejected joints of a model by their replacements, in one edit.
+
+        Returns the tags of the replaced operations; none if no joint was rejected. A joint stays as it is if
+        it was rejected and nothing is known to replace it, while others are replaced.
+
+        Raises
+        ------
+        ImplausibleError
+            If joints were rejected and none of them has a replacement. The message has the reasons.
+        """
+        replacements = self.replacements
+        if not replacements:
+            self.raise_if_implausible()
+            return ()
+        with model.edit() as edit:
+            for tag, operation in replacements.items():
+                edit.replace(tag, operation)
+        return tuple(replacements)
 
     def raise_if_implausible(self) -> None:
         """Raise if a joint was rejected.

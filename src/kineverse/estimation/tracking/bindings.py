@@ -198,7 +198,7 @@ class NativeMapSolver:
             if rounds < 0:
                 return None
             nis, dof = self._results.copy()
-            after = InformationState(belief.sizes, self._belief.copy(), belief.records)
+            after = belief.with_numbers(self._belief.copy())
             return MapResult(after, nis, dof, rounds, squares=self._squares.copy())
 
     def predict(
@@ -218,7 +218,7 @@ class NativeMapSolver:
                 < 0
             ):
                 return None
-            return InformationState(belief.sizes, self._belief.copy(), belief.records)
+            return belief.with_numbers(self._belief.copy())
 
     def are_rigid(self, reading: Measurements) -> bool:
         """Return True if all measured poses are rigid; False if that is unknown."""
@@ -239,6 +239,8 @@ class NativeMapSolver:
 
 # Above this inlier probability a measurement is taken as an inlier.
 _CERTAIN = 1 - 1e-6
+# Groups with more outliers are left to numpy.
+_MOST_TRIMMED = 4
 
 
 class NativeInlierSolver:
@@ -252,7 +254,6 @@ class NativeInlierSolver:
 
     def __init__(self, layout: Layout, native: NativeMapSolver, outliers: Outliers) -> None:
         self._layout, self._native, self._outliers = layout, native, outliers
-        self._log_outlier = np.array([outliers.log_density(one) for one in layout.observations])
         self._log_inlier = math.log(1 - outliers.fraction)
 
     def solve(
@@ -263,29 +264,66 @@ class NativeInlierSolver:
         result = self._native.update(mixture.best, reading, inputs)
         if result is None:
             return [], 0
-        inliers = self._inlier_probabilities(result, reading) > 0.5
+        log_outlier = self._log_outlier(reading)
+        inliers = self._inlier_probabilities(result, reading, log_outlier) > 0.5
         all_right = [n for n in unambiguous if inliers[self._measured(n, reading)].all()]
-        candidates = [self._candidate(mixture, result, reading, inliers, all_right)]
+        candidates = [self._candidate(mixture, result, reading, log_outlier, inliers, all_right)]
         split = [n for n in unambiguous if n not in all_right]
         if not split:
             return candidates, result.rounds
-        refined = self._native.update(mixture.best, reading._replace(mask=reading.mask & inliers), inputs)
-        if refined is None:
+        trimmed = self._trim_worst(mixture, result, reading, inputs, log_outlier, split)
+        if trimmed is None:
             return candidates, result.rounds
-        rivals = self._rival_evidence(mixture, reading, inputs, inliers, split)
-        candidates.append(self._candidate(mixture, refined, reading, inliers, split, rivals))
+        refined, inliers = trimmed
+        rivals = self._rival_evidence(mixture, reading, inputs, log_outlier, inliers, split)
+        candidates.append(self._candidate(mixture, refined, reading, log_outlier, inliers, split, rivals))
         return candidates, max(result.rounds, refined.rounds)
+
+    def _trim_worst(
+        self,
+        mixture: GaussianSum,
+        result: MapResult,
+        reading: Measurements,
+        inputs: Array,
+        log_outlier: Array,
+        groups: Sequence[int],
+    ) -> tuple[MapResult, npt.NDArray[np.bool_]] | None:
+        """Reject the worst measurement of each group until none is an outlier; return the result and a mask.
+
+        One gross error drags the estimate away from the others, so that all seem to be outliers. None if the
+        solver fails.
+        """
+        mask, left = reading.mask.copy(), list(groups)
+        for _ in range(_MOST_TRIMMED):
+            probable = self._inlier_probabilities(result, reading._replace(mask=mask), log_outlier) > 0.5
+            left = [n for n in left if not all(probable[i] for i in self._measured(n, reading) if mask[i])]
+            if not left:
+                break
+            assert result.squares is not None
+            for number in left:
+                kept = [i for i in self._measured(number, reading) if mask[i]]
+                mask[max(kept, key=result.squares.__getitem__)] = False
+            after = self._native.update(mixture.best, reading._replace(mask=mask), inputs)
+            if after is None:
+                return None
+            result = after
+        return result, mask
 
     def _measured(self, number: int, reading: Measurements) -> list[int]:
         return [i for i in self._layout.groups[number].observation_indices if reading.mask[i]]
 
-    def _inlier_probabilities(self, result: MapResult, reading: Measurements) -> Array:
+    def _log_outlier(self, reading: Measurements) -> Array:
+        """Return log(ε u) of each observation."""
+        pairs = zip(self._layout.observations, reading.log_scale.tolist(), strict=True)
+        return np.array([self._outliers.log_density(one, scale) for one, scale in pairs])
+
+    def _inlier_probabilities(self, result: MapResult, reading: Measurements, log_outlier: Array) -> Array:
         """Return the inlier probability of each observation."""
         weights = np.zeros(len(reading.mask))
         assert result.squares is not None
         for i in np.flatnonzero(reading.mask).tolist():
             square, scale = float(result.squares[i]), float(reading.log_scale[i])
-            weights[i], _ = self._outliers.weigh(square, scale, float(self._log_outlier[i]))
+            weights[i], _ = self._outliers.weigh(square, scale, float(log_outlier[i]))
         return weights
 
     def _rival_evidence(
@@ -293,13 +331,14 @@ class NativeInlierSolver:
         mixture: GaussianSum,
         reading: Measurements,
         inputs: Array,
+        log_outlier: Array,
         inliers: npt.NDArray[np.bool_],
         groups: Sequence[int],
     ) -> dict[int, float]:
         """Return an upper bound on the evidence of each group if a rejected measurement is an inlier."""
         best = dict.fromkeys(groups, -np.inf)
         rejected = {n: [i for i in self._measured(n, reading) if not inliers[i]] for n in groups}
-        peaks = np.maximum(self._log_inlier - reading.log_scale, self._log_outlier)
+        peaks = np.maximum(self._log_inlier - reading.log_scale, log_outlier)
         for index in range(max(map(len, rejected.values()))):
             alone = {n: those[index] for n, those in rejected.items() if index < len(those)}
             mask = np.zeros_like(reading.mask)
@@ -316,20 +355,19 @@ class NativeInlierSolver:
         mixture: GaussianSum,
         result: MapResult,
         reading: Measurements,
+        log_outlier: Array,
         inliers: npt.NDArray[np.bool_],
         groups: Sequence[int],
         rivals: dict[int, float] | None = None,
     ) -> Candidate:
         """Return the result as a candidate for those groups of which it is the only one."""
-        weights = self._inlier_probabilities(result, reading)
+        weights = self._inlier_probabilities(result, reading, log_outlier)
         certain = []
         for number in groups:
             measured = self._measured(number, reading)
             accepted = [i for i in measured if inliers[i]]
-            all_outliers = float(self._log_outlier[measured].sum())
-            by_outliers = (
-                len(accepted) * self._log_inlier + all_outliers - float(self._log_outlier[accepted].sum())
-            )
+            all_outliers = float(log_outlier[measured].sum())
+            by_outliers = len(accepted) * self._log_inlier + all_outliers - float(log_outlier[accepted].sum())
             gained = _evidence_gain(result, mixture, number) + by_outliers
             result.belief.evidence[number] += by_outliers
             others = [rivals[number]] if rivals else []

@@ -12,12 +12,14 @@ from kineverse.compile import compile  # noqa: A004
 from kineverse.expressions.expression import array, as_expression
 from kineverse.lie import Array
 from kineverse.model.constraint import Constraint
+from kineverse.model.rate_nodes import to_plain
 from kineverse.symbols import Symbol
 
 from .gaussian import InformationState
-from .layout import Layout
+from .layout import Layout, build_layout
+from .measurements import MeasurementModel
 from .process_model import ProcessModel
-from .tangent import TangentSpace
+from .tangent import TangentSpace, build_tangent_space
 
 if TYPE_CHECKING:
     from kineverse.model.model_view import ModelView
@@ -91,6 +93,36 @@ def _is_coordinate_bound(constraint: Constraint, tangent_space: TangentSpace) ->
     if constraint.line is None or constraint.lower.symbols or constraint.upper.symbols:
         return False
     return constraint.expression.symbols[0] not in tangent_space.by_speeds
+
+
+def arrange_state(
+    model: ModelView, observations: tuple[MeasurementModel, ...], given: frozenset[Symbol]
+) -> tuple[Layout, StateBounds]:
+    """Choose the estimated coordinates, and collect their limits.
+
+    Parameters
+    ----------
+    model, observations
+        The model, and its measurement models.
+    given
+        Coordinates that are measured elsewhere.
+
+    Raises
+    ------
+    InvalidValueError
+        If an observation depends on no estimated coordinate.
+    """
+    rates = model.rates
+    values = [rates.resolve(to_plain(one.value)) for one in observations]
+    tangent_space = build_tangent_space(rates, values, given, model.default_state())
+    limits = collect_bounds(model, tangent_space, given)
+    dependencies = {s for value in values for s in value.symbols}
+    dependencies |= {s for c in limits.curved for s in c.symbols}
+    dependencies |= {
+        s for x in tangent_space.coordinates if x in rates for e in rates[x].values() for s in e.symbols
+    }
+    inputs = sorted(dependencies - set(tangent_space.coordinates), key=lambda s: s.sort_key)
+    return build_layout(tangent_space, observations, limits.curved, inputs), limits
 
 
 def initial_point(

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
+from dataclasses import dataclass
 from functools import cached_property
 from types import MappingProxyType
 
@@ -14,7 +15,37 @@ from kineverse.state import State
 from kineverse.symbols import Symbol
 
 from .gaussian_sum import GaussianSum
+from .residuals import Measurements
 from .step import StepResult, UpdateStep
+from .track_loss import TrackLoss
+
+
+@dataclass(frozen=True, eq=False)
+class TrackerState:
+    """State of a tracker between two steps.
+
+    Attributes
+    ----------
+    mixture
+        Belief.
+    result
+        Result of the last update.
+    loss
+        Groups that are lost.
+    inputs
+        Values of the inputs.
+    stamp
+        Time [s]; None if the tracker was given none.
+    reading
+        Last measurements; None before the first.
+    """
+
+    mixture: GaussianSum
+    result: StepResult
+    loss: TrackLoss
+    inputs: Array
+    stamp: float | None = None
+    reading: Measurements | None = None
 
 
 class Estimate:
@@ -22,42 +53,69 @@ class Estimate:
 
     Parameters
     ----------
-    result, mixture, update_step, inputs, stamp
-        Result of the last update, and components of the tracker.
+    now, update_step
+        State and components of the tracker.
 
     Attributes
     ----------
     nis, dof
-        Normalised innovation squared of the last update, and its degrees of freedom. It is χ² distributed if
-        the noise is as the covariances say.
+        Normalised innovation squared of the last update over all measurements, and its degrees of freedom.
+        It is χ² distributed if the noise is as the covariances say. A rejected measurement adds the square of
+        its residual.
     rounds
         Number of model evaluations; at 50 the iteration stopped without convergence.
     stamp
         Time [s]; None if the tracker was given none.
     """
 
-    def __init__(
-        self,
-        result: StepResult,
-        mixture: GaussianSum,
-        update_step: UpdateStep,
-        inputs: Array,
-        stamp: float | None,
-    ) -> None:
-        self._mixture, self._belief = mixture, mixture.best
-        self._result, self._update_step, self._layout, self._inputs = (
-            result,
-            update_step,
-            update_step.layout,
-            inputs,
-        )
-        self.nis, self.dof, self.rounds, self.stamp = result.nis, result.dof, result.rounds, stamp
+    def __init__(self, now: TrackerState, update_step: UpdateStep) -> None:
+        self._mixture, self._belief, self._loss = now.mixture, now.mixture.best, now.loss
+        self._result, self._inputs = now.result, now.inputs
+        self._update_step, self._layout = update_step, update_step.layout
+        self.nis, self.dof = float(now.result.nis.sum()), int(now.result.dof.sum())
+        self.rounds, self.stamp = now.result.rounds, now.stamp
 
     @cached_property
     def state(self) -> State:
-        """Most probable state inside the limits."""
+        """Most probable state inside the limits, with its speeds if they are estimated."""
         values = dict(zip(self._layout.tangent_space.coordinates, self._belief.x.tolist(), strict=True))
-        return State(values, stamp=self.stamp, source="tracker")
+        return State({**values, **self.speeds}, stamp=self.stamp, source="tracker")
+
+    @cached_property
+    def speeds(self) -> Mapping[Symbol, float]:
+        """Speeds by symbol [m/s], [rad/s]; empty if none are estimated."""
+        result: dict[Symbol, float] = {}
+        if (velocity := self._update_step.velocity) is not None:
+            for number in range(len(self._layout.groups)):
+                means = velocity.at_state(number, self._belief, self._inputs).mean.tolist()
+                result |= zip(self._update_step.process_model.speeds_of(number), means, strict=True)
+        return MappingProxyType(result)
+
+    @cached_property
+    def speed_covariance(self) -> Array:
+        """Covariance of :attr:`speeds`, in their order (k, k) [m²/s²], [rad²/s²]."""
+        blocks = [np.zeros((0, 0))]
+        if (velocity := self._update_step.velocity) is not None:
+            for number, group in enumerate(self._layout.groups):
+                state = self.covariance[group.block]
+                blocks.append(velocity.covariance(number, self._belief, self._inputs, state))
+        size = sum(map(len, blocks))
+        result, at = np.zeros((size, size)), 0
+        for block in blocks:
+            result[at : at + len(block), at : at + len(block)] = block
+            at += len(block)
+        return result
+
+    @property
+    def lost(self) -> bool:
+        """True if measurements refute the estimate of some coordinates, in many updates in a row."""
+        return bool(self._loss.is_lost.any())
+
+    @property
+    def lost_groups(self) -> tuple[tuple[Symbol, ...], ...]:
+        """Groups of coordinates that are lost."""
+        pairs = zip(self._layout.groups, self._loss.is_lost.tolist(), strict=True)
+        return tuple(group.coordinates for group, is_lost in pairs if is_lost)
 
     @property
     def outliers(self) -> tuple[str, ...]:
@@ -75,7 +133,7 @@ class Estimate:
         result = self._belief.information.copy()
         for number, group in enumerate(self._layout.groups):
             if self._belief.records[number] is not None:
-                block = np.ix_(group.t, group.t)
+                block = group.block
                 result[block] = inverse_spd(self.covariance[block])
         return result
 
@@ -84,9 +142,7 @@ class Estimate:
         """Covariance of the Gaussian, not truncated at limits, in the tangent space (t, t) [m²], [rad²]."""
         result = np.zeros_like(self._belief.information)
         for number, group in enumerate(self._layout.groups):
-            result[np.ix_(group.t, group.t)] = self._update_step.ridge_covariance.compute(
-                number, self._belief
-            )
+            result[group.block] = self._update_step.ridge_covariance.compute(number, self._belief)
         return result
 
     @cached_property
@@ -94,32 +150,35 @@ class Estimate:
         """Mean of the Gaussian, not truncated at limits, as a tangent step from the state (t,)."""
         result = np.zeros_like(self._belief.vector)
         for group in self._layout.groups:
-            information = self._belief.information[np.ix_(group.t, group.t)]
+            information = self._belief.information[group.block]
             result[group.t] = inverse_spd(information) @ self._belief.vector[group.t]
         return result
 
     @cached_property
     def deviation(self) -> Mapping[Symbol | str, float]:
-        """Standard deviation of each coordinate, by symbol and by name [m], [rad].
+        """Standard deviation of each coordinate and estimated speed, by symbol and by name.
 
         It belongs to the Gaussian that is not truncated at limits. At a limit the state varies by less.
         """
         result: dict[Symbol | str, float] = {}
         for number, group in enumerate(self._layout.groups):
             basis = self._update_step.process_model.basis(number, self._belief.x[group.x], self._inputs)
-            block = self.covariance[np.ix_(group.t, group.t)]
+            block = self.covariance[group.block]
             variances = np.einsum("ij,jk,ik->i", basis, block, basis)
             for x, variance in zip(group.coordinates, variances.tolist(), strict=True):
                 result[x] = result[str(x)] = float(np.sqrt(variance))
+        for v, variance in zip(self.speeds, np.diag(self.speed_covariance).tolist(), strict=True):
+            result[v] = result[str(v)] = float(np.sqrt(variance))
         return MappingProxyType(result)
 
     @cached_property
     def confidence(self) -> Mapping[tuple[Symbol, ...], float]:
-        """Probability of each group's best component among the components of the Gaussian sum."""
+        """Probability of each group's best component among those of the Gaussian sum; 0 if it is lost."""
         result = {}
         for number, group in enumerate(self._layout.groups):
             evidence = self._mixture.evidence(number)
-            result[group.coordinates] = float(np.exp(evidence[0] - np.logaddexp.reduce(evidence)))
+            best = float(np.exp(evidence[0] - np.logaddexp.reduce(evidence)))
+            result[group.coordinates] = 0.0 if self._loss.is_lost[number] else best
         return MappingProxyType(result)
 
     @cached_property

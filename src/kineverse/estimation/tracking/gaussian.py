@@ -14,6 +14,7 @@ from kineverse.estimation.linear_algebra import inverse_spd, symmetric
 from kineverse.lie import Array
 
 if TYPE_CHECKING:
+    from .constant_velocity import ConditionalSpeeds
     from .static_batch import StaticRecord
 
 TangentIndices = npt.NDArray[np.int64]
@@ -86,6 +87,8 @@ class InformationState:
         All numbers in one array; zeros if None.
     records
         Static record of each group; None for all if not given.
+    speeds
+        Speeds of each group given its state; None for all if not given.
 
     Attributes
     ----------
@@ -97,19 +100,23 @@ class InformationState:
         Log density of all measurements of each group.
     records
         Measurements of each group since it last moved, where they are stored, see :mod:`.static_batch`.
+    speeds
+        Speeds of each group given its state, if they are estimated, see :mod:`.constant_velocity`.
     """
 
-    __slots__ = ("evidence", "information", "numbers", "records", "sizes", "vector", "x")
+    __slots__ = ("evidence", "information", "numbers", "records", "sizes", "speeds", "vector", "x")
 
     def __init__(
         self,
         sizes: tuple[int, int, int],
         numbers: Array | None = None,
         records: Sequence[StaticRecord | None] | None = None,
+        speeds: Sequence[ConditionalSpeeds | None] | None = None,
     ) -> None:
         n, t, groups = sizes
         self.sizes = sizes
         self.records: list[StaticRecord | None] = [None] * groups if records is None else list(records)
+        self.speeds: list[ConditionalSpeeds | None] = [None] * groups if speeds is None else list(speeds)
         self.numbers = np.zeros(n + t + groups + t * t) if numbers is None else numbers
         self.x = self.numbers[:n]
         self.vector = self.numbers[n : n + t]
@@ -118,7 +125,11 @@ class InformationState:
 
     def copy(self) -> InformationState:
         """Return a copy with its own arrays."""
-        return InformationState(self.sizes, self.numbers.copy(), self.records)
+        return self.with_numbers(self.numbers.copy())
+
+    def with_numbers(self, numbers: Array) -> InformationState:
+        """Return the same records and speeds with other numbers."""
+        return InformationState(self.sizes, numbers, self.records, self.speeds)
 
     def group_cost(self, t: TangentIndices) -> QuadraticCost:
         """Return the quadratic cost of a group with tangent indices t."""

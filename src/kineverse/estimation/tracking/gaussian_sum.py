@@ -109,9 +109,7 @@ class GaussianSum:
 
     def evidence(self, number: int) -> Array:
         """Return the log evidence of the components of a group, the best first."""
-        return np.array(
-            [b.evidence[number] for b, alive in zip(self.beliefs, self.alive, strict=True) if alive[number]]
-        )
+        return np.array([belief.evidence[number] for belief in self.components(number)])
 
     @property
     def log_evidence(self) -> float:
@@ -147,31 +145,43 @@ class GaussianSum:
                 if not any(should_merge(group, one, other) for other in chosen):
                     chosen.append(one)
             before: list[tuple[InformationState, Candidate | None]] = [
-                (self.beliefs[component], None)
-                for component in range(len(self.beliefs))
-                if self.alive[component, number]
+                (belief, None) for belief in self.components(number)
             ]
             kept.append([(c.belief, c) for c in chosen] or before)
+        after = self._assemble([[belief for belief, _ in components] for components in kept])
+        return after, [components[0][1] for components in kept]
+
+    def components(self, number: int) -> list[InformationState]:
+        """Return the components of a group, the best first."""
+        return [b for b, alive in zip(self.beliefs, self.alive, strict=True) if alive[number]]
+
+    def replace_groups(self, other: GaussianSum, groups: Iterable[int]) -> GaussianSum:
+        """Return this sum with the components of another one for some groups."""
+        sources = [self] * len(self._layout.groups)
+        for number in groups:
+            sources[number] = other
+        return self._assemble([source.components(number) for number, source in enumerate(sources)])
+
+    def _assemble(self, components: Sequence[Sequence[InformationState]]) -> GaussianSum:
+        """Return the sum of the components of each group, the best first."""
         beliefs, alive = [], []
-        for component in range(max(map(len, kept))):
+        for k in range(max(map(len, components))):
             belief = self.best.copy()
-            for number, (group, own_components) in enumerate(zip(self._layout.groups, kept, strict=True)):
-                source, _ = own_components[min(component, len(own_components) - 1)]
-                copy_group(source, belief, number, group)
+            for number, (group, own) in enumerate(zip(self._layout.groups, components, strict=True)):
+                copy_group(own[min(k, len(own) - 1)], belief, number, group)
             beliefs.append(belief)
-            alive.append([component < len(own_components) for own_components in kept])
-        after = GaussianSum(self._layout, beliefs, np.array(alive))
-        return after, [own_components[0][1] for own_components in kept]
+            alive.append([k < len(own) for own in components])
+        return GaussianSum(self._layout, beliefs, np.array(alive))
 
 
 def copy_group(
     source: InformationState, target: InformationState, number: int, group: CoordinateGroup
 ) -> None:
     """Copy the belief about one group."""
-    block = np.ix_(group.t, group.t)
+    block = group.block
     target.x[group.x], target.vector[group.t] = source.x[group.x], source.vector[group.t]
     target.information[block], target.evidence[number] = source.information[block], source.evidence[number]
-    target.records[number] = source.records[number]
+    target.records[number], target.speeds[number] = source.records[number], source.speeds[number]
 
 
 # Candidates merge if their predictions differ by fewer deviations of the noise, and each coordinate of the
@@ -229,7 +239,7 @@ class MergeCriterion:
         number = self._layout.groups.index(group)
         apart = self._difference(group, other.belief, one.belief, inputs, periodic)
         most = _NEAR**2 * len(apart)
-        if float(apart @ other.belief.information[np.ix_(group.t, group.t)] @ apart) < most:
+        if float(apart @ other.belief.information[group.block] @ apart) < most:
             return True
         mine, theirs = one.belief.records[number], other.belief.records[number]
         if (

@@ -58,6 +58,11 @@ class CoordinateGroup:
         speed = self.coordinates[k].derivative()
         return self.tangent.index(speed) if speed in self.tangent else -1
 
+    @cached_property
+    def block(self) -> tuple[TangentIndices, ...]:
+        """Open mesh that selects the group's block (t, t) of a matrix of the whole tangent space."""
+        return np.ix_(self.t, self.t)
+
     @property
     def by_speeds(self) -> bool:
         """True if some of its coordinates move by rate directions."""

@@ -237,8 +237,8 @@ class MapSolver:
         if loss == "cauchy":
             size = self._layout.observations[i].size
             return cauchy_weight(square, size), (1 + size) / 2 * float(np.log1p(square))
-        density = loss.log_density(self._layout.observations[i])
-        return loss.weigh(square, float(reading.log_scale[i]), density)
+        scale = float(reading.log_scale[i])
+        return loss.weigh(square, scale, loss.log_density(self._layout.observations[i], scale))
 
     def _propose_trial(self, number: int, iterate: _GroupIterate, inputs: Array) -> None:
         """Solve for the next trial, or mark the group as converged."""

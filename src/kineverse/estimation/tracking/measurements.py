@@ -115,6 +115,9 @@ class MeasurementModel:
         Default covariance of one measurement.
     period
         Period of the values; inf if they are not periodic.
+    frame, relative_to
+        Observed and observing frame of a pose or a position, whose first three residuals are lengths [m];
+        empty for an expression.
     """
 
     name: str
@@ -123,11 +126,20 @@ class MeasurementModel:
     value: Expression
     covariance: Array
     period: float = math.inf
+    frame: str = ""
+    relative_to: str = ""
 
     @property
     def size(self) -> int:
         """Number of components of a residual."""
         return 6 if self.is_pose else self.value.shape[0]
+
+
+def list_observed(observed: Iterable[ObservedLike] | ObservedLike) -> list[ObservedLike]:
+    """Return observations as a list; a single one may be given alone."""
+    if isinstance(observed, (str, ObservedPose, ObservedPosition, ObservedExpression)):
+        return [observed]
+    return list(observed)
 
 
 def build_measurement_models(
@@ -144,8 +156,6 @@ def build_measurement_models(
     InvalidValueError
         If there is none, one is of another type, or a covariance is not positive.
     """
-    if isinstance(observed, (str, ObservedPose, ObservedPosition, ObservedExpression)):
-        observed = [observed]
     result: dict[str, MeasurementModel] = {}
     for item in observed:
         one = _observation(model, item)
@@ -189,7 +199,8 @@ def _observation(model: ModelView, item: ObservedLike) -> MeasurementModel:
     period = item.period if isinstance(item, ObservedExpression) and item.period is not None else math.inf
     if not period > 0:
         raise InvalidValueError(f"The period of '{label}' is positive, not {period!r}.")
-    return MeasurementModel(name, label, is_pose, value, covariance, float(period))
+    frames = ("", "") if isinstance(item, ObservedExpression) else (item.frame, item.relative_to)
+    return MeasurementModel(name, label, is_pose, value, covariance, float(period), *frames)
 
 
 def wrap_difference(difference: Array, period: float) -> Array:

@@ -137,10 +137,11 @@ class ProcessModel:
             if group.by_speeds:
                 process_model = [tangent_space.rate_row(x) for x in group.coordinates]
                 self._steps[number] = RateFlow(group.coordinates, process_model, group.tangent, layout.inputs)
+        self._identities = [np.eye(len(group.t)) for group in layout.groups]
         self.speeds: Mapping[str, Symbol] = by_name
 
     def speed(self, key: Symbol | str) -> Symbol:
-        """Return the speed of a name.
+        """Return the speed of a name, or that of the coordinate of this name.
 
         Raises
         ------
@@ -149,10 +150,17 @@ class ProcessModel:
         """
         result = self.speeds.get(str(key))
         if result is None:
+            result = self.speeds.get(f"{key}:velocity")
+        if result is None:
             raise UnknownNameError(
                 f"Nothing that is estimated moves with '{key}'. {suggest(str(key), self.speeds, 'speed')}"
             )
         return result
+
+    def speeds_of(self, number: int) -> tuple[Symbol, ...]:
+        """Return the speeds with which a group moves, in order."""
+        flow = self._flows.get(number)
+        return self._layout.groups[number].tangent if flow is None else flow.speeds
 
     def is_noise_only(self, number: int, speeds: Mapping[Symbol, float]) -> bool:
         """Return True if a group moves by noise alone, in directions that are its coordinates."""
@@ -176,12 +184,8 @@ class ProcessModel:
     def find_moving_groups(self, speeds: Mapping[Symbol, float], noise: Mapping[Symbol, float]) -> list[int]:
         """Return the numbers of the groups that move at given speeds or with noise."""
         active = {v for by in (speeds, noise) for v, value in by.items() if value}
-        result = []
-        for number, group in enumerate(self._layout.groups):
-            flow = self._flows.get(number)
-            if not active.isdisjoint(group.tangent if flow is None else flow.speeds):
-                result.append(number)
-        return result
+        numbers = range(len(self._layout.groups))
+        return [number for number in numbers if not active.isdisjoint(self.speeds_of(number))]
 
     def retract(self, number: int, x: Array, step: Array, inputs: Array) -> tuple[Array, Array | None]:
         """Return a group's coordinates after a tangent step, and the transport J of the tangent space.
@@ -209,12 +213,26 @@ class ProcessModel:
     ) -> None:
         """Predict a belief by ``dt`` seconds, with speeds and variances per second; in place."""
         for number, group in enumerate(self._layout.groups):
-            flow = self._flows.get(number)
-            order = group.tangent if flow is None else flow.speeds
+            order = self.speeds_of(number)
             displacement = np.array([speeds.get(v, 0.0) for v in order]) * dt
             added_variance = np.array([noise.get(v, 0.0) for v in order]) * dt
             if displacement.any() or added_variance.any():
                 self._predict(number, group, belief, inputs, displacement, added_variance)
+
+    def transition(
+        self, number: int, x: Array, displacement: Array, inputs: Array
+    ) -> tuple[Array, Array, Array]:
+        """Return a group's coordinates after a displacement by its speeds, and its derivatives.
+
+        The derivatives by the start (t, t) and by the displacement (t, k) are in the tangent space.
+        """
+        flow = self._flows.get(number)
+        if flow is None:
+            identity = self._identities[number]
+            return x + displacement, identity, identity
+        after, slope, gain = flow.integrate(x, displacement, inputs)
+        back = np.linalg.pinv(self.basis(number, after, inputs))
+        return after, back @ slope @ self.basis(number, x, inputs), back @ gain
 
     def _predict(
         self,
@@ -225,19 +243,11 @@ class ProcessModel:
         displacement: Array,
         added_variance: Array,
     ) -> None:
-        flow, block = self._flows.get(number), np.ix_(group.t, group.t)
-        x = belief.x[group.x]
+        block = group.block
         covariance = inverse_spd(belief.information[block])
-        mean = covariance @ belief.vector[group.t]
-        if flow is None:
-            after = x + displacement
-            covariance = covariance + np.diag(added_variance)
-        else:
-            after, slope, gain = flow.integrate(x, displacement, inputs)
-            back = np.linalg.pinv(self.basis(number, after, inputs))
-            slope, gain = back @ slope @ self.basis(number, x, inputs), back @ gain
-            mean = slope @ mean
-            covariance = slope @ covariance @ slope.T + (gain * added_variance) @ gain.T
+        after, slope, gain = self.transition(number, belief.x[group.x], displacement, inputs)
+        mean = slope @ (covariance @ belief.vector[group.t])
+        covariance = slope @ covariance @ slope.T + (gain * added_variance) @ gain.T
         information = inverse_spd(covariance)
         belief.x[group.x] = after
         belief.information[block] = information

@@ -130,6 +130,23 @@ class MeasurementReader:
         values = np.ascontiguousarray(given).reshape(-1)
         return Measurements(values, observed, self._whitening, self._log_scale)
 
+    def check_repetition(self, before: Measurements, reading: Measurements, stamp: float) -> None:
+        """Check that no measurement is given twice for one time.
+
+        Raises
+        ------
+        InvalidValueError
+            Naming the measurement.
+        """
+        for i in np.flatnonzero(before.mask & reading.mask).tolist():
+            where = self._layout.measurement_slices[i]
+            if np.array_equal(before.values[where], reading.values[where]):
+                name = self._layout.observations[i].name
+                raise InvalidValueError(
+                    f"The same measurement of '{name}' came twice for {stamp:g} s. Counted twice, it would "
+                    "seem more certain than it is."
+                )
+
     def check_poses(self, reading: Measurements) -> None:
         """Check that all measured poses are rigid.
 
@@ -170,9 +187,14 @@ def check_pose(pose: Array, label: str) -> None:
 
 def _is_pair(value: Any, one: MeasurementModel) -> bool:
     """Return True for a pair of value and covariance, False for a vector of two numbers."""
-    if not (isinstance(value, tuple) and len(value) == 2):
+    if not (isinstance(value, tuple | list) and len(value) == 2):
         return False
-    return one.size != 2 or np.ndim(value[0]) > 0
+    if one.is_pose and np.shape(value[0]) == (3,):
+        raise ShapeError(
+            f"The pose of '{one.label}' is a 4×4 transform, or a pair of a transform and a covariance, not a "
+            "position and an orientation: lie.transform(lie.quaternion(xyzw), position) makes a transform."
+        )
+    return isinstance(value, tuple) and (one.size != 2 or np.ndim(value[0]) > 0)
 
 
 def _pose_like(given: npt.ArrayLike, label: str) -> Array:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import partial
 
@@ -16,6 +16,7 @@ from kineverse.symbols import Symbol
 
 from .bindings import NativeInlierSolver, NativeMapSolver, native_library
 from .bounds import StateBounds
+from .constant_velocity import ConstantVelocity
 from .covariance import CovarianceInflation, RidgeCovariance
 from .gaussian import InformationState
 from .gaussian_sum import Candidate, GaussianSum, MergeCriterion
@@ -36,7 +37,8 @@ class StepResult:
     mixture
         Gaussian sum after the update.
     nis, dof
-        Normalised innovation squared, and its degrees of freedom.
+        Normalised innovation squared of each group, and its degrees of freedom. Rejected measurements count
+        with their residuals.
     outliers
         Numbers of the observations with an inlier probability below one half.
     rounds
@@ -44,8 +46,8 @@ class StepResult:
     """
 
     mixture: GaussianSum
-    nis: float
-    dof: int
+    nis: Array
+    dof: Array
     outliers: tuple[int, ...]
     rounds: int
 
@@ -64,17 +66,24 @@ class UpdateStep:
         Layout of the state, and its limits.
     outliers
         Outlier model; None without outliers.
+    has_speeds
+        True if speeds are estimated.
 
     Attributes
     ----------
     periodic
         Periodic coordinates.
+    velocity
+        Prediction of states and speeds; None if no speeds are estimated.
     """
 
-    def __init__(self, layout: Layout, limits: StateBounds, outliers: Outliers | None) -> None:
+    def __init__(
+        self, layout: Layout, limits: StateBounds, outliers: Outliers | None, has_speeds: bool = False
+    ) -> None:
         self.layout, self.limits, self.outliers = layout, limits, outliers
         self.function = layout.compile_function()
         self.process_model = ProcessModel(layout)
+        self.velocity = ConstantVelocity(layout, self.process_model) if has_speeds else None
         self.residuals = Residuals(layout, self.function)
         self.reader = MeasurementReader(layout)
         self.solver = MapSolver(layout, self.residuals, self.process_model, limits)
@@ -119,7 +128,7 @@ class UpdateStep:
         unexplained = self.stationary_points.unexplained(before, result)
         candidates = self._restart(before, result, reading, inputs, unexplained) if unexplained else []
         if not candidates:
-            return StepResult(after, float(result.nis.sum()), int(result.dof.sum()), (), result.rounds)
+            return StepResult(after, result.nis, result.dof, (), result.rounds)
         first = self._candidate(result.belief, None, result.nis, result.dof, unexplained, inputs)
         after, best = after.select(
             [first, *candidates], partial(self.merge_criterion.should_merge, inputs, self.periodic)
@@ -127,7 +136,7 @@ class UpdateStep:
         for number, candidate in enumerate(best):
             if candidate:
                 result.nis[number] = candidate.nis[number]
-        return StepResult(after, float(result.nis.sum()), int(result.dof.sum()), (), result.rounds)
+        return StepResult(after, result.nis, result.dof, (), result.rounds)
 
     def _map_update(
         self, belief: InformationState, reading: Measurements, inputs: Array, groups: list[int] | None = None
@@ -230,25 +239,33 @@ class UpdateStep:
         dt
             Time step [s].
         speeds, noise
-            Commanded speeds, and variances per second added to them.
+            Commanded speeds, and process noise by speed: the variance per second, or the spectral density of
+            the acceleration if speeds are estimated.
         """
+        if self.velocity is not None:
+            result = self._inflated(belief, range(len(self.layout.groups))).copy()
+            self.velocity.periodic = self.periodic
+            self.velocity.predict(result, inputs, dt, speeds, noise)
+            result = self._constrained(result, inputs)
+            self._wrap_angles(result)
+            return result
         moving = self.process_model.find_moving_groups(speeds, noise)
         noise_only = [
             n for n in moving if belief.records[n] is not None and self.process_model.is_noise_only(n, speeds)
         ]
         belief = self._inflated(belief, set(moving).difference(noise_only))
-        result = None
+        moved = None
         if self.native is not None and self.native.is_ready and not self.process_model.has_rates:
             tangent = self.layout.tangent_space.tangent
             displacement, added_variance = (
                 np.array([by.get(v, 0.0) for v in tangent]) * dt for by in (speeds, noise)
             )
-            result = self.native.predict(belief, displacement, added_variance)
-        if result is None:
-            result = belief.copy()
-            self.process_model.predict(result, inputs, dt, speeds, noise)
-            if not self._is_at_mean(result):
-                result = self.solver.constrain(result, self.reader.empty(), inputs)
+            moved = self.native.predict(belief, displacement, added_variance)
+        if moved is None:
+            moved = belief.copy()
+            self.process_model.predict(moved, inputs, dt, speeds, noise)
+            moved = self._constrained(moved, inputs)
+        result = moved
         for number in noise_only:
             # A straight posterior is Gaussian; its prediction is exact.
             if self.inflation.is_straight(number, belief):
@@ -259,6 +276,16 @@ class UpdateStep:
             self.static_batch.add_noise(number, belief, result, added_variance)
         self._wrap_angles(result)
         return result
+
+    def _constrained(self, belief: InformationState, inputs: Array) -> InformationState:
+        """Return a predicted belief about the most probable point inside the limits."""
+        if self._is_at_mean(belief):
+            return belief
+        if self.native is not None and self.native.is_ready and not self.process_model.has_rates:
+            none = np.zeros(len(belief.vector))
+            if (result := self.native.predict(belief, none, none)) is not None:
+                return result
+        return self.solver.constrain(belief, self.reader.empty(), inputs)
 
     def _is_at_mean(self, belief: InformationState) -> bool:
         """Return True if a belief is about its own mean and inside bounds of single coordinates."""
@@ -329,14 +356,52 @@ class UpdateStep:
         after, best = mixture.select(
             candidates, partial(self.merge_criterion.should_merge, inputs, self.periodic)
         )
-        nis = sum(float(c.nis[n]) for n, c in enumerate(best) if c)
-        dof = sum(int(c.dof[n]) for n, c in enumerate(best) if c)
+        nis = np.array([c.nis[n] if c else 0.0 for n, c in enumerate(best)])
+        dof = np.array([c.dof[n] if c else 0.0 for n, c in enumerate(best)])
         rejected = [
             i
             for i, number in enumerate(self.layout.group_of)
             if reading.mask[i] and (c := best[number]) and c.weights is not None and c.weights[i] < 0.5
         ]
+        if rejected:
+            out = self.residuals.evaluate(after.best.x, inputs)
+            for i, (error, _) in self.residuals.errors(out, reading, rejected).items():
+                nis[self.layout.group_of[i]] += error @ error
+                dof[self.layout.group_of[i]] += len(error)
         return StepResult(after, nis, dof, tuple(rejected), rounds)
+
+    def restart(
+        self,
+        before: GaussianSum,
+        initial: GaussianSum,
+        groups: Sequence[int],
+        reading: Measurements,
+        inputs: Array,
+    ) -> StepResult:
+        """Return the result of a reading of some groups that start anew; they keep their evidence.
+
+        Parameters
+        ----------
+        before, initial
+            Beliefs before the reading, and those of the start.
+        groups
+            Numbers of the groups.
+        reading
+            The measurements.
+        inputs
+            Values of the inputs.
+        """
+        mask = reading.mask & np.isin(self.layout.group_of, groups)
+        evidence = {n: float(np.logaddexp.reduce(before.evidence(n))) for n in groups}
+
+        def with_evidence(belief: InformationState) -> InformationState:
+            result = belief.copy()
+            for number, log in evidence.items():
+                result.evidence[number] = log
+            return result
+
+        start = before.replace_groups(initial.map(with_evidence), groups)
+        return self.update(start, reading._replace(mask=mask), inputs)
 
     def _solve_inliers(
         self, mixture: GaussianSum, reading: Measurements, inputs: Array, groups: list[int]
@@ -373,7 +438,10 @@ class UpdateStep:
         none = np.zeros(len(self.layout.groups))
         for number in groups:
             measured = [i for i in self.layout.groups[number].observation_indices if reading.mask[i]]
-            log_outliers = sum(self.outliers.log_density(self.layout.observations[i]) for i in measured)
+            log_outliers = sum(
+                self.outliers.log_density(self.layout.observations[i], float(reading.log_scale[i]))
+                for i in measured
+            )
             all_outliers.evidence[number] += log_outliers
         weights = np.zeros(len(self.layout.observations))
         candidates.append(self._candidate(all_outliers, weights, none, none, groups, inputs))

@@ -4,69 +4,41 @@ from __future__ import annotations
 
 import copy
 import math
-from collections.abc import Iterable, Mapping
+from collections import deque
+from collections.abc import Callable, Iterable, Mapping
+from dataclasses import replace
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import numpy.typing as npt
 
-from kineverse.errors import InvalidValueError, UnknownNameError, suggest
+from kineverse.errors import InvalidValueError
 from kineverse.estimation.robust import Outliers, as_outliers
 from kineverse.lie import Array
-from kineverse.model.rate_nodes import to_plain
 from kineverse.state import State, StateLike
 from kineverse.symbols import Symbol
 
 from .bindings import native_library
-from .bounds import SpeedLocks, StateBounds, collect_bounds, initial_deviations, initial_point
-from .estimate import Estimate
-from .gaussian import InformationState
-from .gaussian_sum import GaussianSum
-from .layout import Layout, build_layout
+from .bounds import SpeedLocks, arrange_state
+from .estimate import Estimate, TrackerState
+from .fixed_lag import FixedLag, Step
+from .initial_belief import GivenValues, make_initial_belief
 from .measurements import (
-    MeasurementModel,
     ObservedLike,
     build_measurement_models,
+    list_observed,
     require_number,
     require_positive,
 )
-from .multi_start import find_periodic_coordinates, spread_starts
+from .process_noise import INITIAL_SPEED_TIME, Process, check_process, default_process_noise
+from .recent_poses import RecentPoses, collect_recent_poses
+from .recursion import Recursion
 from .residuals import Measurements
-from .step import StepResult, UpdateStep
-from .tangent import build_tangent_space
+from .step import UpdateStep
+from .track_loss import TrackLoss
 
 if TYPE_CHECKING:
     from kineverse.model.model_view import ModelView
-
-
-def arrange_state(
-    model: ModelView, observations: tuple[MeasurementModel, ...], given: frozenset[Symbol]
-) -> tuple[Layout, StateBounds]:
-    """Choose the estimated coordinates, and collect their limits.
-
-    Parameters
-    ----------
-    model, observations
-        The model, and its measurement models.
-    given
-        Coordinates that are measured elsewhere.
-
-    Raises
-    ------
-    InvalidValueError
-        If an observation depends on no estimated coordinate.
-    """
-    rates = model.rates
-    values = [rates.resolve(to_plain(one.value)) for one in observations]
-    tangent_space = build_tangent_space(rates, values, given, model.default_state())
-    limits = collect_bounds(model, tangent_space, given)
-    dependencies = {s for value in values for s in value.symbols}
-    dependencies |= {s for c in limits.curved for s in c.symbols}
-    dependencies |= {
-        s for x in tangent_space.coordinates if x in rates for e in rates[x].values() for s in e.symbols
-    }
-    inputs = sorted(dependencies - set(tangent_space.coordinates), key=lambda s: s.sort_key)
-    return build_layout(tangent_space, observations, limits.curved, inputs), limits
 
 
 class Tracker:
@@ -84,11 +56,18 @@ class Tracker:
         :class:`.ObservedExpression`.
     start
         Initial values of some coordinates; others start in the middle of the limits, or at the default state.
+        Speeds, if these are estimated, start at 0 unless they are given.
     uncertainty
         Initial standard deviations [m], [rad], by coordinate, or by speed for directions that are no
-        coordinate's; by default half the width of the limits, π for angles, 10 m.
+        coordinate's; by default half the width of the limits, π for angles, 10 m. Those of estimated speeds
+        [m/s], [rad/s] by speed.
+    process
+        Process model: ``"position"`` for positions that move at random, ``"velocity"`` for speeds that change
+        at random and are estimated, ``"static"`` for a state that is constant unless it is commanded.
     process_noise
-        Process noise as variance per second, by speed.
+        Process noise by speed or coordinate: the variance per second, or for ``process="velocity"`` the
+        spectral density of the acceleration [m²/s³], [rad²/s³]. Others have that of furniture that a hand
+        moves, see :mod:`.process_noise`, and none for ``process="static"``.
     outliers
         Outlier model: :class:`Outliers`, or True for the default one. None without outliers.
     locks
@@ -96,6 +75,16 @@ class Tracker:
     inputs
         Coordinates that are measured elsewhere, such as a robot's joints. Each step takes their values as
         ``inputs``.
+    lost_after
+        Number of updates in a row that refute a group of coordinates until it is lost: all of its
+        measurements are rejected, or without an outlier model, their normalised innovation squared is one in
+        a million.
+    restart
+        True if lost groups start anew from the initial uncertainty where that explains the measurements.
+    lag
+        Time by which measurements may come late [s]; they are applied in the order of their times.
+    keep
+        Number of recent updates that :attr:`recent` has.
     """
 
     def __init__(
@@ -105,54 +94,58 @@ class Tracker:
         *,
         start: StateLike | None = None,
         uncertainty: StateLike | None = None,
+        process: Process = "position",
         process_noise: StateLike | None = None,
         outliers: Outliers | bool | None = None,
         locks: bool = False,
         inputs: Symbol | str | Iterable[Symbol | str] = (),
+        lost_after: int = 10,
+        restart: bool = True,
+        lag: float = 0.0,
+        keep: int = 600,
     ) -> None:
+        self._observed = list_observed(observed)
+        self._options: dict[str, Any] = {
+            "start": start,
+            "uncertainty": uncertainty,
+            "process": process,
+            "process_noise": process_noise,
+            "outliers": outliers,
+            "locks": locks,
+            "inputs": inputs,
+            "lost_after": lost_after,
+            "restart": restart,
+            "lag": lag,
+            "keep": keep,
+        }
+        check_process(process)
+        _check_counts(lost_after, keep, lag)
         keys = (inputs,) if isinstance(inputs, str | Symbol) else inputs
         given = frozenset(k if isinstance(k, Symbol) else model.symbol(k) for k in keys)
-        layout, limits = arrange_state(model, build_measurement_models(model, observed), given)
+        layout, limits = arrange_state(model, build_measurement_models(model, self._observed), given)
+        self.model = model
         self._layout = layout
-        self._update_step = UpdateStep(layout, limits, as_outliers(outliers))
+        self._update_step = UpdateStep(layout, limits, as_outliers(outliers), process == "velocity")
         process_model = self._update_step.process_model
-        self._noise = {
-            process_model.speed(k): require_positive(k, v) for k, v in (process_noise or {}).items()
-        }
-        self._inputs = np.array([np.nan if s.value is None else s.value for s in layout.inputs])
-        self._locks = SpeedLocks(model, layout, process_model) if locks else None
-        self._stamp: float | None = getattr(start, "stamp", None)
-        self._mixture = self._initial_mixture(model, start or {}, uncertainty or {})
-        self._result = StepResult(self._mixture, 0.0, 0, (), 0)
-
-    def _initial_mixture(self, model: ModelView, start: StateLike, uncertainty: StateLike) -> GaussianSum:
-        layout, tangent_space = self._layout, self._layout.tangent_space
-        update_step = self._update_step
-        state = start if isinstance(start, State) else State(start)
-        given = {x: state[x] for x in tangent_space.coordinates if x in state}
-        unknown = [] if isinstance(start, State) else [str(s) for s in state if s not in given]
-        if unknown:
-            hint = suggest(unknown[0], map(str, tangent_space.coordinates), "coordinate")
-            raise UnknownNameError(f"'{unknown[0]}' is not estimated. {hint}")
-        for symbol, value in given.items():
-            if not math.isfinite(value):
-                raise InvalidValueError(f"start= of '{symbol}' is {value!r}; it must be finite.")
-        x = initial_point(model, tangent_space, update_step.limits, given)
-        inputs = np.nan_to_num(self._inputs)
-        update_step.periodic = find_periodic_coordinates(update_step, x, inputs)
-        deviations = initial_deviations(tangent_space, update_step.limits, update_step.periodic)
-        names = {str(v): i for i, v in enumerate(tangent_space.tangent)}
-        own = [v for v in tangent_space.tangent if v.position in tangent_space.coordinates]
-        names.update({str(v.position): tangent_space.tangent.index(v) for v in own})
-        for key, value in uncertainty.items():
-            if str(key) not in names:
-                raise UnknownNameError(f"'{key}' is not estimated. {suggest(str(key), names, 'coordinate')}")
-            deviations[names[str(key)]] = require_positive(key, value)
-        update_step.unobservable.deviations = deviations
-        belief = InformationState((len(x), len(deviations), len(layout.groups)))
-        belief.x[:] = x
-        belief.information[:] = np.diag(deviations**-2.0)
-        return spread_starts(update_step, belief, inputs)
+        noise = {process_model.speed(k): require_positive(k, v) for k, v in (process_noise or {}).items()}
+        values = np.array([np.nan if s.value is None else s.value for s in layout.inputs])
+        known = np.nan_to_num(values)
+        given_values = GivenValues.read(self._update_step, start or {}, uncertainty or {})
+        first = make_initial_belief(model, self._update_step, given_values, known)
+        noise = {**default_process_noise(self._update_step, process, first.x, known), **noise}
+        variances = {v: INITIAL_SPEED_TIME * q for v, q in noise.items()}
+        first = replace(first, speed_variances={**variances, **first.speed_variances})
+        self._recursion = Recursion(
+            self._update_step,
+            first,
+            noise,
+            SpeedLocks(model, layout, process_model) if locks else None,
+            lost_after,
+            restart,
+        )
+        self._now = self._recursion.start(values, getattr(start, "stamp", None))
+        self._buffer = FixedLag[TrackerState](lag)
+        self._recent: deque[tuple[float | None, Measurements, Array]] = deque(maxlen=keep)
 
     @property
     def symbols(self) -> tuple[Symbol, ...]:
@@ -187,16 +180,103 @@ class Tracker:
     @property
     def estimate(self) -> Estimate:
         """Present estimate; innovations and outliers are those of the last update."""
-        return Estimate(self._result, self._mixture, self._update_step, self._inputs, self._stamp)
+        return Estimate(self._now, self._update_step)
 
     @property
     def log_evidence(self) -> float:
         """Log density of all measurements so far, given the model."""
-        return self._mixture.log_evidence
+        return self._now.mixture.log_evidence
+
+    @property
+    def recent(self) -> RecentPoses:
+        """Recently measured poses."""
+        return collect_recent_poses(self._layout, [(stamp, reading) for stamp, reading, _ in self._recent])
+
+    @property
+    def process_noise(self) -> dict[Symbol, float]:
+        """Process noise by speed."""
+        return dict(self._recursion.noise)
 
     def copy(self) -> Tracker:
         """Return an independent tracker in the same state; compiled code is shared, also between threads."""
-        return copy.copy(self)
+        other = copy.copy(self)
+        other._recent, other._buffer = self._recent.copy(), self._buffer.copy()
+        return other
+
+    def rebuild(self, model: ModelView | None = None) -> Tracker:
+        """Return a tracker of an edited model with the same observations and options.
+
+        It starts anew, and repeats the recent updates.
+
+        Parameters
+        ----------
+        model
+            The edited model; the model of this tracker, as it is now, if None.
+
+        Raises
+        ------
+        UnknownNameError
+            If an observed frame is not in the model.
+        """
+        other = Tracker(self.model if model is None else model, self._observed, **self._options)
+        inputs = {str(s): k for k, s in enumerate(self._layout.inputs)}
+        for stamp, reading, values in self._recent:
+            known = {s: values[inputs[str(s)]] for s in other._layout.inputs if str(s) in inputs}
+            other._update(reading, stamp, None, State(known))
+        return other
+
+    def reset(
+        self,
+        start: StateLike | None = None,
+        *,
+        uncertainty: StateLike | None = None,
+        at: float | None = None,
+    ) -> Estimate:
+        """Start anew, or set the estimate of some coordinates.
+
+        Parameters
+        ----------
+        start
+            Values of some coordinates, and of speeds if these are estimated. Other coordinates keep their
+            estimate. If neither values nor uncertainties are given, all start as the tracker did.
+        uncertainty
+            Standard deviations, as at construction; those of other given values are the initial ones.
+        at
+            Time from now on [s]; it may be earlier than before. The time stays if None.
+
+        Raises
+        ------
+        UnknownNameError, InvalidValueError
+            For names that are not estimated, and numbers that are not finite.
+        """
+        tangent_space, now = self._layout.tangent_space, self._now
+        stamp = now.stamp if at is None else _require_time(at)
+        values = GivenValues.read(self._update_step, start or {}, uncertainty or {})
+        first, groups = self._recursion.first, list(range(len(self._layout.groups)))
+        if start or uncertainty:
+            own = {x.derivative() for x in values.coordinates} & {*tangent_space.tangent}
+            anew = [tangent_space.tangent.index(v) for v in own] + list(values.deviations)
+            spread = np.sqrt(np.diag(self.estimate.covariance))
+            spread[anew] = first.deviations[anew]
+            first = replace(first, x=now.mixture.best.x.copy(), deviations=spread)
+            first = first.with_values(self._update_step, values)
+            changed = {*values.coordinates, *values.speeds, *values.speed_deviations}
+            changed |= {tangent_space.tangent[k] for k in values.deviations}
+            groups = [
+                n
+                for n, group in enumerate(self._layout.groups)
+                if not changed.isdisjoint(
+                    (*group.coordinates, *group.tangent, *self._update_step.process_model.speeds_of(n))
+                )
+            ]
+        mixture = now.mixture.replace_groups(
+            first.spread(self._update_step, np.nan_to_num(now.inputs)), groups
+        )
+        chosen = np.isin(np.arange(len(self._layout.groups)), groups)
+        loss = TrackLoss(np.where(chosen, 0, now.loss.refuted), now.loss.is_lost & ~chosen)
+        self._now = replace(now, mixture=mixture, loss=loss, stamp=stamp, reading=None)
+        self._buffer.clear()
+        return self.estimate
 
     def predict(
         self, dt: float, commands: StateLike | None = None, inputs: StateLike | None = None
@@ -208,9 +288,9 @@ class Tracker:
         dt
             Time step [s], not negative.
         commands
-            Commanded speeds by symbol or name [m/s], [rad/s]; others are 0.
+            Commanded speeds by symbol or name [m/s], [rad/s]; others are 0, or their estimates.
         inputs
-            Values of the inputs.
+            Values of the inputs; the last ones if None.
 
         Raises
         ------
@@ -224,29 +304,22 @@ class Tracker:
             raise InvalidValueError(
                 f"Time goes on: a step of {dt!r} s is none. Steps are finite and not negative."
             )
+        speeds = self._read_commands(commands)
+        before = replace(self._now, inputs=self._recursion.read_inputs(self._now.inputs, inputs))
+        self._now = self._recursion.predict(before, dt, speeds)
+        if self._now.stamp is not None:
+            end = self._now.stamp
+            self._remember(before, end, speeds, lambda state: self._recursion.advance(state, end, speeds))
+        return self.estimate
+
+    def _read_commands(self, commands: StateLike | None) -> dict[Symbol, float]:
         speeds = {}
         for key, value in (commands or {}).items():
             speed = require_number(value, f"The commanded speed '{key}'")
             if not math.isfinite(speed):
                 raise InvalidValueError(f"The commanded speed '{key}' is {value!r}; it must be finite.")
             speeds[self._update_step.process_model.speed(key)] = speed
-        self._inputs, self._mixture = self._predicted(dt, speeds, self._read_inputs(inputs))
-        if self._stamp is not None:
-            self._stamp += dt
-        return self.estimate
-
-    def _predicted(
-        self, dt: float, speeds: Mapping[Symbol, float], inputs: Array
-    ) -> tuple[Array, GaussianSum]:
-        if not speeds and not self._noise:
-            return inputs, self._mixture
-
-        def moved(belief: InformationState) -> InformationState:
-            free = self._locks.free(belief, inputs) if self._locks else None
-            moving, noise = (_only(values, free) for values in (speeds, self._noise))
-            return self._update_step.predict(belief, inputs, dt, moving, noise)
-
-        return inputs, self._mixture.map(moved)
+        return speeds
 
     def update(
         self,
@@ -264,7 +337,8 @@ class Tracker:
             Measurements by name of the observation: poses 4×4, vectors or numbers, or pairs of these and a
             covariance of their own. Absent names are missing.
         at
-            Time of the measurements [s]; the state is predicted to it first.
+            Time of the measurements [s]; the state is predicted to it first. Late ones are applied at their
+            time, up to the lag.
         commands
             Speeds during this prediction.
         inputs
@@ -273,7 +347,8 @@ class Tracker:
         Raises
         ------
         UnknownNameError, ShapeError, InvalidValueError
-            For an invalid measurement, naming it, or if time goes backwards. The belief does not change then.
+            For an invalid measurement, naming it, or if time goes backwards by more than the lag. The belief
+            does not change then.
         """
         return self._update(self._update_step.reader.read(seen), at, commands, inputs)
 
@@ -324,57 +399,60 @@ class Tracker:
         native = self._update_step.native
         if native is None or not native.are_rigid(reading):
             self._update_step.reader.check_poses(reading)
-        before = self._mixture, self._inputs, self._stamp
-        try:
-            values = self._read_inputs(inputs)
-            # The prediction uses the previous values of the inputs, if there are any.
-            if not np.isfinite(self._inputs).all():
-                self._inputs = values
-            self._advance(at, commands)
-            self._inputs = values
-            result = self._update_step.update(self._mixture, reading, self._inputs)
-        except BaseException:
-            self._mixture, self._inputs, self._stamp = before
-            raise
-        self._mixture, self._result = result.mixture, result
+        if at is None and commands:
+            raise InvalidValueError("Commands need the time they lasted: give at=, or call predict.")
+        stamp, speeds, before = (
+            None if at is None else _require_time(at),
+            self._read_commands(commands),
+            self._now,
+        )
+
+        def apply(state: TrackerState) -> TrackerState:
+            return self._recursion.update(state, reading, stamp, speeds, inputs)
+
+        if stamp is not None and before.stamp is not None and stamp < before.stamp:
+            if not self._buffer.lag:
+                raise InvalidValueError(
+                    f"Time goes backwards: an observation at {stamp:g} s after one at {before.stamp:g} s. A "
+                    "tracker with lag= takes measurements that come late."
+                )
+            self._now = self._buffer.insert(stamp, apply)
+        else:
+            self._now = apply(before)
+            if stamp is not None:
+                self._remember(before, stamp, speeds, apply)
+        values = reading.values.copy()
+        self._recent.append(
+            (stamp, reading._replace(values=values, mask=reading.mask.copy()), self._now.inputs)
+        )
         return self.estimate
 
-    def _advance(self, at: float | None, commands: StateLike | None) -> None:
-        if at is None:
-            if commands:
-                raise InvalidValueError("Commands need the time they lasted: give at=, or call predict.")
-            return
-        at = require_number(at, "The time of an observation")
-        if not math.isfinite(at):
-            raise InvalidValueError(f"The time of an observation is a finite number of seconds, not {at!r}.")
-        if self._stamp is not None:
-            if at < self._stamp:
-                raise InvalidValueError(
-                    f"Time goes backwards: an observation at {at:g} s after one at {self._stamp:g} s."
-                )
-            self.predict(at - self._stamp, commands, None)
-        self._stamp = at
-
-    def _read_inputs(self, given: StateLike | None) -> Array:
-        symbols = self._layout.inputs
-        values = self._inputs.copy()
-        if given is not None:
-            state = given if isinstance(given, State) else State(given)
-            names = {str(s): i for i, s in enumerate(symbols)}
-            for key in state:
-                if str(key) in names:
-                    values[names[str(key)]] = state[key]
-                elif not isinstance(given, State):
-                    raise UnknownNameError(f"'{key}' is not in inputs=. {suggest(str(key), names, 'symbol')}")
-        missing = [str(s) for s, v in zip(symbols, values.tolist(), strict=True) if not math.isfinite(v)]
-        if missing and (given is not None or symbols):
-            raise InvalidValueError(f"There is no finite value of '{missing[0]}'; give it in inputs=.")
-        return values
+    def _remember(
+        self,
+        before: TrackerState,
+        stamp: float,
+        speeds: Mapping[Symbol, float],
+        apply: Callable[[TrackerState], TrackerState],
+    ) -> None:
+        if self._buffer.lag:
+            step = Step(stamp, before, apply, lambda state, to: self._recursion.advance(state, to, speeds))
+            self._buffer.append(step)
 
     def __repr__(self) -> str:
         sizes = f"{len(self.symbols)} coordinates in {len(self.groups)} groups"
         return f"<Tracker: {sizes}, {len(self.observed)} observed>"
 
 
-def _only(values: Mapping[Symbol, float], free: frozenset[Symbol] | None) -> Mapping[Symbol, float]:
-    return values if free is None else {v: value for v, value in values.items() if v in free}
+def _require_time(at: Any) -> float:
+    time = require_number(at, "The time of an observation")
+    if not math.isfinite(time):
+        raise InvalidValueError(f"The time of an observation is a finite number of seconds, not {at!r}.")
+    return time
+
+
+def _check_counts(lost_after: int, keep: int, lag: float) -> None:
+    for name, count in (("lost_after", lost_after), ("keep", keep)):
+        if not isinstance(count, int) or count < 1:
+            raise InvalidValueError(f"{name}= is a number of updates, at least 1, not {count!r}.")
+    if not (math.isfinite(require_number(lag, "The lag")) and lag >= 0):
+        raise InvalidValueError(f"lag= is a number of seconds that is not negative, not {lag!r}.")

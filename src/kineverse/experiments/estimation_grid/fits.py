@@ -3,12 +3,9 @@
 from __future__ import annotations
 
 import math
-import multiprocessing
 import os
-import threading
-from collections.abc import Iterator, Sequence
-from concurrent.futures import Future, ProcessPoolExecutor
-from contextlib import contextmanager
+from collections.abc import Sequence
+from concurrent.futures import Future
 from itertools import product
 
 import numpy as np
@@ -20,6 +17,7 @@ from kineverse.experiments.estimation_grid.cramer_rao import Bound, compute_atta
 from kineverse.experiments.estimation_grid.results import CellResult
 from kineverse.experiments.estimation_grid.samples import Cell, Joint, JointSamples, draw_samples
 from kineverse.experiments.registry import Progress
+from kineverse.experiments.worker_pool import worker_pool
 from kineverse.lie import Array
 
 SEED = 2011
@@ -75,7 +73,7 @@ def fit_all(
     # Spawned processes, because a fork during a background compilation may hang. Long cells first, so that
     # all processes end at about the same time.
     order = sorted(range(len(cells)), key=lambda k: -cells[k].count)
-    with _workers(workers) as pool:
+    with worker_pool(workers) as pool:
         jobs: list[tuple[int, Future[CellResult]]] = [
             (k, pool.submit(fit_cell, cells[k], samples)) for k in order
         ]
@@ -150,38 +148,3 @@ def _seed(cell: Cell) -> list[int]:
     """Return the seed of a cell, independent of the other cells."""
     micro = (round(1e6 * value) for value in (cell.position, cell.orientation, cell.range))
     return [SEED, cell.joint == "revolute", cell.count, *micro]
-
-
-def _end_with_parent() -> None:
-    """End this worker process when its parent ends, because it receives no signal."""
-    parent = multiprocessing.parent_process()
-    assert parent is not None  # this runs in a worker process
-
-    def wait() -> None:
-        parent.join()
-        os._exit(1)
-
-    threading.Thread(target=wait, daemon=True).start()
-
-
-@contextmanager
-def _workers(count: int) -> Iterator[ProcessPoolExecutor]:
-    """Provide a pool of processes with one thread each."""
-    names = ("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS", "MKL_NUM_THREADS")
-    before = {name: os.environ.get(name) for name in names}
-    os.environ.update(dict.fromkeys(names, "1"))
-    try:
-        with ProcessPoolExecutor(
-            count, multiprocessing.get_context("spawn"), initializer=_end_with_parent
-        ) as pool:
-            try:
-                yield pool
-            except BaseException:
-                pool.shutdown(wait=False, cancel_futures=True)
-                raise
-    finally:
-        for name, value in before.items():
-            if value is None:
-                os.environ.pop(name, None)
-            else:
-                os.environ[name] = value

@@ -1,0 +1,181 @@
+"""Residuals of one observation under a served joint.
+
+The equations are those of :mod:`.known_residuals` and of
+:mod:`kineverse.estimation.identification.optimise`, for one observation of a joint whose values are
+coordinates. Without the axes of many observations, without damping and without parameters they take a tenth
+of the time.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import TYPE_CHECKING, NamedTuple
+
+import numpy as np
+
+from kineverse.estimation.identification.observations import Observations
+from kineverse.estimation.identification.optimise import CLOSE
+from kineverse.lie import Array, log_so3
+
+if TYPE_CHECKING:
+    from .known_motion import KnownJoint
+
+# Largest number of steps, and largest step of an angle [rad].
+_STEPS, _STEP = 12, 0.5
+# Squared residual beyond which the true pose of the parent stays at the observed one. The pose that explains
+# a gross error best is many steps away, and of no use.
+_GROSS = 1e3
+_EYE_3, _EYE_6 = np.eye(3), np.eye(6)
+
+
+class PoseSolution(NamedTuple):
+    """Most likely joint values of one observation inside the limits.
+
+    Attributes
+    ----------
+    values
+        Joint values, (k,).
+    pose, by_joints
+        Pose of the joint there, (4, 4), and twists per unit of each joint value, (6, k).
+    residual, covariance
+        Residual of the relative pose in the parent's axes, (6,), and its covariance, (6, 6).
+    """
+
+    values: Array
+    pose: Array
+    by_joints: Array
+    residual: Array
+    covariance: Array
+
+
+def solve_observation(
+    served: KnownJoint, observations: Observations, start: Array, precision: float
+) -> PoseSolution | None:
+    """Return the solution for one observation of a joint; None if the steps do not converge.
+
+    Parameters
+    ----------
+    served
+        Joint whose joint values are its coordinates.
+    observations
+        The observation of both poses, (1, ...).
+    start
+        Initial joint values, (k,).
+    precision
+        Prior information of the joint values, which only keeps unobservable ones finite.
+    """
+    parent, child = observations.parent[0], observations.child[0]
+    of_parent = None if observations.parent_covariance is None else observations.parent_covariance[0]
+    of_child = observations.child_covariance[0]
+    low, high = served.inner_limits()
+    values, true = np.clip(start, low, high), parent
+    turned, error, own = np.zeros((6, 6)), np.empty(6), np.empty(6)
+    covariance = weights = _EYE_6
+    curbed = bool(np.any(served.is_angle))
+    for count in range(_STEPS):
+        pose, by_joints = served.evaluate(values)
+        rotation = true[:3, :3].T
+        error[:3] = rotation @ (child[:3, 3] - true[:3, 3]) - pose[:3, 3]
+        error[3:] = _rotation_vector(rotation @ child[:3, :3] @ pose[:3, :3].T)
+        if of_parent is not None or not count:
+            turned[:3, :3] = turned[3:, 3:] = rotation
+            covariance = turned @ of_child @ turned.T
+            if of_parent is not None:
+                own[:3] = rotation @ (parent[:3, 3] - true[:3, 3])
+                own[3:] = _rotation_vector(rotation @ parent[:3, :3])
+                lever = _lever(pose)
+                lifted = turned @ of_parent @ turned.T @ lever.T
+                covariance += lever @ lifted
+                error -= lever @ own
+            weights = np.linalg.inv(covariance)
+        gain, left, there = 0.0, error, values
+        if served.joints:
+            weighted = by_joints.T @ weights
+            curvature = weighted @ by_joints + precision * np.eye(served.joints)
+            slope = weighted @ error - precision * values
+            change = slope / curvature[0] if served.joints == 1 else np.linalg.solve(curvature, slope)
+            if curbed and np.abs(change).max() > _STEP:
+                change = np.where(served.is_angle, np.clip(change, -_STEP, _STEP), change)
+            there = np.minimum(np.maximum(values + change, low), high)
+            # At a limit the step is shorter than the one that the slope asks for.
+            change = there - values
+            gain += float(change @ curvature @ change)
+            left = error - by_joints @ change
+        if of_parent is not None and float(error @ weights @ error) < _GROSS:
+            blame = own + lifted @ (weights @ left)
+            gain += float(np.sum(blame**2 / np.diagonal(of_parent)))
+            if gain >= CLOSE:
+                step = np.eye(4)
+                step[:3, :3], step[:3, 3] = _rotation(blame[3:]), blame[:3]
+                true = true @ step
+        if gain < CLOSE:
+            return PoseSolution(values, pose, by_joints, error, covariance)
+        values = there
+        if not math.isfinite(gain):
+            return None
+    return None
+
+
+def complete_basis(directions: Array) -> Array:
+    """Return an orthonormal basis of the vectors that are orthogonal to k directions (6, k), (6, 6 - k)."""
+    count = directions.shape[1]
+    if not count:
+        return _EYE_6
+    if count > 1:
+        return np.linalg.qr(directions, mode="complete")[0][:, count:]
+    # Householder's reflection of the direction to the first axis.
+    v = directions[:, 0].copy()
+    v[0] += math.copysign(math.sqrt(float(v @ v)), float(v[0]))
+    square = float(v @ v)
+    return _EYE_6[:, 1:] - np.outer(v, (2.0 / square) * v[1:]) if square else _EYE_6[:, 1:]
+
+
+def displacement_jacobian(pose: Array, middle: Array) -> Array:
+    """Return the child's twist per unit twist of the joint in the parent, and of the child on it, (6, 12)."""
+    x, y, z = (pose[:3, 3] - middle).tolist()
+    result = np.zeros((6, 12))
+    result[:3, :3] = result[3:, 3:6] = _EYE_3
+    result[0, 4], result[0, 5] = z, -y
+    result[1, 3], result[1, 5] = -z, x
+    result[2, 3], result[2, 4] = y, -x
+    result[:3, 6:9] = result[3:, 9:] = pose[:3, :3]
+    return result
+
+
+def _rotation_vector(rotation: Array) -> Array:
+    """Return the rotation vector of one rotation, as :func:`kineverse.lie.log_so3`."""
+    (xx, xy, xz), (yx, yy, yz), (zx, zy, zz) = rotation.tolist()
+    cosine = 0.5 * (xx + yy + zz - 1.0)
+    if cosine < -0.99:
+        return log_so3(rotation)
+    x, y, z = 0.5 * (zy - yz), 0.5 * (xz - zx), 0.5 * (yx - xy)
+    sine = math.sqrt(x * x + y * y + z * z)
+    factor = 1.0 if sine < 1e-9 else math.atan2(sine, cosine) / sine
+    return np.array([factor * x, factor * y, factor * z])
+
+
+def _rotation(v: Array) -> Array:
+    """Return the rotation of one rotation vector, as :func:`kineverse.lie.exp_so3`."""
+    x, y, z = v.tolist()
+    square = x * x + y * y + z * z
+    angle = math.sqrt(square)
+    a, b = 1.0, 0.5
+    if angle > 1e-5:
+        a, b = math.sin(angle) / angle, 2.0 * (math.sin(0.5 * angle) / angle) ** 2
+    return np.array(
+        [
+            [1.0 - b * (y * y + z * z), b * x * y - a * z, b * x * z + a * y],
+            [b * x * y + a * z, 1.0 - b * (x * x + z * z), b * y * z - a * x],
+            [b * x * z - a * y, b * y * z + a * x, 1.0 - b * (x * x + y * y)],
+        ]
+    )
+
+
+def _lever(pose: Array) -> Array:
+    """Return the displacement of the child by an error of the parent, (6, 6)."""
+    x, y, z = pose[:3, 3].tolist()
+    result = np.eye(6)
+    result[0, 4], result[0, 5] = z, -y
+    result[1, 3], result[1, 5] = -z, x
+    result[2, 3], result[2, 4] = y, -x
+    return result

@@ -1,0 +1,166 @@
+"""Initial belief of a tracker, and that of groups that start anew."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass, field
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from kineverse.errors import InvalidValueError, UnknownNameError, suggest
+from kineverse.lie import Array
+from kineverse.state import State, StateLike
+from kineverse.symbols import Symbol
+
+from .bounds import initial_deviations, initial_point
+from .gaussian import InformationState
+from .gaussian_sum import GaussianSum
+from .measurements import require_positive
+from .multi_start import find_periodic_coordinates, spread_starts
+from .step import UpdateStep
+
+if TYPE_CHECKING:
+    from kineverse.model.model_view import ModelView
+
+
+@dataclass(frozen=True, eq=False)
+class InitialBelief:
+    """Initial state and its standard deviations.
+
+    Attributes
+    ----------
+    x
+        Coordinates (n,).
+    deviations
+        Standard deviation of each tangent direction (t,).
+    speeds, speed_variances
+        Mean and variance of each speed, if speeds are estimated.
+    """
+
+    x: Array
+    deviations: Array
+    speeds: Mapping[Symbol, float] = field(default_factory=dict)
+    speed_variances: Mapping[Symbol, float] = field(default_factory=dict)
+
+    def spread(self, update_step: UpdateStep, inputs: Array) -> GaussianSum:
+        """Return the belief about several initial points, see :mod:`.multi_start`."""
+        groups = len(update_step.layout.groups)
+        belief = InformationState((len(self.x), len(self.deviations), groups))
+        belief.x[:] = self.x
+        belief.information[:] = np.diag(self.deviations**-2.0)
+        if update_step.velocity is not None:
+            update_step.velocity.initialise(belief, self.speeds, self.speed_variances)
+        return spread_starts(update_step, belief, inputs)
+
+    def with_values(self, update_step: UpdateStep, values: GivenValues) -> InitialBelief:
+        """Return the belief with other values of some coordinates and speeds, and other deviations."""
+        x, deviations = self.x.copy(), self.deviations.copy()
+        for symbol, value in values.coordinates.items():
+            x[update_step.layout.tangent_space.coordinates.index(symbol)] = value
+        for k, value in values.deviations.items():
+            deviations[k] = value
+        variances = {v: deviation**2 for v, deviation in values.speed_deviations.items()}
+        speeds, speed_variances = {**self.speeds, **values.speeds}, {**self.speed_variances, **variances}
+        return InitialBelief(x, deviations, speeds, speed_variances)
+
+
+@dataclass(frozen=True, eq=False)
+class GivenValues:
+    """Checked initial values and standard deviations.
+
+    Attributes
+    ----------
+    coordinates, speeds
+        Values by symbol.
+    deviations
+        Standard deviations by number of the tangent direction.
+    speed_deviations
+        Standard deviations of speeds.
+    """
+
+    coordinates: Mapping[Symbol, float]
+    speeds: Mapping[Symbol, float]
+    deviations: Mapping[int, float]
+    speed_deviations: Mapping[Symbol, float]
+
+    @staticmethod
+    def read(update_step: UpdateStep, start: StateLike, uncertainty: StateLike) -> GivenValues:
+        """Check initial values and standard deviations.
+
+        Parameters
+        ----------
+        update_step
+            Components of the tracker.
+        start
+            Values of coordinates, and of speeds if these are estimated; other values of a state are ignored.
+        uncertainty
+            Standard deviations of coordinates, of tangent directions that are no coordinate's, by speed, and
+            of speeds if these are estimated.
+
+        Raises
+        ------
+        UnknownNameError
+            For a name that is not estimated.
+        InvalidValueError
+            For a value that is not finite, or a deviation that is not positive.
+        """
+        tangent_space = update_step.layout.tangent_space
+        speeds = () if update_step.velocity is None else tuple(update_step.process_model.speeds.values())
+        state = start if isinstance(start, State) else State(start)
+        given = {s: state[s] for s in (*tangent_space.coordinates, *speeds) if s in state}
+        for name in () if isinstance(start, State) else state:
+            if name not in given:
+                raise _unknown_name(name, (*tangent_space.coordinates, *speeds))
+        for symbol, value in given.items():
+            if not math.isfinite(value):
+                raise InvalidValueError(f"start= of '{symbol}' is {value!r}; it must be finite.")
+        names: dict[str, int] = {}
+        for k, v in enumerate(tangent_space.tangent):
+            names[str(v.position) if v.position in tangent_space.coordinates else str(v)] = k
+        speed_names = {str(v): v for v in speeds if str(v) not in names}
+        deviations, speed_deviations = {}, {}
+        for key, value in uncertainty.items():
+            if str(key) in speed_names:
+                speed_deviations[speed_names[str(key)]] = require_positive(key, value)
+            elif str(key) in names:
+                deviations[names[str(key)]] = require_positive(key, value)
+            else:
+                raise _unknown_name(key, (*names, *speed_names))
+        return GivenValues(
+            {s: value for s, value in given.items() if s not in speeds},
+            {s: value for s, value in given.items() if s in speeds},
+            deviations,
+            speed_deviations,
+        )
+
+
+def _unknown_name(key: object, names: Iterable[object]) -> UnknownNameError:
+    hint = suggest(str(key), map(str, names), "coordinate")
+    return UnknownNameError(f"'{key}' is not estimated. {hint}")
+
+
+def make_initial_belief(
+    model: ModelView, update_step: UpdateStep, values: GivenValues, inputs: Array
+) -> InitialBelief:
+    """Return the initial belief, and set the periodic coordinates and initial deviations of a tracker.
+
+    Parameters
+    ----------
+    model
+        The model, with default values of coordinates.
+    update_step
+        Components of the tracker.
+    values
+        Given values and standard deviations.
+    inputs
+        Values of the inputs.
+    """
+    tangent_space, limits = update_step.layout.tangent_space, update_step.limits
+    x = initial_point(model, tangent_space, limits, values.coordinates)
+    update_step.periodic = find_periodic_coordinates(update_step, x, inputs)
+    usual = initial_deviations(tangent_space, limits, update_step.periodic)
+    belief = InitialBelief(x, usual).with_values(update_step, values)
+    update_step.unobservable.deviations = belief.deviations
+    return belief

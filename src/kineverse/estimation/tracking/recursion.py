@@ -1,0 +1,151 @@
+"""Recursion of a tracker's state: prediction to a time, update, and restart of lost groups."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from kineverse.errors import InvalidValueError, UnknownNameError, suggest
+from kineverse.lie import Array
+from kineverse.state import State, StateLike
+from kineverse.symbols import Symbol
+
+from .bounds import SpeedLocks
+from .estimate import TrackerState
+from .gaussian import InformationState
+from .initial_belief import InitialBelief
+from .residuals import Measurements
+from .step import StepResult, UpdateStep
+from .track_loss import TrackLoss, find_measured, find_refuted
+
+
+@dataclass(frozen=True, eq=False)
+class Recursion:
+    """Prediction and update of states, which it never changes in place.
+
+    Attributes
+    ----------
+    update_step
+        Prediction and update of beliefs.
+    first
+        Initial belief.
+    noise
+        Process noise by speed.
+    locks
+        Locks that hold speeds; None if they are ignored.
+    lost_after
+        Number of refuted updates in a row after which a group is lost.
+    restarts
+        True if lost groups start anew.
+    """
+
+    update_step: UpdateStep
+    first: InitialBelief
+    noise: Mapping[Symbol, float]
+    locks: SpeedLocks | None
+    lost_after: int
+    restarts: bool
+
+    def start(self, inputs: Array, stamp: float | None) -> TrackerState:
+        """Return the initial state."""
+        mixture = self.first.spread(self.update_step, np.nan_to_num(inputs))
+        count = len(self.update_step.layout.groups)
+        result = StepResult(mixture, np.zeros(count), np.zeros(count), (), 0)
+        return TrackerState(mixture, result, TrackLoss.none(count), inputs, stamp)
+
+    def predict(self, state: TrackerState, dt: float, speeds: Mapping[Symbol, float]) -> TrackerState:
+        """Return the state after a time step [s] with commanded speeds."""
+        stamp = None if state.stamp is None else state.stamp + dt
+        if dt == 0.0 or not (speeds or self.noise):
+            return replace(state, stamp=stamp)
+
+        def moved(belief: InformationState) -> InformationState:
+            moving, noise = speeds, self.noise
+            if self.locks:
+                free = self.locks.free(belief, state.inputs)
+                held = {v: 0.0 for v in self.noise if v not in free}
+                noise = {v: q for v, q in noise.items() if v in free}
+                moving = {v: speed for v, speed in speeds.items() if v in free} | held
+            return self.update_step.predict(belief, state.inputs, dt, moving, noise)
+
+        return replace(state, mixture=state.mixture.map(moved), stamp=stamp)
+
+    def advance(
+        self, state: TrackerState, stamp: float, speeds: Mapping[Symbol, float] | None = None
+    ) -> TrackerState:
+        """Return the state predicted to a time; a state without a time begins there."""
+        if state.stamp is None:
+            return replace(state, stamp=stamp)
+        return replace(self.predict(state, stamp - state.stamp, speeds or {}), stamp=stamp)
+
+    def update(
+        self,
+        state: TrackerState,
+        reading: Measurements,
+        stamp: float | None,
+        speeds: Mapping[Symbol, float],
+        inputs: StateLike | None,
+    ) -> TrackerState:
+        """Return the state after a reading at a time, or at the present one.
+
+        Parameters
+        ----------
+        state
+            State before.
+        reading
+            The measurements.
+        stamp
+            Their time [s]; None for the present one.
+        speeds
+            Commanded speeds until then.
+        inputs
+            Values of the inputs.
+        """
+        values = self.read_inputs(state.inputs, inputs)
+        # The prediction uses the previous values of the inputs, if there are any.
+        if not np.isfinite(state.inputs).all():
+            state = replace(state, inputs=values)
+        if stamp is not None:
+            if stamp == state.stamp and state.reading is not None:
+                self.update_step.reader.check_repetition(state.reading, reading, stamp)
+            state = self.advance(state, stamp, speeds)
+        step = self.update_step
+        result = step.update(state.mixture, reading, values)
+        has_outliers = step.outliers is not None
+        refuted = find_refuted(self.update_step.layout, reading, result, has_outliers)
+        loss = state.loss.after(find_measured(self.update_step.layout, reading), refuted, self.lost_after)
+        mixture = result.mixture
+        due = loss.is_lost & (loss.refuted % self.lost_after == 0) & refuted
+        if self.restarts and due.any():
+            groups = np.flatnonzero(due).tolist()
+            anew = step.restart(state.mixture, self.first.spread(step, values), groups, reading, values)
+            explained = due & ~find_refuted(self.update_step.layout, reading, anew, has_outliers)
+            mixture = mixture.replace_groups(anew.mixture, np.flatnonzero(explained).tolist())
+            loss = loss.with_restarted(explained)
+        return TrackerState(mixture, result, loss, values, state.stamp, reading)
+
+    def read_inputs(self, last: Array, given: StateLike | None) -> Array:
+        """Return the values of the inputs, those not given as they were last.
+
+        Raises
+        ------
+        UnknownNameError, InvalidValueError
+            For a name that is no input, and for an input without a finite value.
+        """
+        symbols = self.update_step.layout.inputs
+        values = last.copy()
+        if given is not None:
+            state = given if isinstance(given, State) else State(given)
+            names = {str(s): i for i, s in enumerate(symbols)}
+            for key in state:
+                if str(key) in names:
+                    values[names[str(key)]] = state[key]
+                elif not isinstance(given, State):
+                    raise UnknownNameError(f"'{key}' is not in inputs=. {suggest(str(key), names, 'symbol')}")
+        missing = [str(s) for s, v in zip(symbols, values.tolist(), strict=True) if not math.isfinite(v)]
+        if missing and (given is not None or symbols):
+            raise InvalidValueError(f"There is no finite value of '{missing[0]}'; give it in inputs=.")
+        return values

@@ -1,0 +1,220 @@
+"""Noise that is not stated: its sizes are estimated and integrated out, and sure answers are right."""
+
+from __future__ import annotations
+
+import itertools
+import math
+
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+from synthetic_recordings import recording
+
+from kineverse.errors import KineverseError
+from kineverse.estimation import Identifier, identify, pose_covariance
+from kineverse.estimation.identification.bindings import library
+from kineverse.estimation.identification.comparison import prepare_data, solve_with_inliers
+from kineverse.estimation.identification.identify import WEIGHTS
+from kineverse.estimation.identification.initial_guess import MotionStatistics, initial_guesses
+from kineverse.estimation.identification.observations import check_observations
+from kineverse.estimation.identification.optimise import InitialGuess
+from kineverse.estimation.identification.result import NoiseDeviations
+from kineverse.estimation.identification.solver import solver
+from kineverse.estimation.identification.unknown_noise import UNKNOWN_NOISE, scale_noise
+from kineverse.experiments.joint_types.answers import Setting, TypeAnswer, identify_case
+from kineverse.experiments.joint_types.report import report_answers
+from kineverse.lie import transform
+
+DEG = math.pi / 180
+NOISE = pose_covariance(0.005, 0.02)
+
+
+@pytest.fixture(autouse=True, scope="module")
+def _compiled() -> None:
+    solver.prepare(wait=True)
+
+
+@pytest.mark.parametrize("family", ["prismatic", "revolute"])
+@pytest.mark.parametrize(
+    ("position", "orientation"), [(0.016, 0.4), (0.04, 1.0), (0.0025, 4.0), (0.001, 1.6)]
+)
+def test_noise_of_any_ratio_is_estimated(family: str, position: float, orientation: float) -> None:
+    seen = recording(family, count=40, position=position, orientation=orientation * DEG, seed=1)
+    found = identify(seen.parent, seen.child)
+    assert found.best.family == family
+    assert not found.is_ambiguous
+    assert found.noise == pytest.approx((position, orientation * DEG), rel=0.35)
+    known = identify(seen.parent, seen.child, noise=pose_covariance(position, orientation * DEG))
+    assert known.noise is None
+    assert found.best.deviation("axis.x") == pytest.approx(known.best.deviation("axis.x"), rel=0.35)
+
+
+def test_noise_of_positions_alone_has_no_orientation() -> None:
+    seen = recording("revolute", count=40, position=0.02, orientation=DEG, seed=3)
+    found = identify(None, seen.true_relative[:, :3, 3] + np.random.default_rng(0).normal(0, 0.02, (40, 3)))
+    assert found.best.family == "revolute"
+    assert found.noise is not None
+    assert found.noise.position == pytest.approx(0.02, rel=0.3)
+    assert math.isnan(found.noise.orientation)
+
+
+@pytest.mark.parametrize("family", ["prismatic", "revolute"])
+def test_evidence_is_that_of_a_sum_over_noises_with_a_solution_for_each(family: str) -> None:
+    seen = recording(family, count=12, position=0.02, orientation=0.3 * DEG, seed=5)
+    unknown = pose_covariance(*UNKNOWN_NOISE)
+    data = prepare_data(
+        check_observations(seen.parent, seen.child, unknown, unknown), False, None, False, unit=1.0
+    )
+    one = solve_with_inliers(data, {family: WEIGHTS[family]})[family]
+    solution, spread, step = one.scored.solution, math.log(5.0), 0.1
+    axis = np.arange(-1.0, 1.01, step)
+    total = []
+    for shift in itertools.product(axis, axis):
+        logs = np.log(one.noise.factors) + shift
+        found = solver.continue_from(
+            scale_noise(data.observations, np.exp(logs)),
+            InitialGuess(solution.motion, solution.values),
+            solution.parent,
+            solution.joint_prior,
+            len(data.observations),
+        )
+        prior = -0.5 * float(logs @ logs) / spread**2 - math.log(math.tau * spread**2)
+        total.append(found.log_evidence + prior)
+    assert one.log_evidence == pytest.approx(np.logaddexp.reduce(total) + 2 * math.log(step), abs=0.05)
+
+
+@pytest.mark.compiler
+def test_unknown_noise_in_c_agrees_with_numpy(monkeypatch: pytest.MonkeyPatch) -> None:
+    seen = recording("revolute", count=8, position=0.02, orientation=0.3 * DEG, seed=5)
+    families = ["prismatic", "revolute"]
+    fast = identify(seen.parent, seen.child, families=families)
+    monkeypatch.setattr(library, "_code", None)
+    monkeypatch.setattr(library, "_failed", True)
+    slow = identify(seen.parent, seen.child, families=families)
+    assert slow.noise == pytest.approx(fast.noise, rel=1e-3)
+    for fit in slow:
+        assert fit.log_evidence == pytest.approx(fast[fit.family].log_evidence, abs=1e-2)
+
+
+def test_arcs_of_positions_that_look_straight_are_solved_with_long_levers() -> None:
+    """The circle through noisy points is small, and no step leads from it to the arc."""
+    random = np.random.default_rng(1)
+    angle = random.uniform(-0.3, 0.3, 100)
+    arc = 0.3 * np.column_stack([np.sin(angle), 1 - np.cos(angle), 0 * angle])
+    points = check_observations(None, arc + random.normal(0, 0.02, arc.shape), None, 0.02**2 * np.eye(3))
+    starts = [*initial_guesses("revolute", MotionStatistics(points))]
+    found = solver.maximise_marginal_likelihood(points, solver.maximum_likelihood(points, starts).solution)
+    assert np.ptp(found.solution.values) < 2.0
+
+
+def test_sure_answers_without_stated_noise_are_right() -> None:
+    setting = Setting(poses=True, stated=False)
+    answers = [identify_case(number, setting) for number in range(16)]
+    assert not [answer for answer in answers if answer.is_sure and not answer.is_right]
+    assert sum(answer.is_right for answer in answers) >= 14
+    assert sum(answer.is_sure for answer in answers) >= 12
+
+
+def test_the_report_counts_right_answers_and_sure_errors() -> None:
+    noise = NoiseDeviations(0.005, DEG)
+    answers = [
+        TypeAnswer(0, "revolute", "revolute", 0.99, False, 20, noise, noise),
+        TypeAnswer(1, "revolute", "rigid", 0.97, False, 20, noise, noise),
+        TypeAnswer(2, "prismatic", "rigid", 0.97, True, 20, noise, NoiseDeviations(0.01, DEG)),
+        TypeAnswer(3, "prismatic", "prismatic", 0.6, True, 20, noise, noise),
+    ]
+    report = report_answers({Setting(True, False): answers})
+    assert report.tables[0].rows[0][1:4] == (50.0, 50.0, 25.0)
+    assert report.tables[0].rows[0][-1] == "no"
+    assert [row[1] for row in report.tables[1].rows][1:] == [
+        "100.0 of 1 (0)",
+        "-",
+        "33.3 of 3 (1)",
+        "-",
+    ]
+
+
+RANDOM = np.random.default_rng(0)
+ANYWHERE = transform(Rotation.random(24, random_state=RANDOM).as_matrix(), RANDOM.uniform(-1.0, 1.0, (24, 3)))
+EQUAL = np.tile(ANYWHERE[0], (10, 1, 1))
+# Observations that tell nothing: parent and child.
+NOTHING = {
+    "two poses": (None, ANYWHERE[:2]),
+    "two positions": (None, ANYWHERE[:2, :3, 3]),
+    "three positions": (None, ANYWHERE[:3, :3, 3]),
+    "equal poses": (None, EQUAL),
+    "equal poses of both": (np.tile(ANYWHERE[1], (10, 1, 1)), EQUAL),
+    "equal positions": (None, EQUAL[:, :3, 3]),
+    "outliers": (None, ANYWHERE[:12]),
+    "outliers of both": (ANYWHERE[12:], ANYWHERE[:12]),
+    "outliers among positions": (ANYWHERE[12:], ANYWHERE[:12, :3, 3]),
+}
+
+
+def found_online(parent, child, noise, outliers):
+    identifier = Identifier(noise=noise, outliers=outliers)
+    for k, pose in enumerate(child):
+        identifier.add(None if parent is None else parent[k], pose)
+    return identifier.result
+
+
+@pytest.mark.parametrize("what", NOTHING)
+@pytest.mark.parametrize("noise", [None, NOISE], ids=["unknown", "stated"])
+def test_observations_that_tell_nothing_have_no_sure_answer(what: str, noise) -> None:
+    parent, child = NOTHING[what]
+    for outliers in (None, True):
+        if what.startswith("outliers") and noise is not None and outliers is None:
+            continue  # with a stated noise and no outliers such a part moves freely
+        for found in (
+            identify(parent, child, noise=noise, outliers=outliers),
+            found_online(parent, child, noise, outliers),
+        ):
+            assert found.is_ambiguous
+            assert all(np.isfinite(fit.log_evidence) for fit in found)
+            assert np.isfinite(list(found.probabilities.values())).all()
+
+
+@pytest.mark.parametrize("noise", [None, NOISE], ids=["unknown", "stated"])
+@pytest.mark.parametrize("outliers", [None, True])
+def test_invalid_observations_are_refused(noise, outliers) -> None:
+    missing, stretched = ANYWHERE[:5].copy(), ANYWHERE[:5].copy()
+    missing[3], stretched[3, :3, :3] = np.nan, 1.1 * stretched[3, :3, :3]
+    for child, message in (
+        (missing, "Leave out"),
+        (stretched, "unit length"),
+        (ANYWHERE[:1], "at least two"),
+        (ANYWHERE[:0], "at least two"),
+    ):
+        for find in (
+            lambda child: identify(None, child, noise=noise, outliers=outliers),
+            lambda child: found_online(None, child, noise, outliers),
+        ):
+            with pytest.raises(KineverseError, match=message):
+                find(child)
+
+
+def test_identifier_refuses_poses_with_and_without_covariance() -> None:
+    identifier = Identifier()
+    identifier.add(None, ANYWHERE[0])
+    with pytest.raises(KineverseError, match="noise= for the rest"):
+        identifier.add(None, ANYWHERE[1], child_covariance=NOISE)
+    assert len(identifier) == 1
+
+
+@pytest.mark.parametrize("family", ["prismatic", "revolute"])
+def test_swapped_parts_have_the_same_family(family: str) -> None:
+    seen = recording(family, count=20, position=0.02, orientation=0.3 * DEG, seed=2)
+    assert identify(seen.child, seen.parent).best.family == family
+
+
+def test_identifier_without_stated_noise_agrees_with_identify() -> None:
+    seen = recording("revolute", count=30, position=0.02, orientation=0.3 * DEG, seed=2)
+    identifier = Identifier(sequential=False)
+    for k, (parent, child) in enumerate(zip(seen.parent, seen.child, strict=True), start=1):
+        identifier.add(parent, child)
+        if k not in (12, 13, 15, 21, 22, 29, 30):
+            continue
+        found, whole = identifier.result, identify(seen.parent[:k], seen.child[:k])
+        assert found.best.family == whole.best.family
+        assert found.best.probability == pytest.approx(whole.best.probability, abs=0.05)
+        assert found.noise == pytest.approx(whole.noise, rel=0.15)
