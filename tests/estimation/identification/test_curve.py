@@ -90,7 +90,7 @@ def test_a_curve_is_found_in_any_order_and_any_unit() -> None:
 
 
 def test_a_curve_is_found_among_outliers() -> None:
-    seen, wrong = seen_along("cosine", 4, 6, count=36), [3, 11, 20, 30]
+    seen, wrong = seen_along("cosine", 4, 6, count=20), [3, 11, 16]
     seen[wrong, :3, 3] += [0.7, -0.5, 0.6]
     found = identify(None, seen, noise=COVARIANCE, outliers=True)
     assert found.best.family == "curve"

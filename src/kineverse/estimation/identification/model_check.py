@@ -200,9 +200,10 @@ def solve_curve(
     if data.outliers is None:
         return best
     best = replace(best, log_prior=log_inlier_prior(data.outliers, count, count, observations.rows))
-    if len(_classify(data, solution)) == count:
-        return best
+    # A curve may pass through outliers that other families leave out.
     some = [one for one in solutions.values() if len(one.inliers) < count]
+    if len(_classify(data, solution)) == count and not some:
+        return best
     some.sort(key=lambda one: -one.log_evidence - one.log_prior)
     for rows in (*(one.inliers for one in some[:1]), densest_half(observations)):
         for _ in range(_ROUNDS):
