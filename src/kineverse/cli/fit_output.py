@@ -11,6 +11,7 @@ import numpy as np
 
 from kineverse.cli.output import format_table
 from kineverse.errors import InvalidValueError
+from kineverse.estimation.identification.curve import CURVE
 from kineverse.estimation.identification.found_operations import joint_operation
 from kineverse.expressions.printing import format_number
 from kineverse.gallery import shapes
@@ -180,16 +181,16 @@ def _revolution_warning(fit: Fit, pair: RecordedPair) -> list[str]:
 def joint_ranges(fit: Fit) -> list[tuple[float, float, float, bool]]:
     """Return for each joint value its range, the standard deviation of the ends, and if it is an angle."""
     ranges = []
-    for k, component in enumerate(fit.motion.parametrisation.joints):
+    for k, kind in enumerate(fit.motion.kinds):
         values, deviations = fit.joint_values[fit.inliers, k], fit.deviations[fit.inliers, k]
         ends = [int(np.argmin(values)), int(np.argmax(values))]
         spread = float(deviations[ends].max())
-        ranges.append((float(values[ends[0]]), float(values[ends[1]]), spread, component >= 3))
+        ranges.append((float(values[ends[0]]), float(values[ends[1]]), spread, bool(kind)))
     return ranges
 
 
 def _format_ranking(found: IdentificationResult) -> list[str]:
-    shown = [fit for fit in found.fits if fit.probability >= _LEAST_PROBABILITY]
+    shown = [found[name] for name, p in found.probabilities.items() if p >= _LEAST_PROBABILITY]
     rows: list[tuple[str, ...]] = []
     for fit in shown:
         angle = format_number(math.degrees(fit.rms[1]), 3) if fit.residuals.shape[1] > 3 else "-"
@@ -208,7 +209,7 @@ def _format_ranking(found: IdentificationResult) -> list[str]:
     if not any(fit.reason for fit in shown):
         head, rows = head[:-1], [row[:-1] for row in rows]
     lines = [format_table(head, rows, "<>>>>")]
-    rest = [fit.family for fit in found.fits if fit.probability < _LEAST_PROBABILITY]
+    rest = [name for name, p in found.probabilities.items() if p < _LEAST_PROBABILITY]
     return [*lines, f"not: {', '.join(rest)}"] if rest else lines
 
 
@@ -277,8 +278,8 @@ def make_joint_model(pair: RecordedPair, fit: Fit) -> Model:
 
 def make_joint_operation(fit: Fit, parent: str, child: str) -> Operation:
     """Return the joint as an operation; for positions alone see :func:`make_joint_model`."""
-    if fit.motion.rows == 6:
-        return fit.operation(name=child, parent=parent, child=child)
+    if fit.motion.rows == 6 or fit.family == CURVE:
+        return fit.operation(name=child, parent=parent, child=child, as_point=True)
     right = fit.motion.right.copy()
     right[:3, :3] = fit.motion.left[:3, :3].T
     limits = [(float(low), float(high)) for low, high in fit.range]

@@ -46,7 +46,7 @@ def test_fits_are_computed_once_and_sorted_by_probability() -> None:
     assert [fit.family for fit in found] == [*found.probabilities]
     assert [fit.probability for fit in found] == sorted(found.probabilities.values(), reverse=True)
     assert found.best is found.fits[0] is found[found.best.family]
-    assert len(found) == len(JOINTS)
+    assert len(found) == len(JOINTS) + 1  # and the curve
 
 
 @pytest.mark.parametrize("pitch", [0.01, -0.03])

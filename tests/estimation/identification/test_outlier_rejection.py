@@ -107,7 +107,8 @@ def test_evidence_includes_the_density_of_the_outliers(hinge) -> None:
     # What moves freely explains everything, and what does not move cannot call almost everything wrong.
     assert found["free"].outliers == found["rigid"].outliers == ()
     assert found["free"].log_evidence < fit.log_evidence - 100
-    assert identify(seen.parent, child, noise=seen.covariance).best.family == "free"
+    every_pose_an_inlier = identify(seen.parent, child, noise=seen.covariance)
+    assert every_pose_an_inlier["free"].probability > 0.99 or every_pose_an_inlier.is_ambiguous
 
 
 @pytest.mark.parametrize("family", ["revolute", "prismatic", "rigid"])

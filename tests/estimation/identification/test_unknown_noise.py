@@ -13,7 +13,8 @@ from synthetic_recordings import recording
 from kineverse.errors import KineverseError
 from kineverse.estimation import Identifier, identify, pose_covariance
 from kineverse.estimation.identification.bindings import library
-from kineverse.estimation.identification.identify import WEIGHTS, prepare_data, solve_with_inliers
+from kineverse.estimation.identification.comparison import prepare_data, solve_with_inliers
+from kineverse.estimation.identification.identify import WEIGHTS
 from kineverse.estimation.identification.initial_guess import MotionStatistics, initial_guesses
 from kineverse.estimation.identification.observations import check_observations
 from kineverse.estimation.identification.optimise import InitialGuess

@@ -25,6 +25,7 @@ from kineverse.articulations import (
     Revolute,
     Screw,
 )
+from kineverse.articulations.limits import FREE
 from kineverse.lie import Array, mean_rotation
 from kineverse.model.body import Pose
 from kineverse.model.constraint import Constraint
@@ -33,7 +34,8 @@ from kineverse.model.read_recorder import ReadRecorder
 from kineverse.spatial import translation
 from kineverse.symbols import position
 
-from .custom_family import FamilyMotion
+from .curve import CurveMotion
+from .custom_family import Family, FamilyMotion
 from .families import GroupMotion
 from .motion_model import FamilyMember
 
@@ -94,10 +96,13 @@ class SlidingPoint(Joint, document_kind="SlidingPoint"):
     Attributes
     ----------
     ranges
-        Limits of each coordinate [m].
+        Range seen of each coordinate [m]; home is in the middle.
+    limited
+        True if the coordinates are limited to the range.
     """
 
     ranges: tuple[tuple[float, float], ...]
+    limited: bool = True
 
     def apply(self, model: ReadRecorder) -> Writes:
         """Write the child frame, the coordinates and their limits."""
@@ -106,7 +111,8 @@ class SlidingPoint(Joint, document_kind="SlidingPoint"):
         q = tuple(position(name) for name in names)
         constraints: dict[str, Constraint] = {}
         for name, coordinate, (low, high) in zip(names, q, self.ranges, strict=True):
-            constraints.update(Limits(low, high).constraints(name, coordinate))
+            if self.limited:
+                constraints.update(Limits(low, high).constraints(name, coordinate))
         home = tuple(0.5 * (low + high) for low, high in self.ranges)
         place = translation(*q, *([0.0] * (3 - len(q))))
         return Writes(
@@ -127,11 +133,14 @@ class FamilyJoint(Joint, document_kind="FamilyJoint"):
     motion
         Member of the family.
     ranges
-        Limits of its joint values.
+        Range seen of its joint values; home is in the middle.
+    limited
+        True if the joint values are limited to the range.
     """
 
     motion: FamilyMotion
     ranges: tuple[tuple[float, float], ...]
+    limited: bool = True
 
     def apply(self, model: ReadRecorder) -> Writes:
         """Write the child frame, the coordinates and their limits."""
@@ -141,7 +150,8 @@ class FamilyJoint(Joint, document_kind="FamilyJoint"):
         home = tuple(0.5 * (low + high) for low, high in self.ranges)
         constraints: dict[str, Constraint] = {}
         for name, coordinate, (low, high) in zip(names, q, self.ranges, strict=True):
-            constraints.update(Limits(low, high).constraints(name, coordinate))
+            if self.limited:
+                constraints.update(Limits(low, high).constraints(name, coordinate))
         return Writes(
             frames={self.child: (self.parent, (self.origin, self.motion.expression(q)))},
             constraints=constraints,
@@ -156,19 +166,39 @@ def family_coordinates(motion: FamilyMotion, name: str) -> tuple[str, ...]:
 
 
 def joint_operation(
-    motion: FamilyMember, limits: Sequence[tuple[float, float]], name: str, parent: str, child: str
+    motion: FamilyMember,
+    ranges: Sequence[tuple[float, float]],
+    name: str,
+    parent: str,
+    child: str,
+    limited: bool = True,
 ) -> Operation:
-    """Return the operation that writes a member of a family, with limits of its joint values."""
+    """Return the operation that writes a member of a family.
+
+    Parameters
+    ----------
+    motion
+        The member.
+    ranges
+        Range of each joint value.
+    name, parent, child
+        Names of the articulation and its frames.
+    limited
+        True if these ranges are its limits.
+    """
     names: dict[str, Any] = {"name": name, "parent": parent, "child": child}
+    if isinstance(motion, CurveMotion):
+        motion = _as_family_motion(motion, ranges[0])
     if isinstance(motion, FamilyMotion):
-        return FamilyJoint(**names, motion=motion, ranges=tuple(limits))
+        return FamilyJoint(**names, motion=motion, ranges=tuple(ranges), limited=limited)
     if not isinstance(motion, GroupMotion):
         raise TypeError(f"A {type(motion).__name__} is no joint.")
     family = motion.name
     if motion.rows == 3 and family in ("planar", "free"):
         place = motion.left.copy()
         place[:3, 3] += place[:3, :3] @ motion.right[:3, 3]
-        return SlidingPoint(**names, origin=rigid_pose(place), ranges=tuple(limits))
+        return SlidingPoint(**names, origin=rigid_pose(place), ranges=tuple(ranges), limited=limited)
+    limits = [Limits(low, high) if limited else FREE for low, high in ranges]
     origin, mount = rigid_pose(motion.left), rigid_pose(motion.right)
     whole = rigid_pose(motion.left @ motion.right)
     # The z axis of L in the axes of the child, at joint value 0.
@@ -177,24 +207,38 @@ def joint_operation(
     if family == "rigid":
         return Fixed(**names, origin=whole)
     if family == "prismatic":
-        (low, high), *_ = limits
-        return Prismatic(**names, origin=whole, axis=axis, lower=low, upper=high)
+        return Prismatic(**names, origin=whole, axis=axis, lower=limits[0].lower, upper=limits[0].upper)
     if family == "revolute":
-        (low, high), *_ = limits
-        return MountedRevolute(**names, origin=origin, mount=mount, axis=_Z, lower=low, upper=high)
+        return MountedRevolute(
+            **names, origin=origin, mount=mount, axis=_Z, lower=limits[0].lower, upper=limits[0].upper
+        )
     if family == "screw":
-        (low, high), *_ = limits
         pitch = 2.0 * np.pi * motion.pitch
-        return MountedScrew(**names, origin=origin, mount=mount, axis=_Z, lower=low, upper=high, pitch=pitch)
+        return MountedScrew(
+            **names,
+            origin=origin,
+            mount=mount,
+            axis=_Z,
+            lower=limits[0].lower,
+            upper=limits[0].upper,
+            pitch=pitch,
+        )
     if family == "cylindrical":
-        slide, turn = (Limits(low, high) for low, high in limits)
+        slide, turn = limits
         return MountedCylindrical(**names, origin=origin, mount=mount, axis=_Z, slide=slide, turn=turn)
     if family == "spherical":
         return MountedBall(**names, origin=origin, mount=mount)
     if family == "planar":
-        most = max(max(-low, high) for low, high in limits[:2])
-        return Planar(**names, origin=whole, axis=axis, lower=-most, upper=most)
+        most = max(max(-low, high) for low, high in ranges[:2]) if limited else None
+        least = None if most is None else -most
+        return Planar(**names, origin=whole, axis=axis, lower=least, upper=most)
     return Floating(**names, origin=whole)
+
+
+def _as_family_motion(motion: CurveMotion, ends: tuple[float, float]) -> FamilyMotion:
+    """Return a curve as the only member of a custom family, whose operation documents can hold."""
+    s = position("s")
+    return FamilyMotion(Family(motion.name, motion.expression(s), {s: ends}), motion.rows, np.zeros(0))
 
 
 def rigid_pose(matrix: Array) -> Pose:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import functools
 import math
 from collections.abc import Callable, Mapping
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from functools import partial
 
 import numpy as np
@@ -16,20 +16,19 @@ from kineverse.estimation.linear_algebra import squared_errors
 from kineverse.estimation.robust import Outliers, as_outliers
 from kineverse.lie import Array
 
-from .custom_family import Family
-from .identify import (
-    Families,
+from .comparison import (
     FamilySolution,
     IdentificationData,
-    family_weights,
     prepare_data,
-    resolve_noise,
     score_solutions,
-    solve_with_inliers,
     weigh_families,
 )
+from .curve import CURVE
+from .custom_family import Family
+from .identify import Families, family_weights, resolve_noise
 from .kinematic_graph.pairwise import SURPRISE_DEVIATIONS
 from .maximum_likelihood import Scored
+from .model_check import fit_of_curve, is_doubtful, solve_joints, weigh_and_check, without_curve
 from .motion_model import FamilyMember
 from .observations import Observations, check_observations
 from .optimise import InitialGuess, Solution
@@ -219,6 +218,7 @@ class Identifier:
         self._sequential = sequential
         self._outliers = as_outliers(outliers)
         self._weights = family_weights(families)
+        self._joint_weights = without_curve(self._weights)
         self._noise = parent_covariance, child_covariance, noise
         self._stated = True
         self._buffer = ObservationBuffer()
@@ -227,6 +227,8 @@ class Identifier:
         self._odds: dict[str | Family, float] = {}
         self._result: IdentificationResult | None = None
         self._full_count, self._noise_count, self._count, self._unit = 0, 0, 0, 1.0
+        # Last check of the most probable family, and the solution of the curve at that time.
+        self._check: _Check | None = None
 
     def __len__(self) -> int:
         return len(self._buffer)
@@ -286,12 +288,16 @@ class Identifier:
 
     def _identify(self) -> IdentificationResult:
         observations = self._buffer.all
+        if not self._joint_weights:
+            data = prepare_data(observations, self._stated, self._outliers, self._sequential)
+            return weigh_and_check(data, {}, self._weights).result
         deferred: dict[str | Family, FamilySolution] = {}
         if len(observations) >= 2 * self._full_count:
             self._full_count = self._noise_count = len(observations)
             data = prepare_data(observations, self._stated, self._outliers, self._sequential)
             self._unit = data.unit
-            known = solve_with_inliers(data, self._weights)
+            known = solve_joints(data, self._weights)
+            self._check = None
         else:
             data = prepare_data(observations, self._stated, self._outliers, self._sequential, self._unit)
             known, deferred = self._update_families(data)
@@ -307,10 +313,37 @@ class Identifier:
             one.scored.solution.motion.name: partial(_deferred_fit, data, name, one, self._weights)
             for name, one in deferred.items()
         }
-        return replace(
+        found = replace(
             found,
             lazy_fits=tuple(_with_deferred_fit(lazy_fit, deferred_fits) for lazy_fit in found.lazy_fits),
         )
+        check, best_family = self._check, found.lazy_fits[0].family
+        if (
+            check is None
+            or check.is_doubted
+            or check.family != best_family
+            or len(observations) >= (1.0 + _MORE) * check.count
+        ):
+            if not is_doubtful(data, found, known):
+                self._check = _Check(best_family, len(observations))
+                return found
+            if check is not None:
+                # The families below one in a million may be those that a larger noise makes probable.
+                known = solve_joints(data, self._weights)
+            return self._check_best(data, known)
+        return found if check.curve is None else _with_curve(data, found, check, self._weights)
+
+    def _check_best(
+        self, data: IdentificationData, known: Mapping[str | Family, FamilySolution]
+    ) -> IdentificationResult:
+        """Return the result with the curve, and with the reason if the best family is not sure."""
+        before = None if self._check is None else self._check.curve
+        result, curve = weigh_and_check(data, known, self._weights, before)
+        p = result.probabilities
+        best_family = next((lazy_fit.family for lazy_fit in result.lazy_fits if lazy_fit.family != CURVE), "")
+        odds = p.get(CURVE, 0.0) / max(p.get(best_family, 0.0), 1e-300)
+        self._check = _Check(best_family, len(data.observations), bool(result.reason), curve, odds)
+        return result
 
     def _update_families(
         self, data: IdentificationData
@@ -345,6 +378,55 @@ class Identifier:
 
     def _log_posterior(self, name: str | Family, one: FamilySolution) -> float:
         return one.log_evidence + one.log_prior + math.log(self._weights[name])
+
+
+@dataclass(frozen=True)
+class _Check:
+    """Check of the most probable family.
+
+    Attributes
+    ----------
+    family
+        The most probable family but the curve.
+    count
+        Number of observations.
+    is_doubted
+        True if there was a reason why the best family was not sure.
+    curve
+        Solution of the curve; None if none was fitted.
+    odds
+        Odds of the curve against that family.
+    """
+
+    family: str
+    count: int
+    is_doubted: bool = False
+    curve: FamilySolution | None = None
+    odds: float = 0.0
+
+
+def _with_curve(
+    data: IdentificationData,
+    found: IdentificationResult,
+    check: _Check,
+    weights: Mapping[str | Family, float],
+) -> IdentificationResult:
+    """Return a result with a curve at the odds of its last check. Its fit uses all observations."""
+    curve_share = check.odds * found.lazy_fits[0].probability
+    total = 1.0 + curve_share
+    p = curve_share / total
+    curve = LazyFit(CURVE, p, partial(fit_of_curve, data, {}, weights, check.curve, p))
+    others = [
+        LazyFit(family, q / total, partial(_with_probability, compute, q / total))
+        for family, q, compute in found.lazy_fits
+    ]
+    return replace(
+        found, lazy_fits=tuple(sorted([curve, *others], key=lambda lazy_fit: -lazy_fit.probability))
+    )
+
+
+def _with_probability(compute: Callable[[], Fit], probability: float) -> Fit:
+    return replace(compute(), probability=probability)
 
 
 def _with_deferred_fit(lazy_fit: LazyFit, deferred_fits: Mapping[str, Callable[[float], Fit]]) -> LazyFit:

@@ -121,7 +121,7 @@ def find_inliers(
     ).most_common(_SHARED)
     subsets = [
         _thinned(rows)
-        for rows in (_densest_half(observations), *(np.flatnonzero(inliers) for inliers, _ in common))
+        for rows in (densest_half(observations), *(np.flatnonzero(inliers) for inliers, _ in common))
     ]
     for name, hypothesis in hypotheses.items():
         if not search.is_settled(hypothesis):
@@ -139,7 +139,7 @@ def _thinned(rows: RowIndices) -> RowIndices:
     return chosen
 
 
-def _densest_half(observations: Observations) -> RowIndices:
+def densest_half(observations: Observations) -> RowIndices:
     """Return the half of the observations with the nearest neighbours. Outliers are mostly isolated."""
     variances = np.einsum("nii->ni", observations.child_covariance).mean(axis=0)
     relative = observations.relative

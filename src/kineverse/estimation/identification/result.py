@@ -15,6 +15,7 @@ from kineverse.lie import Array
 from kineverse.model.operation import Operation
 
 from .ambiguities import slide_child_origin
+from .curve import CurveMotion
 from .evidence import Evidence
 from .families import GroupMotion
 from .found_operations import joint_operation
@@ -67,7 +68,8 @@ class Fit:
     frame
         The joint's frame in the parent, (4, 4). Its z axis is the axis and its origin the point.
     joint_values
-        Joint values, (N, k), [m] and [rad].
+        Joint values, an array (N, k), [m] and [rad]: one row for each observation, also for k = 1. A curve's
+        is the length along it [m].
     deviations
         Standard deviations of the joint values, (N, k).
     residuals
@@ -83,6 +85,9 @@ class Fit:
     outliers
         Indices of the observations that are outliers under this family. The fit ignores them. Their joint
         values are those of the nearest poses, and their residuals are large.
+    misfit
+        Size of the residuals relative to the stated noise, or to the noise that was estimated: about 1 if the
+        family and the noise are right. NaN for a family that leaves no residuals, such as ``free``.
     """
 
     family: str
@@ -100,6 +105,7 @@ class Fit:
     rows: int
     motion: Any
     outliers: tuple[int, ...] = ()
+    misfit: float = math.nan
 
     @property
     def inliers(self) -> npt.NDArray[np.int_]:
@@ -108,7 +114,10 @@ class Fit:
 
     @property
     def range(self) -> Array:
-        """Least and largest value of each joint value over the inliers, (k, 2)."""
+        """Least and largest value of each joint value over the inliers, an array (k, 2) [m] or [rad].
+
+        A joint with one joint value has one row: ``(low, high), = fit.range``.
+        """
         if not self.joint_values.shape[1]:
             return np.zeros((0, 2))
         values = self.joint_values[self.inliers]
@@ -162,7 +171,13 @@ class Fit:
         return math.sqrt(float(self.covariance[k, k]))
 
     def operation(
-        self, name: str, parent: str, child: str | None = None, *, as_point: bool = False
+        self,
+        name: str,
+        parent: str,
+        child: str | None = None,
+        *,
+        as_point: bool = False,
+        limits: bool = True,
     ) -> Operation:
         """Return the joint as an operation, with the observed range as its limits.
 
@@ -172,23 +187,28 @@ class Fit:
             Names of the articulation and its frames. By default the child is named like the articulation.
         as_point
             True if the child is a point, so that the orientation of its frame does not matter.
+        limits
+            False for a joint without limits. The range seen is not the range of the joint: with limits, a
+            controller pulls no further than was seen. Beyond its ends a curve continues straight.
 
         Raises
         ------
         InvalidValueError
             If only positions of the child were observed, so that its orientation is unknown.
         """
-        if self.rows == 3 and isinstance(self.motion, GroupMotion) and not as_point:
+        if self.rows == 3 and isinstance(self.motion, (GroupMotion, CurveMotion)) and not as_point:
             raise InvalidValueError(
                 f"Only positions of the child were seen, so how it is turned on '{name}' is not known. If "
                 "that does not matter, say as_point=True."
             )
-        limits = [(float(low), float(high)) for low, high in self.range]
-        return joint_operation(self.motion, limits, name, parent, name if child is None else child)
+        ranges = [(float(low), float(high)) for low, high in self.range]
+        return joint_operation(
+            self.motion, ranges, name, parent, name if child is None else child, limited=limits
+        )
 
     def __str__(self) -> str:
         words = [f"{self.family}, {self.probability:.1%}"]
-        grouped = isinstance(self.motion, GroupMotion)
+        grouped = isinstance(self.motion, (GroupMotion, CurveMotion))
         for (low, high), kind in zip(self.range, self.motion.kinds, strict=True):
             unit = ("m", "°")[kind] if grouped else ""
             size = math.degrees(high - low) if unit == "°" else high - low
@@ -215,10 +235,13 @@ class IdentificationResult:
     noise
         Estimated standard deviations of the noise under the most probable family; None if the noise was
         stated.
+    reason
+        Reason why the best family is not sure although it is probable, see :mod:`.model_check`, else empty.
     """
 
     lazy_fits: tuple[LazyFit, ...]
     noise: NoiseDeviations | None = None
+    reason: str = ""
     _computed: dict[int, Fit] = field(default_factory=dict, repr=False)
 
     @property
@@ -237,9 +260,14 @@ class IdentificationResult:
         return self._fit(0)
 
     @property
+    def misfit(self) -> float:
+        """Size of the residuals of the best family relative to the noise, see :attr:`Fit.misfit`."""
+        return self.best.misfit
+
+    @property
     def is_ambiguous(self) -> bool:
-        """True if no family is probable enough, or the data do not determine the best one."""
-        return self.best.probability < SURE or not self.best.is_determined
+        """True if no family is probable enough, the data do not determine the best one, or refute it."""
+        return not self.best.probability >= SURE or not self.best.is_determined or bool(self.reason)
 
     def __getitem__(self, family: str) -> Fit:
         tried = [lazy_fit.family for lazy_fit in self.lazy_fits]
@@ -257,9 +285,10 @@ class IdentificationResult:
         if not self.is_ambiguous:
             return str(self.best)
         if self.best.probability >= SURE:
-            return f"cannot tell: {self.best.family}, but {self.best.reason}"
+            return f"cannot tell: {self.best.family}, but {self.reason or self.best.reason}"
         likely = {name: p for name, p in self.probabilities.items() if p > 1.0 - SURE}
-        return "cannot tell: " + " or ".join(f"{name} ({p:.0%})" for name, p in likely.items())
+        words = "cannot tell: " + " or ".join(f"{name} ({p:.0%})" for name, p in likely.items())
+        return f"{words}, but {self.reason}" if self.reason else words
 
     def _fit(self, k: int) -> Fit:
         if k not in self._computed:

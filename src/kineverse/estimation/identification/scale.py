@@ -14,6 +14,7 @@ import numpy as np
 
 from kineverse.lie import Array
 
+from .curve import CurveMotion
 from .custom_family import FamilyMotion
 from .families import WX, GroupMotion
 from .observations import Observations
@@ -60,6 +61,17 @@ def convert_to_metres(fit: Fit, unit: float) -> Fit:
     motion = fit.motion
     if isinstance(motion, FamilyMotion):
         return replace(fit, residuals=residuals, motion=replace(motion, unit=motion.unit / unit))
+    if isinstance(motion, CurveMotion):
+        curve = motion.scaled(unit)
+        return replace(
+            fit,
+            parameters=curve.named_parameters(),
+            covariance=unit**2 * fit.covariance,
+            joint_values=unit * fit.joint_values,
+            deviations=unit * fit.deviations,
+            residuals=residuals,
+            motion=curve,
+        )
     if not isinstance(motion, GroupMotion):
         return replace(fit, residuals=residuals)
     scale = np.array([unit if _is_length(name) else 1.0 for name in fit.coordinates])

@@ -184,7 +184,7 @@ class _NoiseSearch:
             if distance > 1.0 and self.log_density((logs + shift)[None])[0] < here:
                 # The quadratic does not hold so far from here.
                 shift = stencil[best] @ width.T
-            logs, root = logs + shift, root @ axes / np.sqrt(bends)
+            logs, root = logs + shift, _limit_width(root @ axes / np.sqrt(bends))
             if distance < _SETTLED and bends[0] > _FLAT and bends[-1] < _SHARP:
                 break
         return _NoiseMode(logs, root, float(self.log_density(logs[None])[0]))
@@ -194,8 +194,30 @@ class _NoiseSearch:
         nodes = np.array(list(itertools.product(_NODES, repeat=self.dimensions)))
         weights = np.prod(list(itertools.product(_NODE_WEIGHTS, repeat=self.dimensions)), axis=1)
         logs = self.log_density(mode.logs + nodes @ mode.root.T)
+        # Far from the maximum the evidence may be beyond floating point.
+        logs = np.where(np.isfinite(logs), logs, -np.inf)
         logs += np.log(weights) + 0.5 * np.sum(nodes**2, axis=1)
         return float(np.logaddexp.reduce(logs)) + _log_volume(mode.root)
+
+
+def estimate_noise(
+    observations: Observations, solution: Solution[FamilyMember], near: NoisePosterior | None = None
+) -> NoiseSolution:
+    """Return a solution whose motion is kept at the most probable noise.
+
+    Parameters
+    ----------
+    observations
+        The observations, with the medians of the noise.
+    solution
+        Solution at any noise.
+    near
+        Posterior of a similar noise, to save time.
+    """
+    search = _NoiseSearch(observations, solution)
+    return _at_mode(
+        search, search.maximise_anywhere() if near is None else search.maximise(near.logs, near.root)
+    )
 
 
 def solve_unknown_noise(observations: Observations, solve: Callable[[Observations], Scored]) -> NoiseSolution:
@@ -220,6 +242,11 @@ def solve_unknown_noise(observations: Observations, solve: Callable[[Observation
             break
     assert search is not None
     assert mode is not None  # there is a start
+    return _at_mode(search, mode)
+
+
+def _at_mode(search: _NoiseSearch, mode: _NoiseMode) -> NoiseSolution:
+    """Return the solution of a search at its maximum, and Laplace's approximation around it."""
     log = float(search.log_evidences(mode.logs[None])[0])
     weight = mode.log_density - log + 0.5 * len(mode.logs) * math.log(math.tau) + _log_volume(mode.root)
     covariance = np.tensordot(_factors(mode.logs[None])[0] ** 2, search.parts, axes=1)
@@ -227,7 +254,11 @@ def solve_unknown_noise(observations: Observations, solve: Callable[[Observation
     return NoiseSolution(scored, NoisePosterior(mode.logs, mode.root, weight))
 
 
-def adapt_noise(observations: Observations, near: NoiseSolution) -> NoiseSolution:
+def adapt_noise(
+    observations: Observations,
+    near: NoiseSolution,
+    proceed: Callable[[Observations, Solution[FamilyMember]], Scored] | None = None,
+) -> NoiseSolution:
     """Return the solution at the noise that suits it best, with the joint values integrated out.
 
     Parameters
@@ -236,13 +267,17 @@ def adapt_noise(observations: Observations, near: NoiseSolution) -> NoiseSolutio
         The observations, with the medians of the noise. They may be more than those of ``near``.
     near
         Solution of the same observations at a similar noise.
+    proceed
+        Function that continues a solution at some noise; None for that of a joint.
     """
     (solution, _), noise = near
     logs, root, motion = noise.logs, noise.root, solution.motion
     rough = bool(motion.joints and motion.size) and not solution.joint_prior.marginal
     for _ in range(_SOLUTIONS):
         scaled = scale_noise(observations, _factors(logs[None])[0])
-        if rough:
+        if proceed is not None:
+            scored = proceed(scaled, solution)
+        elif rough:
             scored, rough = solver.maximise_marginal_likelihood(scaled, solution), False
         else:
             start = InitialGuess(solution.motion, solution.values)
@@ -292,6 +327,13 @@ def _factors(logs: Array) -> Array:
     return factors
 
 
+def _limit_width(root: Array) -> Array:
+    """Return a square root of a covariance that is at most twice as wide as the prior in any direction."""
+    left, widths, right = np.linalg.svd(root)
+    result: Array = left * np.minimum(widths, 2.0 * _SPREAD) @ right
+    return result
+
+
 def _log_volume(root: Array) -> float:
     """Return the logarithm of the determinant of a square root of a covariance."""
     return float(np.linalg.slogdet(root)[1])
@@ -299,7 +341,7 @@ def _log_volume(root: Array) -> float:
 
 def _covariance_parts(observations: Observations, solution: Solution[FamilyMember]) -> Array:
     """Return the covariances of the residuals by errors of positions, and of orientations, (2, N, m, m)."""
-    rows, count = observations.rows, len(observations)
+    rows, count = observations.rows, len(solution.residuals)
     parts = np.zeros((2, count, rows, rows))
     parents = observations.parent_covariance
     both = 1.0 if parents is None else 2.0

@@ -24,7 +24,9 @@ import numpy as np
 
 from kineverse.errors import InvalidValueError
 from kineverse.estimation.identification import Fit, IdentificationResult, identify
+from kineverse.estimation.identification.curve import CURVE
 from kineverse.estimation.identification.identify import WEIGHTS
+from kineverse.estimation.identification.model_check import CALIBRATED
 from kineverse.estimation.identification.observations import check_observations
 from kineverse.estimation.identification.projection import complete_fit
 from kineverse.estimation.noise import pose_covariance
@@ -174,7 +176,8 @@ def identify_recorded_joint(
     times = {name: comparison.correlation_time(fit) for name, fit in fits.items()}
     best, rows = first, comparison.distinct
     for _ in times:
-        name = best.found.best.family
+        # A curve follows correlated errors; the most probable joint tells them from its motion.
+        name = next((family for family in best.found.probabilities if family != CURVE), "free")
         if times.get(name, 1.0) <= _LONGER * best.correlation_time:
             break
         rows = comparison.sufficient_rows(times[name], first.found[name])
@@ -235,7 +238,8 @@ class _Comparison:
         """Return the fits of families that have residuals to all distinct rows."""
         # If the stated noise is too small, most observations are outliers.
         found = first.found if noise is None else self.assume(None, 1.0, self.distinct).found
-        return {fit.family: fit for fit in found if fit.family != "free"}
+        # A curve follows correlated errors.
+        return {fit.family: fit for fit in found if fit.family not in ("free", CURVE)}
 
     def correlation_time(self, fit: Fit) -> float:
         """Return the autocorrelation time of the residuals of a fit to all distinct rows."""
@@ -283,7 +287,8 @@ class _Comparison:
         known = self.assume(best.noise, best.correlation_time, rows) if stated is None else best
         most = max(log_probability(one.found) for one in (known, *others))
         for other in others:
-            if log_probability(other.found) > most - _REFUTED:
+            # The families of a noise that the residuals refute are compared for a larger one.
+            if not other.found.misfit > CALIBRATED and log_probability(other.found) > most - _REFUTED:
                 yield other
 
     def complete(self, best: Assumption, rows: Indices) -> Fit:

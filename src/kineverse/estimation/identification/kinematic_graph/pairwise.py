@@ -10,7 +10,12 @@ from itertools import combinations
 import numpy as np
 import numpy.typing as npt
 
-from kineverse.estimation.identification.identify import family_weights, identify
+from kineverse.errors import InvalidValueError
+from kineverse.estimation.identification.comparison import prepare_data, solve_with_inliers, weigh_families
+from kineverse.estimation.identification.curve import CURVE
+from kineverse.estimation.identification.custom_family import Family
+from kineverse.estimation.identification.identify import family_weights
+from kineverse.estimation.identification.model_check import without_curve
 from kineverse.estimation.identification.observations import Observations, PoseTrack, pair_tracks
 from kineverse.estimation.identification.result import Fit, IdentificationResult
 from kineverse.estimation.linear_algebra import squared_errors
@@ -84,7 +89,7 @@ def identify_pair(
         return None
     observations = pair_tracks(a, b, times)
     found = identify_observations(observations, families)
-    weights = {str(getattr(f, "name", f)): w for f, w in family_weights(families).items()}
+    weights = {str(getattr(f, "name", f)): w for f, w in _joint_weights(families).items()}
     best = found.best
     log = best.log_evidence + math.log(weights[best.family] / best.probability / sum(weights.values()))
     squares = chi_squared(observations, best)
@@ -143,17 +148,34 @@ def _log_volume(covariance: Array, fit: Fit) -> float:
 def identify_observations(
     observations: Observations, families: FamilyChoice, outliers: Outliers | None = None
 ) -> IdentificationResult:
-    """Identify the joint between two parts from their observations."""
+    """Identify the joint between two parts from their observations.
+
+    The result is not checked: pairs and models are compared by their evidence under one stated noise.
+    """
     exact = observations.parent_covariance is None
-    child = observations.relative if exact else observations.child
-    return identify(
-        None if exact else observations.parent,
-        child if observations.rows == 6 else child[:, :3, 3],
-        parent_covariance=observations.parent_covariance,
-        child_covariance=observations.child_covariance,
-        families=families,
-        outliers=outliers,
-    )
+    if exact:
+        identities = np.tile(np.eye(4), (len(observations), 1, 1))
+        observations = Observations(identities, observations.relative, None, observations.child_covariance)
+    weights = _joint_weights(families)
+    data = prepare_data(observations, True, outliers, False)
+    return weigh_families(data, solve_with_inliers(data, weights), weights)
+
+
+def _joint_weights(families: FamilyChoice) -> dict[str | Family, float]:
+    """Return the families and their weights, by default all but the curve.
+
+    Raises
+    ------
+    InvalidValueError
+        If the curve is among the given families.
+    """
+    weights = family_weights(families)
+    if families is not None and CURVE in weights:
+        raise InvalidValueError(
+            f"Pairs of parts are compared by the joints that they may have, and {CURVE!r} is none. "
+            "kv.estimation.identify takes it for a single pair."
+        )
+    return without_curve(weights)
 
 
 def identify_pairs(

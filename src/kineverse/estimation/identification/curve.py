@@ -1,0 +1,399 @@
+"""Curve in SE(3) with one joint value: a natural cubic spline of poses.
+
+Between its knots u_k, at joint value u,
+
+    parent_T_child = translation(p(u)) · rotation(h(u) / |h(u)|)
+
+where p and h are natural cubic splines through the positions p_k and the unit quaternions h_k of the knots.
+The joint value is the length along the curve [m]. A rotation by an angle φ counts as a length ℓ φ. Beyond its
+ends the curve continues straight.
+
+**Parameters.** A knot moves across the curve only, in five directions (two for positions). A move along the
+curve is a change of joint values.
+
+**Prior.** The mean pose has the density that all families share. The differences between the ends and, times
+a curvature, the second differences of the knots are Gaussian. Their widths are those of the observations
+along the principal directions of their positions and of their rotations: a curve in a plane pays little for
+being in space, but it pays for the plane.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from functools import cached_property
+from typing import NamedTuple, Self
+
+import numpy as np
+
+from kineverse.expressions.expression import Expression
+from kineverse.expressions.piecewise import spline
+from kineverse.lie import (
+    Array,
+    log_so3,
+    mean_rotation,
+    quaternion,
+    skew,
+    to_quaternion,
+    transform,
+    unit_vector,
+)
+from kineverse.spatial import quaternion as rotation_of_quaternion
+from kineverse.spatial import translation
+
+from .motion_model import LinearisedPoses, ParameterPrior
+
+CURVE = "curve"
+"""Name of the family."""
+
+LEVER = 0.25
+"""Length [m] of a rotation by one radian, in the joint value of a curve."""
+
+KNOTS = (3, 4, 5, 7, 9, 12, 16, 21)
+"""Numbers K of knots that are compared."""
+
+# Log prior of a number of knots, for each knot.
+_LOG_KNOT = -0.5
+# Standard deviation of the second derivative of a curve of width 1 and length 1, and its bound for few knots.
+_CURVATURE = 20.0
+# Log density of a width, which is log-uniform over several decades, and least width relative to the largest.
+_LOG_WIDTH, _LEAST_WIDTH = -2.0, 1e-4
+# Range of each of the three angles of principal directions, whose signs do not matter: (8π² / 4)^(1/3).
+_ANGLES = (2.0 * math.pi**2) ** (1.0 / 3.0)
+
+
+class SplineWeights(NamedTuple):
+    """Value and slope of a natural cubic spline as linear functions of its values at the knots, (N, K)."""
+
+    values: Array
+    slopes: Array
+
+
+@dataclass(frozen=True)
+class NaturalSpline:
+    """Natural cubic spline through equidistant knots.
+
+    Attributes
+    ----------
+    first, step
+        First knot, and distance between two of them.
+    count
+        Number of knots.
+    """
+
+    first: float
+    step: float
+    count: int
+
+    @property
+    def knots(self) -> Array:
+        """The knots, (K,)."""
+        return np.asarray(self.first + self.step * np.arange(self.count), dtype=np.float64)
+
+    @property
+    def last(self) -> float:
+        """The last knot."""
+        return self.first + self.step * (self.count - 1)
+
+    @cached_property
+    def knot_slopes(self) -> Array:
+        """Slopes at the knots as a linear function of the values at the knots, (K, K)."""
+        count, step = self.count, self.step
+        system, right = 4.0 * np.eye(count), np.zeros((count, count))
+        system[0, 0] = system[-1, -1] = 2.0
+        for k in range(count - 1):
+            system[k, k + 1] = system[k + 1, k] = 1.0
+            right[k, k : k + 2] += (-3.0 / step, 3.0 / step)
+            right[k + 1, k : k + 2] += (-3.0 / step, 3.0 / step)
+        return np.asarray(np.linalg.solve(system, right))
+
+    def weights(self, u: Array) -> SplineWeights:
+        """Return the weights of the knots at u, (N,). Beyond the ends the spline is straight."""
+        each, step, slopes = np.eye(self.count), self.step, self.knot_slopes
+        inside = np.clip(u, self.first, self.last)
+        beyond = (u - inside)[:, None]
+        k = np.minimum(((inside - self.first) / step).astype(int), self.count - 2)
+        t = ((inside - self.first) / step - k)[:, None]
+        before, after = slopes[k], slopes[k + 1]
+        values = (1.0 + 2.0 * t) * (1.0 - t) ** 2 * each[k] + t**2 * (3.0 - 2.0 * t) * each[k + 1]
+        values += step * t * (1.0 - t) * ((1.0 - t) * before - t * after)
+        rates = 6.0 * t * (1.0 - t) / step * (each[k + 1] - each[k])
+        rates += (1.0 - t) * (1.0 - 3.0 * t) * before + t * (3.0 * t - 2.0) * after
+        return SplineWeights(values + beyond * rates, rates)
+
+
+@dataclass(frozen=True, eq=False)
+class PathWidths:
+    """Widths of poses along the principal directions of their positions and of their rotations.
+
+    Attributes
+    ----------
+    directions
+        Principal directions of positions, and of rotations, as columns, (3, 3) each.
+    widths
+        Twice the standard deviations along them, (3,) each, [m] and [rad].
+    """
+
+    directions: tuple[Array, ...]
+    widths: tuple[Array, ...]
+
+    @staticmethod
+    def of_poses(poses: Array, rows: int) -> PathWidths:
+        """Return the widths of poses (N, 4, 4), or of positions for 3 rows."""
+        places, turns = poses[:, :3, 3], poses[:, :3, :3]
+        vectors = [places - places.mean(axis=0), log_so3(turns @ mean_rotation(turns).T)][: rows // 3]
+        directions, widths = [], []
+        for each in vectors:
+            _, sizes, along = np.linalg.svd(each, full_matrices=False)
+            size = 2.0 * sizes / math.sqrt(len(each))
+            directions.append(along.T)
+            widths.append(np.maximum(size, _LEAST_WIDTH * max(float(size.max()), _LEAST_WIDTH)))
+        return PathWidths(tuple(directions), tuple(widths))
+
+    @cached_property
+    def whitening(self) -> Array:
+        """Matrix (m, m) that divides a twist by the widths."""
+        result = np.zeros((3 * len(self.widths), 3 * len(self.widths)))
+        for k, (directions, widths) in enumerate(zip(self.directions, self.widths, strict=True)):
+            result[3 * k : 3 * k + 3, 3 * k : 3 * k + 3] = (directions / widths) @ directions.T
+        return result
+
+    def log_density(self, count: int) -> float:
+        """Return the log prior of widths and directions, times the uncertainty that ``count`` knots leave."""
+        log = 0.0
+        for widths in self.widths:
+            log += _LOG_WIDTH * len(widths)
+            for i, j in ((0, 1), (0, 2), (1, 2)):
+                information = count * (widths[i] / widths[j] - widths[j] / widths[i]) ** 2
+                log -= max(0.0, math.log(_ANGLES) + 0.5 * math.log(max(information, 1e-9) / math.tau))
+        return log
+
+    def scaled(self, unit: float) -> Self:
+        """Return the widths with lengths in another unit, which is smaller by a factor."""
+        return replace(self, widths=(unit * self.widths[0], *self.widths[1:]))
+
+
+@dataclass(frozen=True, eq=False)
+class CurveMotion:
+    """Curve through poses at equidistant knots. Lengths are in a unit, see :mod:`.scale`.
+
+    Attributes
+    ----------
+    rows
+        6 for poses, 3 for positions.
+    spline
+        The knots.
+    positions, quaternions
+        Positions (K, 3) and unit quaternions (K, 4) at the knots. Successive quaternions are on one half of
+        the sphere.
+    across
+        Twists by which the parameters move each knot, (K, m, m - 1).
+    widths
+        Widths of the prior.
+    lever
+        Length ℓ of a rotation by one radian.
+    """
+
+    rows: int
+    spline: NaturalSpline
+    positions: Array
+    quaternions: Array
+    across: Array
+    widths: PathWidths
+    lever: float = LEVER
+
+    name = CURVE
+    joints = 1
+    kinds = (0,)
+
+    @staticmethod
+    def through(
+        rows: int,
+        spline: NaturalSpline,
+        positions: Array,
+        quaternions: Array,
+        widths: PathWidths,
+        lever: float = LEVER,
+    ) -> CurveMotion:
+        """Return the curve through poses at the knots."""
+        quaternions = unit_vector(quaternions)
+        motion = CurveMotion(
+            rows,
+            spline,
+            positions,
+            quaternions,
+            np.zeros((spline.count, rows, 0)),
+            widths,
+            lever,
+        )
+        tangents = motion.linearise(spline.knots[:, None]).by_joints[:, :, 0] * motion.lengths
+        *_, directions = np.linalg.svd(tangents[:, None, :])
+        across = np.swapaxes(directions[:, 1:], 1, 2)
+        # Directions of neighbours are aligned, so that a common step moves the curve without bending it.
+        for k in range(1, spline.count):
+            u, _, vt = np.linalg.svd(across[k].T @ across[k - 1])
+            across[k] = across[k] @ u @ vt
+        return replace(motion, across=across / motion.lengths[:, None])
+
+    @cached_property
+    def lengths(self) -> Array:
+        """Length of a unit of each component of a twist, (m,)."""
+        return np.array([1.0] * 3 + [self.lever] * 3)[: self.rows]
+
+    @property
+    def size(self) -> int:
+        """Number of parameters."""
+        return self.spline.count * (self.rows - 1)
+
+    @property
+    def length(self) -> float:
+        """Length of the curve between its end knots."""
+        return self.spline.last - self.spline.first
+
+    def linearise(self, values: Array) -> LinearisedPoses:
+        """Return the poses at joint values (N, 1) and their derivatives."""
+        weights, rates = self.spline.weights(values[:, 0])
+        count = len(values)
+        positions = weights @ self.positions
+        by_knots = weights[:, :, None, None] * self.across
+        if self.rows == 3:
+            pose = transform(np.tile(np.eye(3), (count, 1, 1)), positions)
+            by_joints = (rates @ self.positions)[:, :, None]
+            return LinearisedPoses(pose, _in_rows(by_knots), by_joints)
+        mixed = weights @ self.quaternions
+        squared = np.sum(mixed**2, axis=1)
+        omega = 2.0 * _quotient(rates @ self.quaternions, mixed)[:, :3] / squared[:, None]
+        ratio = _quotient(self.quaternions[None], mixed[:, None]) / squared[:, None, None]
+        turned = ratio[:, :, 3, None, None] * np.eye(3) - skew(ratio[:, :, :3])
+        by_knots[:, :, 3:] = turned @ by_knots[:, :, 3:]
+        by_joints = np.concatenate([rates @ self.positions, omega], axis=1)[:, :, None]
+        return LinearisedPoses(transform(quaternion(mixed), positions), _in_rows(by_knots), by_joints)
+
+    def retract(self, step: Array) -> Self:
+        """Return the curve after a step in the parameters."""
+        moved = (self.across @ step.reshape(self.spline.count, self.rows - 1, 1))[:, :, 0]
+        positions = self.positions + moved[:, :3]
+        if self.rows == 3:
+            return replace(self, positions=positions)
+        half = np.concatenate([0.5 * moved[:, 3:], np.ones((len(moved), 1))], axis=1)
+        quaternions = unit_vector(_product(half, self.quaternions))
+        return replace(self, positions=positions, quaternions=quaternions)
+
+    def retract_joints(self, values: Array, step: Array) -> Array:
+        """Return joint values after a step of at most a distance of two knots, not far beyond the ends."""
+        most = self.spline.step
+        moved = values + np.clip(step, -most, most)
+        return np.asarray(np.clip(moved, self.spline.first - most, self.spline.last + most))
+
+    def prior(self) -> ParameterPrior:
+        """Return the Gaussian prior of second differences and of the difference between the ends."""
+        count, rows, each = self.spline.count, self.rows, self.rows - 1
+        by = np.zeros((count - 1, rows, count, each))
+        steps = np.arange(count - 1)
+        by[steps, :, steps] = -self.across[:-1]
+        by[steps, :, steps + 1] = self.across[1:]
+        whitening, bend = self.widths.whitening, min(1.0, _CURVATURE / (count - 1) ** 2)
+        residuals = np.concatenate(
+            [np.diff(self._differences, axis=0) / bend, self._differences.sum(0)[None]]
+        )
+        derivatives = np.concatenate([np.diff(by, axis=0) / bend, by.sum(axis=0)[None]])
+        by_parameters = np.einsum("ij,njke->nike", whitening, derivatives)
+        return ParameterPrior((residuals @ whitening).ravel(), by_parameters.reshape(-1, self.size))
+
+    def log_prior(self, mean: Array) -> tuple[float, Array]:
+        """Return the log prior of the curve beyond a mean pose, and no precision."""
+        count, each = self.spline.count, self.rows - 1
+        prior = self.prior()
+        # The mean pose is the one half-way between the ends, which move by half of their difference each.
+        shape = np.eye(self.size)[:, each:]
+        shape[:each, -each:] = -0.5 * np.eye(each)
+        shape[-each:, -each:] = 0.5 * np.eye(each)
+        by_shape = prior.by_parameters @ shape
+        log = 0.5 * float(np.linalg.slogdet(by_shape.T @ by_shape / math.tau)[1])
+        log -= 0.5 * float(prior.residuals @ prior.residuals)
+        # Volume of mean poses per unit of the steps that move them.
+        moves = np.concatenate([self.across[count // 2], self.linearise(mean[None, :]).by_joints[0]], axis=1)
+        log += float(np.linalg.slogdet(moves)[1])
+        log += self.widths.log_density(count) + _LOG_KNOT * count - _log_sum_knots()
+        return log, np.zeros(self.size + 1)
+
+    def named_parameters(self) -> dict[str, Array | float]:
+        """Return the parameters by name."""
+        return {
+            "length": self.length,
+            "knots": self.spline.knots,
+            "poses": transform(quaternion(self.quaternions), self.positions),
+        }
+
+    def coordinates(self) -> tuple[str, ...]:
+        """Return the names of the parameters: each knot moves in several directions across the curve."""
+        return tuple(f"knot{k}.{j}" for k in range(self.spline.count) for j in range(self.rows - 1))
+
+    def expression(self, joint: Expression) -> Expression:
+        """Return the pose of the child in the parent as an expression of the joint value."""
+        place = translation(*self._splines(joint, self.positions))
+        if self.rows == 3:
+            return place
+        return place @ rotation_of_quaternion(*self._splines(joint, self.quaternions))
+
+    def scaled(self, unit: float) -> Self:
+        """Return the curve with lengths in another unit, which is smaller by a factor."""
+        knots = replace(self.spline, first=unit * self.spline.first, step=unit * self.spline.step)
+        across = self.across.copy()
+        across[:, 3:] /= unit
+        return replace(
+            self,
+            spline=knots,
+            positions=unit * self.positions,
+            across=across,
+            widths=self.widths.scaled(unit),
+            lever=unit * self.lever,
+        )
+
+    def _splines(self, joint: Expression, values: Array) -> Sequence[Expression]:
+        slopes = self.spline.knot_slopes @ values
+        knots = self.spline.knots.tolist()
+        return [
+            spline(joint, knots, v.tolist(), slopes=(float(s[0]), float(s[-1])))
+            for v, s in zip(values.T, slopes.T, strict=True)
+        ]
+
+    @cached_property
+    def _differences(self) -> Array:
+        """Twists from each knot to the next, (K - 1, m)."""
+        moved = np.diff(self.positions, axis=0)
+        if self.rows == 3:
+            return moved
+        turns = quaternion(self.quaternions)
+        return np.concatenate([moved, log_so3(turns[1:] @ np.swapaxes(turns[:-1], 1, 2))], axis=1)
+
+
+def _log_sum_knots() -> float:
+    return math.log(sum(math.exp(_LOG_KNOT * count) for count in KNOTS))
+
+
+def aligned_quaternions(rotations: Array) -> Array:
+    """Return unit quaternions of rotations (N, 3, 3), each on the half of the sphere of the one before."""
+    result = to_quaternion(rotations)
+    signs = np.where(np.sum(result[1:] * result[:-1], axis=1) < 0.0, -1.0, 1.0)
+    result[1:] *= np.cumprod(signs)[:, None]
+    return result
+
+
+def _in_rows(by_knots: Array) -> Array:
+    """Return derivatives (N, K, m, n) by the parameters of each knot as (N, m, K n)."""
+    count, knots, rows, each = by_knots.shape
+    return np.ascontiguousarray(np.swapaxes(by_knots, 1, 2).reshape(count, rows, knots * each))
+
+
+def _product(a: Array, b: Array) -> Array:
+    """Return the products a ⊗ b of quaternions (..., 4), the scalar last."""
+    vector = a[..., 3:] * b[..., :3] + b[..., 3:] * a[..., :3] + np.cross(a[..., :3], b[..., :3])
+    scalar = a[..., 3:] * b[..., 3:] - np.sum(a[..., :3] * b[..., :3], axis=-1, keepdims=True)
+    return np.asarray(np.concatenate([vector, scalar], axis=-1))
+
+
+def _quotient(a: Array, b: Array) -> Array:
+    """Return a ⊗ b* of quaternions (..., 4), the scalar last."""
+    return _product(a, b * np.array([-1.0, -1.0, -1.0, 1.0]))

@@ -1,0 +1,406 @@
+"""Check of the most probable family: curves that are no joint, and residuals that refute the noise.
+
+The comparison of families assumes that one of them is right and that the noise is as stated. This module
+tests both. A one-coordinate curve is a family, too. As it takes long to fit, it is fitted only if the best
+family has several joint values, which may lie on one curve, or leaves residuals that the noise does not
+explain.
+
+**Stated noise.** If χ² of the best family refutes the noise, all families are compared again at the most
+probable larger size. If the best family has several joint values or is a curve, it may only have won because
+the noise is stated too small. So families are also compared for a noise of up to three times that size.
+
+**Unknown noise.** Residuals that vary slowly along the joint value show a joint of the wrong kind.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import replace
+from functools import partial
+from typing import NamedTuple
+
+import numpy as np
+
+from kineverse.errors import InvalidValueError
+from kineverse.lie import Array
+
+from .comparison import (
+    SAME_RATIO,
+    FamilySolution,
+    IdentificationData,
+    solve_families,
+    solve_with_inliers,
+    weigh_families,
+)
+from .curve import CURVE
+from .curve_fit import FEWEST_POSES, continue_curve, fit_curve, may_be_curve, stated_log_evidence
+from .custom_family import Family, FamilyMotion
+from .goodness_of_fit import GoodnessOfFit, measure_fit
+from .maximum_likelihood import Scored
+from .motion_model import FamilyMember
+from .observations import Observations
+from .optimise import Solution
+from .outlier_rejection import RowIndices, densest_half, log_inlier_prior
+from .projection import classify_inliers, project_observations
+from .result import SURE, Fit, IdentificationResult, LazyFit
+from .solver import solver
+from .unknown_noise import (
+    STATED_NOISE,
+    NoisePosterior,
+    NoiseSolution,
+    adapt_noise,
+    estimate_noise,
+    scale_noise,
+)
+
+REFUTED = 1e-3
+"""Largest probability of χ² at which the noise is refuted."""
+
+CALIBRATED = 1.2
+"""Largest size of the residuals relative to the stated noise that is no misfit, however many they are."""
+
+# Probability of χ² at a stated noise, and of slow residuals, at which a curve is tried.
+_DOUBTFUL, _SLOW = 5e-3, 5e-3
+# Sizes of the noise relative to the stated one, of a noise that is refuted and of one that is not, and the
+# standard deviation of the prior of their logarithms.
+_REFUTED_SCALES, _DOUBTED_SCALES = np.geomspace(1.0, 100.0, 41), np.geomspace(1.0, 3.0, 9)
+_SCALE_SPREAD = math.log(1.6)
+# Size of a simple joint's residuals relative to those of a curve up to which correlated errors may explain
+# them.
+_CORRELATED = 2.0
+# Least probability of χ² of a curve, or its largest size of residuals relative to those of the best family,
+# and least probability of the curve, at which the joint values of that family are said to lie on a curve.
+_FITTING, _FITTING_FACTOR, _COMPETITIVE = 1e-3, 1.3, 1e-6
+# Number of observations up to which joint values are judged by the angles between their steps, and the cosine
+# of the largest median angle of a smooth path. That of independent values is beyond a right angle.
+_FEW, _SMOOTH = 20, math.cos(math.radians(45.0))
+# Probability of slow residuals, and their share in χ², that refute a joint of unknown noise.
+_SYSTEMATIC, _SYSTEMATIC_SHARE = 1e-3, 0.7
+# Largest number of classifications of outliers.
+_ROUNDS = 3
+
+Solutions = Mapping["str | Family", FamilySolution]
+
+
+class CheckedComparison(NamedTuple):
+    """Result of a comparison that is checked, and the solution of the curve if one was fitted."""
+
+    result: IdentificationResult
+    curve: FamilySolution | None
+
+
+def weigh_and_check(
+    data: IdentificationData,
+    solutions: Solutions,
+    weights: Mapping[str | Family, float],
+    before: FamilySolution | None = None,
+) -> CheckedComparison:
+    """Return the fits of all families with their probabilities, and the reason if the best is not sure.
+
+    Parameters
+    ----------
+    data
+        The observations and assumptions.
+    solutions
+        Solutions of all families but the curve.
+    weights
+        Prior weights of all families.
+    before
+        Solution of the curve for fewer observations.
+
+    Raises
+    ------
+    InvalidValueError
+        If the curve is the only family, and the observations are too few for one.
+    """
+    found = weigh_families(data, solutions, weights) if solutions else None
+    curve, is_online = None, before is not None
+    is_sure = found is not None and not is_doubtful(data, found, solutions)
+    if CURVE in weights and not is_sure:
+        curve = solve_curve(data, solutions, before)
+        if curve is not None:
+            solutions = {**solutions, CURVE: curve}
+            found = weigh_families(data, solutions, weights)
+    if found is None:
+        raise InvalidValueError(
+            f"A curve takes {FEWEST_POSES} poses at least that are not equal, and there are "
+            f"{len(data.observations)}. Give more poses or other families."
+        )
+    reason = ""
+    if not is_sure and data.stated:
+        name = _best_name(found, solutions)
+        solution = solutions[name].scored.solution
+        fit = measure_fit(solution, observation_weight=data.observation_weight)
+        if fit.p_value < REFUTED and fit.factor > CALIBRATED:
+            factor = _best_scale(data, solutions, weights, _REFUTED_SCALES)[1]
+            return CheckedComparison(_compare_refuted(data, solutions, weights, factor, "", is_online), curve)
+        if solution.motion.joints > 1 or name == CURVE:
+            other, factor, logs = _best_scale(data, solutions, weights, _DOUBTED_SCALES)
+            if other != name and factor > CALIBRATED:
+                if logs[other] - logs[name] > math.log(SURE / (1.0 - SURE)):
+                    best = solution.motion.name
+                    return CheckedComparison(
+                        _compare_refuted(data, solutions, weights, factor, best, is_online), curve
+                    )
+                reason = (
+                    f"with {factor:.1f} times the stated noise it would be "
+                    f"{solutions[other].scored.solution.motion.name}"
+                )
+    found = replace(found, reason=reason or next(_reasons(data, found, solutions), ""))
+    if curve is None and CURVE in weights and may_be_curve(data.observations):
+        later = LazyFit(CURVE, 0.0, partial(fit_of_curve, data, solutions, weights))
+        found = replace(found, lazy_fits=(*found.lazy_fits, later))
+    return CheckedComparison(found, curve)
+
+
+def without_curve(weights: Mapping[str | Family, float]) -> dict[str | Family, float]:
+    """Return the families that are solved in any case."""
+    return {name: weight for name, weight in weights.items() if name != CURVE}
+
+
+def solve_joints(
+    data: IdentificationData, weights: Mapping[str | Family, float]
+) -> dict[str | Family, FamilySolution]:
+    """Return the solutions of all families but the curve."""
+    joints = without_curve(weights)
+    return solve_with_inliers(data, joints) if joints else {}
+
+
+def solve_curve(
+    data: IdentificationData, solutions: Solutions, before: FamilySolution | None = None
+) -> FamilySolution | None:
+    """Return the most probable curve by its inliers; None if there are too few for one, or equal."""
+    observations, count = data.observations, len(data.observations)
+    everything = np.arange(count)
+    # Only an evidence by the same observations is comparable.
+    comparable = [one for one in solutions.values() if len(one.inliers) == count]
+    competitor = max((one.log_evidence for one in comparable), default=-math.inf)
+
+    def solve(rows: RowIndices) -> NoiseSolution | None:
+        some = observations if len(rows) == count else observations.select(rows)
+        if not may_be_curve(some):
+            return None
+        if before is not None and np.array_equal(before.inliers, rows[: len(before.inliers)]):
+            known = before.scored.solution
+            if data.stated:
+                return NoiseSolution(continue_curve(some, known), STATED_NOISE)
+            return adapt_noise(some, NoiseSolution(before.scored, before.noise), continue_curve)
+        orders = [
+            one.scored.solution.values[:, 0]
+            for one in solutions.values()
+            if one.scored.solution.motion.joints == 1 and np.array_equal(one.inliers, rows)
+        ]
+        return _fit_to_noise(data, some, orders, competitor)
+
+    solution = solve(everything)
+    if solution is None:
+        return None
+    best = FamilySolution(*solution, everything, count, 0.0)
+    if data.outliers is None:
+        return best
+    best = replace(best, log_prior=log_inlier_prior(data.outliers, count, count, observations.rows))
+    # A curve may pass through outliers that other families leave out.
+    some = [one for one in solutions.values() if len(one.inliers) < count]
+    if len(_classify(data, solution)) == count and not some:
+        return best
+    some.sort(key=lambda one: -one.log_evidence - one.log_prior)
+    for rows in (*(one.inliers for one in some[:1]), densest_half(observations)):
+        for _ in range(_ROUNDS):
+            solution = solve(rows)
+            if solution is None:
+                break
+            rows, used = _classify(data, solution), rows
+            if np.array_equal(rows, used):
+                break
+        if solution is not None and 2 * len(used) > count:
+            log_prior = log_inlier_prior(data.outliers, count, len(used), observations.rows)
+            other = FamilySolution(*solution, used, count, log_prior)
+            best = max(best, other, key=lambda one: one.log_evidence + one.log_prior)
+    return best
+
+
+def _fit_to_noise(
+    data: IdentificationData, observations: Observations, orders: Sequence[Array], competitor: float
+) -> NoiseSolution:
+    """Return the most probable curve through observations, at the noise that suits it best."""
+    latest: NoisePosterior | None = None
+
+    def log_evidence(solution: Solution[FamilyMember]) -> float:
+        nonlocal latest
+        if data.stated:
+            return stated_log_evidence(solution)
+        estimated = estimate_noise(observations, solution, latest)
+        latest = estimated.noise
+        return estimated.log_evidence
+
+    def fit(some: Observations) -> Scored:
+        free = solve_families(some, ["free"])["free"].solution
+        fitted = fit_curve(some, free.covariance, orders, log_evidence, competitor)
+        assert fitted is not None  # there are enough observations
+        return fitted
+
+    if data.stated:
+        return NoiseSolution(fit(observations), STATED_NOISE)
+    near = estimate_noise(observations, fit(observations).solution, latest)
+    position, orientation = near.noise.factors.tolist()
+    if not 1.0 / SAME_RATIO < position / orientation < SAME_RATIO:
+        scaled = scale_noise(observations, near.noise.factors)
+        near = estimate_noise(observations, fit(scaled).solution, near.noise)
+    return adapt_noise(observations, near, continue_curve)
+
+
+def is_doubtful(data: IdentificationData, found: IdentificationResult, solutions: Solutions) -> bool:
+    """Return True if a curve or a larger noise may explain the observations better than the best family."""
+    solution = solutions[_best_name(found, solutions)].scored.solution
+    if solution.motion.joints > 1:
+        return True
+    fit = measure_fit(solution, observation_weight=data.observation_weight)
+    return fit.slow_p_value < _SLOW or (data.stated and fit.p_value < _DOUBTFUL)
+
+
+def _compare_refuted(
+    data: IdentificationData,
+    solutions: Solutions,
+    weights: Mapping[str | Family, float],
+    factor: float,
+    otherwise: str,
+    is_online: bool,
+) -> IdentificationResult:
+    """Return the comparison at a larger size of the noise than was stated.
+
+    Parameters
+    ----------
+    data, solutions, weights
+        As for :func:`weigh_and_check`.
+    factor
+        The size relative to the stated one.
+    otherwise
+        The best family for the stated noise; empty if its residuals refute that noise.
+    is_online
+        True if the curve keeps its number of knots, to save time.
+    """
+    larger = replace(
+        data, observations=scale_noise(data.observations, np.full(2, factor)), noise_factor=factor
+    )
+    again = solve_joints(larger, weights)
+    if CURVE in solutions:
+        curve = solve_curve(larger, again, solutions[CURVE] if is_online else None)
+        if curve is not None:
+            again[CURVE] = curve
+    found = weigh_families(larger, again, weights)
+    misfit = factor * measure_fit(again[_best_name(found, again)].scored.solution).factor
+    reason = (
+        f"residuals are {factor if math.isnan(misfit) else misfit:.1f} times the stated noise: either the "
+        f"noise is larger, or this is {otherwise or 'none of these joints'}"
+    )
+    return replace(found, reason=reason)
+
+
+def _reasons(data: IdentificationData, found: IdentificationResult, solutions: Solutions) -> Iterator[str]:
+    """Yield the reasons for which the best family is not sure."""
+    name = _best_name(found, solutions)
+    if found.lazy_fits[0].probability < SURE:
+        return
+    solution = solutions[name].scored.solution
+    joints, curve = solution.motion.joints, solutions.get(CURVE)
+    covariance = solution.covariance
+    if name == CURVE:
+        own = measure_fit(solution, covariance.mean(axis=0))
+        for one in solutions.values():
+            other_solution = one.scored.solution
+            if one is not curve and other_solution.motion.joints <= 1:
+                ratio = measure_fit(other_solution, covariance.mean(axis=0)).factor / own.factor
+                if ratio < _CORRELATED:
+                    yield (
+                        f"residuals of {other_solution.motion.name} are only {ratio:.1f} times as large, "
+                        "which errors that are correlated would explain"
+                    )
+    elif joints > 1 and curve is not None and not isinstance(solution.motion, FamilyMotion):
+        fit = measure_fit(curve.scored.solution, covariance.mean(axis=0), data.observation_weight)
+        is_competitive = found.probabilities[CURVE] > _COMPETITIVE and _explains(fit, data.stated)
+        if is_competitive or _is_smooth(solution.values):
+            yield "its joint values lie on one curve"
+    elif not data.stated and joints == 1 and curve is not None:
+        fit = measure_fit(solution, observation_weight=data.observation_weight)
+        if fit.slow_p_value < _SYSTEMATIC and fit.slow_share > _SYSTEMATIC_SHARE:
+            yield "its residuals depend on the joint value, so this may be none of these joints"
+
+
+def _explains(fit: GoodnessOfFit, stated: bool) -> bool:
+    """Return True if a curve explains the observations as well as the noise allows."""
+    return fit.p_value > _FITTING if stated else fit.factor < _FITTING_FACTOR
+
+
+def _is_smooth(values: Array) -> bool:
+    """Return True if a few joint values (N, k), in their order, run along a smooth curve.
+
+    They are too few for a curve with as many knots as their path may need.
+    """
+    if len(values) > _FEW:
+        return False
+    steps = np.diff(values / np.maximum(values.std(axis=0), 1e-12), axis=0)
+    lengths = np.maximum(np.linalg.norm(steps, axis=1), 1e-12)
+    cosines = np.sum(steps[1:] * steps[:-1], axis=1) / (lengths[1:] * lengths[:-1])
+    return bool(np.median(cosines) > _SMOOTH)
+
+
+def _best_scale(
+    data: IdentificationData, solutions: Solutions, weights: Mapping[str | Family, float], scales: Array
+) -> tuple[str | Family, float, dict[str | Family, float]]:
+    """Return the best family, its size of the noise relative to the stated one, and the log evidences.
+
+    They are the evidences of all families with their prior, for a noise of unknown size.
+    """
+    prior = -0.5 * (np.log(scales) / _SCALE_SPREAD) ** 2
+    weight = data.observation_weight
+    at_scales = {
+        name: prior
+        + _log_evidences(one.scored.solution, scales, weight)
+        + weight * one.log_prior
+        + math.log(weights[name])
+        for name, one in solutions.items()
+    }
+    logs = {name: float(np.logaddexp.reduce(each)) for name, each in at_scales.items()}
+    best = max(logs, key=logs.__getitem__)
+    return best, float(scales[int(np.argmax(at_scales[best]))]), logs
+
+
+def _best_name(found: IdentificationResult, solutions: Solutions) -> str | Family:
+    family = found.lazy_fits[0].family
+    return next(name for name, one in solutions.items() if one.scored.solution.motion.name == family)
+
+
+def _log_evidences(solution: Solution[FamilyMember], scales: Array, weight: float) -> Array:
+    """Return the log evidence for each size of the noise relative to the stated one."""
+    covariance = solution.covariance
+    factors, parts = np.column_stack([scales, scales]), np.stack([covariance, 0.0 * covariance])
+    return solver.log_evidences(solution, factors, parts, weight)
+
+
+def _classify(data: IdentificationData, one: NoiseSolution) -> RowIndices:
+    """Return the indices of the inliers under a curve."""
+    assert data.outliers is not None
+    rows, solution = data.observations.rows, one.scored.solution
+    observations = scale_noise(data.observations, one.noise.factors)
+    projected = project_observations(solution.motion, solution.values, observations)
+    covariance = projected.covariance
+    if not data.stated:
+        # The median of χ² is about its degrees of freedom less 2/3, and half of the observations are inliers.
+        weighted = np.linalg.solve(covariance, projected.residuals[:, :, None])[:, :, 0]
+        median = float(np.median(np.sum(projected.residuals * weighted, axis=1)))
+        covariance = covariance * max(median / (rows - 1 - 2.0 / 3.0), 1e-12)
+    return np.flatnonzero(classify_inliers(projected.residuals, covariance, data.outliers, data.stated))
+
+
+def fit_of_curve(
+    data: IdentificationData,
+    solutions: Solutions,
+    weights: Mapping[str | Family, float],
+    before: FamilySolution | None = None,
+    probability: float = 0.0,
+) -> Fit:
+    """Return the fit of a curve whose probability is known."""
+    curve = solve_curve(data, solutions, before)
+    assert curve is not None  # there are enough observations
+    return replace(weigh_families(data, {CURVE: curve}, weights).best, probability=probability)

@@ -1,0 +1,102 @@
+"""Residuals that refute the stated noise, and joints without limits."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import pytest
+from scipy.stats import chi2, f
+from synthetic_recordings import JOINTS, recording
+
+import kineverse as kv
+from kineverse.estimation import Identifier, identify, pose_covariance
+from kineverse.estimation.identification.goodness_of_fit import chi_squared_tail, f_distribution_tail
+
+
+@pytest.mark.parametrize("family", ["revolute", "prismatic"])
+@pytest.mark.parametrize("rows", [6, 3], ids=["poses", "positions"])
+def test_noise_stated_at_half_its_size_is_a_misfit(family: str, rows: int) -> None:
+    seen = recording(family, count=24, position=0.006, orientation=0.02, seed=1)
+    child = seen.child if rows == 6 else seen.child[:, :3, 3]
+    found = identify(seen.parent, child, noise=pose_covariance(0.003, 0.01))
+    assert found.is_ambiguous
+    assert found.best.family == family
+    assert found.misfit == pytest.approx(2.0, rel=0.3)
+    assert "times the stated noise: either the noise is larger" in str(found)
+    # What is known of the joint is that of the larger noise.
+    right = identify(seen.parent, child, noise=seen.covariance)[family]
+    assert found.best.deviation("axis.x") == pytest.approx(right.deviation("axis.x"), rel=0.3)
+
+
+def test_a_free_motion_by_a_noise_stated_too_small_is_ambiguous() -> None:
+    seen = recording("spherical", count=20, position=0.009, orientation=0.03, seed=2)
+    found = identify(seen.parent, seen.child, noise=pose_covariance(0.003, 0.01))
+    assert found.is_ambiguous
+    assert "free" in str(found)
+    assert found.best.family == "spherical"
+
+
+def test_right_noise_is_no_misfit() -> None:
+    misfits = []
+    for seed in range(24):
+        family = ("revolute", "prismatic", "screw", "rigid", "revolute", "prismatic")[seed % 6]
+        seen = recording(family, count=8 + seed % 9, position=0.01, orientation=0.03, seed=seed)
+        child = seen.child if seed % 3 else seen.child[:, :3, 3]
+        found = identify(seen.parent, child, noise=seen.covariance)
+        assert not found.reason
+        if not math.isnan(found.misfit):
+            misfits.append(found.misfit)
+    assert np.median(misfits) == pytest.approx(1.0, abs=0.1)
+
+
+@pytest.mark.parametrize("family", ["planar", "spherical", "cylindrical", "free"])
+def test_joints_with_several_values_are_sure_if_these_lie_on_no_curve(family: str) -> None:
+    seen = recording(family, count=16, position=0.004, orientation=0.015, seed=0)
+    found = identify(seen.parent, seen.child, noise=seen.covariance)
+    assert (found.best.family, found.is_ambiguous) == (family, False)
+
+
+def test_outliers_are_no_misfit() -> None:
+    seen = recording("revolute", count=30, position=0.004, orientation=0.015, seed=3)
+    child = seen.child.copy()
+    child[[4, 9, 22], :3, 3] += 0.4
+    assert identify(seen.parent, child, noise=seen.covariance).is_ambiguous
+    found = identify(seen.parent, child, noise=seen.covariance, outliers=True)
+    assert (found.best.family, found.is_ambiguous) == ("revolute", False)
+    assert found.misfit == pytest.approx(1.0, abs=0.2)
+
+
+def test_identifier_says_a_misfit() -> None:
+    seen = recording("revolute", count=20, position=0.006, orientation=0.02, seed=4)
+    identifier = Identifier(noise=pose_covariance(0.003, 0.01))
+    for k, (a, b) in enumerate(zip(seen.parent, seen.child, strict=True), start=1):
+        identifier.add(a, b)
+        if k in (12, 20):
+            assert identifier.result.is_ambiguous
+    assert identifier.result.misfit == pytest.approx(2.0, rel=0.25)
+    assert identifier.result.best.family == "revolute"
+
+
+@pytest.mark.parametrize("family", JOINTS)
+@pytest.mark.parametrize("rows", [6, 3], ids=["poses", "positions"])
+def test_operation_without_limits_has_none(family: str, rows: int) -> None:
+    seen = recording(family, count=20, position=0.002, orientation=0.01, seed=5)
+    child = seen.child if rows == 6 else seen.child[:, :3, 3]
+    fit = identify(seen.parent, child, noise=seen.covariance, families=family).best
+    model = kv.Model()
+    with model.edit() as edit:
+        edit.add_frame("body", parent="world", transform=np.eye(4))
+        edit.apply(fit.operation("joint", "body", "part", as_point=True, limits=False), tag="learned")
+    joint = model.articulations["joint"]
+    assert not [name for name in model.constraints if name.startswith("joint")]
+    assert len(joint.home) == len(joint.coordinates)
+
+
+@pytest.mark.parametrize("freedom", [1.0, 5.0, 40.0, 2000.0])
+def test_tail_probabilities_agree_with_scipy(freedom: float) -> None:
+    for quantile in (0.5, 0.01, 1e-4):
+        squares = chi2.isf(quantile, freedom)
+        assert chi_squared_tail(squares, freedom) == pytest.approx(quantile, rel=0.7)
+        ratio = f.isf(quantile, freedom, 30.0)
+        assert f_distribution_tail(ratio, freedom, 30.0) == pytest.approx(quantile, rel=0.5)
