@@ -8,6 +8,7 @@ from dataclasses import dataclass
 from functools import partial
 
 import numpy as np
+import numpy.typing as npt
 
 from kineverse.errors import InvalidValueError, KineverseError
 from kineverse.estimation.robust import Outliers
@@ -402,6 +403,26 @@ class UpdateStep:
 
         start = before.replace_groups(initial.map(with_evidence), groups)
         return self.update(start, reading._replace(mask=mask), inputs)
+
+    def find_accepted(
+        self, mixture: GaussianSum, reading: Measurements, inputs: Array
+    ) -> npt.NDArray[np.bool_]:
+        """Return True for each group of which a component accepts a measurement as an inlier (groups,).
+
+        About a broad prior that need not be the best component: all outliers are as probable at first.
+        """
+        result = np.zeros(len(self.layout.groups), dtype=bool)
+        assert self.outliers is not None
+        for component, belief in enumerate(mixture.beliefs):
+            groups = mixture.groups(component, self._measured_groups(reading))
+            indices = [i for n in groups for i in self.layout.groups[n].observation_indices]
+            out = self.residuals.evaluate(belief.x, inputs)
+            for i, (error, _) in self.residuals.errors(out, reading, indices).items():
+                scale = float(reading.log_scale[i])
+                log_density = self.outliers.log_density(self.layout.observations[i], scale)
+                weight, _ = self.outliers.weigh(float(error @ error), scale, log_density)
+                result[self.layout.group_of[i]] |= weight > 0.5
+        return result
 
     def _solve_inliers(
         self, mixture: GaussianSum, reading: Measurements, inputs: Array, groups: list[int]

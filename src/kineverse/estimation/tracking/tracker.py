@@ -7,6 +7,7 @@ import math
 from collections import deque
 from collections.abc import Callable, Iterable, Mapping
 from dataclasses import replace
+from functools import partial
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -28,9 +29,14 @@ from .measurements import (
     build_measurement_models,
     list_observed,
     require_number,
-    require_positive,
 )
-from .process_noise import INITIAL_SPEED_TIME, Process, check_process, default_process_noise
+from .process_noise import (
+    INITIAL_SPEED_TIME,
+    Process,
+    check_process,
+    default_process_noise,
+    require_noise,
+)
 from .recent_poses import RecentPoses, collect_recent_poses
 from .recursion import Recursion
 from .residuals import Measurements
@@ -67,7 +73,7 @@ class Tracker:
     process_noise
         Process noise by speed or coordinate: the variance per second, or for ``process="velocity"`` the
         spectral density of the acceleration [m²/s³], [rad²/s³]. Others have that of furniture that a hand
-        moves, see :mod:`.process_noise`, and none for ``process="static"``.
+        moves, see :mod:`.process_noise`, and none for ``process="static"``. 0 for a part that never moves.
     outliers
         Outlier model: :class:`Outliers`, or True for the default one. None without outliers.
     locks
@@ -127,7 +133,7 @@ class Tracker:
         self._layout = layout
         self._update_step = UpdateStep(layout, limits, as_outliers(outliers), process == "velocity")
         process_model = self._update_step.process_model
-        noise = {process_model.speed(k): require_positive(k, v) for k, v in (process_noise or {}).items()}
+        noise = {process_model.speed(k): require_noise(k, v) for k, v in (process_noise or {}).items()}
         values = np.array([np.nan if s.value is None else s.value for s in layout.inputs])
         known = np.nan_to_num(values)
         given_values = GivenValues.read(self._update_step, start or {}, uncertainty or {})
@@ -206,7 +212,7 @@ class Tracker:
     def rebuild(self, model: ModelView | None = None) -> Tracker:
         """Return a tracker of an edited model with the same observations and options.
 
-        It starts anew, and repeats the recent updates.
+        It starts anew, and repeats the recent updates in the order of their times, without commands.
 
         Parameters
         ----------
@@ -220,7 +226,10 @@ class Tracker:
         """
         other = Tracker(self.model if model is None else model, self._observed, **self._options)
         inputs = {str(s): k for k, s in enumerate(self._layout.inputs)}
-        for stamp, reading, values in self._recent:
+        recent = list(self._recent)
+        if all(stamp is not None for stamp, _, _ in recent):
+            recent.sort(key=lambda one: one[0] or 0.0)
+        for stamp, reading, values in recent:
             known = {s: values[inputs[str(s)]] for s in other._layout.inputs if str(s) in inputs}
             other._update(reading, stamp, None, State(known))
         return other
@@ -242,7 +251,7 @@ class Tracker:
         uncertainty
             Standard deviations, as at construction; those of other given values are the initial ones.
         at
-            Time from now on [s]; it may be earlier than before. The time stays if None.
+            Time from now on [s]; the time stays if None. If it is earlier than before, :attr:`recent` is empty.
 
         Raises
         ------
@@ -258,7 +267,15 @@ class Tracker:
             anew = [tangent_space.tangent.index(v) for v in own] + list(values.deviations)
             spread = np.sqrt(np.diag(self.estimate.covariance))
             spread[anew] = first.deviations[anew]
-            first = replace(first, x=now.mixture.best.x.copy(), deviations=spread)
+            kept = {v: u for v, u in self.estimate.speeds.items() if v not in own}
+            variances = {v: self.estimate.deviation[v] ** 2 for v in kept}
+            first = replace(
+                first,
+                x=now.mixture.best.x.copy(),
+                deviations=spread,
+                speeds={**first.speeds, **kept},
+                speed_variances={**first.speed_variances, **variances},
+            )
             first = first.with_values(self._update_step, values)
             changed = {*values.coordinates, *values.speeds, *values.speed_deviations}
             changed |= {tangent_space.tangent[k] for k in values.deviations}
@@ -276,6 +293,8 @@ class Tracker:
         loss = TrackLoss(np.where(chosen, 0, now.loss.refuted), now.loss.is_lost & ~chosen)
         self._now = replace(now, mixture=mixture, loss=loss, stamp=stamp, reading=None)
         self._buffer.clear()
+        if stamp is not None and now.stamp is not None and stamp < now.stamp:
+            self._recent.clear()
         return self.estimate
 
     def predict(
@@ -305,11 +324,12 @@ class Tracker:
                 f"Time goes on: a step of {dt!r} s is none. Steps are finite and not negative."
             )
         speeds = self._read_commands(commands)
-        before = replace(self._now, inputs=self._recursion.read_inputs(self._now.inputs, inputs))
-        self._now = self._recursion.predict(before, dt, speeds)
+        before = self._now
+        known = self._recursion.read_inputs(before.inputs, inputs)
+        self._now = self._recursion.predict(replace(before, inputs=known), dt, speeds)
         if self._now.stamp is not None:
-            end = self._now.stamp
-            self._remember(before, end, speeds, lambda state: self._recursion.advance(state, end, speeds))
+            advance = partial(self._recursion.advance, speeds=speeds, inputs=copy.copy(inputs))
+            self._remember(before, self._now.stamp, partial(advance, stamp=self._now.stamp), advance)
         return self.estimate
 
     def _read_commands(self, commands: StateLike | None) -> dict[Symbol, float]:
@@ -396,6 +416,8 @@ class Tracker:
         commands: StateLike | None,
         inputs: StateLike | None,
     ) -> Estimate:
+        # The caller may use the arrays again, while late measurements repeat the update.
+        reading = reading._replace(values=reading.values.copy(), mask=reading.mask.copy())
         native = self._update_step.native
         if native is None or not native.are_rigid(reading):
             self._update_step.reader.check_poses(reading)
@@ -406,10 +428,9 @@ class Tracker:
             self._read_commands(commands),
             self._now,
         )
-
-        def apply(state: TrackerState) -> TrackerState:
-            return self._recursion.update(state, reading, stamp, speeds, inputs)
-
+        apply = partial(
+            self._recursion.update, reading=reading, stamp=stamp, speeds=speeds, inputs=copy.copy(inputs)
+        )
         if stamp is not None and before.stamp is not None and stamp < before.stamp:
             if not self._buffer.lag:
                 raise InvalidValueError(
@@ -419,24 +440,22 @@ class Tracker:
             self._now = self._buffer.insert(stamp, apply)
         else:
             self._now = apply(before)
-            if stamp is not None:
-                self._remember(before, stamp, speeds, apply)
-        values = reading.values.copy()
-        self._recent.append(
-            (stamp, reading._replace(values=values, mask=reading.mask.copy()), self._now.inputs)
-        )
+            if self._now.stamp is not None:
+                self._remember(
+                    before, self._now.stamp, apply, partial(self._recursion.advance, speeds=speeds)
+                )
+        self._recent.append((stamp, reading, self._now.inputs))
         return self.estimate
 
     def _remember(
         self,
         before: TrackerState,
         stamp: float,
-        speeds: Mapping[Symbol, float],
         apply: Callable[[TrackerState], TrackerState],
+        predict: Callable[[TrackerState, float], TrackerState],
     ) -> None:
         if self._buffer.lag:
-            step = Step(stamp, before, apply, lambda state, to: self._recursion.advance(state, to, speeds))
-            self._buffer.append(step)
+            self._buffer.append(Step(stamp, before, apply, predict))
 
     def __repr__(self) -> str:
         sizes = f"{len(self.symbols)} coordinates in {len(self.groups)} groups"
