@@ -90,7 +90,7 @@ class FixedLag(Generic[State]):
         began = later[0].before.stamp if later else math.inf
         if began is not None and began > stamp:
             raise InvalidValueError(
-                f"A measurement at {stamp:g} s is from before the start or a reset of the tracker: leave it out."
+                f"A measurement at {stamp:g} s is from before the start or a reset: leave it out."
             )
         predict, state = later[0].predict, later[0].before
         steps = [one for one in self._steps if one.stamp <= stamp]

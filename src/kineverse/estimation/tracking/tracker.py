@@ -8,6 +8,7 @@ from collections import deque
 from collections.abc import Callable, Iterable, Mapping
 from dataclasses import replace
 from functools import partial
+from numbers import Integral
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -28,6 +29,7 @@ from .measurements import (
     ObservedLike,
     build_measurement_models,
     list_observed,
+    require_mapping,
     require_number,
 )
 from .process_noise import (
@@ -127,16 +129,23 @@ class Tracker:
         check_process(process)
         _check_counts(lost_after, keep, lag)
         keys = (inputs,) if isinstance(inputs, str | Symbol) else inputs
+        if not isinstance(keys, Iterable):
+            raise InvalidValueError(f"inputs= has names of coordinates, not {inputs!r:.80}.")
         given = frozenset(k if isinstance(k, Symbol) else model.symbol(k) for k in keys)
         layout, limits = arrange_state(model, build_measurement_models(model, self._observed), given)
         self.model = model
         self._layout = layout
         self._update_step = UpdateStep(layout, limits, as_outliers(outliers), process == "velocity")
         process_model = self._update_step.process_model
-        noise = {process_model.speed(k): require_noise(k, v) for k, v in (process_noise or {}).items()}
+        given_noise = require_mapping({} if process_noise is None else process_noise, "process_noise=")
+        noise = {process_model.speed(k): require_noise(k, v) for k, v in given_noise.items()}
         values = np.array([np.nan if s.value is None else s.value for s in layout.inputs])
         known = np.nan_to_num(values)
-        given_values = GivenValues.read(self._update_step, start or {}, uncertainty or {})
+        given_values = GivenValues.read(
+            self._update_step,
+            {} if start is None else start,
+            {} if uncertainty is None else uncertainty,
+        )
         first = make_initial_belief(model, self._update_step, given_values, known)
         noise = {**default_process_noise(self._update_step, process, first.x, known), **noise}
         variances = {v: INITIAL_SPEED_TIME * q for v, q in noise.items()}
@@ -251,7 +260,7 @@ class Tracker:
         uncertainty
             Standard deviations, as at construction; those of other given values are the initial ones.
         at
-            Time from now on [s]; the time stays if None. If it is earlier than before, :attr:`recent` is empty.
+            Time from now on [s]; the time stays if None. If it is earlier, :attr:`recent` is emptied.
 
         Raises
         ------
@@ -260,9 +269,10 @@ class Tracker:
         """
         tangent_space, now = self._layout.tangent_space, self._now
         stamp = now.stamp if at is None else _require_time(at)
-        values = GivenValues.read(self._update_step, start or {}, uncertainty or {})
+        start, uncertainty = ({} if given is None else given for given in (start, uncertainty))
+        values = GivenValues.read(self._update_step, start, uncertainty)
         first, groups = self._recursion.first, list(range(len(self._layout.groups)))
-        if start or uncertainty:
+        if len(start) or len(uncertainty):
             own = {x.derivative() for x in values.coordinates} & {*tangent_space.tangent}
             anew = [tangent_space.tangent.index(v) for v in own] + list(values.deviations)
             spread = np.sqrt(np.diag(self.estimate.covariance))
@@ -334,7 +344,7 @@ class Tracker:
 
     def _read_commands(self, commands: StateLike | None) -> dict[Symbol, float]:
         speeds = {}
-        for key, value in (commands or {}).items():
+        for key, value in require_mapping({} if commands is None else commands, "commands=").items():
             speed = require_number(value, f"The commanded speed '{key}'")
             if not math.isfinite(speed):
                 raise InvalidValueError(f"The commanded speed '{key}' is {value!r}; it must be finite.")
@@ -471,7 +481,7 @@ def _require_time(at: Any) -> float:
 
 def _check_counts(lost_after: int, keep: int, lag: float) -> None:
     for name, count in (("lost_after", lost_after), ("keep", keep)):
-        if not isinstance(count, int) or count < 1:
+        if not isinstance(count, Integral) or count < 1:
             raise InvalidValueError(f"{name}= is a number of updates, at least 1, not {count!r}.")
     if not (math.isfinite(require_number(lag, "The lag")) and lag >= 0):
-        raise InvalidValueError(f"lag= is a number of seconds that is not negative, not {lag!r}.")
+        raise InvalidValueError(f"lag= is a finite number of seconds, not negative, not {lag!r}.")
