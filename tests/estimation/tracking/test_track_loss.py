@@ -358,3 +358,19 @@ def test_numbers_beyond_floating_point_are_refused(outliers):
             step()
     assert tracker.estimate.state == before.state
     assert tracker.estimate.stamp == 0.0
+
+
+def test_a_reset_quaternion_is_as_uncertain_as_at_the_start():
+    model = kv.Model()
+    with model.edit() as edit:
+        edit.apply(kv.Floating(name="box", parent="world", child="box"))
+    for process in ("position", "velocity"):
+        tracker = Tracker(model, ["box"], process=process)
+        for k in range(5):
+            before = tracker.update({"box": kv.rotation_z(1.0)()}, at=k / 30)
+        after = tracker.reset({"box/qw": 1.0, "box/qz": 0.0})
+        turns = [k for k, v in enumerate(after.tangent) if str(v).startswith("box/w")]
+        np.testing.assert_allclose(np.sqrt(np.diag(after.covariance))[turns], np.pi)
+        assert after.deviation["box/x"] == pytest.approx(before.deviation["box/x"])
+        found = tracker.update({"box": kv.rotation_z(1.0)()}).state
+        assert 2 * np.arctan2(found["box/qz"], found["box/qw"]) == pytest.approx(1.0, abs=1e-3)

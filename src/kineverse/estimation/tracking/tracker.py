@@ -273,7 +273,8 @@ class Tracker:
         values = GivenValues.read(self._update_step, start, uncertainty)
         first, groups = self._recursion.first, list(range(len(self._layout.groups)))
         if len(start) or len(uncertainty):
-            own = {x.derivative() for x in values.coordinates} & {*tangent_space.tangent}
+            own = {v for x in values.coordinates for v in tangent_space.rate_row(x)}
+            own &= {*tangent_space.tangent}
             anew = [tangent_space.tangent.index(v) for v in own] + list(values.deviations)
             spread = np.sqrt(np.diag(self.estimate.covariance))
             spread[anew] = first.deviations[anew]
