@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -54,11 +54,11 @@ class Outliers:
     gate: float | None = None
 
     def __post_init__(self) -> None:
-        if not 0 < self.fraction < 1:
+        if not 0 < _as_number(self.fraction) < 1:
             raise InvalidValueError(f"The fraction of outliers is between 0 and 1, not {self.fraction!r}.")
-        if not (math.isfinite(self.reach) and self.reach > 0):
+        if not (math.isfinite(_as_number(self.reach)) and self.reach > 0):
             raise InvalidValueError(f"The reach of outliers is positive and finite, not {self.reach!r}.")
-        if self.gate is not None and not (math.isfinite(self.gate) and self.gate > 0):
+        if self.gate is not None and not (math.isfinite(_as_number(self.gate)) and self.gate > 0):
             raise InvalidValueError(
                 f"The gate of outliers is a positive number of standard deviations, not {self.gate!r}."
             )
@@ -97,6 +97,14 @@ class Outliers:
         outlier = log_density + log_scale
         total = float(np.logaddexp(inlier, outlier))
         return math.exp(inlier - total), -total
+
+
+def _as_number(given: Any) -> float:
+    """Return a float; NaN for what is none."""
+    try:
+        return float(given)
+    except (TypeError, ValueError):
+        return math.nan
 
 
 def cauchy_weight(square: float, size: int) -> float:

@@ -148,3 +148,40 @@ def test_initial_speeds_are_given_by_name():
     for wrong in ({"start": {"a:velocity": 1.0}}, {"uncertainty": {"a:velocity": 1.0}}):
         with pytest.raises(UnknownNameError, match="'a:velocity' is not estimated"):
             Tracker(make_slides(), ["cart"], **wrong)
+
+
+def test_compiled_and_numpy_predictions_agree_at_a_limit():
+    """A door hits its limit at speed: the predicted state stays inside."""
+    model, trackers = kv.Model(), []
+    with model.edit() as edit:
+        edit.apply(kv.Revolute(name="q", parent="world", child="door", axis=(0, 0, 1), lower=0, upper=1.5))
+    for compiled in (True, False):
+        tracker = Tracker(model, ["door"], process="velocity")
+        if compiled and not tracker.wait():
+            pytest.skip("there is no compiler")
+        if not compiled:
+            tracker._update_step.native = None
+        observer = NoisyObserver(model, ["door"])
+        for k in range(20):
+            tracker.update(observer({"q": min(1.5, 1.1 + 0.03 * k)}), at=k / 30)
+        trackers.append(tracker)
+    for _ in range(3):
+        one, other = (tracker.predict(0.2) for tracker in trackers)
+        assert one.state["q"] <= 1.5
+        assert one.state["q"] == pytest.approx(other.state["q"])
+        np.testing.assert_allclose(one.mean, other.mean, atol=1e-9)
+        assert one.state["q:velocity"] == pytest.approx(other.state["q:velocity"], abs=1e-9)
+        np.testing.assert_allclose(one.covariance, other.covariance, rtol=1e-9)
+
+
+def test_a_reset_keeps_the_speeds_of_other_coordinates():
+    a, b = kv.position("a"), kv.position("b")
+    observed = ObservedExpression("z", kv.array([a + b, a - b]), 0.01 * np.eye(2))
+    tracker = Tracker(make_slides(), [observed], process="velocity")
+    for k in range(30):
+        before = tracker.update({"z": np.array([0.2 * k, -0.2 * k])}, at=0.1 * k)
+    after = tracker.reset({"a": 1.0}, uncertainty={"a": 0.1})
+    assert after.state["b:velocity"] == before.state["b:velocity"]
+    assert before.state["b:velocity"] > 1.0
+    assert after.deviation["b:velocity"] == pytest.approx(before.deviation["b:velocity"])
+    assert after.state["a:velocity"] == 0.0

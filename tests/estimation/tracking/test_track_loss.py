@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import pickle
+
 import numpy as np
 import pytest
 from scipy.stats import chi2
@@ -244,3 +246,133 @@ def test_recent_poses_and_a_rebuilt_tracker():
     assert tracker.estimate.state["q"] > 0.5
     assert again.estimate.state["q"] == pytest.approx(0.2)
     assert again.estimate.stamp == tracker.estimate.stamp
+
+
+def make_cart_pose(x: float) -> np.ndarray:
+    pose = np.eye(4)
+    pose[0, 3] = x
+    return pose
+
+
+def test_a_free_body_that_jumped_is_found_again():
+    """Its broad prior explains a pose no better than an outlier does; two poses that agree decide."""
+    model = kv.Model()
+    with model.edit() as edit:
+        edit.apply(kv.Floating(name="box", parent="world", child="box"))
+    tracker, rng, lost = Tracker(model, ["box"], outliers=True), np.random.default_rng(0), []
+    for k in range(40):
+        pose = kv.rotation_x(2.5 * (k >= 20))()
+        pose[:3, 3] = (3.0 * (k >= 20), 0, 0) + 0.005 * rng.standard_normal(3)
+        estimate = tracker.update({"box": pose}, at=k / 30)
+        lost.append(estimate.lost)
+    assert 1 <= sum(lost) <= 4
+    assert not lost[-1]
+    assert estimate.state["box/x"] == pytest.approx(3.0, abs=0.02)
+
+
+def test_late_measurements_repeat_all_that_happened():
+    """Updates without a time, steps with inputs, arrays that are used again, and the first two swapped."""
+    model, buffer = make_slide(), np.empty((1, 4, 4))
+    with model.edit() as edit:
+        edit.add_frame("box", parent="cart", transform=kv.translation(kv.position("p"), 0, 0))
+    looks = [(1.0, 0.1), (1.1, 0.2), (1.2, 0.4), (None, 0.6), (1.3, 0.5)]
+    found = []
+    for order in ((0, 1, 2, 3, 4), (1, 0, 2, 3, 4), (0, 2, 3, 4, 1)):
+        tracker = Tracker(model, ["box"], lag=0.5, inputs=["p"], start={"a": 0.0})
+        for k in order:
+            at, x = looks[k]
+            buffer[0] = make_cart_pose(x)
+            given = {"p": 0.1 * (at is not None and at >= 1.2)}
+            estimate = tracker.update_poses(buffer, at=at, inputs=given)
+            if k == 4:
+                given = {"p": 0.3}
+                tracker.predict(0.2, inputs=given)
+                given["p"] = 9.0
+        tracker = pickle.loads(pickle.dumps(tracker))
+        estimate = tracker.update({"box": make_cart_pose(0.7)}, at=1.6)
+        found.append((estimate.state["a"], estimate.deviation["a"], estimate.log_evidence))
+    np.testing.assert_allclose(found[1:], [found[0]] * 2, rtol=1e-12)
+
+
+def test_a_measurement_is_repeated_only_within_its_time():
+    tracker, poses = Tracker(MODEL, ["hinge", "drawer"]), {"hinge": np.eye(4)}
+    tracker.update(poses, at=1.0)
+    tracker.update({"drawer": make_cart_pose(0.2)}, at=1.0)
+    with pytest.raises(InvalidValueError, match="'hinge' came twice"):
+        tracker.update(poses, at=1.0)
+    tracker.predict(0.5)
+    assert tracker.update(poses, at=1.5).stamp == 1.5
+
+
+def test_a_tracker_is_rebuilt_after_late_measurements_and_resets():
+    tracker = Tracker(make_slide(), ["cart"], lag=0.5, keep=3)
+    for at in (0.0, 0.1, 0.3, 0.2, 0.25):
+        tracker.update({"cart": make_cart_pose(at)}, at=at)
+    assert tracker.rebuild().estimate.stamp == 0.3
+    with pytest.raises(InvalidValueError, match="before the start or a reset"):
+        tracker.reset({"a": 0.1})
+        tracker.update({"cart": np.eye(4)}, at=0.29)
+    tracker.reset(at=0.0)
+    tracker.update({"cart": (make_cart_pose(0.1), 1e-6 * np.eye(6))}, at=0.1)
+    assert tracker.rebuild().estimate.stamp == 0.1
+    np.testing.assert_allclose(tracker.recent.covariances["cart"], 1e-6 * np.eye(6))
+
+
+def test_start_and_reset_stay_inside_limits():
+    tracker = Tracker(MODEL, ["hinge"], start={"q": 7.0})
+    assert tracker.estimate.state["q"] == 1.5
+    assert tracker.reset({"q": -7.0}).state["q"] == 0.0
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        ({"process_noise": {"q": -1.0}}, "or 0 for a part that never moves"),
+        ({"process_noise": 0.1}, "process_noise= is a mapping"),
+        ({"uncertainty": 0.1}, "uncertainty= is a mapping"),
+        ({"uncertainty": {"q": 1e-300}}, "too small for floating point"),
+        ({"inputs": 5}, "inputs= has names"),
+        ({"lag": np.inf}, "lag= is a finite number"),
+    ],
+)
+def test_invalid_options_say_what_to_give(options, message):
+    with pytest.raises(InvalidValueError, match=message):
+        Tracker(MODEL, ["hinge"], **options)
+
+
+def test_a_part_without_process_noise_never_moves():
+    for process in ("position", "velocity"):
+        tracker = Tracker(MODEL, ["hinge"], process=process, process_noise={"q": 0.0})
+        assert tracker.predict(10.0).deviation["q"] == pytest.approx(0.75)
+
+
+@pytest.mark.parametrize("outliers", [True, None])
+@pytest.mark.filterwarnings("ignore:overflow")
+def test_numbers_beyond_floating_point_are_refused(outliers):
+    tracker = Tracker(MODEL, ["hinge"], process="velocity", outliers=outliers)
+    before = tracker.update({"hinge": np.eye(4)}, at=0.0)
+    for step in (
+        lambda: tracker.update({"hinge": make_cart_pose(1e200)}, at=0.1),
+        lambda: tracker.update({"hinge": np.eye(4)}, at=1e300),
+        lambda: tracker.predict(1e10, {"q:velocity": 1e300}),
+    ):
+        with pytest.raises(InvalidValueError, match="floating point"):
+            step()
+    assert tracker.estimate.state == before.state
+    assert tracker.estimate.stamp == 0.0
+
+
+def test_a_reset_quaternion_is_as_uncertain_as_at_the_start():
+    model = kv.Model()
+    with model.edit() as edit:
+        edit.apply(kv.Floating(name="box", parent="world", child="box"))
+    for process in ("position", "velocity"):
+        tracker = Tracker(model, ["box"], process=process)
+        for k in range(5):
+            before = tracker.update({"box": kv.rotation_z(1.0)()}, at=k / 30)
+        after = tracker.reset({"box/qw": 1.0, "box/qz": 0.0})
+        turns = [k for k, v in enumerate(after.tangent) if str(v).startswith("box/w")]
+        np.testing.assert_allclose(np.sqrt(np.diag(after.covariance))[turns], np.pi)
+        assert after.deviation["box/x"] == pytest.approx(before.deviation["box/x"])
+        found = tracker.update({"box": kv.rotation_z(1.0)()}).state
+        assert 2 * np.arctan2(found["box/qz"], found["box/qw"]) == pytest.approx(1.0, abs=1e-3)

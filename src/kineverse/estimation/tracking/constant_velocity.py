@@ -131,8 +131,10 @@ class ConstantVelocity:
         noise
             Spectral density q of the acceleration of each other speed [m²/s³], [rad²/s³].
         """
-        for numbers in self._batches:
-            self._predict(numbers, belief, inputs, dt, commands, noise)
+        # Too long a step leads to numbers that are not finite, which the caller refuses.
+        with np.errstate(over="ignore", invalid="ignore"):
+            for numbers in self._batches:
+                self._predict(numbers, belief, inputs, np.float64(dt), commands, noise)
 
     def _predict(
         self,

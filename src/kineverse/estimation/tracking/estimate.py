@@ -37,7 +37,7 @@ class TrackerState:
     stamp
         Time [s]; None if the tracker was given none.
     reading
-        Last measurements; None before the first.
+        Latest measurements of this time, of each observation; None if there are none.
     """
 
     mixture: GaussianSum

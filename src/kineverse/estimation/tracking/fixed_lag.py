@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
 from dataclasses import dataclass
+from functools import partial
 from typing import Generic, Protocol, TypeVar
 
 from kineverse.errors import InvalidValueError
@@ -76,21 +78,31 @@ class FixedLag(Generic[State]):
         Raises
         ------
         InvalidValueError
-            If it comes later than the lag.
+            If it comes later than the lag, or is from before the start or a reset.
         """
         later = [one for one in self._steps if one.stamp > stamp]
-        began = later[0].before.stamp if later else None
-        newest = later[-1].stamp if later else stamp
-        if began is None or began > stamp or newest - stamp > self.lag:
+        if later and later[-1].stamp - stamp > self.lag:
             raise InvalidValueError(
                 f"A measurement at {stamp:g} s is later than the lag of {self.lag:g} s: leave it out, or "
                 "give the tracker a longer lag=."
             )
+        # A state without a time begins at the first measurement.
+        began = later[0].before.stamp if later else math.inf
+        if began is not None and began > stamp:
+            raise InvalidValueError(
+                f"A measurement at {stamp:g} s is from before the start or a reset: leave it out."
+            )
         predict, state = later[0].predict, later[0].before
         steps = [one for one in self._steps if one.stamp <= stamp]
-        late = Step(stamp, state, lambda before: apply(predict(before, stamp)), predict)
+        late = Step(stamp, state, partial(_apply_late, predict, stamp, apply), predict)
         for one in (late, *later):
             steps.append(Step(one.stamp, state, one.apply, one.predict))
             state = one.apply(state)
         self._steps = tuple(steps)
         return state
+
+
+def _apply_late(
+    predict: Callable[[State, float], State], stamp: float, apply: Callable[[State], State], before: State
+) -> State:
+    return apply(predict(before, stamp))

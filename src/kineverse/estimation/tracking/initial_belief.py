@@ -17,7 +17,7 @@ from kineverse.symbols import Symbol
 from .bounds import initial_deviations, initial_point
 from .gaussian import InformationState
 from .gaussian_sum import GaussianSum
-from .measurements import require_positive
+from .measurements import require_mapping, require_positive
 from .multi_start import find_periodic_coordinates, spread_starts
 from .step import UpdateStep
 
@@ -49,6 +49,10 @@ class InitialBelief:
         groups = len(update_step.layout.groups)
         belief = InformationState((len(self.x), len(self.deviations), groups))
         belief.x[:] = self.x
+        with np.errstate(over="ignore"):
+            variances = np.array([*self.deviations**2, *self.deviations**-2.0])
+        if not (np.isfinite(variances).all() and variances.all()):
+            raise InvalidValueError("An initial uncertainty is too large or too small for floating point.")
         belief.information[:] = np.diag(self.deviations**-2.0)
         if update_step.velocity is not None:
             update_step.velocity.initialise(belief, self.speeds, self.speed_variances)
@@ -58,7 +62,8 @@ class InitialBelief:
         """Return the belief with other values of some coordinates and speeds, and other deviations."""
         x, deviations = self.x.copy(), self.deviations.copy()
         for symbol, value in values.coordinates.items():
-            x[update_step.layout.tangent_space.coordinates.index(symbol)] = value
+            k = update_step.layout.tangent_space.coordinates.index(symbol)
+            x[k] = np.clip(value, update_step.limits.lower[k], update_step.limits.upper[k])
         for k, value in values.deviations.items():
             deviations[k] = value
         variances = {v: deviation**2 for v, deviation in values.speed_deviations.items()}
@@ -121,7 +126,7 @@ class GivenValues:
             names[str(v.position) if v.position in tangent_space.coordinates else str(v)] = k
         speed_names = {str(v): v for v in speeds if str(v) not in names}
         deviations, speed_deviations = {}, {}
-        for key, value in uncertainty.items():
+        for key, value in require_mapping(uncertainty, "uncertainty=").items():
             if str(key) in speed_names:
                 speed_deviations[speed_names[str(key)]] = require_positive(key, value)
             elif str(key) in names:

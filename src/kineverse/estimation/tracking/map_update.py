@@ -14,7 +14,7 @@ from typing import Literal, TypeAlias
 
 import numpy as np
 
-from kineverse.errors import ModelError
+from kineverse.errors import InvalidValueError, ModelError
 from kineverse.estimation.linear_algebra import inverse_spd
 from kineverse.estimation.robust import Outliers, cauchy_weight
 from kineverse.lie import Array
@@ -208,14 +208,19 @@ class MapSolver:
     ) -> None:
         """Accept the trial as the best iterate if it is better; otherwise increase the damping."""
         group = self._layout.groups[number]
-        with np.errstate(invalid="ignore"):  # a trial with an infinite Jacobian is rejected
+        # A trial with an infinite Jacobian is rejected.
+        with np.errstate(invalid="ignore", over="ignore"):
             measured = self._residuals.errors(out, reading, group.observation_indices)
-        squares = {i: float(e @ e) for i, (e, _) in measured.items()}
+            squares = {i: float(e @ e) for i, (e, _) in measured.items()}
         weighed = {i: self._robust_cost(i, square, reading, loss) for i, square in squares.items()}
         cost = iterate.trial_prior.cost + sum(each for _, each in weighed.values())
         is_finite = np.isfinite(cost) and all(np.isfinite(s).all() for _, s in measured.values())
         if not is_finite and iterate.rows is None:
             self._residuals.check(out, group.observation_indices)
+            names = ", ".join(map(str, group.coordinates))
+            raise InvalidValueError(
+                f"What was seen of {names} is too far away, or its covariance too small, for floating point."
+            )
         rows = self.group_bounds[number].rows(iterate.trial, out)
         if not is_finite or not _is_better(iterate, cost, rows):
             iterate.damping = max(10 * iterate.damping, 1e-3)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, TypeAlias
 
@@ -263,6 +263,19 @@ def require_number(given: Any, what: str) -> float:
         return float(given)
     except (TypeError, ValueError):
         raise InvalidValueError(f"{what} is a number, not {given!r:.80}.") from None
+
+
+def require_mapping(given: Any, what: str) -> Mapping[Any, Any]:
+    """Check values by name.
+
+    Raises
+    ------
+    InvalidValueError
+        If it is no mapping; ``what`` names the argument.
+    """
+    if not isinstance(given, Mapping):
+        raise InvalidValueError(f"{what} is a mapping {{name: number}}, not {given!r:.80}.")
+    return given
 
 
 def require_positive(key: object, given: Any) -> float:

@@ -98,7 +98,10 @@ class RateFlow:
         largest = float((self.is_varying * np.abs(self.rates(q, inputs))).sum(axis=0) @ np.abs(speeds))
         if not math.isfinite(largest) or largest > _MOST_STEPS * _LONGEST:
             names = ", ".join(map(str, self.coordinates))
-            raise InvalidValueError(f"{names} cannot be followed so far in one step.")
+            raise InvalidValueError(
+                f"{names} cannot be followed so far in one step: after a long time without measurements, "
+                "reset the tracker."
+            )
         count = max(1, math.ceil(largest / _LONGEST))
         by_start, by_speeds = np.eye(len(q)), np.zeros((len(q), len(speeds)))
         for _ in range(count):

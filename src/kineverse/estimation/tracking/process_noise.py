@@ -6,14 +6,17 @@ largest noise with which no observed frame moves by more.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping
-from typing import TYPE_CHECKING, Literal, TypeAlias
+from typing import TYPE_CHECKING, Any, Literal, TypeAlias
 
 import numpy as np
 
 from kineverse.errors import InvalidValueError, KineverseError, suggest
 from kineverse.lie import Array
 from kineverse.symbols import Symbol
+
+from .measurements import require_number
 
 if TYPE_CHECKING:
     from .step import UpdateStep
@@ -44,6 +47,23 @@ def check_process(process: str) -> None:
     known = (*PROCESSES, "static")
     if process not in known:
         raise InvalidValueError(f"There is no process {process!r}. {suggest(str(process), known, 'process')}")
+
+
+def require_noise(key: object, given: Any) -> float:
+    """Check the process noise of ``key``.
+
+    Raises
+    ------
+    InvalidValueError
+        If it is negative or not finite.
+    """
+    number = require_number(given, f"The process noise of '{key}'")
+    if not (math.isfinite(number) and number >= 0):
+        raise InvalidValueError(
+            f"The process noise of '{key}' is positive and finite, or 0 for a part that never moves, not "
+            f"{given!r}."
+        )
+    return number
 
 
 def default_process_noise(

@@ -24,7 +24,7 @@ class RecentPoses:
     poses
         Poses by name of the frame (N, 4, 4), in order; NaN where missing.
     covariances
-        Covariance of the error of each frame (6, 6).
+        Mean covariance of the errors of each frame (6, 6).
     times
         (N,) [s]; None if they have none.
     """
@@ -51,9 +51,13 @@ def collect_recent_poses(
     for i, one in poses.items():
         if one.relative_to == observer:
             measured[one.frame] = np.full((len(times), 4, 4), np.nan)
-            covariances[one.frame] = one.covariance
+            weights = []
             for row, (_, reading) in zip(rows.tolist(), readings, strict=True):
                 if reading.mask[i]:
                     pose = reading.values[layout.measurement_slices[i]].reshape(4, 4)
                     measured[one.frame][row] = pose
+                    weights.append(reading.whitening[layout.whitening_slices[i]].reshape(6, 6))
+            white: Array = np.array(weights).reshape(-1, 6, 6)
+            given = np.linalg.inv(white.transpose(0, 2, 1) @ white)
+            covariances[one.frame] = given.mean(axis=0) if weights else one.covariance
     return RecentPoses(observer, measured, covariances, times if has_times else None)

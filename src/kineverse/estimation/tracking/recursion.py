@@ -58,9 +58,11 @@ class Recursion:
 
     def predict(self, state: TrackerState, dt: float, speeds: Mapping[Symbol, float]) -> TrackerState:
         """Return the state after a time step [s] with commanded speeds."""
-        stamp = None if state.stamp is None else state.stamp + dt
-        if dt == 0.0 or not (speeds or self.noise):
-            return replace(state, stamp=stamp)
+        if dt == 0.0:
+            return state
+        state = replace(state, stamp=None if state.stamp is None else state.stamp + dt, reading=None)
+        if not (speeds or self.noise):
+            return state
 
         def moved(belief: InformationState) -> InformationState:
             moving, noise = speeds, self.noise
@@ -71,15 +73,24 @@ class Recursion:
                 moving = {v: speed for v, speed in speeds.items() if v in free} | held
             return self.update_step.predict(belief, state.inputs, dt, moving, noise)
 
-        return replace(state, mixture=state.mixture.map(moved), stamp=stamp)
+        return replace(state, mixture=state.mixture.map(moved))
 
     def advance(
-        self, state: TrackerState, stamp: float, speeds: Mapping[Symbol, float] | None = None
+        self,
+        state: TrackerState,
+        stamp: float,
+        speeds: Mapping[Symbol, float],
+        inputs: StateLike | None = None,
     ) -> TrackerState:
-        """Return the state predicted to a time; a state without a time begins there."""
+        """Return the state predicted to a time, with other values of inputs if these are given.
+
+        A state without a time begins there.
+        """
+        if inputs is not None:
+            state = replace(state, inputs=self.read_inputs(state.inputs, inputs))
         if state.stamp is None:
             return replace(state, stamp=stamp)
-        return replace(self.predict(state, stamp - state.stamp, speeds or {}), stamp=stamp)
+        return replace(self.predict(state, stamp - state.stamp, speeds), stamp=stamp)
 
     def update(
         self,
@@ -108,10 +119,11 @@ class Recursion:
         # The prediction uses the previous values of the inputs, if there are any.
         if not np.isfinite(state.inputs).all():
             state = replace(state, inputs=values)
+        seen = None
         if stamp is not None:
-            if stamp == state.stamp and state.reading is not None:
-                self.update_step.reader.check_repetition(state.reading, reading, stamp)
-            state = self.advance(state, stamp, speeds)
+            state, seen = self.advance(state, stamp, speeds), reading
+            if state.reading is not None:
+                seen = self.update_step.reader.combine(state.reading, reading, stamp)
         step = self.update_step
         result = step.update(state.mixture, reading, values)
         has_outliers = step.outliers is not None
@@ -122,10 +134,14 @@ class Recursion:
         if self.restarts and due.any():
             groups = np.flatnonzero(due).tolist()
             anew = step.restart(state.mixture, self.first.spread(step, values), groups, reading, values)
-            explained = due & ~find_refuted(self.update_step.layout, reading, anew, has_outliers)
+            explained = due & (
+                step.find_accepted(anew.mixture, reading, values)
+                if has_outliers
+                else ~find_refuted(step.layout, reading, anew, has_outliers)
+            )
             mixture = mixture.replace_groups(anew.mixture, np.flatnonzero(explained).tolist())
             loss = loss.with_restarted(explained)
-        return TrackerState(mixture, result, loss, values, state.stamp, reading)
+        return TrackerState(mixture, result, loss, values, state.stamp, seen or state.reading)
 
     def read_inputs(self, last: Array, given: StateLike | None) -> Array:
         """Return the values of the inputs, those not given as they were last.

@@ -130,14 +130,15 @@ class MeasurementReader:
         values = np.ascontiguousarray(given).reshape(-1)
         return Measurements(values, observed, self._whitening, self._log_scale)
 
-    def check_repetition(self, before: Measurements, reading: Measurements, stamp: float) -> None:
-        """Check that no measurement is given twice for one time.
+    def combine(self, before: Measurements, reading: Measurements, stamp: float) -> Measurements:
+        """Return two readings of one time as one, with the latest of each observation.
 
         Raises
         ------
         InvalidValueError
-            Naming the measurement.
+            Naming a measurement that is given twice.
         """
+        values = reading.values.copy()
         for i in np.flatnonzero(before.mask & reading.mask).tolist():
             where = self._layout.measurement_slices[i]
             if np.array_equal(before.values[where], reading.values[where]):
@@ -146,6 +147,10 @@ class MeasurementReader:
                     f"The same measurement of '{name}' came twice for {stamp:g} s. Counted twice, it would "
                     "seem more certain than it is."
                 )
+        for i in np.flatnonzero(before.mask & ~reading.mask).tolist():
+            where = self._layout.measurement_slices[i]
+            values[where] = before.values[where]
+        return reading._replace(values=values, mask=before.mask | reading.mask)
 
     def check_poses(self, reading: Measurements) -> None:
         """Check that all measured poses are rigid.

@@ -8,6 +8,7 @@ from dataclasses import dataclass
 from functools import partial
 
 import numpy as np
+import numpy.typing as npt
 
 from kineverse.errors import InvalidValueError, KineverseError
 from kineverse.estimation.robust import Outliers
@@ -246,6 +247,8 @@ class UpdateStep:
             result = self._inflated(belief, range(len(self.layout.groups))).copy()
             self.velocity.periodic = self.periodic
             self.velocity.predict(result, inputs, dt, speeds, noise)
+            moments = [m for one in result.speeds if one for m in (one.mean, one.gain, one.covariance)]
+            _require_finite(result.numbers, *moments)
             result = self._constrained(result, inputs)
             self._wrap_angles(result)
             return result
@@ -283,7 +286,8 @@ class UpdateStep:
             return belief
         if self.native is not None and self.native.is_ready and not self.process_model.has_rates:
             none = np.zeros(len(belief.vector))
-            if (result := self.native.predict(belief, none, none)) is not None:
+            # C leaves out groups without motion; so little noise changes no number.
+            if (result := self.native.predict(belief, none, none + np.finfo(float).tiny)) is not None:
                 return result
         return self.solver.constrain(belief, self.reader.empty(), inputs)
 
@@ -325,11 +329,7 @@ class UpdateStep:
         InvalidValueError
             If the belief is not finite. Non-finite results are never returned.
         """
-        if not np.isfinite(belief.numbers).all():
-            raise InvalidValueError(
-                "The step leads to numbers that are not finite, as what was seen or the covariances are too "
-                "large or too small for floating point. The belief stays as it was."
-            )
+        _require_finite(belief.numbers)
         for x in self.periodic:
             i = self.layout.tangent_space.coordinates.index(x)
             belief.x[i] = math.remainder(belief.x[i], 2 * math.pi)
@@ -403,6 +403,26 @@ class UpdateStep:
         start = before.replace_groups(initial.map(with_evidence), groups)
         return self.update(start, reading._replace(mask=mask), inputs)
 
+    def find_accepted(
+        self, mixture: GaussianSum, reading: Measurements, inputs: Array
+    ) -> npt.NDArray[np.bool_]:
+        """Return True for each group of which a component accepts a measurement as an inlier (groups,).
+
+        About a broad prior that need not be the best component: all outliers are as probable at first.
+        """
+        result = np.zeros(len(self.layout.groups), dtype=bool)
+        assert self.outliers is not None
+        for component, belief in enumerate(mixture.beliefs):
+            groups = mixture.groups(component, self._measured_groups(reading))
+            indices = [i for n in groups for i in self.layout.groups[n].observation_indices]
+            out = self.residuals.evaluate(belief.x, inputs)
+            for i, (error, _) in self.residuals.errors(out, reading, indices).items():
+                scale = float(reading.log_scale[i])
+                log_density = self.outliers.log_density(self.layout.observations[i], scale)
+                weight, _ = self.outliers.weigh(float(error @ error), scale, log_density)
+                result[self.layout.group_of[i]] |= weight > 0.5
+        return result
+
     def _solve_inliers(
         self, mixture: GaussianSum, reading: Measurements, inputs: Array, groups: list[int]
     ) -> tuple[list[Candidate], int]:
@@ -469,3 +489,11 @@ class UpdateStep:
         inputs: Array,
     ) -> Candidate:
         return Candidate(belief, self.residuals.evaluate(belief.x, inputs), weights, nis, dof, groups)
+
+
+def _require_finite(*arrays: Array) -> None:
+    if not all(np.isfinite(one).all() for one in arrays):
+        raise InvalidValueError(
+            "The step leads to numbers that are not finite, as what was seen or the covariances are too "
+            "large or too small for floating point. The belief stays as it was."
+        )

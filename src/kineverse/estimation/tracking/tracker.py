@@ -7,6 +7,8 @@ import math
 from collections import deque
 from collections.abc import Callable, Iterable, Mapping
 from dataclasses import replace
+from functools import partial
+from numbers import Integral
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -27,10 +29,16 @@ from .measurements import (
     ObservedLike,
     build_measurement_models,
     list_observed,
+    require_mapping,
     require_number,
-    require_positive,
 )
-from .process_noise import INITIAL_SPEED_TIME, Process, check_process, default_process_noise
+from .process_noise import (
+    INITIAL_SPEED_TIME,
+    Process,
+    check_process,
+    default_process_noise,
+    require_noise,
+)
 from .recent_poses import RecentPoses, collect_recent_poses
 from .recursion import Recursion
 from .residuals import Measurements
@@ -67,7 +75,7 @@ class Tracker:
     process_noise
         Process noise by speed or coordinate: the variance per second, or for ``process="velocity"`` the
         spectral density of the acceleration [m²/s³], [rad²/s³]. Others have that of furniture that a hand
-        moves, see :mod:`.process_noise`, and none for ``process="static"``.
+        moves, see :mod:`.process_noise`, and none for ``process="static"``. 0 for a part that never moves.
     outliers
         Outlier model: :class:`Outliers`, or True for the default one. None without outliers.
     locks
@@ -121,6 +129,8 @@ class Tracker:
         check_process(process)
         _check_counts(lost_after, keep, lag)
         keys = (inputs,) if isinstance(inputs, str | Symbol) else inputs
+        if not isinstance(keys, Iterable):
+            raise InvalidValueError(f"inputs= has names of coordinates, not {inputs!r:.80}.")
         given = frozenset(k if isinstance(k, Symbol) else model.symbol(k) for k in keys)
         layout, limits = arrange_state(model, build_measurement_models(model, self._observed), given)
         self.model = model
@@ -129,10 +139,15 @@ class Tracker:
             layout, limits, as_outliers(outliers, has_gate=True), process == "velocity"
         )
         process_model = self._update_step.process_model
-        noise = {process_model.speed(k): require_positive(k, v) for k, v in (process_noise or {}).items()}
+        given_noise = require_mapping({} if process_noise is None else process_noise, "process_noise=")
+        noise = {process_model.speed(k): require_noise(k, v) for k, v in given_noise.items()}
         values = np.array([np.nan if s.value is None else s.value for s in layout.inputs])
         known = np.nan_to_num(values)
-        given_values = GivenValues.read(self._update_step, start or {}, uncertainty or {})
+        given_values = GivenValues.read(
+            self._update_step,
+            {} if start is None else start,
+            {} if uncertainty is None else uncertainty,
+        )
         first = make_initial_belief(model, self._update_step, given_values, known)
         noise = {**default_process_noise(self._update_step, process, first.x, known), **noise}
         variances = {v: INITIAL_SPEED_TIME * q for v, q in noise.items()}
@@ -208,7 +223,7 @@ class Tracker:
     def rebuild(self, model: ModelView | None = None) -> Tracker:
         """Return a tracker of an edited model with the same observations and options.
 
-        It starts anew, and repeats the recent updates.
+        It starts anew, and repeats the recent updates in the order of their times, without commands.
 
         Parameters
         ----------
@@ -222,7 +237,10 @@ class Tracker:
         """
         other = Tracker(self.model if model is None else model, self._observed, **self._options)
         inputs = {str(s): k for k, s in enumerate(self._layout.inputs)}
-        for stamp, reading, values in self._recent:
+        recent = list(self._recent)
+        if all(stamp is not None for stamp, _, _ in recent):
+            recent.sort(key=lambda one: one[0] or 0.0)
+        for stamp, reading, values in recent:
             known = {s: values[inputs[str(s)]] for s in other._layout.inputs if str(s) in inputs}
             other._update(reading, stamp, None, State(known))
         return other
@@ -244,7 +262,7 @@ class Tracker:
         uncertainty
             Standard deviations, as at construction; those of other given values are the initial ones.
         at
-            Time from now on [s]; it may be earlier than before. The time stays if None.
+            Time from now on [s]; the time stays if None. If it is earlier, :attr:`recent` is emptied.
 
         Raises
         ------
@@ -253,14 +271,24 @@ class Tracker:
         """
         tangent_space, now = self._layout.tangent_space, self._now
         stamp = now.stamp if at is None else _require_time(at)
-        values = GivenValues.read(self._update_step, start or {}, uncertainty or {})
+        start, uncertainty = ({} if given is None else given for given in (start, uncertainty))
+        values = GivenValues.read(self._update_step, start, uncertainty)
         first, groups = self._recursion.first, list(range(len(self._layout.groups)))
-        if start or uncertainty:
-            own = {x.derivative() for x in values.coordinates} & {*tangent_space.tangent}
+        if len(start) or len(uncertainty):
+            own = {v for x in values.coordinates for v in tangent_space.rate_row(x)}
+            own &= {*tangent_space.tangent}
             anew = [tangent_space.tangent.index(v) for v in own] + list(values.deviations)
             spread = np.sqrt(np.diag(self.estimate.covariance))
             spread[anew] = first.deviations[anew]
-            first = replace(first, x=now.mixture.best.x.copy(), deviations=spread)
+            kept = {v: u for v, u in self.estimate.speeds.items() if v not in own}
+            variances = {v: self.estimate.deviation[v] ** 2 for v in kept}
+            first = replace(
+                first,
+                x=now.mixture.best.x.copy(),
+                deviations=spread,
+                speeds={**first.speeds, **kept},
+                speed_variances={**first.speed_variances, **variances},
+            )
             first = first.with_values(self._update_step, values)
             changed = {*values.coordinates, *values.speeds, *values.speed_deviations}
             changed |= {tangent_space.tangent[k] for k in values.deviations}
@@ -278,6 +306,8 @@ class Tracker:
         loss = TrackLoss(np.where(chosen, 0, now.loss.refuted), now.loss.is_lost & ~chosen)
         self._now = replace(now, mixture=mixture, loss=loss, stamp=stamp, reading=None)
         self._buffer.clear()
+        if stamp is not None and now.stamp is not None and stamp < now.stamp:
+            self._recent.clear()
         return self.estimate
 
     def predict(
@@ -307,16 +337,17 @@ class Tracker:
                 f"Time goes on: a step of {dt!r} s is none. Steps are finite and not negative."
             )
         speeds = self._read_commands(commands)
-        before = replace(self._now, inputs=self._recursion.read_inputs(self._now.inputs, inputs))
-        self._now = self._recursion.predict(before, dt, speeds)
+        before = self._now
+        known = self._recursion.read_inputs(before.inputs, inputs)
+        self._now = self._recursion.predict(replace(before, inputs=known), dt, speeds)
         if self._now.stamp is not None:
-            end = self._now.stamp
-            self._remember(before, end, speeds, lambda state: self._recursion.advance(state, end, speeds))
+            advance = partial(self._recursion.advance, speeds=speeds, inputs=copy.copy(inputs))
+            self._remember(before, self._now.stamp, partial(advance, stamp=self._now.stamp), advance)
         return self.estimate
 
     def _read_commands(self, commands: StateLike | None) -> dict[Symbol, float]:
         speeds = {}
-        for key, value in (commands or {}).items():
+        for key, value in require_mapping({} if commands is None else commands, "commands=").items():
             speed = require_number(value, f"The commanded speed '{key}'")
             if not math.isfinite(speed):
                 raise InvalidValueError(f"The commanded speed '{key}' is {value!r}; it must be finite.")
@@ -398,6 +429,8 @@ class Tracker:
         commands: StateLike | None,
         inputs: StateLike | None,
     ) -> Estimate:
+        # The caller may use the arrays again, while late measurements repeat the update.
+        reading = reading._replace(values=reading.values.copy(), mask=reading.mask.copy())
         native = self._update_step.native
         if native is None or not native.are_rigid(reading):
             self._update_step.reader.check_poses(reading)
@@ -408,10 +441,9 @@ class Tracker:
             self._read_commands(commands),
             self._now,
         )
-
-        def apply(state: TrackerState) -> TrackerState:
-            return self._recursion.update(state, reading, stamp, speeds, inputs)
-
+        apply = partial(
+            self._recursion.update, reading=reading, stamp=stamp, speeds=speeds, inputs=copy.copy(inputs)
+        )
         if stamp is not None and before.stamp is not None and stamp < before.stamp:
             if not self._buffer.lag:
                 raise InvalidValueError(
@@ -421,24 +453,22 @@ class Tracker:
             self._now = self._buffer.insert(stamp, apply)
         else:
             self._now = apply(before)
-            if stamp is not None:
-                self._remember(before, stamp, speeds, apply)
-        values = reading.values.copy()
-        self._recent.append(
-            (stamp, reading._replace(values=values, mask=reading.mask.copy()), self._now.inputs)
-        )
+            if self._now.stamp is not None:
+                self._remember(
+                    before, self._now.stamp, apply, partial(self._recursion.advance, speeds=speeds)
+                )
+        self._recent.append((stamp, reading, self._now.inputs))
         return self.estimate
 
     def _remember(
         self,
         before: TrackerState,
         stamp: float,
-        speeds: Mapping[Symbol, float],
         apply: Callable[[TrackerState], TrackerState],
+        predict: Callable[[TrackerState, float], TrackerState],
     ) -> None:
         if self._buffer.lag:
-            step = Step(stamp, before, apply, lambda state, to: self._recursion.advance(state, to, speeds))
-            self._buffer.append(step)
+            self._buffer.append(Step(stamp, before, apply, predict))
 
     def __repr__(self) -> str:
         sizes = f"{len(self.symbols)} coordinates in {len(self.groups)} groups"
@@ -454,7 +484,7 @@ def _require_time(at: Any) -> float:
 
 def _check_counts(lost_after: int, keep: int, lag: float) -> None:
     for name, count in (("lost_after", lost_after), ("keep", keep)):
-        if not isinstance(count, int) or count < 1:
+        if not isinstance(count, Integral) or count < 1:
             raise InvalidValueError(f"{name}= is a number of updates, at least 1, not {count!r}.")
     if not (math.isfinite(require_number(lag, "The lag")) and lag >= 0):
-        raise InvalidValueError(f"lag= is a number of seconds that is not negative, not {lag!r}.")
+        raise InvalidValueError(f"lag= is a finite number of seconds, not negative, not {lag!r}.")
