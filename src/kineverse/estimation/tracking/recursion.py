@@ -59,8 +59,12 @@ class Recursion:
     def predict(self, state: TrackerState, dt: float, speeds: Mapping[Symbol, float]) -> TrackerState:
         """Return the state after a time step [s] with commanded speeds."""
         stamp = None if state.stamp is None else state.stamp + dt
-        if dt == 0.0 or not (speeds or self.noise):
-            return replace(state, stamp=stamp)
+        if dt == 0.0:
+            return state
+        # A measurement that comes again at a later time is a new one.
+        state = replace(state, stamp=stamp, reading=None)
+        if not (speeds or self.noise):
+            return state
 
         def moved(belief: InformationState) -> InformationState:
             moving, noise = speeds, self.noise
@@ -71,7 +75,7 @@ class Recursion:
                 moving = {v: speed for v, speed in speeds.items() if v in free} | held
             return self.update_step.predict(belief, state.inputs, dt, moving, noise)
 
-        return replace(state, mixture=state.mixture.map(moved), stamp=stamp)
+        return replace(state, mixture=state.mixture.map(moved))
 
     def advance(
         self, state: TrackerState, stamp: float, speeds: Mapping[Symbol, float] | None = None
@@ -125,6 +129,9 @@ class Recursion:
             explained = due & ~find_refuted(self.update_step.layout, reading, anew, has_outliers)
             mixture = mixture.replace_groups(anew.mixture, np.flatnonzero(explained).tolist())
             loss = loss.with_restarted(explained)
+        # All measurements of one time are kept, so that none of them counts again.
+        if state.reading is not None and stamp is not None:
+            reading = step.reader.join(state.reading, reading)
         return TrackerState(mixture, result, loss, values, state.stamp, reading)
 
     def read_inputs(self, last: Array, given: StateLike | None) -> Array:

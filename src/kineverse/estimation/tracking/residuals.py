@@ -10,6 +10,7 @@ import numpy.typing as npt
 
 from kineverse.compile import CompiledFunction
 from kineverse.errors import InvalidValueError, ShapeError, UnknownNameError, suggest
+from kineverse.expressions.expression import Expression
 from kineverse.lie import Array, inverse_right_jacobian, pose_difference, transform
 
 from .layout import Layout
@@ -147,6 +148,14 @@ class MeasurementReader:
                     "seem more certain than it is."
                 )
 
+    def join(self, before: Measurements, reading: Measurements) -> Measurements:
+        """Return the measurements of two readings, of the second one where both have them."""
+        values = before.values.copy()
+        for i in np.flatnonzero(reading.mask).tolist():
+            where = self._layout.measurement_slices[i]
+            values[where] = reading.values[where]
+        return before._replace(values=values, mask=before.mask | reading.mask)
+
     def check_poses(self, reading: Measurements) -> None:
         """Check that all measured poses are rigid.
 
@@ -233,7 +242,9 @@ def _numbers(given: npt.ArrayLike, what: str) -> Array:
             raise TypeError
         return np.asarray(given, dtype=np.float64)
     except (TypeError, ValueError):
-        raise InvalidValueError(f"{what}: these are no numbers: {given!r:.80}.") from None
+        is_expression = isinstance(given, Expression)
+        hint = " expression({symbol: value}) has those of an expression." if is_expression else ""
+        raise InvalidValueError(f"{what}: these are no numbers: {given!r:.80}.{hint}") from None
 
 
 class Residuals:
