@@ -188,6 +188,31 @@ def test_tracker_is_checked_and_its_model_repaired(kitchen: kv.Model) -> None:
         lost.repair(model)
 
 
+def test_tracker_with_a_moving_camera_is_checked(kitchen: kv.Model) -> None:
+    """The camera's coordinate is an input. The door is displaced, then only its errors are too large."""
+    model = kitchen.copy()
+    with model.edit() as edit:
+        place = kv.translation(0.0, -1.0, 1.0) @ kv.rotation_z(kv.position("pan"))
+        edit.add_frame("camera", parent="world", transform=place)
+    pans = 0.5 * np.sin(np.arange(50.0))
+    cameras = kv.compile(model.fk("camera")).batch(pans[:, None])
+    observed = observe_frames(model, [HANDLE], {DOOR: np.linspace(0.0, 1.2, 50)}, 3)[HANDLE]
+    observed[:, 1, 3] += 0.05
+    poses = np.linalg.inv(cameras) @ observed
+    observation = ObservedPose(HANDLE, relative_to="camera", covariance=NOISE)
+    tracker = Tracker(model, [observation], inputs=["pan"], outliers=True)
+    for k, pan in enumerate(pans.tolist()):
+        tracker.update({HANDLE: poses[k]}, at=0.5 * k, inputs={"pan": pan})
+    assert tracker.recent.relative_to == "world"
+    assert np.allclose(tracker.recent.poses[HANDLE], observed)
+    assert check_plausibility(tracker, families=SOME).repair(model) == (TAG,)
+
+    observed[:, :3, 3] += np.random.default_rng(0).normal(0.0, 0.04, (50, 3))
+    report = check_plausibility(kitchen, {HANDLE: observed}, noise=NOISE, families=SOME)
+    with pytest.raises(ImplausibleError, match="larger than stated"):
+        report.repair(kitchen)
+
+
 def test_exchanged_frames_are_told(kitchen: kv.Model) -> None:
     poses = observe_frames(kitchen, FRAMES, {DOOR: np.linspace(0.0, 1.2, 30)}, 3)
     exchanged = dict(zip(FRAMES, reversed([poses[f] for f in FRAMES]), strict=True))
