@@ -108,6 +108,9 @@ def test_replacement_keeps_names_limits_and_children(kitchen: kv.Model) -> None:
     low, high = model.limits(DOOR)
     assert low <= 0.0
     assert high >= 1.5707
+    # A displaced hinge keeps its zero: the door is turned as before.
+    turned = model.fk(HANDLE)({DOOR: 0.6})[:3, :3] @ truth.fk(HANDLE)({DOOR: 0.6})[:3, :3].T
+    assert abs(np.arctan2(turned[1, 0], turned[0, 0])) < 0.01
     assert np.allclose(model.fk("lamp")({DOOR: 0.5}), served.fk("lamp")({DOOR: 0.5}))
 
 

@@ -31,6 +31,7 @@ from kineverse.experiments.stream.observations import (
     correlated_errors,
     simulate_stream,
 )
+from kineverse.lie import exp_so3
 
 Array = npt.NDArray[np.float64]
 
@@ -186,6 +187,40 @@ def test_tracker_is_checked_and_its_model_repaired(kitchen: kv.Model) -> None:
     assert lost[TAG].probabilities == {}
     with pytest.raises(ImplausibleError, match="unrelated"):
         lost.repair(model)
+
+
+def test_tracker_with_a_moving_camera_is_checked(kitchen: kv.Model) -> None:
+    """The camera's coordinate is an input, and the door is displaced."""
+    model = kitchen.copy()
+    with model.edit() as edit:
+        place = kv.translation(0.0, -1.0, 1.0) @ kv.rotation_z(kv.position("pan"))
+        edit.add_frame("camera", parent="world", transform=place)
+    pans = 0.5 * np.sin(np.arange(50.0))
+    cameras = kv.compile(model.fk("camera")).batch(pans[:, None])
+    observed = observe_frames(model, [HANDLE], {DOOR: np.linspace(0.0, 1.2, 50)}, 3)[HANDLE]
+    observed[:, 1, 3] += 0.05
+    poses = np.linalg.inv(cameras) @ observed
+    observation = ObservedPose(HANDLE, relative_to="camera", covariance=NOISE)
+    tracker = Tracker(model, [observation], inputs=["pan"], outliers=True)
+    for k, pan in enumerate(pans.tolist()):
+        tracker.update({HANDLE: poses[k]}, at=0.5 * k, inputs={"pan": pan})
+    assert tracker.recent.relative_to == "world"
+    assert np.allclose(tracker.recent.poses[HANDLE], observed)
+    assert check_plausibility(tracker, families=SOME).repair(model) == (TAG,)
+
+
+@pytest.mark.parametrize(("factor", "most_probable"), [(2.2, "served"), (4.0, "free")])
+def test_joints_stay_if_only_the_errors_are_larger_than_stated(
+    kitchen: kv.Model, factor: float, most_probable: str
+) -> None:
+    random = np.random.default_rng(0)
+    poses = kv.compile(kitchen.fk(HANDLE)).batch(np.linspace(0.0, 1.2, 50)[:, None])
+    poses[:, :3, 3] += factor * random.normal(0.0, 0.01, (50, 3))
+    poses[:, :3, :3] = exp_so3(factor * random.normal(0.0, 0.02, (50, 3))) @ poses[:, :3, :3]
+    report = check_plausibility(kitchen, {HANDLE: poses}, noise=NOISE, families=SOME)
+    assert report[TAG].probabilities[most_probable] > 0.9
+    with pytest.raises(ImplausibleError, match="larger than stated"):
+        report.repair(kitchen)
 
 
 def test_exchanged_frames_are_told(kitchen: kv.Model) -> None:

@@ -199,6 +199,20 @@ def test_measurements_beyond_the_lag_or_given_twice_are_refused():
         Tracker(make_slide(), ["cart"], process="speed")
 
 
+def test_equal_measurements_count_once_for_each_time():
+    """A door at rest is measured without noise; measurements of other frames come in between."""
+    poses = {name: MODEL.fk(name)({"q": 0.3}) for name in ("hinge", "handle")}
+    tracker = Tracker(MODEL, ["hinge", "handle"], lag=1.0)
+    tracker.update(poses, at=0.0)
+    tracker.predict(0.1)
+    tracker.update(poses, at=0.1)
+    tracker.update(poses, at=0.05)
+    tracker.update({"hinge": poses["hinge"]}, at=0.2)
+    tracker.update({"handle": poses["handle"]}, at=0.2)
+    with pytest.raises(InvalidValueError, match=r"'hinge' came twice for 0\.2 s"):
+        tracker.update({"hinge": poses["hinge"]}, at=0.2)
+
+
 def test_gate_is_a_number_of_standard_deviations():
     observed = ObservedExpression("z", kv.position("a"), 0.01)
     for gate, is_outlier in ((3.0, True), (5.0, False)):

@@ -361,8 +361,16 @@ def _propose_replacement(
 ) -> tuple[Operation | None, str]:
     if alternative is None or len(recent.times) < _LEAST_COUNT:
         return None, "it was seen too seldom since to say what it is instead"
+    if alternative.best.family == "free":
+        return (
+            None,
+            "no joint explains what is seen since; the part is loose, or the errors are larger than stated",
+        )
     if not alternative.best.is_determined:
         return None, f"what it is instead is not known yet, {alternative}"
+    probabilities = _probabilities(recent, alternative)
+    if probabilities["served"] == max(probabilities.values()):
+        return None, "no other joint explains better what is seen; the errors are larger than stated"
     if not follows_another(model, data.joint) and _explains_alone(model, recent, alternative):
         # Another joint would not resolve the contradiction.
         return None, "by itself it explains what is seen, but not together with what limits or moves it"

@@ -27,7 +27,7 @@ from kineverse.estimation.identification.result import Fit
 from kineverse.estimation.linear_algebra import squared_errors
 from kineverse.estimation.robust import CHI_SQUARED_6
 from kineverse.expressions.expression import Expression
-from kineverse.lie import Array, exp_so3, inverse, transform
+from kineverse.lie import Array, exp_so3, inverse, log_so3, transform
 from kineverse.model.articulation import Articulation
 from kineverse.model.body import Pose
 from kineverse.model.frame import Frame
@@ -214,6 +214,8 @@ def build_replacement(
     if motion.joints == 1 and before is not None:
         turns = motion.parametrisation.joints[0] >= WX
         same_kind = bool(served.is_angle[0]) == turns
+        if same_kind and turns and not before.is_derived:
+            coordinates = coordinates + _turn_about_axis(served, coordinates, motion, values)
         known = others[:, 0] if others.shape[1] else coordinates[:, 0]
         old = before.evaluate(np.where(np.isfinite(known), known, coordinates[:, 0]))
         motion, values, slope = _align_values(
@@ -286,6 +288,24 @@ def _remaining_writes(
                 continue
         kept.append(((kind, name), value))
     return tuple(kept)
+
+
+# Hinges with axes that differ by more [rad] have no common zero.
+_PARALLEL = 0.3
+
+
+def _turn_about_axis(served: KnownJoint, coordinates: Array, motion: GroupMotion, values: Array) -> float:
+    """Return the mean change of a served hinge's joint value that turns its poses like the identified ones.
+
+    At a displaced hinge, the served joint values nearest to the poses compensate the displacement by a
+    rotation. The zero of the relearned joint is that of the orientation.
+    """
+    there = served.linearise(coordinates)
+    turns = log_so3(motion.linearise(values).pose[:, :3, :3] @ there.pose[:, :3, :3].mT)
+    axes = there.by_joints[:, 3:, 0]
+    about = np.einsum("ni,ni->n", turns, axes) / np.einsum("ni,ni->n", axes, axes)
+    across = np.linalg.norm(turns - about[:, None] * axes, axis=1)
+    return float(np.mean(about)) if float(np.max(across)) < _PARALLEL else 0.0
 
 
 def _align_values(

@@ -153,9 +153,12 @@ class Plausibility:
             if verdict.replacement is not None and verdict.result is not None:
                 alternative = f"what is seen is {verdict.result}"
             lines.append(f"\n  '{verdict.tag}' {verdict.verdict}: {alternative}")
+        advice = (
+            "Replace these operations by their proposals" if self.replacements else "See more of the motion"
+        )
         raise ImplausibleError(
-            "The model does not explain what is seen. Replace these operations by their proposals, or look "
-            "whether the noise is as stated:" + "".join(lines)
+            f"The model does not explain what is seen. {advice}, or look whether the noise is as stated:"
+            + "".join(lines)
         )
 
     def __getitem__(self, tag: str) -> JointVerdict:

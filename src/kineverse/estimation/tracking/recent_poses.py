@@ -7,7 +7,10 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from kineverse.compile import compile  # noqa: A004
 from kineverse.lie import Array
+from kineverse.model.frame import WORLD
+from kineverse.model.model_view import ModelView
 
 from .layout import Layout
 from .residuals import Measurements
@@ -20,11 +23,11 @@ class RecentPoses:
     Attributes
     ----------
     relative_to
-        Name of the observing frame.
+        Name of the observing frame; the world if that frame moves with inputs only, and so is known.
     poses
         Poses by name of the frame (N, 4, 4), in order; NaN where missing.
     covariances
-        Mean covariance of the errors of each frame (6, 6).
+        Mean covariance of the errors of each frame (6, 6), or (N, 6, 6) if the observing frame moved.
     times
         (N,) [s]; None if they have none.
     """
@@ -36,23 +39,36 @@ class RecentPoses:
 
 
 def collect_recent_poses(
-    layout: Layout, readings: Sequence[tuple[float | None, Measurements]]
+    model: ModelView, layout: Layout, readings: Sequence[tuple[float | None, Measurements, Array]]
 ) -> RecentPoses:
-    """Return the poses of readings with their times, of the first observer among the observations."""
+    """Return the poses of readings with their times, of the first observer among the observations.
+
+    Parameters
+    ----------
+    model
+        Model with the frames.
+    layout
+        Layout of the readings.
+    readings
+        Times [s], measurements and values of the inputs.
+    """
     poses = {i: one for i, one in enumerate(layout.observations) if one.is_pose}
     observer = next((one.relative_to for one in poses.values()), "")
-    has_times = all(stamp is not None for stamp, _ in readings)
+    has_times = all(stamp is not None for stamp, _, _ in readings)
     stamps: Array = np.array(
-        [stamp if has_times else k for k, (stamp, _) in enumerate(readings)], dtype=float
+        [stamp if has_times else k for k, (stamp, _, _) in enumerate(readings)], dtype=float
     )
     # Readings of one time are one row.
     times, rows = np.unique(stamps, return_inverse=True)
     measured, covariances = {}, {}
+    inputs = np.zeros((len(times), len(layout.inputs)))
+    for row, (_, _, values) in zip(rows.tolist(), readings, strict=True):
+        inputs[row] = values
     for i, one in poses.items():
         if one.relative_to == observer:
             measured[one.frame] = np.full((len(times), 4, 4), np.nan)
             weights = []
-            for row, (_, reading) in zip(rows.tolist(), readings, strict=True):
+            for row, (_, reading, _) in zip(rows.tolist(), readings, strict=True):
                 if reading.mask[i]:
                     pose = reading.values[layout.measurement_slices[i]].reshape(4, 4)
                     measured[one.frame][row] = pose
@@ -60,4 +76,14 @@ def collect_recent_poses(
             white: Array = np.array(weights).reshape(-1, 6, 6)
             given = np.linalg.inv(white.transpose(0, 2, 1) @ white)
             covariances[one.frame] = given.mean(axis=0) if weights else one.covariance
+    if observer in model.frames and len(times):
+        place = model.fk(observer)
+        if place.symbols and {*place.symbols} <= {*layout.inputs}:
+            # No joint between an observer that moves and a part could be tested.
+            places = compile(place, layout.inputs).batch(inputs)
+            turns = np.zeros((len(times), 6, 6))
+            turns[:, :3, :3] = turns[:, 3:, 3:] = places[:, :3, :3]
+            measured = {name: places @ seen for name, seen in measured.items()}
+            covariances = {name: turns @ one @ turns.mT for name, one in covariances.items()}
+            observer = WORLD
     return RecentPoses(observer, measured, covariances, times if has_times else None)

@@ -10,6 +10,7 @@ import numpy.typing as npt
 
 from kineverse.compile import CompiledFunction
 from kineverse.errors import InvalidValueError, ShapeError, UnknownNameError, suggest
+from kineverse.expressions.expression import Expression
 from kineverse.lie import Array, inverse_right_jacobian, pose_difference, transform
 
 from .layout import Layout
@@ -238,7 +239,9 @@ def _numbers(given: npt.ArrayLike, what: str) -> Array:
             raise TypeError
         return np.asarray(given, dtype=np.float64)
     except (TypeError, ValueError):
-        raise InvalidValueError(f"{what}: these are no numbers: {given!r:.80}.") from None
+        is_expression = isinstance(given, Expression)
+        hint = " expression({symbol: value}) has those of an expression." if is_expression else ""
+        raise InvalidValueError(f"{what}: these are no numbers: {given!r:.80}.{hint}") from None
 
 
 class Residuals:

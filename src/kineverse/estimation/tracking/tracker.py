@@ -207,7 +207,7 @@ class Tracker:
     @property
     def recent(self) -> RecentPoses:
         """Recently measured poses."""
-        return collect_recent_poses(self._layout, [(stamp, reading) for stamp, reading, _ in self._recent])
+        return collect_recent_poses(self.model, self._layout, self._recent)
 
     @property
     def process_noise(self) -> dict[Symbol, float]:
