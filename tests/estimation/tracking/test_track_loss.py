@@ -333,9 +333,14 @@ def test_a_tracker_is_rebuilt_after_late_measurements_and_resets():
 
 
 def test_start_and_reset_stay_inside_limits():
-    tracker = Tracker(MODEL, ["hinge"], start={"q": 7.0})
+    tracker = Tracker(MODEL, ["hinge"], start=kv.State({"q": 7.0}))
     assert tracker.estimate.state["q"] == 1.5
-    assert tracker.reset({"q": -7.0}).state["q"] == 0.0
+    assert tracker.reset(kv.State({"q": -7.0})).state["q"] == 0.0
+    # Degrees in place of radians, likely.
+    with pytest.raises(InvalidValueError, match=r"'q' is 7, beyond its limits 0 to 1\.5"):
+        Tracker(MODEL, ["hinge"], start={"q": 7.0})
+    with pytest.raises(InvalidValueError, match="beyond its limits"):
+        tracker.reset({"q": -7.0})
 
 
 @pytest.mark.parametrize(

@@ -292,7 +292,9 @@ class Identifier:
             data = prepare_data(observations, self._stated, self._outliers, self._sequential)
             return weigh_and_check(data, {}, self._weights).result
         deferred: dict[str | Family, FamilySolution] = {}
-        if len(observations) >= 2 * self._full_count:
+        # Poses of a few observations cannot tell which of them are outliers.
+        growth = 2.0 if self._outliers is None else 1.0 + _MORE
+        if len(observations) >= growth * self._full_count:
             self._full_count = self._noise_count = len(observations)
             data = prepare_data(observations, self._stated, self._outliers, self._sequential)
             self._unit = data.unit

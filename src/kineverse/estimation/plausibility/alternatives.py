@@ -366,7 +366,7 @@ def _propose_replacement(
             None,
             "no joint explains what is seen since; the part is loose, or the errors are larger than stated",
         )
-    if not alternative.best.is_determined:
+    if not alternative.best.is_determined or not alternative.best.probability >= SURE:
         return None, f"what it is instead is not known yet, {alternative}"
     probabilities = _probabilities(recent, alternative)
     if probabilities["served"] == max(probabilities.values()):

@@ -54,7 +54,7 @@ def check_plausibility(
     Parameters
     ----------
     model
-        The served model; or a tracker, with its model and recent poses.
+        The served model; or a tracker, with its model, recent poses and the covariances that it was given.
     observations
         Poses over time by name of the frame, (N, 4, 4), or pairs of poses and covariance, (6, 6) or (N, 6,
         6), in order of time; missing poses are NaN throughout.
@@ -93,7 +93,10 @@ def check_plausibility(
     if isinstance(model, Tracker):
         if observations is None:
             recent = model.recent
-            observations = {name: (poses, recent.covariances[name]) for name, poses in recent.poses.items()}
+            observations = {
+                name: (poses, recent.covariances[name]) if name in recent.covariances else poses
+                for name, poses in recent.poses.items()
+            }
             times, relative_to = recent.times, recent.relative_to
     checked = _checked_model(model)
     observations = {} if observations is None else observations

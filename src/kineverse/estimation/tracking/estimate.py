@@ -185,3 +185,8 @@ class Estimate:
     def log_evidence(self) -> float:
         """Log density of all measurements so far."""
         return self._mixture.log_evidence
+
+    def __repr__(self) -> str:
+        at = "" if self.stamp is None else f" at {self.stamp:g} s"
+        values = ", ".join(f"{s}={value:.4g}±{self.deviation[s]:.2g}" for s, value in self.state.items())
+        return f"<Estimate{at}: {values}{', lost' if self.lost else ''}>"

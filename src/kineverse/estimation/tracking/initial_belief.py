@@ -121,6 +121,8 @@ class GivenValues:
         for symbol, value in given.items():
             if not math.isfinite(value):
                 raise InvalidValueError(f"start= of '{symbol}' is {value!r}; it must be finite.")
+            if not isinstance(start, State) and symbol in tangent_space.coordinates:
+                _check_limits(update_step, symbol, value)
         names: dict[str, int] = {}
         for k, v in enumerate(tangent_space.tangent):
             names[str(v.position) if v.position in tangent_space.coordinates else str(v)] = k
@@ -139,6 +141,26 @@ class GivenValues:
             deviations,
             speed_deviations,
         )
+
+
+def _check_limits(update_step: UpdateStep, symbol: Symbol, value: float) -> None:
+    """Check that a given value is within the limits of its coordinate.
+
+    Raises
+    ------
+    InvalidValueError
+        Otherwise.
+    """
+    k = update_step.layout.tangent_space.coordinates.index(symbol)
+    low, high = float(update_step.limits.lower[k]), float(update_step.limits.upper[k])
+    if not low - _BEYOND <= value <= high + _BEYOND:
+        raise InvalidValueError(
+            f"start= of '{symbol}' is {value:g}, beyond its limits {low:g} to {high:g} [m], [rad]."
+        )
+
+
+# Distance beyond limits that may be rounding.
+_BEYOND = 1e-3
 
 
 def _unknown_name(key: object, names: Iterable[object]) -> UnknownNameError:

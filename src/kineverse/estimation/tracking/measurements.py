@@ -118,6 +118,8 @@ class MeasurementModel:
     frame, relative_to
         Observed and observing frame of a pose or a position, whose first three residuals are lengths [m];
         empty for an expression.
+    is_stated
+        False if the covariance is a default.
     """
 
     name: str
@@ -128,6 +130,7 @@ class MeasurementModel:
     period: float = math.inf
     frame: str = ""
     relative_to: str = ""
+    is_stated: bool = True
 
     @property
     def size(self) -> int:
@@ -200,7 +203,9 @@ def _observation(model: ModelView, item: ObservedLike) -> MeasurementModel:
     if not period > 0:
         raise InvalidValueError(f"The period of '{label}' is positive, not {period!r}.")
     frames = ("", "") if isinstance(item, ObservedExpression) else (item.frame, item.relative_to)
-    return MeasurementModel(name, label, is_pose, value, covariance, float(period), *frames)
+    return MeasurementModel(
+        name, label, is_pose, value, covariance, float(period), *frames, item.covariance is not None
+    )
 
 
 def wrap_difference(difference: Array, period: float) -> Array:

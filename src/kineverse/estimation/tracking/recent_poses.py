@@ -27,7 +27,8 @@ class RecentPoses:
     poses
         Poses by name of the frame (N, 4, 4), in order; NaN where missing.
     covariances
-        Mean covariance of the errors of each frame (6, 6), or (N, 6, 6) if the observing frame moved.
+        Mean covariance of the errors of each frame (6, 6), or (N, 6, 6) if the observing frame moved. Frames
+        whose covariance was never stated are absent.
     times
         (N,) [s]; None if they have none.
     """
@@ -75,7 +76,9 @@ def collect_recent_poses(
                     weights.append(reading.whitening[layout.whitening_slices[i]].reshape(6, 6))
             white: Array = np.array(weights).reshape(-1, 6, 6)
             given = np.linalg.inv(white.transpose(0, 2, 1) @ white)
-            covariances[one.frame] = given.mean(axis=0) if weights else one.covariance
+            mean = given.mean(axis=0) if weights else one.covariance
+            if one.is_stated or not np.allclose(mean, one.covariance, rtol=1e-9):
+                covariances[one.frame] = mean
     if observer in model.frames and len(times):
         place = model.fk(observer)
         if place.symbols and {*place.symbols} <= {*layout.inputs}:
