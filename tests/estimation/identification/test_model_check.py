@@ -100,3 +100,15 @@ def test_tail_probabilities_agree_with_scipy(freedom: float) -> None:
         assert chi_squared_tail(squares, freedom) == pytest.approx(quantile, rel=0.7)
         ratio = f.isf(quantile, freedom, 30.0)
         assert f_distribution_tail(ratio, freedom, 30.0) == pytest.approx(quantile, rel=0.5)
+
+
+@pytest.mark.parametrize("lever", [0.0, 0.5])
+@pytest.mark.parametrize("turn", [0.2, 2.0])
+def test_an_exact_hinge_is_a_hinge_and_no_curve(lever: float, turn: float) -> None:
+    """Whatever the noise is taken for, exact poses of a joint are that joint, also about its own origin."""
+    hinge = kv.rotation_z(kv.position("q")) @ kv.translation(lever, 0, 0)
+    poses = np.stack([hinge({"q": q}) for q in np.linspace(0, turn, 12)])
+    for noise in (None, pose_covariance(1e-4, 1e-3), pose_covariance(0.005, 0.02)):
+        found = identify(None, poses, noise=noise)
+        assert found.best.family == "revolute"
+        assert not found.is_ambiguous

@@ -24,6 +24,8 @@ from .range_prior import LITTLE
 
 # Number of slow cosines along a joint value: at most, and relative to the number of observations.
 _COSINES, _DENSITY = 6, 0.25
+# Size of residuals relative to the noise below which they are rounding errors.
+_EXACT = 0.1
 
 
 @dataclass(frozen=True)
@@ -80,7 +82,7 @@ def measure_fit(
         return GoodnessOfFit(math.nan, 1.0)
     factor = math.sqrt(squares / free)
     p_value = chi_squared_tail(observation_weight * squares, observation_weight * free)
-    if observation_weight < 1.0:
+    if observation_weight < 1.0 or factor < _EXACT:
         return GoodnessOfFit(factor, p_value)
     components = residuals.shape[1] - 1
     cosines = min(_COSINES, int(_DENSITY * len(residuals)))

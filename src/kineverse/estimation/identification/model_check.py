@@ -119,7 +119,7 @@ def weigh_and_check(
     is_sure = found is not None and not is_doubtful(data, found, solutions)
     if CURVE in weights and not is_sure:
         curve = solve_curve(data, solutions, before)
-        if curve is not None:
+        if curve is not None and not _is_explained(curve, solutions):
             solutions = {**solutions, CURVE: curve}
             found = weigh_families(data, solutions, weights)
     if found is None:
@@ -148,7 +148,7 @@ def weigh_and_check(
                     f"{solutions[other].scored.solution.motion.name}"
                 )
     found = replace(found, reason=reason or next(_reasons(data, found, solutions), ""))
-    if curve is None and CURVE in weights and may_be_curve(data.observations):
+    if CURVE not in found.probabilities and CURVE in weights and may_be_curve(data.observations):
         later = LazyFit(CURVE, 0.0, partial(fit_of_curve, data, solutions, weights))
         found = replace(found, lazy_fits=(*found.lazy_fits, later))
     return CheckedComparison(found, curve)
@@ -325,6 +325,18 @@ def _reasons(data: IdentificationData, found: IdentificationResult, solutions: S
         fit = measure_fit(solution, observation_weight=data.observation_weight)
         if fit.slow_p_value < _SYSTEMATIC and fit.slow_share > _SYSTEMATIC_SHARE:
             yield "its residuals depend on the joint value, so this may be none of these joints"
+
+
+def _is_explained(curve: FamilySolution, solutions: Solutions) -> bool:
+    """Return True if a joint with one joint value leaves no more than the noise of a curve.
+
+    Then the curve is that joint, and its evidence is no argument: its smoothness is estimated, so it pays
+    less for an axis through the origin than the joint does.
+    """
+    covariance = curve.scored.solution.covariance.mean(axis=0)
+    others = [one.scored.solution for one in solutions.values() if len(one.inliers) >= len(curve.inliers)]
+    simple = [one for one in others if one.motion.joints == 1]
+    return any(measure_fit(one, covariance).factor < 1.0 for one in simple)
 
 
 def _explains(fit: GoodnessOfFit, stated: bool) -> bool:
