@@ -86,7 +86,15 @@ def _milliseconds(seconds: float) -> str:
 def _monitoring_table(rows: Sequence[MonitoringRow]) -> ReportTable:
     return ReportTable(
         "Monitor of the model's plausibility",
-        ("door", "streams", "alarms", "looks until the alarm", "worst", "look [ms CPU]", "99 of 100 within"),
+        (
+            "door",
+            "streams",
+            "alarms",
+            "looks from 45° to the alarm",
+            "worst",
+            "look [ms CPU]",
+            "99 of 100 within",
+        ),
         tuple(
             (
                 row.case,
