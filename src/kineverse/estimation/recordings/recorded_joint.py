@@ -176,12 +176,12 @@ def identify_recorded_joint(
     times = {name: comparison.correlation_time(fit) for name, fit in fits.items()}
     best, rows = first, comparison.distinct
     for _ in times:
-        # A curve follows correlated errors; the most probable joint tells them from its motion.
-        name = next((family for family in best.found.probabilities if family != CURVE), "free")
+        name = best.found.best.family
         if times.get(name, 1.0) <= _LONGER * best.correlation_time:
             break
         rows = comparison.sufficient_rows(times[name], first.found[name])
         best = comparison.assume(noise, times[name], rows)
+    best = comparison.with_curve(noise, best, rows)
     objections = tuple(
         other for other in comparison.alternatives(noise, best, fits, times, rows) if objects(other, best)
     )
@@ -209,7 +209,10 @@ class _Comparison:
     """Comparison of families under several assumptions."""
 
     def __init__(self, pair: RecordedPair, families: list[str] | None, independent: bool) -> None:
-        self.pair, self.families = pair, families
+        self.pair = pair
+        self.families = [*WEIGHTS] if families is None else families
+        # A curve follows correlated errors and takes long. So it is compared once, at the end.
+        self.joints = [name for name in self.families if name != CURVE] or self.families
         repeats = pair.repeats
         self.distinct: Indices = np.flatnonzero(~repeats)
         if len(self.distinct) == 1 < len(repeats):
@@ -220,14 +223,22 @@ class _Comparison:
         if independent:
             self.distinct = np.arange(len(repeats))
 
-    def assume(self, noise: ObservationNoise | None, time: float, rows: Indices) -> Assumption:
+    def with_curve(self, noise: ObservationNoise | None, best: Assumption, rows: Indices) -> Assumption:
+        """Return an assumption with the curve among the families, if it is asked for."""
+        if self.joints == self.families:
+            return best
+        return self.assume(noise, best.correlation_time, rows, self.families)
+
+    def assume(
+        self, noise: ObservationNoise | None, time: float, rows: Indices, families: list[str] | None = None
+    ) -> Assumption:
         """Identify the joint from some rows, which stand for all distinct rows with a correlation time."""
         some = self.pair.select(rows)
         found = identify(
             some.parent_poses,
             some.child_poses,
             noise=None if noise is None else noise.covariance,
-            families=self.families,
+            families=families or self.joints,
             outliers=True,
             sequential=self.pair.is_timed,
             correlation_time=max(1.0, time * len(rows) / len(self.distinct)),
@@ -238,7 +249,6 @@ class _Comparison:
         """Return the fits of families that have residuals to all distinct rows."""
         # If the stated noise is too small, most observations are outliers.
         found = first.found if noise is None else self.assume(None, 1.0, self.distinct).found
-        # A curve follows correlated errors.
         return {fit.family: fit for fit in found if fit.family not in ("free", CURVE)}
 
     def correlation_time(self, fit: Fit) -> float:
