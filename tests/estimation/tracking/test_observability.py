@@ -38,12 +38,12 @@ def make_tip_tracker(model: kv.Model, observer: NoisyObserver, deviation: float,
 
 
 def test_covariance_of_a_redundant_arm_is_consistent():
-    """The sample mean of NEES varies by 6 % between such runs; over many runs it is 0.95."""
+    """The sample mean of NEES varies by 7 % between such runs; over many runs it is 0.95."""
     model, rng = make_arm(), np.random.default_rng(1)
     observer = NoisyObserver(model, ["tip"], seed=1)
     first = make_tip_tracker(model, observer, 0.2)
     found = []
-    for _ in range(70):
+    for _ in range(45):
         truth = {name: value + 0.2 * rng.standard_normal() for name, value in BENT.items()}
         tracker = first.copy()
         for _ in range(6):
@@ -53,9 +53,9 @@ def test_covariance_of_a_redundant_arm_is_consistent():
     assert 0.9 < np.mean(found) < 1.1
 
 
-@pytest.mark.parametrize(("noise", "runs", "looks"), [(1e-4, 40, 10), (1e-2, 40, 10)])
+@pytest.mark.parametrize(("noise", "runs", "looks"), [(1e-4, 24, 10), (1e-2, 24, 10)])
 def test_covariance_of_a_redundant_arm_with_process_noise_is_consistent(noise, runs, looks):
-    """The sample mean of NEES varies by 9 %; over many runs it is 0.95 to 1.05."""
+    """The sample mean of NEES varies by 12 %; over many runs it is 0.95 to 1.05."""
     model, rng = make_arm(), np.random.default_rng(2)
     observer = NoisyObserver(model, ["tip"], seed=2)
     first = make_tip_tracker(model, observer, 0.2, process_noise={f"{name}:velocity": noise for name in BENT})
