@@ -128,19 +128,20 @@ class Recursion:
         result = step.update(state.mixture, reading, values)
         has_outliers = step.outliers is not None
         refuted = find_refuted(self.update_step.layout, reading, result, has_outliers)
-        loss = state.loss.after(find_measured(self.update_step.layout, reading), refuted, self.lost_after)
-        mixture = result.mixture
-        due = loss.is_lost & (loss.refuted % self.lost_after == 0) & refuted
-        if self.restarts and due.any():
-            groups = np.flatnonzero(due).tolist()
-            anew = step.restart(state.mixture, self.first.spread(step, values), groups, reading, values)
-            explained = due & (
-                step.find_accepted(anew.mixture, reading, values)
-                if has_outliers
-                else ~find_refuted(step.layout, reading, anew, has_outliers)
-            )
-            mixture = mixture.replace_groups(anew.mixture, np.flatnonzero(explained).tolist())
-            loss = loss.with_restarted(explained)
+        loss, mixture = state.loss, result.mixture
+        if not loss.is_clear or refuted.any():
+            loss = loss.after(find_measured(step.layout, reading), refuted, self.lost_after)
+            due = loss.is_lost & (loss.refuted % self.lost_after == 0) & refuted
+            if self.restarts and due.any():
+                groups = np.flatnonzero(due).tolist()
+                anew = step.restart(state.mixture, self.first.spread(step, values), groups, reading, values)
+                explained = due & (
+                    step.find_accepted(anew.mixture, reading, values)
+                    if has_outliers
+                    else ~find_refuted(step.layout, reading, anew, has_outliers)
+                )
+                mixture = mixture.replace_groups(anew.mixture, np.flatnonzero(explained).tolist())
+                loss = loss.with_restarted(explained)
         return TrackerState(mixture, result, loss, values, state.stamp, seen or state.reading)
 
     def read_inputs(self, last: Array, given: StateLike | None) -> Array:

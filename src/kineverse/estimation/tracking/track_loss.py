@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 import numpy.typing as npt
@@ -39,6 +40,11 @@ class TrackLoss:
         """Return the state of groups of which none is lost."""
         return TrackLoss(np.zeros(count, dtype=np.int64), np.zeros(count, dtype=bool))
 
+    @cached_property
+    def is_clear(self) -> bool:
+        """True if no group is lost or refuted."""
+        return not (self.refuted.any() or self.is_lost.any())
+
     def after(self, measured: Groups, refuted: Groups, lost_after: int) -> TrackLoss:
         """Return the state after an update with masks of measured and of refuted groups (groups,).
 
@@ -66,6 +72,9 @@ def find_refuted(layout: Layout, reading: Measurements, result: StepResult, has_
     squared exceeds its quantile of one in a million.
     """
     if not has_outliers:
+        # The quantile of any number of degrees of freedom is beyond this.
+        if not (result.nis > result.dof + 20.0).any():
+            return np.zeros(len(layout.groups), dtype=bool)
         return np.asarray(result.nis > chi_squared_quantile(result.dof))
     kept = reading.mask.copy()
     kept[list(result.outliers)] = False
