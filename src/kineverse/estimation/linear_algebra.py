@@ -41,8 +41,8 @@ def sum_log_determinants(matrices: Array) -> float:
 
 
 def symmetric(matrix: Array) -> Array:
-    """Return the symmetric part ½ (A + Aᵀ), which removes rounding errors."""
-    return (matrix + matrix.T) / 2
+    """Return the symmetric part ½ (A + Aᵀ) of a matrix or a stack of them, which removes rounding errors."""
+    return (matrix + transposed(matrix)) / 2
 
 
 def inverse_spd(matrix: Array) -> Array:

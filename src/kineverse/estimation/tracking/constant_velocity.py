@@ -176,16 +176,17 @@ class ConstantVelocity:
         state += coupled + transposed(coupled)
         spread_and_noise = dt**2 * spread + dt**3 / 3 * density[:, :, None] * np.eye(density.shape[1])
         state += by_speed @ spread_and_noise @ transposed(by_speed)
-        information = invert_matrices((state + transposed(state)) / 2)
+        information = invert_matrices(symmetric(state))
         regression, mean = moved @ information, multiply_vectors(slope, mean)
         left = spread + dt * density[:, :, None] * np.eye(density.shape[1]) - regression @ transposed(moved)
+        left = symmetric(left)
         belief.information[rows, columns] = information
         belief.vector[t] = multiply_vectors(information, mean)
         speed -= multiply_vectors(regression, mean)
         for g, (number, group) in enumerate(zip(numbers, groups, strict=True)):
             after = ends[g][0]
             belief.x[group.x] = after
-            belief.speeds[number] = ConditionalSpeeds(after, speed[g], regression[g], symmetric(left[g]))
+            belief.speeds[number] = ConditionalSpeeds(after, speed[g], regression[g], left[g])
 
     def _step_between(
         self, number: int, start: Array, end: Array, inputs: Array

@@ -25,6 +25,10 @@ if TYPE_CHECKING:
     from kineverse.model.model_view import ModelView
 
 
+# Distance beyond limits that may be rounding.
+_BEYOND = 1e-3
+
+
 @dataclass(frozen=True, eq=False)
 class InitialBelief:
     """Initial state and its standard deviations.
@@ -157,10 +161,6 @@ def _check_limits(update_step: UpdateStep, symbol: Symbol, value: float) -> None
         raise InvalidValueError(
             f"start= of '{symbol}' is {value:g}, beyond its limits {low:g} to {high:g} [m], [rad]."
         )
-
-
-# Distance beyond limits that may be rounding.
-_BEYOND = 1e-3
 
 
 def _unknown_name(key: object, names: Iterable[object]) -> UnknownNameError:

@@ -71,6 +71,8 @@ def find_refuted(layout: Layout, reading: Measurements, result: StepResult, has_
     With an outlier model, all measurements of the group are rejected. Without one, the normalised innovation
     squared exceeds its quantile of one in a million.
     """
+    if has_outliers and not result.outliers:
+        return np.zeros(len(layout.groups), dtype=bool)
     if not has_outliers:
         # The quantile of any number of degrees of freedom is beyond this.
         if not (result.nis > result.dof + 20.0).any():
