@@ -12,6 +12,7 @@ from synthetic_recordings import JOINTS, recording
 import kineverse as kv
 from kineverse.estimation import Identifier, identify, pose_covariance
 from kineverse.estimation.identification.goodness_of_fit import chi_squared_tail, f_distribution_tail
+from kineverse.lie import retract
 
 
 @pytest.mark.parametrize("family", ["revolute", "prismatic"])
@@ -112,3 +113,15 @@ def test_an_exact_hinge_is_a_hinge_and_no_curve(lever: float, turn: float) -> No
         found = identify(None, poses, noise=noise)
         assert found.best.family == "revolute"
         assert not found.is_ambiguous
+
+
+def test_parts_that_are_swapped_in_half_of_the_recording_are_no_curve() -> None:
+    """The two motions are apart. Across the gap, a curve through both is a guess."""
+    door = kv.translation(0.3, 0, 0.9) @ kv.rotation_z(kv.position("q")) @ kv.translation(0.6, 0, 0)
+    for seed in range(3):
+        rng = np.random.default_rng(seed)
+        poses = np.stack([door({"q": q}) for q in rng.uniform(0.0, 1.2, 30)])
+        swapped = rng.random(30) < 0.5
+        poses[swapped] = np.linalg.inv(poses[swapped])
+        poses = retract(poses, rng.normal(size=(30, 6)) * np.array([0.005] * 3 + [0.017] * 3))
+        assert identify(None, poses, noise=pose_covariance(0.005, 0.017)).is_ambiguous

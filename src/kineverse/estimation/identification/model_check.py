@@ -69,6 +69,8 @@ _SCALE_SPREAD = math.log(1.6)
 # Size of a simple joint's residuals relative to those of a curve up to which correlated errors may explain
 # them.
 _CORRELATED = 2.0
+# Largest distance between neighbours along a curve, relative to its length, across which it is told.
+_GAP = 0.3
 # Least probability of χ² of a curve, or its largest size of residuals relative to those of the best family,
 # and least probability of the curve, at which the joint values of that family are said to lie on a curve.
 _FITTING, _FITTING_FACTOR, _COMPETITIVE = 1e-3, 1.3, 1e-6
@@ -306,6 +308,9 @@ def _reasons(data: IdentificationData, found: IdentificationResult, solutions: S
     joints, curve = solution.motion.joints, solutions.get(CURVE)
     covariance = solution.covariance
     if name == CURVE:
+        along = np.sort(solution.values[:, 0])
+        if np.diff(along).max() > _GAP * np.ptp(along):
+            yield "no pose is in its longest part, so these may be two motions, such as of swapped parts"
         own = measure_fit(solution, covariance.mean(axis=0))
         for one in solutions.values():
             other_solution = one.scored.solution
