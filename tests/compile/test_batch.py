@@ -22,7 +22,7 @@ from hypothesis import HealthCheck, given, settings
 
 import kineverse as kv
 from hypothesis_profiles import attempts
-from kineverse.compile import batch, batch_codegen, parallel
+from kineverse.compile import batch, parallel, vector_codegen
 from kineverse.compile import batch as memory
 from kineverse.expressions.expression import from_casadi
 
@@ -209,7 +209,7 @@ def test_random_programs_equal_single_calls(program: RandomProgram) -> None:
 
 @pytest.mark.compiler
 def test_programs_longer_than_one_c_function(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(batch_codegen, "_PART_LENGTH", 7)
+    monkeypatch.setattr(vector_codegen, "PART_LENGTH", 7)
     # A constant of its own, for a library of its own.
     mechanism = arm()
     f = kv.compile([mechanism.pose, mechanism.jacobian * 1.03125], tier="c")

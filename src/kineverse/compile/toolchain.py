@@ -116,6 +116,18 @@ def optimisation_level(instructions: int) -> str | None:
     return None
 
 
+def vector_optimisation_level(instructions: int) -> str | None:
+    """Return the optimisation flag for a program of vectors; None if it is too large for a compiler.
+
+    Such programs are split into C functions, so that time grows with their length only.
+    """
+    if instructions <= 8_000:
+        return "-O3"
+    if instructions <= 400_000:
+        return "-O1"
+    return None
+
+
 @functools.lru_cache(maxsize=16)
 def _find(preferred: str, path: str) -> Toolchain | None:
     for candidate in (preferred, "cc", "gcc", "clang"):
