@@ -75,9 +75,7 @@ def find_uncovered(polytope: CoverPolytope, centres: Floats, radii: Floats, tole
     return Uncovered(growth, np.concatenate(points))
 
 
-def _measure_gaps(
-    cells: Floats, centres: Floats, radii: Floats
-) -> tuple[Floats, Integers, Floats, Floats]:
+def _measure_gaps(cells: Floats, centres: Floats, radii: Floats) -> tuple[Floats, Integers, Floats, Floats]:
     """Return how far each cell is from lying in one sphere, and in which one.
 
     Further, how far its worst corner is from all spheres, negative inside; and that corner.

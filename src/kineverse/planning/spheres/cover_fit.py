@@ -21,11 +21,11 @@ import numpy as np
 from kineverse.geometry.mesh_files import Floats, Integers
 
 from .certificate import distances, find_uncovered
+from .cover_mesh import CoverMesh
 from .cover_starts import CoverStarts
 from .polytope import CoverPolytope
-from .power_cells import find_power_cells
 
-_ROUNDS, _FEW_ROUNDS, _STEPS, _MEMORY = 24, 12, 6, 4
+_ROUNDS, _FEW_ROUNDS, _STEPS, _MEMORY = 24, 12, 6, 2
 """Power diagrams of a descent and of a short one, steps between two of them, and diagrams whose corners are
 remembered."""
 
@@ -33,6 +33,7 @@ _WARM, _COLD = 0.2, 0.015
 """First and last temperature of the smoothed maximum, as a fraction of the protrusion."""
 
 _MOMENTUM = 0.6
+_SAMPLES, _HARD = 600, 0.6
 _TRIALS = 4
 _REMOVALS, _FEW_SPHERES = 3, 12
 _PROOF = 0.01
@@ -57,30 +58,42 @@ class FittedSpheres:
         return (len(self.radii), self.protrusion) < (len(other.radii), other.protrusion)
 
 
+class _Problem:
+    """Polytope with the points of it that a cover is fitted to."""
+
+    def __init__(self, polytope: CoverPolytope, protrusion: float) -> None:
+        self.polytope = polytope
+        a, b, c = np.moveaxis(polytope.corners[polytope.faces], 1, 0)
+        area = float(np.linalg.norm(np.cross(b - a, c - a), axis=1).sum()) / 2
+        self.mesh = CoverMesh(polytope, max(protrusion, math.sqrt(area / _SAMPLES)))
+        self.uncovered = np.zeros((0, 3))
+
+
 def fit_spheres(polytope: CoverPolytope, protrusion: float, most: int) -> FittedSpheres:
     """Return few spheres that cover a polytope.
 
     Parameters
     ----------
     polytope
-        Polytopes of a solid whose extent is of order 1.
+        Polytopes of a solid about the origin, whose extent is of order 1.
     protrusion
         Largest protrusion; it is exceeded where ``most`` spheres are not enough.
     most
         Largest number of spheres.
     """
+    problem = _Problem(polytope, protrusion)
     aim = protrusion / (1.0 + 2 * _PROOF)
-    best = descend(polytope, np.zeros((1, 3)), aim, _FEW_ROUNDS)
+    best = descend(problem, np.zeros((1, 3)), aim, _FEW_ROUNDS)
     if best.protrusion > aim and most > 1:
-        best = _search_start(polytope, CoverStarts(polytope, aim), aim, most, best)
-        polished = descend(polytope, best.centres, aim)
+        best = _search_start(problem, CoverStarts(polytope, aim), aim, most, best)
+        polished = descend(problem, best.centres, aim)
         best = polished if polished.is_better(best, aim) else best
-        best = _remove(polytope, best, aim)
+        best = _remove(problem, best, aim)
     return prove(polytope, best)
 
 
 def _search_start(
-    polytope: CoverPolytope, start: CoverStarts, aim: float, most: int, best: FittedSpheres
+    problem: _Problem, start: CoverStarts, aim: float, most: int, best: FittedSpheres
 ) -> FittedSpheres:
     """Return the best of several short descents, each from a start for another protrusion."""
     least = start.least_greedy(most)
@@ -91,7 +104,7 @@ def _search_start(
         if len(centres) in tried:
             break
         tried.add(len(centres))
-        found = descend(polytope, centres, aim, _FEW_ROUNDS)
+        found = descend(problem, centres, aim, _FEW_ROUNDS)
         best = found if found.is_better(best, aim) else best
         # The protrusion after the descent is about proportional to that of the start.
         wanted = max(wanted * aim / found.protrusion, least)
@@ -101,24 +114,27 @@ def _search_start(
         if len(centres) in tried or len(centres) > (len(best.radii) if reached else most):
             continue
         tried.add(len(centres))
-        found = descend(polytope, centres, aim, _FEW_ROUNDS)
+        found = descend(problem, centres, aim, _FEW_ROUNDS)
         best = found if found.is_better(best, aim) else best
     return best
 
 
-def descend(polytope: CoverPolytope, centres: Floats, aim: float, rounds: int = _ROUNDS) -> FittedSpheres:
+def descend(problem: _Problem, centres: Floats, aim: float, rounds: int = _ROUNDS) -> FittedSpheres:
     """Return the cover with the least protrusion on the way down from some centres (N, 3)."""
+    polytope = problem.polytope
     best = FittedSpheres(centres, np.zeros(0), math.inf)
     estimate = aim
     remembered: list[Floats] = []
     for k in range(rounds):
         centres = _pull_inside(polytope, centres)
         depths = polytope.depths(centres)
-        corners, owners = find_power_cells(
-            polytope.outer_normals, polytope.outer_offsets, centres, depths + estimate
-        )
+        points = problem.mesh.find_critical(centres, depths + estimate)
+        points = np.concatenate([points, problem.uncovered])
+        apart = distances(points, centres)
+        owners = (apart - depths).argmin(axis=1)
+        lengths = apart[np.arange(len(points)), owners]
         radii = np.zeros(len(centres))
-        np.maximum.at(radii, owners, np.linalg.norm(corners - centres[owners], axis=1))
+        np.maximum.at(radii, owners, lengths)
         protrusions = radii - depths
         used = radii > 0.0
         protrusion = float(protrusions[used].max())
@@ -127,10 +143,11 @@ def descend(polytope: CoverPolytope, centres: Floats, aim: float, rounds: int = 
         estimate = min(protrusion, best.protrusion)
         if k == rounds - 1:
             break
-        remembered = [_merge(corners), *remembered[: _MEMORY - 1]]
+        hard = lengths - depths[owners] > _HARD * protrusion
         if not used.all():
-            centres = _relocate(centres, radii, protrusions, corners)
+            centres = _relocate(centres, radii, protrusions, points)
         temperature = estimate * _WARM * (_COLD / _WARM) ** (k / (rounds - 1))
+        remembered = [points[hard], *remembered[: _MEMORY - 1]]
         centres = _relax(polytope, centres, np.concatenate(remembered), temperature)
     return best
 
@@ -144,13 +161,6 @@ def _pull_inside(polytope: CoverPolytope, centres: Floats) -> Floats:
     middle = float(polytope.depths(np.zeros((1, 3)))[0])
     part = np.where(depths < 0.0, -depths / np.maximum(middle - depths, 1e-300), 0.0)
     return centres * (1.0 - np.minimum(1.0001 * part, 1.0))[:, None]
-
-
-def _merge(corners: Floats) -> Floats:
-    """Return corners without those that neighbouring cells share."""
-    marks = np.round(corners @ np.array([1.0, math.sqrt(2.0), math.pi]), 6)
-    merged: Floats = corners[np.unique(marks, return_index=True)[1]]
-    return merged
 
 
 def _relocate(centres: Floats, radii: Floats, protrusions: Floats, corners: Floats) -> Floats:
@@ -180,7 +190,9 @@ def _relax(polytope: CoverPolytope, centres: Floats, points: Floats, temperature
         weights = np.exp((needs - largest[owners]) / temperature)
         pulls = (centres[owners] - points) * (weights / np.maximum(lengths, 1e-12))[:, None]
         sums = np.maximum(np.bincount(owners, weights, count), 1e-300)
-        gradient = np.column_stack([np.bincount(owners, pulls[:, k], count) for k in range(3)]) / sums[:, None]
+        gradient = (
+            np.column_stack([np.bincount(owners, pulls[:, k], count) for k in range(3)]) / sums[:, None]
+        )
         near = np.exp((depths[:, None] - slack) / temperature)
         gradient += (near @ polytope.normals) / near.sum(axis=1, keepdims=True)
         speed = _MOMENTUM * speed - temperature * gradient
@@ -188,7 +200,7 @@ def _relax(polytope: CoverPolytope, centres: Floats, points: Floats, temperature
     return centres
 
 
-def _remove(polytope: CoverPolytope, cover: FittedSpheres, aim: float) -> FittedSpheres:
+def _remove(problem: _Problem, cover: FittedSpheres, aim: float) -> FittedSpheres:
     """Return the cover without spheres that the others can replace within the aim."""
     failures = 0
     while cover.protrusion <= aim and len(cover.radii) > 1 and failures < _REMOVALS:
@@ -197,8 +209,8 @@ def _remove(polytope: CoverPolytope, cover: FittedSpheres, aim: float) -> Fitted
         if count == 0 and len(cover.radii) > _FEW_SPHERES:
             break
         count = max(count >> failures, 1)
-        dropped = np.argsort(_removal_losses(polytope, cover), kind="stable")[:count]
-        found = descend(polytope, np.delete(cover.centres, dropped, axis=0), aim)
+        dropped = np.argsort(_removal_losses(problem, cover), kind="stable")[:count]
+        found = descend(problem, np.delete(cover.centres, dropped, axis=0), aim)
         if found.protrusion <= aim:
             cover = found
         elif count == 1:
@@ -208,14 +220,13 @@ def _remove(polytope: CoverPolytope, cover: FittedSpheres, aim: float) -> Fitted
     return cover
 
 
-def _removal_losses(polytope: CoverPolytope, cover: FittedSpheres) -> Floats:
-    """Return for each sphere the protrusion (N,) that the others would need for its power cell."""
-    depths = polytope.depths(cover.centres)
-    corners, owners = find_power_cells(
-        polytope.outer_normals, polytope.outer_offsets, cover.centres, depths + cover.protrusion
-    )
-    needs = distances(corners, cover.centres) - depths
-    needs[np.arange(len(corners)), owners] = np.inf
+def _removal_losses(problem: _Problem, cover: FittedSpheres) -> Floats:
+    """Return for each sphere the protrusion (N,) that the others would need for what it covers."""
+    depths = problem.polytope.depths(cover.centres)
+    points = problem.mesh.find_critical(cover.centres, depths + cover.protrusion)
+    needs = distances(points, cover.centres) - depths
+    rows, owners = np.arange(len(points)), needs.argmin(axis=1)
+    needs[rows, owners] = np.inf
     losses = np.full(len(depths), -np.inf)
     np.maximum.at(losses, owners, needs.min(axis=1))
     return losses

@@ -9,6 +9,7 @@ import numpy as np
 from kineverse.geometry.mesh_files import Floats, Integers
 
 from .certificate import distances
+from .cover_mesh import split_triangles
 from .polytope import CoverPolytope
 
 _SAMPLES, _CANDIDATES = 300, 1500
@@ -28,7 +29,7 @@ class CoverStarts:
         a, b, c = np.moveaxis(triangles, 1, 0)
         area = float(np.linalg.norm(np.cross(b - a, c - a), axis=1).sum()) / 2
         spacing = max(1.1 * protrusion, math.sqrt(area / _SAMPLES))
-        triangles = _split_triangles(triangles, spacing)
+        triangles = split_triangles(triangles, spacing)
         surface = _thin(triangles.reshape(-1, 3), 0.6 * spacing)[0]
         self._points = np.concatenate([surface, 0.7 * surface, 0.35 * surface])
         middles, kept = _thin(triangles.mean(axis=1), spacing)
@@ -38,7 +39,11 @@ class CoverStarts:
         deepest = max(float(polytope.depths(np.zeros((1, 3)))[0]), protrusion)
         levels = protrusion * np.geomspace(0.7, max(1.2 * deepest / protrusion, 1.5), 5)
         candidates = np.concatenate(
-            [np.zeros((1, 3)), *(f * surface for f in (0.3, 0.6, 0.8, 0.9)), *(middles - t * normals for t in levels)]
+            [
+                np.zeros((1, 3)),
+                *(f * surface for f in (0.3, 0.6, 0.8, 0.9)),
+                *(middles - t * normals for t in levels),
+            ]
         )
         candidates = candidates[polytope.depths(candidates) > 0.0]
         self._candidates = candidates[:: len(candidates) // _CANDIDATES + 1]
@@ -97,23 +102,6 @@ def _principal_axes(corners: Floats) -> Floats:
     principal = np.linalg.svd(corners - corners.mean(axis=0), full_matrices=False)[2]
     boxes = [float(np.ptp(corners @ axes.T, axis=0).prod()) for axes in (np.eye(3), principal)]
     return principal if boxes[1] < 0.99 * boxes[0] else np.eye(3)
-
-
-def _split_triangles(triangles: Floats, longest: float) -> Floats:
-    """Return (n, 3, 3) triangles cut at the middle of their longest edges, until none is too long."""
-    done: list[Floats] = []
-    while len(triangles):
-        edges = np.linalg.norm(triangles - np.roll(triangles, -1, axis=1), axis=2)
-        first = edges.argmax(axis=1)
-        rows = np.arange(len(triangles))
-        long = edges[rows, first] > longest
-        done.append(triangles[~long])
-        triangles, first = triangles[long], first[long]
-        rows = np.arange(len(triangles))
-        a, b, c = (triangles[rows, (first + k) % 3] for k in range(3))
-        middle = (a + b) / 2
-        triangles = np.concatenate([np.stack([a, middle, c], axis=1), np.stack([middle, b, c], axis=1)])
-    return np.concatenate(done)
 
 
 def _thin(points: Floats, spacing: float) -> tuple[Floats, Integers]:

@@ -17,16 +17,12 @@ from kineverse.geometry.mesh_files import Faces, Floats, Integers
 from kineverse.geometry.shapes import Hull, Solid, solid_from_points, solid_surface
 from kineverse.model.body import Box, Capsule, Cone, Cylinder, Ellipsoid, Sphere
 
-from .power_cells import find_power_cells
-
 _ROUNDNESS = 0.03
 """Gap between a round solid and either polytope, as a fraction of the protrusion of a cover."""
 
 _FEWEST_SIDES, _MOST_SIDES = 12, 192
 
-_FINENESS, _MANY_CORNERS, _DIRECTIONS = 0.1, 150, 300
-"""Hulls with many corners are replaced by hulls of those that are extreme along some directions, if the gap is
-below a fraction of the protrusion."""
+_ASCENT = 120
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -39,8 +35,6 @@ class CoverPolytope:
         Outer polytope: (V, 3) corners [m] and (T, 3) triangles, counter-clockwise seen from outside.
     normals, offsets
         Inner polytope: the points x with ``normals @ x <= offsets``; (F, 3) unit vectors and (F,) [m].
-    outer_normals, outer_offsets
-        The half-spaces of the outer polytope in the same form.
     volume
         Volume of the solid itself [m³].
     """
@@ -49,14 +43,27 @@ class CoverPolytope:
     faces: Integers
     normals: Floats
     offsets: Floats
-    outer_normals: Floats
-    outer_offsets: Floats
     volume: float
 
     def depths(self, points: Floats) -> Floats:
         """Return lower bounds (n,) of the depths of points (n, 3) in the solid [m]; negative outside."""
         depths: Floats = (self.offsets - points @ self.normals.T).min(axis=1)
         return depths
+
+    def find_deepest_point(self) -> Floats:
+        """Return a point (3,) of the solid that is far from all planes [m]."""
+        point = best = self.corners.mean(axis=0)
+        width = -math.inf
+        step = 0.5 * float(np.ptp(self.corners, axis=0).max())
+        for _ in range(_ASCENT):
+            slack = self.offsets - self.normals @ point
+            nearest = int(slack.argmin())
+            if slack[nearest] > width:
+                best, width = point, float(slack[nearest])
+            # Away from the nearest plane; from outside, at least to its inner side.
+            point = point - self.normals[nearest] * max(step, -1.1 * float(slack[nearest]))
+            step *= 0.93
+        return best
 
     def normalize(self, centre: Floats, radius: float) -> CoverPolytope:
         """Return the polytopes about a point (3,) as the origin, with a radius [m] as the unit of length."""
@@ -65,8 +72,6 @@ class CoverPolytope:
             self.faces,
             self.normals,
             (self.offsets - self.normals @ centre) / radius,
-            self.outer_normals,
-            (self.outer_offsets - self.outer_normals @ centre) / radius,
             self.volume / radius**3,
         )
 
@@ -85,7 +90,7 @@ def bound_solid(solid: Solid, protrusion: float) -> CoverPolytope:
             "A triangle mesh has no inside to be covered by spheres: use its hull or its decomposition."
         )
     if isinstance(surface, Hull):
-        return _bound_hull(solid, _FINENESS * protrusion)
+        return _bound_hull(solid)
     if isinstance(surface, Box):
         signs = np.array([[i, j, k] for i in (-1.0, 1.0) for j in (-1.0, 1.0) for k in (-1.0, 1.0)])
         return _bound_hull(solid_from_points(signs * solid.half))
@@ -113,45 +118,16 @@ def bound_solid(solid: Solid, protrusion: float) -> CoverPolytope:
     return _between(ends[0], ends[1], disc * 2 * half / 3)
 
 
-def _bound_hull(solid: Solid, gap: float = 0.0) -> CoverPolytope:
-    """Return the bounds of a hull: itself, or ones with fewer corners within a gap [m]."""
+def _bound_hull(solid: Solid) -> CoverPolytope:
     mesh, surface = solid_surface(solid), solid.surface
     assert isinstance(mesh, Faces)
     assert isinstance(surface, Hull)
     a, b, c = np.moveaxis(mesh.vertices[mesh.faces] - mesh.vertices.mean(axis=0), 1, 0)
     volume = float(np.einsum("ij,ij->", a, np.cross(b, c)) / 6)
-    if gap > 0.0 and len(mesh.vertices) > _MANY_CORNERS:
-        simple = _simplify(mesh.vertices, solid, gap)
-        if simple is not None:
-            return replace(simple, volume=volume)
     # Triangles of one flat face share a plane.
     planes = np.column_stack([surface.normals, surface.offsets / solid.radius])
     kept = np.unique(np.round(planes, 9), axis=0, return_index=True)[1]
-    normals, offsets = surface.normals[kept], surface.offsets[kept]
-    return CoverPolytope(mesh.vertices, mesh.faces, normals, offsets, normals, offsets, volume)
-
-
-def _simplify(corners: Floats, solid: Solid, gap: float) -> CoverPolytope | None:
-    """Return bounds of a hull by its extreme corners along some directions; None if they are too far apart.
-
-    The planes of the hull of these corners, moved outwards to all corners, bound it from outside.
-    """
-    directions = _sphere_lattice(_DIRECTIONS)
-    extreme = np.unique((corners @ directions.T).argmax(axis=0))
-    try:
-        inner = _bound_hull(solid_from_points(corners[extreme]))
-        offsets = (corners @ inner.normals.T).max(axis=0)
-        if float((offsets - inner.offsets).max()) > gap:
-            return None
-        around = find_power_cells(
-            inner.normals, offsets, solid.centre[None], np.array([solid.radius])
-        )[0]
-        outer = _bound_hull(solid_from_points(around))
-    except InvalidValueError:  # the extreme corners of a very thin hull may be flat
-        return None
-    return replace(
-        outer, normals=inner.normals, offsets=inner.offsets
-    )
+    return CoverPolytope(mesh.vertices, mesh.faces, surface.normals[kept], surface.offsets[kept], volume)
 
 
 def _between(inner: Floats, outer: Floats, volume: float) -> CoverPolytope:

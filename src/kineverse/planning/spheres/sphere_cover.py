@@ -14,7 +14,6 @@ from kineverse.model.body import Capsule, Sphere
 
 from .cover_fit import FittedSpheres, fit_spheres
 from .polytope import bound_solid
-from .power_cells import find_deepest_point
 from .union_volume import union_volume
 
 MOST = 32
@@ -87,7 +86,7 @@ def cover_solid(solid: Solid, protrusion: float | None = None, most: int = MOST)
         centres, radii, reached = _capsule_chain(solid.surface, protrusion, most)
         return _make_cover(centres, radii, reached, _volume(solid))
     polytope = bound_solid(solid, protrusion)
-    origin = find_deepest_point(polytope.normals, polytope.offsets, polytope.corners.mean(axis=0))
+    origin = polytope.find_deepest_point()
     unit = solid.radius
     fitted: FittedSpheres = fit_spheres(polytope.normalize(origin, unit), protrusion / unit, most)
     return _make_cover(

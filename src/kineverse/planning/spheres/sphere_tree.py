@@ -66,7 +66,9 @@ def make_sphere_tree(centres: npt.ArrayLike, radii: npt.ArrayLike) -> SphereTree
     ball_centre, ball_radius = enclosing_ball(where, sizes)
     if len(sizes) <= _ALWAYS_FLAT:
         order = np.arange(len(sizes))
-        return SphereTree(where, sizes, order, where, sizes, np.arange(len(sizes) + 1), ball_centre, ball_radius)
+        return SphereTree(
+            where, sizes, order, where, sizes, np.arange(len(sizes) + 1), ball_centre, ball_radius
+        )
     clusters = _cluster(where, sizes, round(math.sqrt(len(sizes))))
     order = np.argsort(clusters, kind="stable")
     where, sizes, clusters = where[order], sizes[order], clusters[order]
@@ -74,9 +76,7 @@ def make_sphere_tree(centres: npt.ArrayLike, radii: npt.ArrayLike) -> SphereTree
     balls = [enclosing_ball(where[i:j], sizes[i:j]) for i, j in zip(first[:-1], first[1:], strict=True)]
     coarse_centres = np.array([centre for centre, _ in balls])
     coarse_radii = np.array([radius for _, radius in balls])
-    return SphereTree(
-        where, sizes, order, coarse_centres, coarse_radii, first, ball_centre, ball_radius
-    )
+    return SphereTree(where, sizes, order, coarse_centres, coarse_radii, first, ball_centre, ball_radius)
 
 
 def enclosing_ball(centres: Floats, radii: Floats) -> tuple[Floats, float]:
