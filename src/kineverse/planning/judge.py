@@ -1,0 +1,74 @@
+"""Judgement of configurations and paths by the collision scene, in double precision."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+
+from kineverse.geometry import Rule, Scene
+from kineverse.geometry.results import DistanceResult
+from kineverse.lie import Array
+from kineverse.state import State
+from kineverse.symbols import Symbol
+
+from .path import densify
+
+FINE = 1 / 640
+"""Step of samples where no certificate vouches for what lies between them [rad], [m]."""
+
+
+class SceneJudge:
+    """Contacts of configurations of some coordinates, by the scene.
+
+    Parameters
+    ----------
+    scene
+        The scene; it is left at the last configuration.
+    coordinates
+        The n coordinates that move.
+    rules
+        Rules about pairs that do not count.
+    """
+
+    def __init__(self, scene: Scene, coordinates: Sequence[Symbol], rules: Sequence[Rule]) -> None:
+        self._scene = scene
+        self._query = scene.watch(moving=coordinates, rules=rules, radius=0.0)
+        place = {s: k for k, s in enumerate(scene.inputs)}
+        self._columns = np.array([place.get(s, -1) for s in coordinates], dtype=int)
+        self._moved = self._columns >= 0
+        self._values = np.zeros(len(scene.inputs))
+
+    def place(self, state: State) -> None:
+        """Set the values of everything else."""
+        self._values[:] = state.vector(self._scene.inputs)
+
+    def contacts(self, q: Array, radius: float = 0.0) -> Sequence[DistanceResult]:
+        """Return the pairs of bodies within a radius [m] at a configuration (n,), deepest first."""
+        self._values[self._columns[self._moved]] = q[self._moved]
+        self._scene.update(self._values)
+        return self._query(radius)
+
+    def first_contact(self, points: Array, step: float) -> tuple[Array, DistanceResult] | None:
+        """Return the first sample of a polyline (N, n) with a contact, and the contact."""
+        for q in densify(points, step):
+            found = self.contacts(q)
+            if len(found):
+                return q, found[0]
+        return None
+
+    def clearance(self, points: Array, step: float, radius: float = 0.5) -> float:
+        """Return the least distance of a pair at samples of a polyline [m]; infinite beyond a radius."""
+        least = np.inf
+        for q in densify(points, step):
+            found = self.contacts(q, min(radius, least))
+            if len(found):
+                least = float(found.distances[0])
+        return float(least)
+
+
+def describe_contacts(found: Sequence[DistanceResult], most: int = 3) -> str:
+    """Return the names of touching pairs of bodies, and how deep they penetrate [mm]."""
+    pairs = [f"'{f.a}' and '{f.b}' ({-1e3 * f.distance:.1f} mm deep)" for f in list(found)[:most]]
+    more = f" and {len(found) - most} more pairs" if len(found) > most else ""
+    return ", ".join(pairs) + more
