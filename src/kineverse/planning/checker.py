@@ -4,7 +4,10 @@ from __future__ import annotations
 
 import ctypes
 import math
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
+from collections.abc import Set as AbstractSet
+from contextlib import contextmanager
+from itertools import permutations
 
 import numpy as np
 import numpy.typing as npt
@@ -116,7 +119,7 @@ class CollisionChecker:
         owners = world.table.body[self._static]
         used, numbers = np.unique(owners, return_inverse=True)
         self.standing = tuple(world.bodies[k] for k in used)
-        moving = [world.body_index(body) for body in self.moving]
+        moving = np.array([world.body_index(body) for body in self.moving], dtype=int)
         self._allowed = np.ascontiguousarray(world.table.allowed[np.ix_(moving, used)], dtype=np.uint8)
         solids = [world.solid(k) for k in self._static]
         self._world = ObstacleSet(solids, numbers.astype(np.int32), self._planes, self.program.lanes)
@@ -211,6 +214,41 @@ class CollisionChecker:
         self._world.place(self.scene.collision_world.table.poses[self._static])
         self._kept = self.program.prepare(state.vector(self.parameters))
         self.struct.kept = self._kept.ctypes.data
+
+    @contextmanager
+    def excepting(self, pairs: AbstractSet[frozenset[str]]) -> Iterator[None]:
+        """Leave out pairs of bodies, {a, b} each, while the context lasts."""
+        if not pairs:
+            yield
+            return
+        standing = {body: k for k, body in enumerate(self.standing)}
+        numbers = {body: k for k, body in enumerate(self.moving)}
+        allowed = self._allowed.copy()
+        for pair in pairs:
+            for a, b in permutations(pair):
+                if a in numbers and b in standing:
+                    allowed[numbers[a], standing[b]] = 0
+
+        def keep(rows: npt.NDArray[np.int32]) -> npt.NDArray[np.int32]:
+            names = [frozenset((self.moving[i], self.moving[j])) for i, j in rows.tolist()]
+            return np.ascontiguousarray(rows[[name not in pairs for name in names]].reshape(-1, 2))
+
+        spheres, shapes = keep(self.pairs), keep(self.moving_pairs)
+        self._use(allowed, spheres, shapes)
+        try:
+            yield
+        finally:
+            self._use(self._allowed, self.pairs, self.moving_pairs)
+
+    def _use(
+        self,
+        allowed: npt.NDArray[np.uint8],
+        pairs: npt.NDArray[np.int32],
+        moving_pairs: npt.NDArray[np.int32],
+    ) -> None:
+        s = self.struct
+        s.allowed, s.pair, s.moving_pair = allowed.ctypes.data, pairs.ctypes.data, moving_pairs.ctypes.data
+        s.pairs, s.moving_pairs = len(pairs), len(moving_pairs)
 
     # -- configurations ------------------------------------------------------------------------------------
 

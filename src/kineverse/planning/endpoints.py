@@ -10,11 +10,14 @@ from kineverse.lie import Array
 
 from .checker import CollisionChecker
 from .configuration import PlanningSpace
+from .manifold import EXACT, Manifold
 from .judge import FINE, SceneJudge, describe_contacts
 
 _DISTANCES = (0.01, 0.02, 0.04, 0.08, 0.15, 0.3, 0.5)
 _TRIES, _WAYS = 256, 6
 _LIMIT = 1e-6
+_NEAR = 0.01
+"""Largest residual of an end that is brought onto a manifold [m], [rad]."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -49,10 +52,14 @@ class Endpoints:
         Collision checker with spheres.
     judge
         Collision scene.
+    manifold
+        Manifold that they are on; None for the whole space.
     """
 
-    def __init__(self, space: PlanningSpace, checker: CollisionChecker, judge: SceneJudge) -> None:
-        self._space, self._checker, self._judge = space, checker, judge
+    def __init__(
+        self, space: PlanningSpace, checker: CollisionChecker, judge: SceneJudge, manifold: Manifold | None
+    ) -> None:
+        self._space, self._checker, self._judge, self._manifold = space, checker, judge, manifold
 
     def check(self, what: str, q: Array) -> Endpoint:
         """Return a start or goal (n,), with the reason why it cannot be used, or the way out of its spheres."""
@@ -60,6 +67,15 @@ class Endpoints:
         outside = self._beyond_limits(q)
         if outside:
             return Endpoint(way, f"{what} is out of limits: {outside}.")
+        if self._manifold is not None:
+            off = float(self._manifold.residuals(way)[0])
+            way, residuals = self._manifold.polish(way) if off <= _NEAR else (way, np.array([off]))
+            if not residuals[0] <= EXACT or self._beyond_limits(way[0]):
+                return Endpoint(
+                    q[None],
+                    f"{what} does not meet the holds: it is off by {off:.3g}. planner.solutions(holds) finds some.",
+                )
+            q = way[0]
         narrow = np.ascontiguousarray(
             np.clip(way, self._checker.lower, self._checker.upper), dtype=np.float32
         )
@@ -99,9 +115,13 @@ class Endpoints:
         for distance in _DISTANCES:
             step = generator.standard_normal((_TRIES, len(q)))
             step *= distance / np.linalg.norm(step, axis=1)[:, None]
-            tries = np.clip(q + step, low, high)
-            free = tries[self._checker.valid(np.ascontiguousarray(tries, dtype=np.float32))]
-            for other in free[:_WAYS]:
+            tries = np.ascontiguousarray(np.clip(q + step, low, high), dtype=np.float32)
+            if self._manifold is not None:
+                tries = np.ascontiguousarray(tries[self._manifold.project(tries)])
+            free = tries[self._checker.valid(tries)][:_WAYS].astype(float)
+            if self._manifold is not None and len(free):
+                free = self._manifold.polish(free)[0]
+            for other in free:
                 if self._judge.first_contact(np.array([q, other]), FINE * 4) is None:
                     return np.asarray(other)
         return None

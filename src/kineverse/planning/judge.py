@@ -7,7 +7,7 @@ from collections.abc import Sequence
 import numpy as np
 
 from kineverse.geometry import Rule, Scene
-from kineverse.geometry.results import DistanceResult
+from kineverse.geometry.results import DistanceResult, DistanceResults
 from kineverse.lie import Array
 from kineverse.state import State
 from kineverse.symbols import Symbol
@@ -43,7 +43,7 @@ class SceneJudge:
         """Set the values of everything else."""
         self._values[:] = state.vector(self._scene.inputs)
 
-    def contacts(self, q: Array, radius: float = 0.0) -> Sequence[DistanceResult]:
+    def contacts(self, q: Array, radius: float = 0.0) -> DistanceResults:
         """Return the pairs of bodies within a radius [m] at a configuration (n,), deepest first."""
         self._values[self._columns[self._moved]] = q[self._moved]
         self._scene.update(self._values)

@@ -115,7 +115,7 @@ class ObstacleSet:
             self._order = _spatial_order(centre, lanes)
         order = self._order
         # A box along the axes is the same box with its edges in another order.
-        turned = (np.abs(rotation) > 1 - _ALIGNED).any(axis=2).all(axis=1)
+        turned = np.all(np.any(np.abs(rotation) > 1 - _ALIGNED, axis=2), axis=1)
         boxes = items["kind"] == BOX
         upright = np.abs(rotation[:, 2, 2]) > 1 - _ALIGNED
         round_ = (items["kind"] == CYLINDER) | (items["kind"] == CAPSULE)

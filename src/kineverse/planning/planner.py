@@ -10,29 +10,33 @@ import numpy as np
 import numpy.typing as npt
 
 from kineverse._checks import as_count, as_tolerance, real_number
+from kineverse.control.tasks import Goal, Hold
 from kineverse.errors import InvalidValueError, ShapeError
+from kineverse.expressions.expression import ExpressionLike
 from kineverse.geometry import Rule, Scene
+from kineverse.geometry.collision_filter import rigid_group
 from kineverse.geometry.objects import Exclusion
+from kineverse.geometry.prepared_query import flag_subtree
 from kineverse.lie import Array
 from kineverse.model.model_view import ModelView
 from kineverse.state import State, StateLike, as_state
 from kineverse.symbols import Symbol
 
-from .bindings import TIME_IS_UP
 from .checker import RESOLUTION, CollisionChecker
 from .configuration import PlanningSpace
+from .connection import connect, connect_on_manifold
 from .endpoints import Endpoint, Endpoints
-from .judge import FINE, SceneJudge, describe_contacts
-from .path import Path, densify
-from .search import RrtConnect, SearchResult
+from .judge import SceneJudge, describe_contacts
+from .manifold import FrameHold, Manifold, hold_frames
+from .path import Path
+from .solutions import find_solutions
 
-_SHORTCUTS = 60
-_REPAIRS = 12
-_FINER = 8.0
-"""Factor of the resolution where an edge collides between its samples."""
 _JUDGED = 1.0
 """Longest step between judged configurations of a path that is certified [rad], [m]."""
 _SAMPLES = 64
+_TASK_GOALS = 32
+"""Number of configurations that are looked for where tasks are the goal."""
+_MOST_MANIFOLDS = 16
 
 
 class Planner:
@@ -106,9 +110,8 @@ class Planner:
         self.scene = scene
         self.checker = CollisionChecker(scene, space.symbols, space.conditions, self.margin, self._protrusion)
         space.turning &= self.checker.find_periodic(space.turning)
-        self._judge = SceneJudge(scene, space.symbols, ())
-        self._search = RrtConnect(self.checker)
-        self._endpoints = Endpoints(space, self.checker, self._judge)
+        self._manifolds: dict[tuple[Hold, ...], Manifold] = {}
+        self._judges: dict[frozenset[frozenset[str]], SceneJudge] = {}
         self._version = model.version
         self._place(model.default_state() if self._state is None else model.default_state() | self._state)
 
@@ -157,7 +160,6 @@ class Planner:
     def _place(self, state: State) -> None:
         self._state = state
         self.checker.place(state)
-        self._judge.place(state)
         self._set_bounds(self._here, self._here[None])
 
     @property
@@ -211,13 +213,88 @@ class Planner:
             raise InvalidValueError(f"{name} has values that are not finite.")
         return np.ascontiguousarray(points)
 
+    # -- holds and solutions -------------------------------------------------------------------------------
+
+    def hold(
+        self, a: str, b: str, mask: str = "xyz rx ry rz", offset: ExpressionLike | None = None
+    ) -> FrameHold:
+        """Return the hold of a frame by another one, such as a grasp: see :func:`.hold_frames`.
+
+        While it lasts, the bodies at and below both frames may touch each other.
+        """
+        return hold_frames(self.model, a, b, mask, offset)
+
+    def solutions(
+        self,
+        tasks: Hold | Goal | Iterable[Hold | Goal],
+        count: int = 16,
+        *,
+        seconds: float = 1.0,
+        seed: int = 0,
+    ) -> Array:
+        """Return different configurations (K, n), free of collisions, at which holds and goals are met.
+
+        Parameters
+        ----------
+        tasks
+            Holds and goals; targets of goals are met exactly, and their weights have no meaning.
+        count
+            Largest number of configurations; those near to where the coordinates are placed come first.
+        seconds
+            Largest time [s], spent only if there are fewer.
+        seed
+            Seed of the random starts.
+        """
+        self._synchronize()
+        given = as_holds(tasks)
+        self._set_bounds(self._here, self._here[None])
+        manifold = self._manifold(given)
+        if manifold is None:
+            raise InvalidValueError("There is no hold and no goal, so every configuration is a solution.")
+        with self.checker.excepting(self._touching(given)):
+            return find_solutions(
+                self.checker,
+                manifold,
+                self._here,
+                as_count("count", count, 1),
+                seconds,
+                as_count("seed", seed, 0),
+            )
+
+    def _manifold(self, holds: Sequence[Hold]) -> Manifold | None:
+        """Return the manifold of holds and equalities of the model, at the present place."""
+        if not holds and not self.space.equalities:
+            return None
+        key = tuple(holds)
+        if key not in self._manifolds:
+            if len(self._manifolds) >= _MOST_MANIFOLDS:
+                self._manifolds.clear()
+            self._manifolds[key] = Manifold(self.checker, self.model, key, self.space.equalities)
+        manifold = self._manifolds[key]
+        assert self._state is not None
+        manifold.place(self._state)
+        return manifold
+
+    def _touching(self, holds: Iterable[Hold]) -> frozenset[frozenset[str]]:
+        """Return the pairs of bodies that may touch while holds last."""
+        bodies = self.scene.bodies
+        return frozenset(
+            frozenset((a, b))
+            for hold in holds
+            if isinstance(hold, FrameHold)
+            for a in find_carried_bodies(self.model, bodies, hold.frames[0])
+            for b in find_carried_bodies(self.model, bodies, hold.frames[1])
+            if a != b
+        )
+
     # -- paths ---------------------------------------------------------------------------------------------
 
     def plan(
         self,
         start: StateLike | npt.ArrayLike | None,
-        goals: StateLike | npt.ArrayLike | Sequence[StateLike],
+        goals: StateLike | npt.ArrayLike | Sequence[StateLike] | Sequence[Hold | Goal],
         *,
+        along: Hold | Iterable[Hold] = (),
         seconds: float = 1.0,
         seed: int = 0,
     ) -> Path:
@@ -228,95 +305,93 @@ class Planner:
         start
             A configuration (n,) or a state; None for where the coordinates are placed.
         goals
-            A configuration (n,), several (K, n), or states.
+            A configuration (n,), several (K, n), states, or holds and goals that are met together at the end.
+        along
+            Holds that are met all along the path. Start and goals have to meet them up to 1 cm or .01 rad.
         seconds
             Largest time of the search [s]; checks of its result come on top.
         seed
-            Seed of the search: the same one leads to the same path, unless the time is up.
+            Seed of the search: the same one leads to the same path on one machine, unless the time is up.
         """
         self._synchronize()
         begin = perf_counter()
         seconds, seed = max(real_number(seconds), 0.0), as_count("seed", seed, 0)
+        holds = as_holds(along)
         q = self._here if start is None else self._configurations(start, "start")[0]
-        ends = self._configurations(goals, "goals")
+        tasks = () if not _are_tasks(goals) else as_holds(goals)
+        if tasks:
+            ends = self.solutions([*holds, *tasks], _TASK_GOALS, seconds=seconds, seed=seed)
+            if not len(ends):
+                return self._no_path(q, self._no_solution([*holds, *tasks]), begin)
+        else:
+            ends = self._configurations(goals, "goals")
         self._set_bounds(q, ends)
-        first = self._endpoints.check("The start", q)
-        if first.reason:
-            return self._no_path(q, first.reason, begin)
-        goals_checked = [
-            self._endpoints.check("The goal" if len(ends) == 1 else f"Goal {k}", end)
-            for k, end in enumerate(ends)
-        ]
-        usable = [goal for goal in goals_checked if not goal.reason]
-        if not usable:
-            return self._no_path(q, " ".join(goal.reason for goal in goals_checked[:3]), begin)
-        return self._connect(first, usable, seconds, seed, begin)
+        manifold = self._manifold(holds)
+        touching = self._touching([*holds, *tasks])
+        with self.checker.excepting(touching):
+            endpoints = Endpoints(self.space, self.checker, self._judge(touching), manifold)
+            first = endpoints.check("The start", q)
+            if first.reason:
+                return self._no_path(q, first.reason, begin)
+            names = ["The goal"] if len(ends) == 1 else [f"Goal {k}" for k in range(len(ends))]
+            last = [endpoints.check(name, end) for name, end in zip(names, ends, strict=True)]
+            usable = [goal for goal in last if not goal.reason]
+            if not usable:
+                return self._no_path(q, " ".join(goal.reason for goal in last[:3]), begin)
+            return self._connect(first, usable, manifold, touching, seconds, seed, begin)
 
     def _connect(
-        self, first: Endpoint, goals: Sequence[Endpoint], seconds: float, seed: int, begin: float
+        self,
+        first: Endpoint,
+        goals: Sequence[Endpoint],
+        manifold: Manifold | None,
+        touching: frozenset[frozenset[str]],
+        seconds: float,
+        seed: int,
+        begin: float,
     ) -> Path:
         q = first.inner
         variants = [(goal, v) for goal in goals for v in self.space.equivalents(goal.inner, q)]
         targets = np.ascontiguousarray([v for _, v in variants], dtype=np.float32)
         starts = np.ascontiguousarray(q[None], dtype=np.float32)
         searched = perf_counter()
-        found = self._search.solve(starts, targets, seconds, seed)
-        points, problem = found.points, ""
-        if found.found:
-            points = self._search.shorten(
-                points, max(seconds - (perf_counter() - searched), 0.0), seed, _SHORTCUTS
-            )
-            points, problem = self._certify(points, seconds, seed, searched)
+        if manifold is None:
+            found = connect(self.checker, starts, targets, seconds, seed)
+        else:
+            found = connect_on_manifold(self.checker, manifold, starts, targets, seconds, seed)
         spent = perf_counter() - searched
-        whole = points.astype(float)
-        if not found.found:
-            return self._no_path(whole, self._why_not(found, seconds), begin, spent, found.iterations)
-        if problem:
-            return self._no_path(whole, problem, begin, spent, found.iterations)
+        if found.problem:
+            return self._no_path(found.points, found.problem, begin, spent, found.iterations)
+        points = found.points
         goal, variant = variants[int(np.argmin(np.abs(targets - points[-1]).max(axis=1)))]
-        whole[0], whole[-1] = q, variant
-        contact = self._judge.first_contact(whole, _JUDGED)
+        points[0], points[-1] = q, variant
+        contact = self._judge(touching).first_contact(points, _JUDGED)
         if contact is not None:
-            return self._no_path(
-                whole,
-                f"The scene finds a contact on the path: {describe_contacts([contact[1]])}.",
-                begin,
-                spent,
-            )
+            problem = f"The scene finds a contact on the path: {describe_contacts([contact[1]])}."
+            return self._no_path(points, problem, begin, spent, found.iterations)
         shift = variant - goal.inner
-        points_all = np.vstack([first.way[:-1], whole, (goal.way[::-1] + shift)[1:]])
+        whole = np.vstack([first.way[:-1], points, (goal.way[::-1] + shift)[1:]])
         why = f"Found after {found.iterations} samples."
-        return self._path(True, points_all, why, begin, spent, found.iterations)
+        return self._path(True, whole, why, begin, spent, found.iterations, touching)
 
-    def _certify(self, points: Any, seconds: float, seed: int, searched: float) -> tuple[Any, str]:
-        """Return a path that is free between its samples too; edges that are not are planned anew, finer."""
-        resolution = RESOLUTION
-        for _ in range(_REPAIRS):
-            collision = self.checker.find_collision(points)
-            if collision is None:
-                return points, ""
-            k, _fraction = collision
-            left = seconds - (perf_counter() - searched)
-            resolution *= _FINER if resolution < 4000 else 1.0
-            detour = self._search.solve(points[k : k + 1], points[k + 1 : k + 2], left, seed, resolution)
-            if not detour.found:
-                break
-            points = np.ascontiguousarray(np.vstack([points[:k], detour.points, points[k + 2 :]]))
-        return points, (
-            "A path was found whose samples are free, but something thin lies between two of them, and no way around "
-            "it was found in the time given. More seconds=, or another seed=, may find one."
-        )
+    def _judge(self, touching: frozenset[frozenset[str]] = frozenset()) -> SceneJudge:
+        """Return the judge of the scene in which some pairs may touch, at the present place."""
+        if touching not in self._judges:
+            if len(self._judges) >= _MOST_MANIFOLDS:
+                self._judges.clear()
+            rules = [Rule(a, b, False, "held") for a, b in map(sorted, touching)]
+            self._judges[touching] = SceneJudge(self.scene, self.space.symbols, rules)
+        judge = self._judges[touching]
+        assert self._state is not None
+        judge.place(self._state)
+        return judge
 
-    def _why_not(self, found: SearchResult, seconds: float) -> str:
-        nodes = (
-            f"{found.nodes[0]} configurations from the start and {found.nodes[1]} from the goals were reached"
+    def _no_solution(self, tasks: Sequence[Hold]) -> str:
+        names = ", ".join(repr(task) for task in tasks)
+        return (
+            f"No configuration without collision was found at which {names} are met. Out of reach, or always in "
+            "contact? kv.control.inverse_kinematics says which; another place of the base may help."
         )
-        if found.status == TIME_IS_UP:
-            return (
-                f"The time of {seconds:g} s is up: {nodes}, and the nearest pair is {found.gap:.3g} apart. More "
-                "seconds= may help; if few were reached, start or goal is enclosed."
-            )
-        return f"The search ended: {nodes}, and the nearest pair is {found.gap:.3g} apart."
 
     def _no_path(
         self, points: Array, why: str, begin: float, spent: float = 0.0, iterations: int = 0
@@ -324,18 +399,49 @@ class Planner:
         return self._path(False, np.atleast_2d(points), why, begin, spent, iterations)
 
     def _path(
-        self, found: bool, points: Array, why: str, begin: float, spent: float, iterations: int
+        self,
+        found: bool,
+        points: Array,
+        why: str,
+        begin: float,
+        spent: float,
+        iterations: int,
+        touching: frozenset[frozenset[str]] = frozenset(),
     ) -> Path:
-        state, judge = self._state, self._judge
+        state, judge = self._state, self._judge(touching)
         assert state is not None
 
         def measure(points: Array) -> float:
             judge.place(state)
             return judge.clearance(points, 1 / RESOLUTION)
 
-        return Path(
-            found, self.space.symbols, points, why, perf_counter() - begin, spent, iterations, state, measure
-        )
+        seconds = perf_counter() - begin
+        return Path(found, self.space.symbols, points, why, seconds, spent, iterations, state, measure)
 
     def __repr__(self) -> str:
         return f"<Planner: {len(self.symbols)} coordinates, {len(self.checker.moving)} bodies that move>"
+
+
+def as_holds(tasks: Any) -> tuple[Hold, ...]:
+    """Return holds from holds and goals, one or several."""
+    given = (tasks,) if isinstance(tasks, Hold | Goal) else tuple(tasks)
+    for task in given:
+        if not isinstance(task, Hold | Goal):
+            raise InvalidValueError(f"Expected kv.control.Hold or Goal, not {task!r}.")
+    return tuple(t if isinstance(t, Hold) else Hold(t.expression, t.target, name=t.name) for t in given)
+
+
+def _are_tasks(goals: Any) -> bool:
+    if isinstance(goals, Hold | Goal):
+        return True
+    return isinstance(goals, list | tuple) and len(goals) > 0 and isinstance(goals[0], Hold | Goal)
+
+
+def find_carried_bodies(model: ModelView, bodies: Sequence[str], frame: str) -> tuple[str, ...]:
+    """Return the bodies at and below a frame; if there are none, those that are rigidly connected with it."""
+    below = [body for body, flag in zip(bodies, flag_subtree(model, bodies, frame), strict=True) if flag]
+    if below:
+        return tuple(below)
+    frames = dict(model.frames)
+    group = rigid_group(frame, frames)
+    return tuple(body for body in bodies if rigid_group(body, frames) == group)

@@ -9,6 +9,7 @@ import numpy as np
 
 from .bindings import FOUND, SearchStruct, planning_functions
 from .checker import LEAST_INFLATION, RESOLUTION, CollisionChecker
+from .manifold import Manifold
 from .obstacles import Floats32
 
 RANGE = 1.0
@@ -34,16 +35,18 @@ class SearchResult(NamedTuple):
 
 
 class RrtConnect:
-    """RRT-Connect over a checker, with or without a manifold.
+    """RRT-Connect over a checker, in the whole space or on a manifold.
 
     Parameters
     ----------
     checker
         Collision checker.
+    manifold
+        The manifold; None for the whole space.
     """
 
-    def __init__(self, checker: CollisionChecker) -> None:
-        self._checker, self._code = checker, planning_functions()
+    def __init__(self, checker: CollisionChecker, manifold: Manifold | None = None) -> None:
+        self._checker, self._manifold, self._code = checker, manifold, planning_functions()
         self._path = np.zeros((_ROOM, len(checker.coordinates)), dtype=np.float32)
         self._struct = SearchStruct()
 
@@ -95,8 +98,25 @@ class RrtConnect:
         keep[-1] = True
         return np.ascontiguousarray(found[keep])
 
+    def walk(self, a: Floats32, b: Floats32, resolution: float = RESOLUTION) -> Floats32 | None:
+        """Return points (N, n) on the manifold from a to b, without a and with b; None if the way ends before.
+
+        Parameters
+        ----------
+        a, b
+            (n,) configurations on the manifold, contiguous.
+        resolution
+            Points for each unit of length.
+        """
+        s = self._setup(0.0, 0, resolution, 0)
+        count = self._code.kineverse_walk(
+            ctypes.addressof(s), a.ctypes.data, b.ctypes.data, self._path.ctypes.data, _ROOM
+        )
+        return None if count < 0 else self._path[:count].copy()
+
     def _setup(self, seconds: float, seed: int, resolution: float, nodes: int) -> SearchStruct:
         s = self._struct
-        s.checker, s.projection = self._checker.address, None
+        s.checker = self._checker.address
+        s.projection = None if self._manifold is None else self._manifold.address
         s.range, s.resolution, s.seconds, s.nodes, s.seed = RANGE, resolution, seconds, nodes, seed
         return s
