@@ -255,10 +255,11 @@ class VectorProgram:
         vectors = self.allocate(blocks, self.size)
         with np.errstate(over="ignore"):
             vectors[:] = padded.reshape(blocks, lanes, self.size).swapaxes(1, 2)
-        results = self.allocate(blocks, sum(self.sizes))
+        width = sum(self.sizes)
+        results = self.allocate(blocks, width)
         store = self.allocate(self.stored)
         self._code.evaluate(*(a.ctypes.data for a in (vectors, kept, store, results)), blocks)
-        columns = results.swapaxes(1, 2).reshape(blocks * lanes, -1)[: len(rows)]
+        columns = results.swapaxes(1, 2).reshape(blocks * lanes, width)[: len(rows)]
         ends = itertools.accumulate(self.sizes)
         return tuple(
             columns[:, end - size : end].reshape(len(rows), *shape)
