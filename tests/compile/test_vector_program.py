@@ -27,6 +27,8 @@ from compiled_programs import (
 
 import kineverse as kv
 from kineverse.compile import vector_codegen, vector_program
+from kineverse.compile.batch import _load as load_batch
+from kineverse.compile.batch_codegen import generate_batch_source
 from kineverse.compile.vector_program import VectorProgram, vector_header, vector_source
 from kineverse.expressions.expression import Expression, binary, from_casadi, unary
 
@@ -109,15 +111,15 @@ def mechanism() -> Arm:
     return arm("vectors")
 
 
-def test_doubles_equal_batches(mechanism: Arm) -> None:
-    outputs = [mechanism.pose, mechanism.jacobian]
-    program = VectorProgram(outputs, mechanism.symbols, scalar="double")
-    batch = kv.compile(outputs, mechanism.symbols, tier="c").batch
+def test_doubles_equal_batches(mechanism: Arm, tmp_path: Path) -> None:
+    program = VectorProgram([mechanism.pose, mechanism.jacobian], mechanism.symbols, scalar="double")
+    batch = load_batch(build_for("native", generate_batch_source(program._program), tmp_path))
     for count in (0, 1, 2 * program.lanes + 1):
         rows = np.random.default_rng(count).uniform(-3, 3, (count, 7))
-        results = program.evaluate(rows)
-        assert [r.shape for r in results] == [(count, 4, 4), (count, 6, 7)]
-        assert all(same_bits(r, w) for r, w in zip(results, batch(rows), strict=True))
+        wanted = np.empty((count, 4, 4)), np.empty((count, 6, 7))
+        places = (ctypes.c_void_p * 2)(*(w.ctypes.data for w in wanted))
+        assert batch(rows.ctypes.data, ctypes.addressof(places), count, 0) == 0
+        assert all(same_bits(r, w) for r, w in zip(program.evaluate(rows), wanted, strict=True))
 
 
 def test_parameters_are_prepared_as_in_single_calls() -> None:
@@ -136,7 +138,7 @@ def test_prepared_parameters_and_pieces_change_nothing(
     outputs = [mechanism.pose, mechanism.jacobian, kv.array([[1.0, 2.0]])]
     rows = np.random.default_rng(0).uniform(-3, 3, (37, 7))
     rows[:, 3:] = rows[0, 3:]
-    wanted = kv.compile(outputs, mechanism.symbols).batch(rows)
+    wanted = kv.compile(outputs, mechanism.symbols, tier="interpreter").batch(rows)
     monkeypatch.setattr(vector_codegen, "PART_LENGTH", 7)
     split = VectorProgram(outputs, mechanism.symbols[:3], mechanism.symbols[3:])
     results = split.evaluate(rows[:, :3], dict(zip(mechanism.symbols[3:], rows[0, 3:], strict=True)))
@@ -157,7 +159,7 @@ def test_far_away_nothing_is_lost_between_parameters(mechanism: Arm) -> None:
     seen = kv.inverse(kv.translation(obstacle, 0, 0)) @ kv.translation(base, 0, 0) @ mechanism.pose
     program = VectorProgram([seen], mechanism.symbols, [base, obstacle])
     rows = np.random.default_rng(0).uniform(-3, 3, (20, 7))
-    wanted = kv.compile(mechanism.pose, mechanism.symbols).batch(rows)
+    wanted = kv.compile(mechanism.pose, mechanism.symbols, tier="interpreter").batch(rows)
     wanted[:, 0, 3] += 0.3
     assert np.abs(program.evaluate(rows, [1e4 + 0.1, 1e4 - 0.2])[0] - wanted).max() < 1e-6
 
@@ -185,7 +187,7 @@ def test_closed_loops_close_in_float() -> None:
     start = model.default_state().vector(symbols)
     rows = start + np.linspace(-0.05, 0.05, 20)[:, None]
     results = VectorProgram(outputs, symbols).evaluate(rows)
-    wanted = kv.compile(outputs, symbols).batch(rows)
+    wanted = kv.compile(outputs, symbols, tier="interpreter").batch(rows)
     assert all(np.abs(r - w).max() < 1e-5 for r, w in zip(results, wanted, strict=True))
 
 
@@ -225,7 +227,7 @@ def test_written_c_includes_and_calls_programs(mechanism: Arm, tmp_path: Path) -
     assert call(ctypes.c_void_p(program.compute_address), *addresses) == 0
     poses = o[:16].T.reshape(-1, 4, 4)
     rows = np.concatenate([np.tile(parameters, (program.lanes, 1)), vectors.T], axis=1)
-    wanted = kv.compile(mechanism.pose, mechanism.symbols).batch(rows)
+    wanted = kv.compile(mechanism.pose, mechanism.symbols, tier="interpreter").batch(rows)
     assert np.abs(poses - wanted).max() < 1e-13
     assert program.prepare_address
 
