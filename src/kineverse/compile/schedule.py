@@ -13,6 +13,8 @@ from dataclasses import dataclass, field
 
 import casadi as ca
 
+from kineverse.expressions.implicit import FLOAT_RESIDUAL_TOLERANCE, RESIDUAL_TOLERANCE
+
 from .program import CasadiFunction
 
 # Known before the program runs: inputs, numbers that :func:`separate_parameters` keeps, and constants.
@@ -144,6 +146,20 @@ def separate_parameters(program: StraightLine, inputs: int) -> tuple[StraightLin
     for place, value in enumerate(kept):
         computing[value] = Instruction(ca.OP_PARAMETER, (place,))
     return StraightLine(preparing, list(enumerate(kept))), StraightLine(computing, program.outputs)
+
+
+def relax_residuals(program: StraightLine) -> StraightLine:
+    """Return a program for float, in which residuals of implicit functions are not as small as in double.
+
+    The only comparison with the square of the tolerance is that of :class:`.Implicit`.
+    """
+    exact, relaxed = RESIDUAL_TOLERANCE**2, FLOAT_RESIDUAL_TOLERANCE**2
+    compared = {step.arguments[1] for step in program.steps if step.op == ca.OP_LE}
+    steps = [
+        Instruction(step.op, (), relaxed) if v in compared and step.constant == exact else step
+        for v, step in enumerate(program.steps)
+    ]
+    return StraightLine(steps, program.outputs)
 
 
 def schedule(program: StraightLine, length: int) -> Schedule:

@@ -102,8 +102,8 @@ INLINE void sincos_(V x, V *sine, V *cosine) {
   V c = fused(z, cosine_polynomial(z), splat(REAL(1.0)));
   I odd = -(quadrant & 1);
   V a = select_(odd, c, s), b = select_(odd, s, c);
-  *sine = (V)((I)a ^ ((quadrant & 2) << (8 * sizeof(Real) - 2)));
-  *cosine = (V)((I)b ^ (((quadrant + 1) & 2) << (8 * sizeof(Real) - 2)));
+  *sine = (V)((I)a ^ ((quadrant & 2) << (int)(8 * sizeof(Real) - 2)));
+  *cosine = (V)((I)b ^ (((quadrant + 1) & 2) << (int)(8 * sizeof(Real) - 2)));
   if (__builtin_expect(any(magnitude(x) > splat(LARGEST_ANGLE)), 0)) sincos_lanes(&x, sine, cosine);
 }
 

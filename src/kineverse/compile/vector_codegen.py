@@ -15,6 +15,7 @@ from .schedule import CFunction, Instruction, Schedule
 from .simd_functions import Scalar
 
 # From so many operations on, a program is split: compile time grows faster than the length of a function.
+# From 250 to 4000, the time to run changes by 6 % and that to compile by 30 %, with no clear best.
 PART_LENGTH = 1000
 
 
