@@ -7,7 +7,7 @@ import math
 from collections.abc import Iterator, Sequence
 from collections.abc import Set as AbstractSet
 from contextlib import contextmanager
-from itertools import permutations
+from itertools import combinations, permutations
 
 import numpy as np
 import numpy.typing as npt
@@ -17,13 +17,14 @@ from kineverse.expressions.expression import Expression, as_expression
 from kineverse.geometry import Scene
 from kineverse.geometry.collision_filter import rigid_group
 from kineverse.geometry.objects import CollisionObject
+from kineverse.geometry.shapes import Solid
 from kineverse.lie import Array
 from kineverse.model.frame_dependence import FrameDependence
 from kineverse.state import State
 from kineverse.symbols import Symbol
 
 from .bindings import CheckerStruct, ObstacleSetStruct, planning_functions
-from .links import LinkTable, box_corners
+from .links import LinkTable, is_thin
 from .obstacles import Floats32, ObstacleSet
 
 RESOLUTION = 32.0
@@ -53,6 +54,8 @@ class CollisionChecker:
     ----------
     moving
         Names of the bodies that move.
+    uncovered
+        Pairs of bodies that are not checked here, but by the scene: spheres are too coarse for them.
     lower, upper
         (n,) limits, which are written in place.
     struct
@@ -81,12 +84,17 @@ class CollisionChecker:
         self.program = self._make_program([model.fk(g)[:3] for g in self.groups], conditions)
         members = [
             [
-                (world.objects[k], self._in_group(groups[body], k))
+                (world.objects[k], world.solid(k), self._in_group(groups[body], k))
                 for k in world.members[world.body_index(body)]
             ]
             for body in self.moving
         ]
-        self.links = LinkTable(members, poses, protrusion)
+        # A plate that one joint moves, such as a door: spheres would fill the gaps beside it.
+        covered = [
+            len(dependence.moving_ancestors(body)) > 1 or not any(is_thin(solid) for _, solid, _ in items)
+            for body, items in zip(self.moving, members, strict=True)
+        ]
+        self.links = LinkTable(members, poses, covered, protrusion)
         self._planes: list[Array] = []
         self._place_static(dependence)
         self._place_moving(members, poses)
@@ -121,52 +129,56 @@ class CollisionChecker:
         self.standing = tuple(world.bodies[k] for k in used)
         moving = np.array([world.body_index(body) for body in self.moving], dtype=int)
         self._allowed = np.ascontiguousarray(world.table.allowed[np.ix_(moving, used)], dtype=np.uint8)
+        self.uncovered = [
+            (body, self.standing[j])
+            for i, body in enumerate(self.moving)
+            if not len(self.links.spheres[i])
+            for j in np.flatnonzero(self._allowed[i]).tolist()
+        ]
         solids = [world.solid(k) for k in self._static]
         self._world = ObstacleSet(solids, numbers.astype(np.int32), self._planes, self.program.lanes)
 
     def _place_moving(
-        self, members: Sequence[Sequence[tuple[CollisionObject, Array]]], poses: Sequence[int]
+        self, members: Sequence[Sequence[tuple[CollisionObject, Solid, Array]]], poses: Sequence[int]
     ) -> None:
         """Collect the shapes of the bodies that move, each body in a set of its own."""
-        world, lanes = self.scene.collision_world, self.program.lanes
+        lanes = self.program.lanes
         self._sets: list[ObstacleSet] = []
         self._costs = []
         for k, items in enumerate(members):
-            solids = [world.solid(i) for i in world.members[world.body_index(self.moving[k])]]
+            solids = [solid for _, solid, _ in items]
             found = ObstacleSet(
                 solids, np.zeros(len(solids), dtype=np.int32), self._planes, lanes, poses[k], k
             )
-            placed = np.array([T[:3] for _, T in items])
-            found.place(placed)
+            found.place(np.array([T[:3] for _, _, T in items]))
             self._sets.append(found)
             self._costs.append(found.cost)
-            for solid, T in zip(solids, placed, strict=True):
-                corners = box_corners(solid.centre - solid.half, solid.centre + solid.half)
-                self.links.widen(k, corners @ T[:, :3].T + T[:, 3])
 
     def _choose_pairs(self, dependence: FrameDependence) -> None:
-        """Choose for each pair of moving bodies whether shapes or spheres stand for the second one."""
+        """Choose for each pair of moving bodies whether shapes or spheres stand for the second one.
+
+        Pairs without any spheres are left to the scene.
+        """
         world = self.scene.collision_world
         number = [world.body_index(body) for body in self.moving]
         spheres = [len(s) for s in self.links.spheres]
-        pairs, moving_pairs = [], []
-        for i, a in enumerate(self.moving):
-            for j in range(i + 1, len(self.moving)):
-                if not world.table.allowed[number[i], number[j]] or not dependence.moves_between(
-                    a, self.moving[j]
-                ):
-                    continue
-                # Shapes are exact, but spheres have a hierarchy.
-                costs = (
-                    spheres[i] * spheres[j] / 2,
-                    spheres[i] * self._costs[j],
-                    spheres[j] * self._costs[i],
-                )
-                choice = int(np.argmin(costs))
-                if choice:
-                    moving_pairs.append((i, j) if choice == 1 else (j, i))
-                else:
-                    pairs.append((i, j))
+        pairs: list[tuple[int, int]] = []
+        moving_pairs: list[tuple[int, int]] = []
+        for (i, a), (j, b) in combinations(enumerate(self.moving), 2):
+            if not world.table.allowed[number[i], number[j]] or not dependence.moves_between(a, b):
+                continue
+            # Shapes are exact, but spheres have a hierarchy.
+            costs = {
+                0: spheres[i] * spheres[j] / 2,
+                1: spheres[i] * self._costs[j],
+                2: spheres[j] * self._costs[i],
+            }
+            possible = [k for k, cost in costs.items() if cost > 0]
+            if not possible:
+                self.uncovered.append((a, b))
+                continue
+            choice = min(possible, key=lambda k: costs[k])
+            (moving_pairs if choice else pairs).append((j, i) if choice == 2 else (i, j))
         self.pairs = np.array(pairs, dtype=np.int32).reshape(-1, 2)
         self.moving_pairs = np.array(moving_pairs, dtype=np.int32).reshape(-1, 2)
 

@@ -7,17 +7,14 @@ from collections.abc import Iterable, Sequence
 import numpy as np
 
 from kineverse.geometry.objects import CollisionObject
+from kineverse.geometry.shapes import Solid
 from kineverse.lie import Array
 
 from .bindings import COARSE, LINK
-from functools import lru_cache
-from .spheres import cover_solid, make_sphere_tree
+from .spheres import cover_object, default_protrusion, make_sphere_tree
 
-_C = lru_cache(4096)(cover_solid)
-
-
-def cover_object(item, protrusion):
-    return _C(item.make_solid(), protrusion)
+_MANY = 64
+"""Number of spheres beyond which a shape counts as thin."""
 
 
 class LinkTable:
@@ -26,9 +23,11 @@ class LinkTable:
     Parameters
     ----------
     members
-        Of each body, its objects with their poses in the frame, (4, 4).
+        Of each body, its objects with their solids and their poses in the frame, (4, 4).
     poses
         Of each body, the number of its pose.
+    covered
+        Of each body, whether it has spheres.
     protrusion
         Largest distance of a sphere from the shape that it covers [m]; None for what suits the shape.
 
@@ -42,8 +41,9 @@ class LinkTable:
 
     def __init__(
         self,
-        members: Sequence[Sequence[tuple[CollisionObject, Array]]],
+        members: Sequence[Sequence[tuple[CollisionObject, Solid, Array]]],
         poses: Sequence[int],
+        covered: Sequence[bool],
         protrusion: float | None,
     ) -> None:
         self.links = np.zeros(len(members), dtype=LINK)
@@ -52,36 +52,48 @@ class LinkTable:
         self.spheres: list[Array] = []
         count = 0
         for k, (items, pose) in enumerate(zip(members, poses, strict=True)):
-            spheres = np.concatenate([_placed_cover(item, T, protrusion) for item, T in items])
-            tree = make_sphere_tree(spheres[:, :3], spheres[:, 3])
-            spheres = np.column_stack([tree.centres, tree.radii])
             link = self.links[k]
             link["pose"], link["body"], link["first"] = pose, k, len(coarse)
+            corners = np.concatenate([_placed_corners(solid, T) for _, solid, T in items])
+            link["low"], link["high"] = corners.min(axis=0), corners.max(axis=0)
+            self.spheres.append(np.zeros((0, 4)))
+            if not covered[k]:
+                continue
+            spheres = np.concatenate([_placed_cover(item, T, protrusion) for item, _, T in items])
+            tree = make_sphere_tree(spheres[:, :3], spheres[:, 3])
             link["coarse"] = len(tree.coarse_radii)
             link["ball"] = *tree.ball_centre, tree.ball_radius
-            link["low"], link["high"] = tree.centres.min(axis=0), tree.centres.max(axis=0)
             ends = tree.first.tolist()
             for j, (centre, radius) in enumerate(zip(tree.coarse_centres, tree.coarse_radii, strict=True)):
                 coarse.append((np.array([*centre, radius]), count + ends[j], ends[j + 1] - ends[j]))
-            fine.append(spheres)
-            count += len(spheres)
-            self.spheres.append(spheres)
-        self.coarse = np.zeros(len(coarse), dtype=COARSE)
+            self.spheres[-1] = np.column_stack([tree.centres, tree.radii])
+            fine.append(self.spheres[-1])
+            count += len(tree.radii)
+        self.coarse = np.zeros(max(len(coarse), 1), dtype=COARSE)
         for j, (sphere, first, number) in enumerate(coarse):
             self.coarse[j] = sphere, first, number
-        self.fine = np.concatenate(fine or [np.zeros((0, 4))]).astype(np.float32)
+        self.fine = np.concatenate(fine or [np.zeros((1, 4))]).astype(np.float32)
 
-    def widen(self, link: int, points: Array) -> None:
-        """Extend the box of a link, whose motion bounds that of its shapes, to (N, 3) points in its frame."""
-        row = self.links[link]
-        row["low"] = np.minimum(row["low"], points.min(axis=0))
-        row["high"] = np.maximum(row["high"], points.max(axis=0))
+
+def is_thin(solid: Solid) -> bool:
+    """Return True for a solid like a plate, for which many spheres are needed.
+
+    A sphere that sticks out by e covers a disc of area π (2 c e + e²) of a plate of the thickness 2 c.
+    """
+    least, *others = sorted(solid.half.tolist())
+    e = default_protrusion(solid)
+    return 2.0 * others[0] * others[1] > _MANY * (2.0 * least * e + e * e)
 
 
 def _placed_cover(item: CollisionObject, T: Array, protrusion: float | None) -> Array:
     cover = cover_object(item, protrusion)
     centres = cover.centres @ T[:3, :3].T + T[:3, 3]
     return np.column_stack([centres, cover.radii])
+
+
+def _placed_corners(solid: Solid, T: Array) -> Array:
+    corners = box_corners(solid.centre - solid.half, solid.centre + solid.half)
+    return np.asarray(corners @ T[:3, :3].T + T[:3, 3])
 
 
 def box_corners(low: Iterable[float], high: Iterable[float]) -> Array:

@@ -61,10 +61,10 @@ def hold_frames(
     a, b
         The frames, such as a hand and a handle.
     mask
-        Directions that are held, in the axes of b: of ``x``, ``y``, ``z`` (the position of a) and ``rx``, ``ry``,
-        ``rz`` (its rotation), in any order, such as ``"xyz rx ry"`` for a bar along z that the hand may turn about.
+        Directions that are held, of ``x``, ``y``, ``z`` (positions) and ``rx``, ``ry``, ``rz`` (rotations), in
+        any order and in the axes of the pose that is held: ``"xyz rx ry"`` lets the hand turn about its z axis.
     offset
-        b_T_a, 4×4, the pose that is held; None for frames that coincide.
+        b_T_a, 4×4, the pose of a in b that is held; None for frames that coincide.
 
     Raises
     ------

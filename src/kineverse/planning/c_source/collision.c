@@ -328,6 +328,7 @@ INLINE I find_collisions(const Checker *c, Work *w, int early) {
   if (early ? any(hit) : !any(~hit)) return hit;
   for (int k = 0; k < c->links; k++) {
     const Link *l = c->link + k;
+    if (!l->coarse) continue;
     const V *T = w->o + 12 * l->pose;
     transform_point(T, l->ball, w->centre + 3 * k);
     hit = link_against_set(c, l, T, w->centre + 3 * k, c->world, c->allowed + k * c->bodies,
