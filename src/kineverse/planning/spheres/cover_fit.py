@@ -25,9 +25,8 @@ from .cover_mesh import CoverMesh
 from .cover_starts import CoverStarts
 from .polytope import CoverPolytope
 
-_ROUNDS, _FEW_ROUNDS, _STEPS, _MEMORY = 24, 12, 6, 2
-"""Power diagrams of a descent and of a short one, steps between two of them, and diagrams whose corners are
-remembered."""
+_ROUNDS, _FEW_ROUNDS, _STEPS = 24, 12, 6
+"""Power diagrams of a descent and of a short one, and steps between two of them."""
 
 _WARM, _COLD = 0.2, 0.015
 """First and last temperature of the smoothed maximum, as a fraction of the protrusion."""
@@ -36,7 +35,7 @@ _MOMENTUM = 0.6
 _SAMPLES, _HARD = 600, 0.6
 _TRIALS = 4
 _REMOVALS, _FEW_SPHERES = 3, 12
-_PROOF = 0.01
+_PROOF, _ALLOWANCE, _ATTEMPTS = 0.01, 1.04, 4
 """Growth of radii for the sake of the proof, as a fraction of the protrusion."""
 
 _ROUNDING = 1e-9
@@ -59,14 +58,22 @@ class FittedSpheres:
 
 
 class _Problem:
-    """Polytope with the points of it that a cover is fitted to."""
+    """Polytope, with the points of it that a cover is fitted to."""
 
     def __init__(self, polytope: CoverPolytope, protrusion: float) -> None:
-        self.polytope = polytope
+        self.polytope = polytope.simplify()
         a, b, c = np.moveaxis(polytope.corners[polytope.faces], 1, 0)
         area = float(np.linalg.norm(np.cross(b - a, c - a), axis=1).sum()) / 2
-        self.mesh = CoverMesh(polytope, max(protrusion, math.sqrt(area / _SAMPLES)))
-        self.uncovered = np.zeros((0, 3))
+        self.mesh = CoverMesh(self.polytope, max(protrusion, math.sqrt(area / _SAMPLES)))
+        self.gaps: Floats = np.zeros((0, 3))
+
+    def find_critical(self, centres: Floats, radii: Floats) -> tuple[Floats, Integers]:
+        """Return the points that are hardest to cover by spheres, and the sphere of each."""
+        points, owners = self.mesh.find_critical(centres, radii)
+        if not len(self.gaps):
+            return points, owners
+        powers = np.square(distances(self.gaps, centres)) - radii**2
+        return np.concatenate([points, self.gaps]), np.concatenate([owners, powers.argmin(axis=1)])
 
 
 def fit_spheres(polytope: CoverPolytope, protrusion: float, most: int) -> FittedSpheres:
@@ -82,14 +89,30 @@ def fit_spheres(polytope: CoverPolytope, protrusion: float, most: int) -> Fitted
         Largest number of spheres.
     """
     problem = _Problem(polytope, protrusion)
-    aim = protrusion / (1.0 + 2 * _PROOF)
+    aim = protrusion / _ALLOWANCE
+    for _ in range(_ATTEMPTS):
+        fitted = _fit_to_points(problem, aim, most)
+        proved, gaps = prove(polytope, fitted)
+        if len(gaps) and proved.protrusion > _ALLOWANCE * fitted.protrusion:
+            # The proof found points between those of the mesh.
+            problem.gaps = gaps[:: len(gaps) // _SAMPLES + 1]
+            fitted = descend(problem, fitted.centres, aim)
+            mended, _ = prove(polytope, fitted)
+            proved = min(proved, mended, key=lambda cover: cover.protrusion)
+        if proved.protrusion <= protrusion or fitted.protrusion > aim:
+            break
+        aim *= 0.99 * protrusion / proved.protrusion
+    return proved
+
+
+def _fit_to_points(problem: _Problem, aim: float, most: int) -> FittedSpheres:
+    """Return few spheres that cover the points of a problem."""
     best = descend(problem, np.zeros((1, 3)), aim, _FEW_ROUNDS)
-    if best.protrusion > aim and most > 1:
-        best = _search_start(problem, CoverStarts(polytope, aim), aim, most, best)
-        polished = descend(problem, best.centres, aim)
-        best = polished if polished.is_better(best, aim) else best
-        best = _remove(problem, best, aim)
-    return prove(polytope, best)
+    if best.protrusion <= aim or most == 1:
+        return best
+    best = _search_start(problem, CoverStarts(problem.polytope, aim), aim, most, best)
+    polished = descend(problem, best.centres, aim)
+    return _remove(problem, polished if polished.is_better(best, aim) else best, aim)
 
 
 def _search_start(
@@ -124,15 +147,11 @@ def descend(problem: _Problem, centres: Floats, aim: float, rounds: int = _ROUND
     polytope = problem.polytope
     best = FittedSpheres(centres, np.zeros(0), math.inf)
     estimate = aim
-    remembered: list[Floats] = []
     for k in range(rounds):
         centres = _pull_inside(polytope, centres)
         depths = polytope.depths(centres)
-        points = problem.mesh.find_critical(centres, depths + estimate)
-        points = np.concatenate([points, problem.uncovered])
-        apart = distances(points, centres)
-        owners = (apart - depths).argmin(axis=1)
-        lengths = apart[np.arange(len(points)), owners]
+        points, owners = problem.find_critical(centres, depths + estimate)
+        lengths = np.linalg.norm(points - centres[owners], axis=1)
         radii = np.zeros(len(centres))
         np.maximum.at(radii, owners, lengths)
         protrusions = radii - depths
@@ -147,8 +166,7 @@ def descend(problem: _Problem, centres: Floats, aim: float, rounds: int = _ROUND
         if not used.all():
             centres = _relocate(centres, radii, protrusions, points)
         temperature = estimate * _WARM * (_COLD / _WARM) ** (k / (rounds - 1))
-        remembered = [points[hard], *remembered[: _MEMORY - 1]]
-        centres = _relax(polytope, centres, np.concatenate(remembered), temperature)
+        centres = _relax(polytope, centres, points[hard], owners[hard], temperature)
     return best
 
 
@@ -174,30 +192,30 @@ def _relocate(centres: Floats, radii: Floats, protrusions: Floats, corners: Floa
     return moved
 
 
-def _relax(polytope: CoverPolytope, centres: Floats, points: Floats, temperature: float) -> Floats:
-    """Return centres after gradient steps on the smoothed largest need of points, for each sphere its own."""
-    count, rows = len(centres), np.arange(len(points))
-    speed = np.zeros_like(centres)
+def _relax(
+    polytope: CoverPolytope, centres: Floats, points: Floats, owners: Integers, temperature: float
+) -> Floats:
+    """Return centres after gradient steps on the smoothed largest need of the points of each sphere."""
+    order = np.argsort(owners, kind="stable")
+    points, owners = points[order], owners[order]
+    first = np.flatnonzero(np.diff(owners, prepend=-1))
+    moving = owners[first]
+    group = np.cumsum(np.diff(owners, prepend=-1) > 0) - 1
+    found = centres.copy()
+    centres, speed = centres[moving], np.zeros((len(moving), 3))
     for _ in range(_STEPS):
         slack = polytope.offsets - centres @ polytope.normals.T
-        depths = slack.min(axis=1)
-        apart = distances(points, centres)
-        owners = (apart - depths).argmin(axis=1)
-        lengths = apart[rows, owners]
-        needs = lengths - depths[owners]
-        largest = np.full(count, -np.inf)
-        np.maximum.at(largest, owners, needs)
-        weights = np.exp((needs - largest[owners]) / temperature)
-        pulls = (centres[owners] - points) * (weights / np.maximum(lengths, 1e-12))[:, None]
-        sums = np.maximum(np.bincount(owners, weights, count), 1e-300)
-        gradient = (
-            np.column_stack([np.bincount(owners, pulls[:, k], count) for k in range(3)]) / sums[:, None]
-        )
-        near = np.exp((depths[:, None] - slack) / temperature)
+        apart = centres[group] - points
+        lengths = np.sqrt(np.einsum("ij,ij->i", apart, apart))
+        weights = np.exp((lengths - np.maximum.reduceat(lengths, first)[group]) / temperature)
+        pulls = apart * (weights / np.maximum(lengths, 1e-12))[:, None]
+        gradient = np.add.reduceat(pulls, first) / np.add.reduceat(weights, first)[:, None]
+        near = np.exp((slack.min(axis=1, keepdims=True) - slack) / temperature)
         gradient += (near @ polytope.normals) / near.sum(axis=1, keepdims=True)
         speed = _MOMENTUM * speed - temperature * gradient
         centres = centres + speed
-    return centres
+    found[moving] = centres
+    return found
 
 
 def _remove(problem: _Problem, cover: FittedSpheres, aim: float) -> FittedSpheres:
@@ -223,7 +241,7 @@ def _remove(problem: _Problem, cover: FittedSpheres, aim: float) -> FittedSphere
 def _removal_losses(problem: _Problem, cover: FittedSpheres) -> Floats:
     """Return for each sphere the protrusion (N,) that the others would need for what it covers."""
     depths = problem.polytope.depths(cover.centres)
-    points = problem.mesh.find_critical(cover.centres, depths + cover.protrusion)
+    points = problem.find_critical(cover.centres, depths + cover.protrusion)[0]
     needs = distances(points, cover.centres) - depths
     rows, owners = np.arange(len(points)), needs.argmin(axis=1)
     needs[rows, owners] = np.inf
@@ -232,11 +250,14 @@ def _removal_losses(problem: _Problem, cover: FittedSpheres) -> Floats:
     return losses
 
 
-def prove(polytope: CoverPolytope, cover: FittedSpheres) -> FittedSpheres:
-    """Return a cover whose radii have grown as far as the proof by subdivision needs."""
+def prove(polytope: CoverPolytope, cover: FittedSpheres) -> tuple[FittedSpheres, Floats]:
+    """Return a cover whose radii have grown as far as the proof by subdivision needs.
+
+    Further, points (n, 3) that the given spheres do not cover.
+    """
     tolerance = _PROOF * cover.protrusion
     radii = cover.radii + tolerance
-    radii = radii + find_uncovered(polytope, cover.centres, radii, 0.5 * tolerance).growth
-    radii *= 1.0 + _ROUNDING
+    uncovered = find_uncovered(polytope, cover.centres, radii, 0.5 * tolerance)
+    radii = (radii + uncovered.growth) * (1.0 + _ROUNDING)
     protrusion = float((radii - polytope.depths(cover.centres)).max())
-    return FittedSpheres(cover.centres, radii, protrusion)
+    return FittedSpheres(cover.centres, radii, protrusion), uncovered.points

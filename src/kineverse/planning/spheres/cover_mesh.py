@@ -18,8 +18,8 @@ from kineverse.geometry.mesh_files import Floats, Integers
 
 from .polytope import CoverPolytope
 
-_LAYERS = (0.75, 0.5, 0.25)
-"""Sizes of the inner surfaces beside the outer one."""
+_LAYERS, _INNER_TRIANGLES = (0.75, 0.5, 0.25), 150
+"""Sizes of the inner surfaces beside the outer one, and the number of their triangles."""
 
 
 class CoverMesh:
@@ -34,7 +34,7 @@ class CoverMesh:
     def __init__(self, polytope: CoverPolytope, spacing: float) -> None:
         surface = split_triangles(polytope.corners[polytope.faces], spacing)
         inner = split_triangles(polytope.corners[polytope.faces], 2 * spacing)
-        inner = inner[:: max(len(inner) // max(len(surface), 1), 1)]
+        inner = inner[:: len(inner) // _INNER_TRIANGLES + 1]
         triangles = np.concatenate([surface, *(size * inner for size in _LAYERS)]).reshape(-1, 3)
         # Corners are merged, so that each counts once.
         marks = np.round(triangles @ np.array([1.0, math.sqrt(2.0), math.pi]), 9)
@@ -46,8 +46,8 @@ class CoverMesh:
         keys = np.unique(pairs[:, 0] * len(self.points) + pairs[:, 1])
         self._edges = np.column_stack(np.divmod(keys, len(self.points)))
 
-    def find_critical(self, centres: Floats, radii: Floats) -> Floats:
-        """Return points (n, 3) of the polytope that may be the hardest to cover by spheres.
+    def find_critical(self, centres: Floats, radii: Floats) -> tuple[Floats, Integers]:
+        """Return points (n, 3) of the polytope that may be the hardest to cover, and the sphere (n,) of each.
 
         They are all corners of triangles, and points of equal power on edges and in triangles.
         """
@@ -66,11 +66,14 @@ class CoverMesh:
         corners, own = self._triangles[mixed], own[mixed]
         u, v = (powers[corners, own[:, :1]] - powers[corners, own[:, k : k + 1]] for k in (1, 2))
         weights = np.cross(u, v)
-        total = weights.sum(axis=1, keepdims=True)
-        weights = np.maximum(weights * np.sign(total), 0.0) + 1e-300
+        weights = np.maximum(weights * np.sign(weights.sum(axis=1, keepdims=True)), 0.0) + 1e-300
         weights /= weights.sum(axis=1, keepdims=True)
         inside = np.einsum("nk,nkj->nj", weights, self.points[corners])
-        return np.concatenate([self.points, on_edges, inside])
+        points = np.concatenate([self.points, on_edges, inside])
+        # Points between two triangles may belong to yet another sphere.
+        added = points[len(self.points) :]
+        others = (centres**2).sum(axis=1) - radii**2 - 2.0 * added @ centres.T
+        return points, np.concatenate([owners, others.argmin(axis=1)])
 
 
 def split_triangles(triangles: Floats, longest: float) -> Floats:

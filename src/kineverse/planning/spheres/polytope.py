@@ -8,7 +8,7 @@ points on their surface and that of points around them.
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 
@@ -24,6 +24,8 @@ _FEWEST_SIDES, _MOST_SIDES = 12, 192
 
 _ASCENT = 120
 
+_MANY_CORNERS, _DIRECTIONS = 200, 400
+
 
 @dataclass(frozen=True, slots=True, eq=False)
 class CoverPolytope:
@@ -37,6 +39,8 @@ class CoverPolytope:
         Inner polytope: the points x with ``normals @ x <= offsets``; (F, 3) unit vectors and (F,) [m].
     volume
         Volume of the solid itself [m³].
+    is_round
+        True if the solid lies between the two; False if both are the solid.
     """
 
     corners: Floats
@@ -44,11 +48,22 @@ class CoverPolytope:
     normals: Floats
     offsets: Floats
     volume: float
+    is_round: bool = False
 
     def depths(self, points: Floats) -> Floats:
         """Return lower bounds (n,) of the depths of points (n, 3) in the solid [m]; negative outside."""
         depths: Floats = (self.offsets - points @ self.normals.T).min(axis=1)
         return depths
+
+    def simplify(self) -> CoverPolytope:
+        """Return the hull of the corners that are extreme along some directions, for a hull with many corners."""
+        if self.is_round or len(self.corners) <= _MANY_CORNERS:
+            return self
+        extreme = np.unique((self.corners @ _sphere_lattice(_DIRECTIONS).T).argmax(axis=0))
+        try:
+            return _bound_hull(solid_from_points(self.corners[extreme]))
+        except InvalidValueError:  # those of a very thin hull may be flat
+            return self
 
     def find_deepest_point(self) -> Floats:
         """Return a point (3,) of the solid that is far from all planes [m]."""
@@ -63,7 +78,7 @@ class CoverPolytope:
             # Away from the nearest plane; from outside, at least to its inner side.
             point = point - self.normals[nearest] * max(step, -1.1 * float(slack[nearest]))
             step *= 0.93
-        return best
+        return np.asarray(best)
 
     def normalize(self, centre: Floats, radius: float) -> CoverPolytope:
         """Return the polytopes about a point (3,) as the origin, with a radius [m] as the unit of length."""
@@ -73,6 +88,7 @@ class CoverPolytope:
             self.normals,
             (self.offsets - self.normals @ centre) / radius,
             self.volume / radius**3,
+            self.is_round,
         )
 
 
@@ -133,7 +149,7 @@ def _bound_hull(solid: Solid) -> CoverPolytope:
 def _between(inner: Floats, outer: Floats, volume: float) -> CoverPolytope:
     """Return the bounds of a solid between the hulls of two sets of points."""
     inside, outside = _bound_hull(solid_from_points(inner)), _bound_hull(solid_from_points(outer))
-    return replace(outside, normals=inside.normals, offsets=inside.offsets, volume=volume)
+    return CoverPolytope(outside.corners, outside.faces, inside.normals, inside.offsets, volume, True)
 
 
 def _count_sides(radius: float, protrusion: float) -> int:
@@ -147,7 +163,7 @@ def _sphere_points(count: int) -> tuple[Floats, float]:
 
     They are as far from each other as the corners of a regular polygon with that many sides, about.
     """
-    points = _sphere_lattice(min(int(count**2 / 3.0), 250))
+    points = _sphere_lattice(min(int(count**2 / 3.0), 500))
     return points, 1.0 / float(_bound_hull(solid_from_points(points)).offsets.min())
 
 
