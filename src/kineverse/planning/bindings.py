@@ -57,7 +57,7 @@ def _fields(kinds: str, names: str) -> list[tuple[str, Any]]:
 class ObstacleSetStruct(ctypes.Structure):
     """Set of obstacles as C reads it."""
 
-    _fields_ = _fields("pppiiii", "items boxes chunks padded padded_chunks pose link")
+    _fields_ = _fields("pppiiiii", "items boxes chunks count padded padded_chunks pose link")
 
 
 class CheckerStruct(ctypes.Structure):

@@ -252,6 +252,18 @@ class CollisionChecker:
         finally:
             self._use(self._allowed, self.pairs, self.moving_pairs)
 
+    @contextmanager
+    def widened(self, by: float, ends: Floats32) -> Iterator[None]:
+        """Widen the margin by a length [m] while the context lasts, if configurations (N, n) stay valid with it."""
+        margin = self.struct.margin
+        self.struct.margin = margin + by
+        if not self.valid(np.ascontiguousarray(ends)).all():
+            self.struct.margin = margin
+        try:
+            yield
+        finally:
+            self.struct.margin = margin
+
     def _use(
         self,
         allowed: npt.NDArray[np.uint8],

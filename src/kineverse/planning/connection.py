@@ -12,7 +12,7 @@ from kineverse.lie import Array
 
 from .bindings import TIME_IS_UP
 from .checker import RESOLUTION, CollisionChecker
-from .constrained_path import join_nodes, polish, shorten_on_manifold
+from .constrained_path import polish, shorten_on_manifold
 from .manifold import Manifold
 from .obstacles import Floats32
 from .search import RrtConnect, SearchResult
@@ -23,6 +23,8 @@ _FINER = 8.0
 """Factor of the resolution where an edge collides between its samples."""
 _FINEST = 4000.0
 _ATTEMPTS = 4
+_WIDER = 1e-3
+"""Margin beyond the one asked for, with which edges of a search are free between their samples too, mostly [m]."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -53,7 +55,8 @@ def connect(
     """
     begin = perf_counter()
     search = RrtConnect(checker)
-    found = search.solve(starts, goals, seconds, seed)
+    with checker.widened(_WIDER, np.vstack([starts, goals])):
+        found = search.solve(starts, goals, seconds, seed)
     if not found.found:
         return Connected(found.points.astype(float), explain_failure(found, seconds), found.iterations)
     points = search.shorten(found.points, seconds - (perf_counter() - begin), seed, _SHORTCUTS)
@@ -92,25 +95,21 @@ def connect_on_manifold(
     begin = perf_counter()
     search = RrtConnect(checker, manifold)
     iterations, resolution, problem = 0, RESOLUTION, ""
-    lower, upper = checker.lower.astype(float), checker.upper.astype(float)
     points = starts
     for attempt in range(_ATTEMPTS):
         left = seconds - (perf_counter() - begin)
         if attempt and left <= 0.0:
             break
-        found = search.solve(starts, goals, left, seed + 7919 * attempt, resolution)
+        with checker.widened(_WIDER, np.vstack([starts, goals])):
+            found = search.solve(starts, goals, left, seed + 7919 * attempt, resolution)
         iterations += found.iterations
         if not found.found:
             return Connected(
                 found.points.astype(float), problem or explain_failure(found, seconds), iterations
             )
         points = found.points
-        joined = join_nodes(search, found.points, resolution)
-        if joined is None:
-            problem = "A path was found, but its projection onto the holds cannot be followed twice."
-            continue
-        whole = shorten_on_manifold(search, joined, left, seed, _SHORTCUTS)
-        exact = polish(manifold, whole.astype(float), lower, upper)
+        whole = shorten_on_manifold(search, found.points, left, seed, _SHORTCUTS)
+        exact = polish(manifold, whole.astype(float))
         if exact is None:
             problem = "A path was found, but it leaves the limits where the holds are met exactly."
             continue

@@ -1,4 +1,4 @@
-"""Paths on a manifold: nodes of a search joined by points on it, shortened and polished."""
+"""Paths on a manifold: shortened, and polished in double precision."""
 
 from __future__ import annotations
 
@@ -8,7 +8,6 @@ import numpy as np
 
 from kineverse.lie import Array
 
-from .checker import RESOLUTION
 from .manifold import EXACT, Manifold
 from .obstacles import Floats32
 from .search import RrtConnect
@@ -17,25 +16,6 @@ DEVIATION = 5e-6
 """Largest residual half way between two points of a polished path [m], [rad]."""
 _LEVELS = 6
 _MOST_POINTS = 4000
-
-
-def join_nodes(search: RrtConnect, nodes: Floats32, resolution: float = RESOLUTION) -> Floats32 | None:
-    """Return points (N, n) on the manifold through the nodes of a path (K, n); None if a way ends.
-
-    Edges of the two trees were found in opposite directions, so a way is tried backwards too.
-    """
-    parts = [nodes[:1]]
-    for a, b in zip(nodes[:-1], nodes[1:], strict=True):
-        if np.abs(b - a).max() < 1e-5:
-            continue
-        way = search.walk(a, b, resolution)
-        if way is None:
-            back = search.walk(b, a, resolution)
-            if back is None:
-                return None
-            way = np.vstack([back[-2::-1], b[None]])
-        parts.append(way)
-    return np.ascontiguousarray(np.vstack(parts))
 
 
 def shorten_on_manifold(
@@ -77,11 +57,11 @@ def shorten_on_manifold(
     return points
 
 
-def polish(manifold: Manifold, points: Array, lower: Array, upper: Array) -> Array | None:
+def polish(manifold: Manifold, points: Array) -> Array | None:
     """Return points in double precision on the manifold, so dense that lines between them keep to it.
 
-    Half way between two of them the residual is at most :data:`DEVIATION`. None if a point does not arrive or leaves
-    the limits (n,).
+    Half way between two of them the residual is at most :data:`DEVIATION`. None if a point does not arrive within
+    limits.
     """
     exact, residuals = manifold.polish(points)
     for _ in range(_LEVELS):
@@ -94,5 +74,4 @@ def polish(manifold: Manifold, points: Array, lower: Array, upper: Array) -> Arr
         added, more = manifold.polish(middle[off])
         exact = np.insert(exact, off + 1, added, axis=0)
         residuals = np.insert(residuals, off + 1, more)
-    inside = (exact >= lower - 1e-6).all() and (exact <= upper + 1e-6).all()
-    return np.clip(exact, lower, upper) if inside else None
+    return exact

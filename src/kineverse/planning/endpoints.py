@@ -10,8 +10,8 @@ from kineverse.lie import Array
 
 from .checker import CollisionChecker
 from .configuration import PlanningSpace
-from .manifold import EXACT, Manifold
 from .judge import FINE, SceneJudge, describe_contacts
+from .manifold import EXACT, Manifold
 
 _DISTANCES = (0.01, 0.02, 0.04, 0.08, 0.15, 0.3, 0.5)
 _TRIES, _WAYS = 256, 6

@@ -56,6 +56,8 @@ class LinkTable:
             link["pose"], link["body"], link["first"] = pose, k, len(coarse)
             corners = np.concatenate([_placed_corners(solid, T) for _, solid, T in items])
             link["low"], link["high"] = corners.min(axis=0), corners.max(axis=0)
+            link["ball"] = *(corners.min(axis=0) + corners.max(axis=0)) / 2, 0.0
+            link["ball"][3] = np.linalg.norm(corners - link["ball"][:3], axis=1).max() + 1e-6
             self.spheres.append(np.zeros((0, 4)))
             if not covered[k]:
                 continue
@@ -82,7 +84,7 @@ def is_thin(solid: Solid) -> bool:
     """
     least, *others = sorted(solid.half.tolist())
     e = default_protrusion(solid)
-    return 2.0 * others[0] * others[1] > _MANY * (2.0 * least * e + e * e)
+    return bool(2.0 * others[0] * others[1] > _MANY * (2.0 * least * e + e * e))
 
 
 def _placed_cover(item: CollisionObject, T: Array, protrusion: float | None) -> Array:

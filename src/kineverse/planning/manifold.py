@@ -159,13 +159,14 @@ class Manifold:
         return arrived.astype(bool)
 
     def polish(self, Q: Array) -> tuple[Array, Array]:
-        """Return configurations (N, n) on the manifold in double precision, and their largest residuals (N,)."""
+        """Return configurations (N, n) on the manifold and within limits in double precision, and residuals (N,)."""
         x = np.array(Q, dtype=float)
+        lower, upper = self._checker.lower.astype(float), self._checker.upper.astype(float)
         for _ in range(_POLISHING):
             steps, residuals = self._exact.evaluate(x, self._values)
             if (residuals <= EXACT).all():
                 break
-            x += np.where((residuals > EXACT)[:, None], steps, 0.0)
+            x = np.clip(x + np.where((residuals > EXACT)[:, None], steps, 0.0), lower, upper)
         return x, np.asarray(self._exact.evaluate(x, self._values)[1])
 
     def residuals(self, Q: Array) -> Array:

@@ -78,6 +78,7 @@ class ObstacleSet:
             self._sorted.ctypes.data,
             self._boxes.ctypes.data,
             self._chunks.ctypes.data,
+            count,
             chunks * lanes,
             padded_chunks,
             pose,

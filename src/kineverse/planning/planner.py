@@ -380,7 +380,7 @@ class Planner:
             if len(self._judges) >= _MOST_MANIFOLDS:
                 self._judges.clear()
             rules = [Rule(a, b, False, "held") for a, b in map(sorted, touching)]
-            self._judges[touching] = SceneJudge(self.scene, self.space.symbols, rules)
+            self._judges[touching] = SceneJudge(self.scene, self.space.symbols, rules, self.checker.uncovered)
         judge = self._judges[touching]
         assert self._state is not None
         judge.place(self._state)

@@ -15,7 +15,7 @@ from .obstacles import Floats32
 RANGE = 1.0
 """Largest length of an edge of a tree [rad], [m]."""
 _MOST_NODES = 200_000
-_ROOM = 4096
+_ROOM = 16_384
 """Largest number of points of a path."""
 
 

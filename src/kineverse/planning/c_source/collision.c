@@ -19,7 +19,7 @@ typedef struct {
   const Obstacle *items;
   const float *boxes;  /* (6, padded): lowest x y z, highest x y z */
   const float *chunks; /* (6, padded chunks) */
-  long long padded, padded_chunks, pose, link;
+  long long count, padded, padded_chunks, pose, link;
 } ObstacleSet;
 
 /* A body with spheres. `low` and `high` bound the centres of its spheres and its shapes, in its frame. */
@@ -178,6 +178,7 @@ INLINE I touches(const Obstacle *b, const float (*planes)[4], const V *p, V reac
 }
 
 #define MOST_CANDIDATES 128
+#define FEW 6
 
 /* Columns of boxes: the lowest and the highest corners. */
 INLINE I meets(const float *columns, long long padded, long long k, const V *low, const V *high) {
@@ -230,12 +231,22 @@ INLINE I link_against_set(const Checker *c, const Link *l, const V *T, const V *
   const float grown = inflation + (float)c->margin;
   const Obstacle *found[MOST_CANDIDATES];
   BoxSearch search;
-  box_search_begin(&search, centre, l->ball[3] + grown);
-  for (int count; (count = box_search_next(&search, s, allowed, found)) > 0;) {
-    int near = 0;
+  /* For a few obstacles a search takes longer than asking them all. */
+  const int few = s->count <= FEW;
+  if (!few) box_search_begin(&search, centre, l->ball[3] + grown);
+  for (int more = 1; more;) {
+    int count = 0, near = 0;
+    if (few) {
+      for (; count < s->count; count++) found[count] = s->items + count;
+      more = 0;
+    } else {
+      count = box_search_next(&search, s, allowed, found);
+      more = count > 0;
+    }
     const V reach = splat(l->ball[3] + grown);
     for (int k = 0; k < count; k++)
-      if (any(touches(found[k], c->planes, centre, reach) & ~hit)) found[near++] = found[k];
+      if ((!allowed || allowed[found[k]->body]) && any(touches(found[k], c->planes, centre, reach) & ~hit))
+        found[near++] = found[k];
     if (!near) continue;
     for (int a = l->first; a < l->first + l->coarse; a++) {
       const Coarse *q = c->coarse + a;
@@ -328,9 +339,9 @@ INLINE I find_collisions(const Checker *c, Work *w, int early) {
   if (early ? any(hit) : !any(~hit)) return hit;
   for (int k = 0; k < c->links; k++) {
     const Link *l = c->link + k;
-    if (!l->coarse) continue;
     const V *T = w->o + 12 * l->pose;
     transform_point(T, l->ball, w->centre + 3 * k);
+    if (!l->coarse) continue;
     hit = link_against_set(c, l, T, w->centre + 3 * k, c->world, c->allowed + k * c->bodies,
                            w->inflation[k], early, hit);
     if (early ? any(hit) : !any(~hit)) return hit;
@@ -349,11 +360,14 @@ INLINE I find_collisions(const Checker *c, Work *w, int early) {
     const int i = c->moving_pair[k].one;
     const Link *a = c->link + i;
     const ObstacleSet *s = c->moving + c->moving_pair[k].other;
+    const Link *b = c->link + s->link;
+    /* A body that moves has its inflation among those of the links. */
+    const float grown = w->inflation[i] + w->inflation[s->link];
+    const float reach = a->ball[3] + b->ball[3] + grown + (float)c->margin;
+    if (!any(spheres_touch(w->centre + 3 * i, w->centre + 3 * s->link, reach) & ~hit)) continue;
     V centre[3];
     relative_pose(w->o + 12 * s->pose, w->o + 12 * a->pose, w->relative);
     transform_point(w->relative, a->ball, centre);
-    /* A body that moves has its inflation among those of the links. */
-    const float grown = w->inflation[i] + w->inflation[s->link];
     hit = link_against_set(c, a, w->relative, centre, s, 0, grown, early, hit);
     if (early ? any(hit) : !any(~hit)) return hit;
   }

@@ -21,6 +21,7 @@ INLINE float random_unit(Random *state) { return (random_bits(state) >> 40) * 0x
 /* A tree of configurations, W of them in a chunk of columns. */
 typedef struct {
   float *columns;
+  float *aims; /* on a manifold, where the edge to each node was aimed at, (room, n) */
   int *parent;
   float *domain; /* radius of the dynamic domain; infinite until an extension fails */
   long long count, room;
@@ -29,11 +30,13 @@ typedef struct {
 static int tree_grow(Tree *t, int n) {
   const long long room = t->room ? 2 * t->room : 1024;
   float *columns = aligned_alloc(64, room * n * sizeof(float));
+  float *aims = realloc(t->aims, room * n * sizeof(float));
+  if (aims) t->aims = aims;
   int *parent = realloc(t->parent, room * sizeof(int));
   if (parent) t->parent = parent;
   float *domain = realloc(t->domain, room * sizeof(float));
   if (domain) t->domain = domain;
-  if (!columns || !parent || !domain) {
+  if (!columns || !aims || !parent || !domain) {
     free(columns);
     return 1;
   }
@@ -44,10 +47,11 @@ static int tree_grow(Tree *t, int n) {
   return 0;
 }
 
-static int tree_add(Tree *t, int n, const float *q, int parent) {
+static int tree_add(Tree *t, int n, const float *q, const float *aim, int parent) {
   if (t->count == t->room && tree_grow(t, n)) return -1;
   const long long k = t->count++;
   for (int i = 0; i < n; i++) t->columns[(k / W * n + i) * W + k % W] = q[i];
+  memcpy(t->aims + k * n, aim, n * sizeof(float));
   t->parent[k] = parent;
   t->domain[k] = INFINITY;
   return (int)k;
@@ -59,6 +63,7 @@ static void tree_read(const Tree *t, int n, long long k, float *q) {
 
 static void tree_free(Tree *t) {
   free(t->columns);
+  free(t->aims);
   free(t->parent);
   free(t->domain);
 }
@@ -158,18 +163,45 @@ static void towards(const float *a, const float *b, int n, float range, float *o
   for (int i = 0; i < n; i++) out[i] = t < 1.0f ? a[i] + t * (b[i] - a[i]) : b[i];
 }
 
-/* Write the nodes from a root to node k, or backwards; return their number. */
-static long long branch(const Tree *t, int n, int k, int backwards, float *out, long long room) {
-  long long count = 0;
-  for (int i = k; i >= 0; i = t->parent[i]) count++;
-  if (count > room) return -1;
-  long long place = backwards ? 0 : count - 1;
-  for (int i = k; i >= 0; i = t->parent[i], place += backwards ? 1 : -1) tree_read(t, n, i, out + place * n);
+/* Write the configurations from a root to node j, or backwards; return their number, or -1 without room. On a manifold
+   the edges are gone again, with all their points. */
+static long long branch(Walk *k, const Tree *t, int j, int backwards, float *out, long long room) {
+  const Checker *c = k->s->checker;
+  const int n = (int)c->coordinates;
+  long long depth = 0, count = 0;
+  for (int i = j; i >= 0; i = t->parent[i]) depth++;
+  int *nodes = malloc(depth * sizeof(int));
+  if (!nodes) return -1;
+  for (long long i = depth - 1; i >= 0; i--, j = t->parent[j]) nodes[i] = j;
+  for (long long i = 0; i < depth; i++) {
+    int points = 1, full;
+    float from[MOST_COORDINATES];
+    if (k->s->projection && i) {
+      tree_read(t, n, nodes[i - 1], from);
+      points = edge_on_manifold(c, k->s->projection, &k->w, k->store, k->o, from, t->aims + (long long)nodes[i] * n,
+                                (float)k->s->resolution, k->points, &full);
+    }
+    if (count + points > room) {
+      count = -1;
+      break;
+    }
+    if (k->s->projection && i)
+      memcpy(out + count * n, k->points, points * n * sizeof(float));
+    else
+      tree_read(t, n, nodes[i], out + count * n);
+    count += points;
+  }
+  free(nodes);
+  for (long long a = 0, b = count - 1; backwards && a < b; a++, b--)
+    for (int i = 0; i < n; i++) {
+      const float swap = out[a * n + i];
+      out[a * n + i] = out[b * n + i], out[b * n + i] = swap;
+    }
   return count;
 }
 
-/* Search a path from any start to any goal; write its nodes (room, n) and return their number. Without a path those
-   from a start to the node nearest to a goal are written, and the status says why. */
+/* Search a path from any start to any goal; write its configurations (room, n) and return their number. Without a
+   path those from a start to the node nearest to a goal are written, and the status says why. */
 EXPORT long long kineverse_rrt_connect(Search *s, const float *starts, long long start_count, const float *goals,
                                        long long goal_count, float *path, long long room) {
   const Checker *c = s->checker;
@@ -186,9 +218,9 @@ EXPORT long long kineverse_rrt_connect(Search *s, const float *starts, long long
   s->status = NO_MEMORY;
   if (walk_begin(&k, s)) return -1;
   for (long long i = 0; i < start_count; i++)
-    if (tree_add(&trees[0], n, starts + i * n, -1) < 0) goto end;
+    if (tree_add(&trees[0], n, starts + i * n, starts + i * n, -1) < 0) goto end;
   for (long long i = 0; i < goal_count; i++)
-    if (tree_add(&trees[1], n, goals + i * n, -1) < 0) goto end;
+    if (tree_add(&trees[1], n, goals + i * n, goals + i * n, -1) < 0) goto end;
   for (long long i = 0; i < start_count; i++) {
     float away;
     nearest(&trees[1], n, starts + i * n, &away);
@@ -223,7 +255,7 @@ EXPORT long long kineverse_rrt_connect(Search *s, const float *starts, long long
       continue;
     }
     if (own->domain[parent] < INFINITY) own->domain[parent] *= 1.0001f;
-    const int fresh = tree_add(own, n, reached, parent);
+    const int fresh = tree_add(own, n, reached, to, parent);
     if (fresh < 0) {
       s->status = NO_MEMORY;
       break;
@@ -244,7 +276,7 @@ EXPORT long long kineverse_rrt_connect(Search *s, const float *starts, long long
       met = outcome == 2 && before <= range && distance(reached, goal, n) < 1e-3f;
       if (met && !s->projection) break;
       if (!met && distance(reached, goal, n) > before - 0.1f * fminf(range, before)) break;
-      last = tree_add(other, n, reached, last);
+      last = tree_add(other, n, reached, to, last);
       if (last < 0 || met || outcome == 1) break;
     }
     if (last < 0) {
@@ -253,15 +285,15 @@ EXPORT long long kineverse_rrt_connect(Search *s, const float *starts, long long
     }
     if (met) {
       const int a = grown ? last : fresh, b = grown ? fresh : last;
-      const long long first = branch(&trees[0], n, a, 0, path, room);
-      const long long rest = first < 0 ? -1 : branch(&trees[1], n, b, 1, path + first * n, room - first);
+      const long long first = branch(&k, &trees[0], a, 0, path, room);
+      const long long rest = first < 0 ? -1 : branch(&k, &trees[1], b, 1, path + first * n, room - first);
       s->status = rest < 0 ? NO_MEMORY : FOUND;
       if (rest >= 0) count = first + rest;
       best_gap = 0.0f;
       break;
     }
   }
-  if (s->status != FOUND && trees[0].count) count = branch(&trees[0], n, (int)best, 0, path, room);
+  if (s->status != FOUND && trees[0].count) count = branch(&k, &trees[0], (int)best, 0, path, room);
 end:
   s->gap = best_gap;
   s->count_start = trees[0].count;
