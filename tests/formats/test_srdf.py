@@ -229,7 +229,7 @@ def test_other_texts_are_refused(model: kv.Model, text: str, what: str) -> None:
 
 def test_a_wrong_prefix_is_an_error_that_names_the_right_one(model: kv.Model) -> None:
     text = '<robot><group name="g"><joint name="elbow"/></group></robot>'
-    with pytest.raises(UnknownNameError, match="below the prefix 'bob'"):
+    with pytest.raises(UnknownNameError, match="below prefix 'bob'"):
         parse_srdf(text, model)
 
 

@@ -113,7 +113,7 @@ class ModelNames:
         prefixes = sorted(name.removesuffix(f"/{first}") for name in known if name.endswith(f"/{first}"))
         prefixes += [""] if first in known else []
         hint = (
-            f"There is one below the prefix {' and below '.join(map(repr, prefixes[:4]))}: give it as prefix=."
+            f"There is one below prefix {' and below '.join(map(repr, prefixes[:4]))}: give it as prefix=."
             if prefixes
             else suggest(self._prefix + first, known, "link or joint")
         )
