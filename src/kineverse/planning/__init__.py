@@ -1,7 +1,17 @@
 """Motion planning (layer 5)."""
 
 from .blends import BlendedPath, round_corners
+from .follower import TrajectoryFollower
+from .motion_limits import MotionLimits, motion_limits
 from .time_parameterization import time_parameterize
 from .trajectory import Trajectory
 
-__all__ = ["BlendedPath", "Trajectory", "round_corners", "time_parameterize"]
+__all__ = [
+    "BlendedPath",
+    "MotionLimits",
+    "Trajectory",
+    "TrajectoryFollower",
+    "motion_limits",
+    "round_corners",
+    "time_parameterize",
+]

@@ -57,19 +57,22 @@ class BlendedPath:
     def turns(self) -> npt.NDArray[np.bool_]:
         """Flags of the inner corners where the direction changes (N-2,)."""
         turn = np.linalg.norm(np.diff(self.directions, axis=0), axis=1)
-        return np.greater(turn, _STRAIGHT)
+        turns: npt.NDArray[np.bool_] = turn > _STRAIGHT
+        return turns
 
     @property
     def deviation(self) -> Array:
         """Distances between the inner corners and their blends (N-2,)."""
-        return np.asarray(self.reach * np.linalg.norm(np.diff(self.directions, axis=0), axis=1) / 4)
+        found: Array = self.reach * np.linalg.norm(np.diff(self.directions, axis=0), axis=1) / 4
+        return found
 
     @property
     def curvature(self) -> Array:
         """Second derivatives q'' of the blends (N-2, n); 0 where there is none."""
-        change = np.diff(self.directions, axis=0)
+        change: Array = np.diff(self.directions, axis=0)
         reach = self.reach[:, None]
-        return np.divide(change, 2 * reach, out=np.zeros_like(change), where=reach > 0)
+        found: Array = np.where(reach > 0, change / np.where(reach > 0, 2 * reach, 1.0), 0.0)
+        return found
 
     def blend(self, corner: int, count: int) -> Array:
         """Return ``count`` configurations on the blend of an inner corner, both ends included."""

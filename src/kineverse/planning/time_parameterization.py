@@ -110,9 +110,9 @@ def _limits(
         limits = np.broadcast_to(limits, (n,)).copy()
         good = (limits > 0) & ((noun == "speed") | np.isfinite(limits))
         for k in np.flatnonzero(~good & (travel > 0)):
-            more = "" if noun == "speed" else " and finite"
+            wanted = "positive" if noun == "speed" else "positive and finite"
             raise InvalidValueError(
-                f"The {noun} limit of '{symbols[int(k)]}' is positive{more}, not {limits[k]:g}, since it moves."
+                f"The {noun} limit of '{symbols[int(k)]}', which moves, is {wanted}, not {limits[k]:g}."
             )
         limits[~good] = 1.0
         found.append(limits)
