@@ -76,7 +76,8 @@ class BlendedPath:
 
     def blend(self, corner: int, count: int) -> Array:
         """Return ``count`` configurations on the blend of an inner corner, both ends included."""
-        return _blend_points(self, np.array([corner]), count)[0]
+        points: Array = _blend_points(self, np.array([corner]), count)[0]
+        return points
 
 
 def round_corners(

@@ -20,18 +20,20 @@ _ITERATIONS = 12
 _ROUNDING = 1e-9
 """Relative difference of values that is rounding."""
 
-_TINY = 1e-100
-"""Coefficient below which a row has no part of a variable: its inverse might overflow."""
+_LARGEST_CHANGE = 0.3
+"""Relative change of a derivative q' in a cell up to which the tangent of the speed limit is used."""
+
+_TINY = 1e-9
+"""Relative size of a coefficient that counts as 0: a bound that is divided by it is nothing but rounding."""
 
 
 def maximal_squared_speeds(grid: PathGrid, speeds: Array, accelerations: Array) -> Array:
     """Return the largest squared path speeds at the nodes (K+1,): the backward and the forward pass."""
-    steepest = np.maximum(np.abs(grid.first), np.abs(grid.last))
+    before, after = _speed_caps(grid, speeds)
     with np.errstate(divide="ignore", over="ignore"):
-        cell_caps = ((speeds / steepest) ** 2).min(axis=1)
         path_accelerations = (accelerations / np.abs(grid.first)).min(axis=1)
-    caps = np.append(cell_caps, np.inf)
-    caps[1:] = np.minimum(caps[1:], cell_caps)
+    caps = np.append(before, np.inf)
+    caps[1:] = np.minimum(caps[1:], after)
     caps[grid.stops] = 0.0
     gains = (2 * path_accelerations * grid.lengths).tolist()
     blended = np.flatnonzero(~grid.straight)
@@ -45,6 +47,22 @@ def maximal_squared_speeds(grid: PathGrid, speeds: Array, accelerations: Array) 
     for i, k in enumerate(places):
         x[i + 1] = min(x[i + 1], x[i] + gains[i] if k < 0 else program.forward(k, x[i]))
     return np.array(x)
+
+
+def _speed_caps(grid: PathGrid, speeds: Array) -> tuple[Array, Array]:
+    """Return bounds of x at both ends of each cell (K,) with which q'·√x keeps the speed limits between.
+
+    In a cell x and q' are linear. x has to stay below (v/q')², which is convex, and below its tangent in the
+    middle of the cell it does. Where q' changes much, it stays below the smallest value instead.
+    """
+    with np.errstate(divide="ignore", over="ignore", invalid="ignore"):
+        least = (speeds / np.maximum(np.abs(grid.first), np.abs(grid.last))) ** 2
+        change = 2 * (grid.last - grid.first) / (grid.first + grid.last)
+        middle = (2 * speeds / np.abs(grid.first + grid.last)) ** 2
+        near = np.abs(change) < _LARGEST_CHANGE
+        before = np.where(near, middle * (1 + change), least)
+        after = np.where(near, middle * (1 - change), least)
+    return before.min(axis=1), after.min(axis=1)
 
 
 class CellPrograms:
@@ -65,7 +83,7 @@ class CellPrograms:
         # Of each pair of rows, one bounds from above and the other one from below.
         self._x0, self._x1 = _lines(p, q, b), _lines(q, p, b)
         lower = _lines(p, q, -b)
-        only = (np.abs(p) <= _TINY) & (np.abs(q) > _TINY)
+        only = (np.abs(p) <= _TINY * np.abs(q)) & (q != 0)
         alone = np.where(only, b / np.where(only, np.abs(q), 1.0), np.inf).min(axis=1)
         self._best = self._find_best(lower, np.minimum(alone, caps[cells + 1])).tolist()
         self._row = np.empty(p.shape[1])
@@ -122,7 +140,7 @@ class CellPrograms:
 
 def _lines(divisor: Array, other: Array, b: Array) -> tuple[Array, Array]:
     """Return offsets and slopes of the bounds (±b - other·y)/divisor, above for b > 0 and below for b < 0."""
-    used = np.abs(divisor) > _TINY
+    used = np.abs(divisor) > _TINY * np.abs(other)
     safe = np.where(used, divisor, 1.0)
     return np.where(used, b / np.abs(safe), np.copysign(np.inf, b)), np.where(used, -other / safe, 0.0)
 

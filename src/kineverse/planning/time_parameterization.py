@@ -13,6 +13,7 @@ everywhere in the cell if they hold at both ends: a linear program in the values
 from __future__ import annotations
 
 from collections.abc import Sequence
+from typing import NamedTuple
 
 import numpy as np
 import numpy.typing as npt
@@ -27,11 +28,17 @@ from .path_grid import PathGrid, make_grid
 from .reachability import maximal_squared_speeds
 from .trajectory import Trajectory
 
-_CELLS = 5
-"""Cells of a blend."""
+_CELLS = 250
+"""Cells of all blends together, where none is asked for."""
 
-_PARTS = 3
-"""Knots of a cell: between them a trajectory is a cubic, which differs a little from the motion."""
+_FEWEST = 4
+"""Fewest cells of a blend."""
+
+_EXCESS = 1e-3
+"""Error of the accelerations of cubics between knots, relative to the limits."""
+
+_MOST_PHASES = 50
+"""Most knots of a cell."""
 
 _ROUNDING = 1e-9
 """Relative excess of a limit that is rounding."""
@@ -71,7 +78,7 @@ def time_parameterize(
     valid
         Function that says which configurations (K, n) are valid, for the blends.
     cells
-        Number of cells of a blend.
+        Number of cells of all blends together, of which each has at least 4.
 
     Raises
     ------
@@ -88,11 +95,12 @@ def time_parameterize(
     if len(path.points) == 1:
         return Trajectory(tuple(symbols), np.zeros(1), path.points, np.zeros((1, n)))
     speeds, accelerations = _limits(path, velocity_limits, acceleration_limits, symbols)
-    grid = make_grid(path, as_count("cells", cells, 2))
+    blends = max(int(np.count_nonzero(path.reach)), 1)
+    grid = make_grid(path, max(as_count("cells", cells, 0) // blends, _FEWEST))
     times, positions, velocities = _motion(
         grid, maximal_squared_speeds(grid, speeds, accelerations), speeds, accelerations
     )
-    positions[-1], velocities[-1] = path.points[-1], 0.0
+    positions[[0, -1]], velocities[-1] = path.points[[0, -1]], 0.0
     return Trajectory(tuple(symbols), times, positions, velocities)
 
 
@@ -121,82 +129,111 @@ def _limits(
     return np.minimum(speeds, 2 * np.sqrt(accelerations * travel) + np.finfo(float).tiny), accelerations
 
 
-def _motion(grid: PathGrid, x: Array, speeds: Array, accelerations: Array) -> tuple[Array, Array, Array]:
-    """Return times (T,), positions and velocities (T, n) of the motion with squared path speeds at the nodes.
+class _Phases(NamedTuple):
+    """Parts of cells in which the path speed is linear in time, (P,) each.
 
-    A straight segment has three phases: up to its largest speed, along at that, down from it. Cells of
-    blends have as many parts of equal duration.
+    Attributes
+    ----------
+    cells
+        Indices of the cells.
+    durations
+        Durations [s].
+    begins, lengths
+        Beginning in the cell and length, in s.
+    before, after
+        Path speeds ṡ at both ends.
     """
-    rate, following = np.sqrt(x[:-1]), np.sqrt(x[1:])
+
+    cells: npt.NDArray[np.intp]
+    durations: Array
+    begins: Array
+    lengths: Array
+    before: Array
+    after: Array
+
+
+def _straight_phases(grid: PathGrid, x: Array, speeds: Array, accelerations: Array) -> _Phases:
+    """Return three phases of each straight segment: up to its largest speed, along at that, down from it."""
+    cells = np.flatnonzero(grid.straight)
+    first, last, length = x[cells], x[cells + 1], grid.lengths[cells]
     with np.errstate(divide="ignore", over="ignore"):
-        cap = ((speeds / np.abs(grid.first)) ** 2).min(axis=1)
-        slope = (accelerations / np.abs(grid.first)).min(axis=1)
-    peak = np.minimum(cap, (x[:-1] + x[1:]) / 2 + slope * grid.lengths)
-    peak = np.where(grid.straight, np.maximum(peak, np.maximum(x[:-1], x[1:])), 1.0)
-    fast = np.sqrt(peak)
-    up, down = (peak - x[:-1]) / (2 * slope), (peak - x[1:]) / (2 * slope)
-    along = np.maximum(grid.lengths - up - down, 0.0)
-    phases = np.stack([(fast - rate) / slope, along / fast, (fast - following) / slope], axis=1)
-    distances = np.stack([up, up + along, grid.lengths], axis=1)
-    duration = 2 * grid.lengths / np.where(grid.straight, 1.0, rate + following)
-    change = (following - rate) / duration
-    parts = np.arange(1, _PARTS + 1) / _PARTS
-    elapsed = duration[:, None] * parts
-    curved = rate[:, None] * elapsed + change[:, None] * elapsed**2 / 2
-    straight = grid.straight[:, None]
-    phases = np.where(straight, phases, duration[:, None] / _PARTS)
-    distances = np.where(straight, distances, curved)
-    rates = np.where(
-        straight, np.stack([fast, fast, following], axis=1), rate[:, None] + change[:, None] * elapsed
-    )
-    s = distances[..., None]
-    tangents = grid.first[:, None] + grid.curvature[:, None] * s
-    positions = grid.start[:, None] + (grid.first[:, None] + grid.curvature[:, None] * s / 2) * s
-    velocities = tangents * rates[..., None]
-    slower = _excess(grid, rate, phases, distances, velocities, speeds, accelerations)
-    n = grid.first.shape[1]
-    phases = phases.ravel()
-    keep = phases > _SHORTEST * phases.sum()
-    times = np.concatenate(([0.0], np.cumsum(phases[keep]))) * slower
-    zero = np.zeros((1, n))
-    return (
-        times,
-        np.concatenate([grid.start[:1], positions.reshape(-1, n)[keep]]),
-        np.concatenate([zero, velocities.reshape(-1, n)[keep] / slower]),
+        cap = ((speeds / np.abs(grid.first[cells])) ** 2).min(axis=1)
+        slope = (accelerations / np.abs(grid.first[cells])).min(axis=1)
+    peak = np.minimum(cap, (first + last) / 2 + slope * length)
+    peak = np.maximum(peak, np.maximum(first, last))
+    before, fast, after = np.sqrt(first), np.sqrt(peak), np.sqrt(last)
+    up, down = (peak - first) / (2 * slope), (peak - last) / (2 * slope)
+    along = np.maximum(length - up - down, 0.0)
+    return _Phases(
+        np.repeat(cells, 3),
+        np.stack([(fast - before) / slope, along / fast, (fast - after) / slope], axis=1).ravel(),
+        np.stack([0 * up, up, up + along], axis=1).ravel(),
+        np.stack([up, along, down], axis=1).ravel(),
+        np.stack([before, fast, fast], axis=1).ravel(),
+        np.stack([fast, fast, after], axis=1).ravel(),
     )
 
 
-def _excess(
-    grid: PathGrid,
-    rate: Array,
-    phases: Array,
-    distances: Array,
-    velocities: Array,
-    speeds: Array,
-    accelerations: Array,
-) -> float:
-    """Return the factor on all times with which cubics between the knots keep the limits, at least 1.
+def _blend_phases(grid: PathGrid, x: Array, accelerations: Array) -> _Phases:
+    """Return phases of the cells of blends, so short that cubics are near to the motion.
 
-    Within a part of a blend the motion is a polynomial of degree 4 in time, and the cubic through its ends
-    differs a little. On straight segments there is no difference.
+    The motion has the fourth derivative 3·q''·u² in time. At the ends of a phase of duration T, the second
+    derivative of the cubic with the same ends differs by that times T²/12.
     """
-    curved = ~grid.straight
-    if not curved.any():
+    cells = np.flatnonzero(~grid.straight)
+    rate, following = np.sqrt(x[cells]), np.sqrt(x[cells + 1])
+    duration = 2 * grid.lengths[cells] / (rate + following)
+    bend = np.abs(grid.curvature[cells]) / (4 * accelerations)
+    error = bend.max(axis=1, initial=0.0) * (following - rate) ** 2
+    counts = np.clip(np.ceil(np.sqrt(error / _EXCESS)), 1, _MOST_PHASES).astype(int)
+    owner = np.repeat(np.arange(len(cells)), counts)
+    number = np.arange(len(owner)) - np.repeat(np.cumsum(counts) - counts, counts)
+    step = (duration / counts)[owner]
+    change = ((following - rate) / duration)[owner]
+    before = rate[owner] + change * step * number
+    after = before + change * step
+    begins = (rate[owner] + before) / 2 * step * number
+    return _Phases(cells[owner], step, begins, (before + after) / 2 * step, before, after)
+
+
+def _motion(grid: PathGrid, x: Array, speeds: Array, accelerations: Array) -> tuple[Array, Array, Array]:
+    """Return times (T,), positions and velocities (T, n) of the motion with the squared path speeds x."""
+    blends = _blend_phases(grid, x, accelerations)
+    slower = _excess(grid, blends, speeds, accelerations)
+    straight = _straight_phases(grid, x, speeds, accelerations)
+    phases = _Phases(*(np.concatenate(pair) for pair in zip(straight, blends, strict=True)))
+    order = np.argsort(phases.cells, kind="stable")
+    order = order[(phases.durations > _SHORTEST * phases.durations.sum())[order]]
+    cells, s = phases.cells[order], (phases.begins + phases.lengths)[order, None]
+    tangents = grid.first[cells] + grid.curvature[cells] * s
+    positions = grid.start[cells] + (grid.first[cells] + tangents) / 2 * s
+    velocities = tangents * phases.after[order, None] / slower
+    times = slower * np.cumsum(phases.durations[order])
+    start = grid.start[:1]
+    return (
+        np.concatenate([[0.0], times]),
+        np.concatenate([start, positions]),
+        np.concatenate([0 * start, velocities]),
+    )
+
+
+def _excess(grid: PathGrid, phases: _Phases, speeds: Array, accelerations: Array) -> float:
+    """Return the factor on all times with which the cubics of phases of blends keep the limits, at least 1.
+
+    On straight segments the cubics are the motion.
+    """
+    if not len(phases.cells):
         return 1.0
-    first, bend = grid.first[curved, None], grid.curvature[curved, None]
-    ends = distances[curved]
-    begins = np.concatenate([np.zeros((len(ends), 1)), ends[:, :-1]], axis=1)
-    moved = (first + bend * ((begins + ends) / 2)[..., None]) * (ends - begins)[..., None]
-    after = velocities[curved]
-    before = np.concatenate([first * rate[curved, None, None], after[:, :-1]], axis=1)
-    dt = phases[curved][..., None]
-    mean = moved / dt
+    first, bend = grid.first[phases.cells], grid.curvature[phases.cells]
+    begin, length, dt = (values[:, None] for values in (phases.begins, phases.lengths, phases.durations))
+    mean = (first + bend * (begin + length / 2)) * length / dt
+    before = (first + bend * begin) * phases.before[:, None]
+    after = (first + bend * (begin + length)) * phases.after[:, None]
     initial = (6 * mean - 4 * before - 2 * after) / dt
     final = (2 * before + 4 * after - 6 * mean) / dt
     factor = np.sqrt((np.maximum(np.abs(initial), np.abs(final)) / accelerations).max())
     jerk = final - initial
-    with np.errstate(divide="ignore", invalid="ignore"):
-        inside = (np.abs(initial + final) < np.abs(jerk)) & (jerk != 0)
-        turning = np.where(inside, before - initial**2 * dt / (2 * jerk), 0.0)
+    inside = np.abs(initial + final) < np.abs(jerk)
+    turning = np.where(inside, before - initial**2 * dt / (2 * np.where(inside, jerk, 1.0)), 0.0)
     factor = max(float(factor), float((np.abs(turning) / speeds).max()))
     return factor if factor > 1 + _ROUNDING else 1.0
