@@ -3,8 +3,8 @@
 ``import kineverse as kv`` gives what most programs need. The rest is in the packages below it:
 :mod:`kineverse.articulations` (joints, mechanisms, locks), :mod:`kineverse.model` (operations, edits, data),
 :mod:`kineverse.errors`, :mod:`kineverse.logic`, :mod:`kineverse.spatial`, :mod:`kineverse.loops` and
-:mod:`kineverse.formats`. :mod:`kineverse.geometry`, :mod:`kineverse.estimation`, :mod:`kineverse.reasoning`
-and the viewer (:func:`show`) are imported on first use.
+:mod:`kineverse.formats`. :mod:`kineverse.geometry`, :mod:`kineverse.estimation`, :mod:`kineverse.reasoning`,
+:mod:`kineverse.planning` and the viewer (:func:`show`) are imported on first use.
 """
 
 from typing import TYPE_CHECKING
@@ -35,7 +35,7 @@ from .state import State, StateLike
 from .symbols import Symbol, parameter, position, velocity
 
 if TYPE_CHECKING:
-    from . import control, estimation, geometry, reasoning
+    from . import control, estimation, geometry, planning, reasoning
     from .view.show import show
 
 __all__ = [
@@ -77,6 +77,7 @@ __all__ = [
     "model",
     "norm",
     "parameter",
+    "planning",
     "position",
     "quaternion",
     "reasoning",
@@ -95,7 +96,7 @@ __all__ = [
     "where",
 ]
 
-_LAZY = ("control", "estimation", "geometry", "reasoning")
+_LAZY = ("control", "estimation", "geometry", "planning", "reasoning")
 
 # Entries are texts: the packages are imported at first use.
 model.registry.register_collection(

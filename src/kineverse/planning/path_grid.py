@@ -41,7 +41,7 @@ class PathGrid:
     stops: npt.NDArray[np.bool_]
 
 
-def make_grid(path: BlendedPath, cells: int) -> PathGrid:
+def divide_path(path: BlendedPath, cells: int) -> PathGrid:
     """Divide a path into cells."""
     segments = len(path.lengths)
     reach = np.concatenate(([0.0], path.reach, [0.0]))

@@ -24,7 +24,7 @@ from kineverse.lie import Array
 from kineverse.symbols import Symbol
 
 from .blends import BlendedPath, Validity, round_corners
-from .path_grid import PathGrid, make_grid
+from .path_grid import PathGrid, divide_path
 from .reachability import maximal_squared_speeds
 from .trajectory import Trajectory
 
@@ -96,7 +96,7 @@ def time_parameterize(
         return Trajectory(tuple(symbols), np.zeros(1), path.points, np.zeros((1, n)))
     speeds, accelerations = _limits(path, velocity_limits, acceleration_limits, symbols)
     blends = max(int(np.count_nonzero(path.reach)), 1)
-    grid = make_grid(path, max(as_count("cells", cells, 0) // blends, _FEWEST))
+    grid = divide_path(path, max(as_count("cells", cells, 0) // blends, _FEWEST))
     times, positions, velocities = _motion(
         grid, maximal_squared_speeds(grid, speeds, accelerations), speeds, accelerations
     )
