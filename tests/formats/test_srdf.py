@@ -120,6 +120,15 @@ def test_end_effectors_and_virtual_joints(model: kv.Model) -> None:
     assert srdf.warnings == ()
 
 
+def test_a_virtual_joint_in_a_group_is_the_base_of_the_model() -> None:
+    text = (
+        '<robot><virtual_joint name="stand" type="planar" parent_frame="map" child_link="base_link"/>'
+        '<group name="base"><joint name=" stand "/></group></robot>'
+    )
+    group = parse_srdf(text, kv.load("pr2"), "pr2", strict=True).groups["base"]
+    assert group.coordinates == ("pr2/base/x", "pr2/base/y", "pr2/base/angle")
+
+
 def state(name: str, group: str, **values: object) -> str:
     joints = "".join(f'<joint name="{k}" value="{v}"/>' for k, v in values.items())
     return f'<group_state name="{name}" group="{group}">{joints}</group_state>'

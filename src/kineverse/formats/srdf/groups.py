@@ -8,7 +8,7 @@ from dataclasses import dataclass, field
 from kineverse.errors import UnknownNameError
 from kineverse.formats.reader_warnings import ReaderWarnings
 from kineverse.formats.srdf.description import SrdfGroup, VirtualJoint
-from kineverse.formats.srdf.model_names import ModelNames, required
+from kineverse.formats.srdf.model_names import ModelNames, optional, required
 from kineverse.formats.xml_reader import Element, ElementError, label, quote
 
 MOST_GROUPS = 1000
@@ -85,7 +85,7 @@ class GroupResolver:
                     open_names.discard(name)
                     done[name] = None
                     continue
-                inner = part[1].get("name", "") if part[0] == "group" else ""
+                inner = optional(part, "name") if part[0] == "group" else ""
                 if inner in open_names:
                     mistake = ElementError(part, "contains itself.")
                     self._remarks.mend(mistake, PASSED_OVER, self._elements[name])
@@ -133,10 +133,10 @@ class GroupResolver:
             self._remarks.add(part, "is ignored: a group has no such part.", group)
 
     def _add_joint(self, members: _Members, part: Element) -> None:
-        name = part[1].get("name", "")
+        name = optional(part, "name")
         if name in self._virtual_joints:
             # The model may have a base in its place, whose articulation has another name.
-            above = self._names.joint_above(self._virtual_joints[name].child_link)
+            above = self._names.moving_joint_above(self._virtual_joints[name].child_link)
             joint = [] if above is None else [above]
         else:
             joint = [self._names.joint(part)]

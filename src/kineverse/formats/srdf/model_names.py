@@ -68,6 +68,14 @@ class ModelNames:
         """Return the articulation that has a frame as its child; None if there is none."""
         return self._above.get(link)
 
+    def moving_joint_above(self, link: str) -> str | None:
+        """Return the nearest articulation that moves a frame; None if there is none."""
+        for frame in self._ancestors(link):
+            joint = self._above.get(frame)
+            if joint is not None and self.is_moving(joint):
+                return joint
+        return None
+
     def is_moving(self, joint: str) -> bool:
         """Return whether an articulation moves: it has coordinates, or follows others."""
         record = self.articulations[joint]
@@ -137,15 +145,20 @@ class ModelNames:
         return ElementError(element, f"{quote(said)} is no {what} of the model{hint}.")
 
 
+def optional(element: Element, key: str) -> str:
+    """Return an attribute of an element without blanks around it, as MoveIt takes names; empty if missing."""
+    return element[1].get(key, "").strip()
+
+
 def required(element: Element, key: str) -> str:
-    """Return an attribute of an element.
+    """Return an attribute of an element without blanks around it.
 
     Raises
     ------
     ElementError
         If it is missing or empty.
     """
-    said = element[1].get(key, "")
+    said = optional(element, key)
     if not said:
         raise ElementError(element, f"has no {key}; {label(element).split()[0].strip('<>')} needs one.")
     return said

@@ -17,7 +17,7 @@ from kineverse.formats.names import check_prefix
 from kineverse.formats.reader_warnings import ReaderWarnings
 from kineverse.formats.srdf.description import CollisionRule, EndEffector, Srdf, SrdfGroup, VirtualJoint
 from kineverse.formats.srdf.groups import MOST_GROUPS, PASSED_OVER, GroupResolver, add_unique
-from kineverse.formats.srdf.model_names import ModelNames, required
+from kineverse.formats.srdf.model_names import ModelNames, optional, required
 from kineverse.formats.xml_reader import Element, ElementError, label, parse_xml, quote
 from kineverse.formats.xml_values import parse_number
 from kineverse.model.model_view import ModelView
@@ -173,7 +173,7 @@ class _SemanticDocument:
                     a, b = self._names.link(element, "link1"), self._names.link(element, "link2")
                     if a == b:
                         raise ElementError(element, f"names {quote(a)} twice; a pair has two links.")
-                    rules.append((a, b, check, element[1].get("reason", "").strip()))
+                    rules.append((a, b, check, optional(element, "reason")))
                 except ElementError as mistake:
                     # A link that this variant of the robot lacks may have a rule with each of the others.
                     if mistake.message not in warned:
@@ -190,7 +190,7 @@ class _SemanticDocument:
                     continue
                 name, group = required(element, "name"), required(element, "group")
                 parent = self._names.link(element, "parent_link")
-                above = element[1].get("parent_group", "")
+                above = optional(element, "parent_group")
                 for key, said in (("group", group), ("parent_group", above)):
                     if said and said not in groups:
                         raise ElementError(element, f"{key}={quote(said)} is no group of this file.")
