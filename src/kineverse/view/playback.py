@@ -12,6 +12,9 @@ from kineverse.planning.trajectory import Trajectory
 _STEPS = 1000
 """Steps of the slider of the time."""
 
+_DIGITS = 3
+"""Decimals of the time on the page."""
+
 _SHORTEST = 1e-3
 """Shortest range of the slider [s], for a trajectory of no duration."""
 
@@ -58,7 +61,8 @@ class TrajectoryPlayback:
         self._speed, self._loop = factor, loop
         self._time, self._begin = 0.0, 0.0
         longest = max(trajectory.duration, _SHORTEST)
-        self._folder = gui.add_folder("trajectory")
+        # Above everything else, where it is in view beside a robot with many sliders.
+        self._folder = gui.add_folder("trajectory", order=-1.0)
         with self._folder:
             self._running = gui.add_checkbox(
                 "run", False, hint="Play the trajectory, or stop it where it is."
@@ -71,6 +75,7 @@ class TrajectoryPlayback:
                 initial_value=0.0,
                 hint="Time of the trajectory.",
             )
+            self._slider.precision = _DIGITS
         # Values set by this program come back as events without a client.
         self._running.on_update(
             lambda event: on_run(event.target.value) if event.client is not None else None
@@ -103,7 +108,7 @@ class TrajectoryPlayback:
     def seek(self, time: float) -> dict[str, float]:
         """Go to a time of the trajectory [s], and return the values there by name."""
         self._time = min(max(time, 0.0), self.trajectory.duration)
-        self._slider.value = self._time
+        self._slider.value = round(self._time, _DIGITS)
         values = self.trajectory.positions_at(self._time).tolist()
         return dict(zip(map(str, self.trajectory.symbols), values, strict=True))
 
