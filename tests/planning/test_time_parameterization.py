@@ -195,6 +195,23 @@ def test_lengths_of_all_magnitudes(seed: int, exponent: float) -> None:
     check_limits(t, velocity, acceleration, 1e-4)
 
 
+@settings(max_examples=attempts(40))
+@given(seeds, st.sampled_from([0.0, 1e-9, 1e-4, 0.1, np.inf]))
+def test_limits_and_ranges_of_all_magnitudes(seed: int, deviation: float) -> None:
+    rng = np.random.default_rng(seed)
+    points = rng.normal(size=(6, 3)) * 10 ** rng.uniform(-5, 2, 3)
+    points[2] = points[0]
+    velocity, acceleration = 10 ** rng.uniform(-3, 3, (2, 3))
+    t = time_parameterize(points, velocity, acceleration, names(3), deviation=deviation)
+    assert (np.abs(t.velocities_at(np.linspace(0, t.duration, 2000))) <= velocity * (1 + 1e-6)).all()
+    dt = np.diff(t.times)[:, None]
+    change = np.abs(np.diff(t.velocities, axis=0)) / dt
+    # Velocities have a relative error of some 1e-15, and times one relative to the last of them.
+    tolerance = 1e-6 + 1e-14 * t.duration / dt
+    rounding = 1e-14 * np.abs(t.velocities).max() / dt
+    assert (change <= acceleration * (1 + tolerance) + rounding).all()
+
+
 @pytest.mark.parametrize(
     ("velocity", "acceleration", "error", "what"),
     [

@@ -43,9 +43,9 @@ def maximal_squared_speeds(grid: PathGrid, speeds: Array, accelerations: Array) 
     places, x = place.tolist(), caps.tolist()
     for i in range(len(places) - 1, -1, -1):
         k = places[i]
-        x[i] = min(x[i], x[i + 1] + gains[i] if k < 0 else program.backward(k, x[i + 1]))
+        x[i] = max(min(x[i], x[i + 1] + gains[i] if k < 0 else program.backward(k, x[i + 1])), 0.0)
     for i, k in enumerate(places):
-        x[i + 1] = min(x[i + 1], x[i] + gains[i] if k < 0 else program.forward(k, x[i]))
+        x[i + 1] = max(min(x[i + 1], x[i] + gains[i] if k < 0 else program.forward(k, x[i])), 0.0)
     return np.array(x)
 
 

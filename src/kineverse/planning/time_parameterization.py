@@ -43,8 +43,8 @@ _MOST_PHASES = 50
 _ROUNDING = 1e-9
 """Relative excess of a limit that is rounding."""
 
-_SHORTEST = 1e-12
-"""Shortest time between two knots, relative to the duration."""
+_SHORTEST = 4 * np.finfo(float).eps
+"""Shortest time between two knots, relative to the duration: times increase."""
 
 
 def time_parameterize(
