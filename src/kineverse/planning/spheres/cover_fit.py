@@ -111,6 +111,9 @@ def _fit_to_points(problem: _Problem, aim: float, most: int) -> FittedSpheres:
     if best.protrusion <= aim or most == 1:
         return best
     best = _search_start(problem, CoverStarts(problem.polytope, aim), aim, most, best)
+    if best.protrusion > aim and len(best.radii) < most:
+        added = descend(problem, _split_worst(problem, best, most), aim)
+        best = added if added.is_better(best, aim) else best
     polished = descend(problem, best.centres, aim)
     return _remove(problem, polished if polished.is_better(best, aim) else best, aim)
 
@@ -140,6 +143,17 @@ def _search_start(
         found = descend(problem, centres, aim, _FEW_ROUNDS)
         best = found if found.is_better(best, aim) else best
     return best
+
+
+def _split_worst(problem: _Problem, cover: FittedSpheres, most: int) -> Floats:
+    """Return the centres with one more beside each of those that protrude most, at most so many."""
+    depths = problem.polytope.depths(cover.centres)
+    points, owners = problem.find_critical(cover.centres, depths + cover.protrusion)
+    needs = np.linalg.norm(points - cover.centres[owners], axis=1) - depths[owners]
+    order = np.argsort(-needs, kind="stable")
+    first = order[np.sort(np.unique(owners[order], return_index=True)[1])][: most - len(cover.radii)]
+    added = 0.4 * cover.centres[owners[first]] + 0.6 * points[first]
+    return np.concatenate([cover.centres, added])
 
 
 def descend(problem: _Problem, centres: Floats, aim: float, rounds: int = _ROUNDS) -> FittedSpheres:
