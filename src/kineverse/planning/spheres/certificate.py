@@ -1,9 +1,9 @@
 """Proof that spheres cover a polytope: subdivision until each tetrahedron lies in one sphere.
 
-A sphere is convex, so it contains a tetrahedron if it contains the four corners. The polytope is the union of
-the tetrahedra between an inner point and its triangles. Those that no sphere contains are cut at the middle of
-their longest edge, until the sphere that lacks least of them would have to grow by a small length only, or by as
-much as for one of their corners alone. By that much it does grow.
+A sphere is convex, so it contains a tetrahedron if it contains the four corners. The polytope is the union
+of the tetrahedra between an inner point and its triangles. Those that no sphere contains are cut at the middle
+of their longest edge. A tetrahedron is final once the sphere that lacks least of it would have to grow by a
+small length only, or hardly more than for one of its corners alone. By that much it does grow.
 """
 
 from __future__ import annotations
@@ -56,11 +56,13 @@ def find_uncovered(polytope: CoverPolytope, centres: Floats, radii: Floats, tole
     corners = polytope.corners[polytope.faces]
     cells = np.concatenate([np.broadcast_to(middle, (len(corners), 1, 3)), corners], axis=1)
     while len(cells):
-        gaps, nearest, needs, outside = _measure_gaps(cells, centres, radii)
+        gaps, nearest, needs, outside = _measure_gaps(cells, centres, radii + growth)
         final = (gaps > 0.0) & (gaps <= np.maximum(needs, 0.0) + tolerance)
         if len(cells) > _MOST_CELLS:
             final = gaps > 0.0
-        np.maximum.at(growth, nearest[final], gaps[final])
+        grown = growth.copy()
+        np.maximum.at(grown, nearest[final], growth[nearest[final]] + gaps[final])
+        growth = grown
         points.append(outside[final & (needs > 0.0)])
         cells = cells[(gaps > 0.0) & ~final]
         a, b = cells[:, _EDGES[:, 0]], cells[:, _EDGES[:, 1]]

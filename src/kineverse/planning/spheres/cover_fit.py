@@ -1,14 +1,14 @@
 """Few spheres that cover a polytope within a protrusion.
 
-A ball about a point c inside of a convex solid sticks out of it by its radius less the depth d(c), exactly. A
-point p therefore needs the protrusion min_i |p - c_i| - d(c_i), and a cover with N spheres is the location
+A ball about a point c inside of a convex solid sticks out of it by its radius less the depth d(c), exactly.
+A point p therefore needs the protrusion min_i |p - c_i| - d(c_i), and a cover with N spheres is the location
 problem that minimises the largest need over the centres. The needs are largest at corners of the power cells of
-the spheres. So rounds alternate, as in Lloyd's iteration: the power diagram gives corners, and with it a cover
-that is proved; the needs of the corners, smoothed, are descended over the centres.
+the spheres. So rounds alternate, as in Lloyd's iteration: the power diagram gives points that are hard to
+cover, and the needs of these, smoothed, are descended over the centres.
 
-The first centres come from a greedy set cover, or from a lattice. As covers with N spheres lie in many local
-minima, and the protrusion of either start is known only after the descent, the number of spheres is found by
-trying.
+The first centres come from a greedy set cover, or from a lattice. Covers with N spheres lie in many local
+minima, and the protrusion of either start is known only after the descent, so that the number of spheres is
+found by trying.
 """
 
 from __future__ import annotations
@@ -271,7 +271,7 @@ def prove(polytope: CoverPolytope, cover: FittedSpheres) -> tuple[FittedSpheres,
     """
     tolerance = _PROOF * cover.protrusion
     radii = cover.radii + tolerance
-    uncovered = find_uncovered(polytope, cover.centres, radii, 0.5 * tolerance)
+    uncovered = find_uncovered(polytope, cover.centres, radii, tolerance)
     radii = (radii + uncovered.growth) * (1.0 + _ROUNDING)
     protrusion = float((radii - polytope.depths(cover.centres)).max())
     return FittedSpheres(cover.centres, radii, protrusion), uncovered.points

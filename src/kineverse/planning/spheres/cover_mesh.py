@@ -1,8 +1,8 @@
 """Points of a polytope that are hardest to cover by given spheres.
 
 The power of a point x for a sphere is |x - c|² - r². Spheres cover a solid if and only if each one covers the
-part where its own power is least. These parts are convex, so that what is hardest to cover are their corners: on
-the surface, points of equal power for three spheres; on an edge, for two. A triangle whose corners belong to
+part where its own power is least. These parts are convex, so that their corners are hardest to cover: on the
+surface, points of equal power for three spheres; on an edge, for two. A triangle whose corners belong to
 different spheres is likely to have one.
 
 Source: F. Aurenhammer, Power diagrams: properties, algorithms and applications, SIAM J. Comput. 16 (1987).
