@@ -1,9 +1,9 @@
 """Proof that spheres cover a polytope: subdivision until each tetrahedron lies in one sphere.
 
 A sphere is convex, so it contains a tetrahedron if it contains the four corners. The polytope is the union
-of the tetrahedra between an inner point and its triangles. Those that no sphere contains are cut at the middle
-of their longest edge. A tetrahedron is final once the sphere that lacks least of it would have to grow by a
-small length only, or hardly more than for one of its corners alone. By that much it does grow.
+of the tetrahedra between an inner point and its triangles. One that no sphere contains is cut at the middle
+of its longest edge. It is final once the sphere that lacks least of it would have to grow by a small length
+only, or hardly more than for one corner alone. By that much the sphere does grow.
 """
 
 from __future__ import annotations

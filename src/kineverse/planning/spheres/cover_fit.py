@@ -2,8 +2,8 @@
 
 A ball about a point c inside of a convex solid sticks out of it by its radius less the depth d(c), exactly.
 A point p therefore needs the protrusion min_i |p - c_i| - d(c_i), and a cover with N spheres is the location
-problem that minimises the largest need over the centres. The needs are largest at corners of the power cells of
-the spheres. So rounds alternate, as in Lloyd's iteration: the power diagram gives points that are hard to
+problem that minimises the largest need over the centres. The needs are largest at corners of the power cells
+of the spheres. So rounds alternate, as in Lloyd's iteration: the power diagram gives points that are hard to
 cover, and the needs of these, smoothed, are descended over the centres.
 
 The first centres come from a greedy set cover, or from a lattice. Covers with N spheres lie in many local
