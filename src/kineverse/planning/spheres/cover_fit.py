@@ -25,14 +25,14 @@ from .cover_mesh import CoverMesh
 from .cover_starts import CoverStarts
 from .polytope import CoverPolytope
 
-_ROUNDS, _FEW_ROUNDS, _STEPS = 24, 12, 6
+_ROUNDS, _FEW_ROUNDS, _STEPS = 20, 10, 6
 """Power diagrams of a descent and of a short one, and steps between two of them."""
 
 _WARM, _COLD = 0.2, 0.015
 """First and last temperature of the smoothed maximum, as a fraction of the protrusion."""
 
 _MOMENTUM = 0.6
-_SAMPLES, _HARD = 600, 0.6
+_SAMPLES, _HARD = 300, 0.6
 _TRIALS = 4
 _REMOVALS, _FEW_SPHERES = 3, 12
 _PROOF, _ALLOWANCE, _ATTEMPTS = 0.01, 1.04, 4
@@ -127,7 +127,7 @@ def _search_start(
     tried: set[int] = set()
     for _ in range(_TRIALS):
         centres = start.greedy(wanted)
-        if len(centres) in tried:
+        if len(centres) in tried or len(centres) > most:
             break
         tried.add(len(centres))
         found = descend(problem, centres, aim, _FEW_ROUNDS)

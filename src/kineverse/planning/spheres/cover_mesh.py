@@ -18,7 +18,7 @@ from kineverse.geometry.mesh_files import Floats, Integers
 
 from .polytope import CoverPolytope
 
-_LAYERS, _INNER_TRIANGLES = (0.75, 0.5, 0.25), 150
+_LAYERS, _INNER_TRIANGLES = (0.75, 0.5, 0.25), 60
 """Sizes of the inner surfaces beside the outer one, and the number of their triangles."""
 
 

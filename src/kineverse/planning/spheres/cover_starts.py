@@ -12,7 +12,7 @@ from .certificate import distances
 from .cover_mesh import split_triangles
 from .polytope import CoverPolytope
 
-_SAMPLES, _CANDIDATES = 300, 1500
+_SAMPLES, _CANDIDATES = 150, 1500
 
 
 class CoverStarts:
@@ -51,14 +51,17 @@ class CoverStarts:
         self._protrusion = protrusion
 
     def least_greedy(self, most: int) -> float:
-        """Return the least protrusion for which :meth:`greedy` chooses at most so many spheres."""
-        low = high = self._protrusion
+        """Return a protrusion, close to the least one, for which :meth:`greedy` chooses at most so many.
+
+        The search begins at half the protrusion of the starts.
+        """
+        low = high = 0.5 * self._protrusion
         while len(self.greedy(high)) > most:
             low, high = high, 2.0 * high
-        while high > 1.05 * low:
+        while high > 1.1 * low:
             middle = math.sqrt(low * high)
             low, high = (middle, high) if len(self.greedy(middle)) > most else (low, middle)
-        return high if high > self._protrusion else 0.5 * high
+        return high
 
     def greedy(self, protrusion: float) -> Floats:
         """Return centres whose balls cover the points, each chosen because it covers most new ones."""
