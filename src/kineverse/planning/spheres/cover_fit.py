@@ -60,11 +60,12 @@ class FittedSpheres:
 class _Problem:
     """Polytope, with the points of it that a cover is fitted to."""
 
-    def __init__(self, polytope: CoverPolytope, protrusion: float) -> None:
+    def __init__(self, polytope: CoverPolytope, protrusion: float, most: int) -> None:
         self.polytope = polytope.simplify()
         a, b, c = np.moveaxis(polytope.corners[polytope.faces], 1, 0)
+        samples = max(_SAMPLES, 10 * most)
         area = float(np.linalg.norm(np.cross(b - a, c - a), axis=1).sum()) / 2
-        self.mesh = CoverMesh(self.polytope, max(protrusion, math.sqrt(area / _SAMPLES)))
+        self.mesh = CoverMesh(self.polytope, max(protrusion, math.sqrt(area / samples)))
         self.gaps: Floats = np.zeros((0, 3))
 
     def find_critical(self, centres: Floats, radii: Floats) -> tuple[Floats, Integers]:
@@ -88,7 +89,7 @@ def fit_spheres(polytope: CoverPolytope, protrusion: float, most: int) -> Fitted
     most
         Largest number of spheres.
     """
-    problem = _Problem(polytope, protrusion)
+    problem = _Problem(polytope, protrusion, most)
     aim = protrusion / _ALLOWANCE
     for _ in range(_ATTEMPTS):
         fitted = _fit_to_points(problem, aim, most)
