@@ -14,7 +14,7 @@ from kineverse.geometry.mesh_files import Floats, Integers
 
 _ALWAYS_FLAT = 4
 _LLOYD_ROUNDS = 10
-_BALL_STEPS, _FEW_STEPS = 400, 20
+_BALL_STEPS = 100
 _ROUNDING = 1e-9
 
 
@@ -117,10 +117,7 @@ def _cluster(centres: Floats, radii: Floats, count: int) -> Integers:
         reach = np.linalg.norm(centres[:, None] - means, axis=2) + radii[:, None]
         clusters = reach.argmin(axis=1)
         used = np.unique(clusters)
-        means = np.array(
-            [
-                enclosing_ball(centres[clusters == k], radii[clusters == k], _FEW_STEPS)[0]
-                for k in used.tolist()
-            ]
-        )
+        before, means = means, np.array([centres[clusters == k].mean(axis=0) for k in used.tolist()])
+        if means.shape == before.shape and np.allclose(means, before):
+            break
     return np.asarray(np.unique(clusters, return_inverse=True)[1].reshape(-1), dtype=np.int64)
