@@ -80,6 +80,9 @@ class Endpoints:
             np.clip(way, self._checker.lower, self._checker.upper), dtype=np.float32
         )
         if self._checker.valid(narrow)[0]:
+            touching = self._judge.uncovered_contacts(q)
+            if touching is not None:
+                return Endpoint(way, f"{what} is in collision: {describe_contacts(touching)}.")
             return Endpoint(way)
         _, conditions = self._checker.outputs(narrow[0])
         broken = [

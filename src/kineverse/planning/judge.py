@@ -95,6 +95,27 @@ class SceneJudge:
                 return q, found[0]
         return None
 
+    def uncovered_contacts(self, q: Array) -> DistanceResults | None:
+        """Return the touching pairs that nobody else checks, at a configuration (n,); None if there are none."""
+        if not self._concerned.any():
+            return None
+        self._update(q)
+        found = self._uncovered()
+        return found if len(found) else None
+
+    def free_interval(self, q: Array, column: int, lower: float, upper: float) -> tuple[float, float]:
+        """Return bounds of one coordinate about a configuration (n,) between which these pairs do not touch."""
+        ends = []
+        for bound in (lower, upper):
+            point, free = q.copy(), float(q[column])
+            for value in np.linspace(q[column], bound, max(int(abs(bound - q[column]) * RESOLUTION * 2), 2)):
+                point[column] = value
+                if self.uncovered_contacts(point) is not None:
+                    break
+                free = float(value)
+            ends.append(free)
+        return min(ends), max(ends)
+
     def clearance(self, points: Array, step: float, radius: float = 0.5) -> float:
         """Return the least distance of a pair at samples of a polyline [m]; infinite beyond a radius."""
         least = np.inf
