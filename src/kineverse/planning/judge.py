@@ -14,7 +14,7 @@ from kineverse.state import State
 from kineverse.symbols import Symbol
 
 from .checker import RESOLUTION
-from .path import densify
+from .path import densify, sample_along, sample_path
 
 FINE = 1 / 640
 """Step of samples where no certificate vouches for what lies between them [rad], [m]."""
@@ -82,13 +82,14 @@ class SceneJudge:
 
         Pairs that nobody else checks are looked at 32 times a unit at least.
         """
-        for q in densify(points, step):
+        for q in sample_path(points, step):
             found = self.contacts(q)
             if len(found):
                 return q, found[0]
-        if not np.ptp(points[:, self._concerned], axis=0).any():
+        moved = np.abs(np.diff(points[:, self._concerned], axis=0)).sum(axis=1)
+        if not moved.any():
             return None
-        for q in densify(points, min(step, 1 / RESOLUTION)):
+        for q in sample_along(points, moved, min(step, 1 / RESOLUTION)):
             self._update(q)
             found = self._uncovered()
             if len(found):

@@ -36,7 +36,7 @@ from .solutions import find_solutions
 
 Flags: TypeAlias = npt.NDArray[np.bool_]
 
-_JUDGED = 1.0
+_JUDGED = 0.5
 """Longest step between judged configurations of a path that is certified [rad], [m]."""
 _SAMPLES = 64
 _TASK_GOALS = 32
@@ -118,6 +118,7 @@ class Planner:
         space.turning &= self.checker.find_periodic(space.turning)
         self._manifolds: dict[tuple[object, ...], Manifold] = {}
         self._judges: dict[BodyPairs, SceneJudge] = {}
+        self._carried_bodies: dict[str, tuple[str, ...]] = {}
         self._version = model.version
         self._place(model.default_state() if self._state is None else model.default_state() | self._state)
 
@@ -296,15 +297,19 @@ class Planner:
 
     def _touching(self, holds: Iterable[Hold]) -> BodyPairs:
         """Return the pairs of bodies that may touch while holds last."""
-        bodies = self.scene.bodies
         return frozenset(
             frozenset((a, b))
             for hold in holds
             if isinstance(hold, FrameHold)
-            for a in find_carried_bodies(self.model, bodies, hold.frames[0])
-            for b in find_carried_bodies(self.model, bodies, hold.frames[1])
+            for a in self._carried(hold.frames[0])
+            for b in self._carried(hold.frames[1])
             if a != b
         )
+
+    def _carried(self, frame: str) -> tuple[str, ...]:
+        if frame not in self._carried_bodies:
+            self._carried_bodies[frame] = find_carried_bodies(self.model, self.scene.bodies, frame)
+        return self._carried_bodies[frame]
 
     # -- paths ---------------------------------------------------------------------------------------------
 
@@ -397,11 +402,9 @@ class Planner:
             first = endpoints.check("The start", q)
             if first.reason:
                 return self._no_path(q, first.reason, begin)
-            names = ["The goal"] if len(ends) == 1 else [f"Goal {k}" for k in range(len(ends))]
-            last = [endpoints.check(name, end) for name, end in zip(names, ends, strict=True)]
-            usable = [goal for goal in last if not goal.reason]
-            if not usable:
-                return self._no_path(q, " ".join(goal.reason for goal in last[:3]), begin)
+            usable = endpoints.check_goals(ends)
+            if isinstance(usable, str):
+                return self._no_path(q, usable, begin)
             for _ in range(_NARROWINGS):
                 path, contact = self._connect(first, usable, manifold, touching, seconds, seed, begin)
                 if contact is None or not self._narrow(contact, q, touching):
