@@ -37,6 +37,8 @@ _SAMPLES = 64
 _TASK_GOALS = 32
 """Number of configurations that are looked for where tasks are the goal."""
 _MOST_MANIFOLDS = 16
+_LARGEST = 1e6
+"""Largest coordinate of a configuration [rad], [m]; edges are computed in single precision."""
 
 
 class Planner:
@@ -179,6 +181,8 @@ class Planner:
         """
         self._synchronize()
         points = self._configurations(Q, "Q")
+        if not len(points):
+            return np.zeros(0, dtype=bool)
         # Any turn of a joint without limits is allowed.
         lower, upper = self.space.bounds(self._here, points)
         self.checker.lower[:] = np.where(self.space.turning, np.minimum(lower, points.min(axis=0)), lower)
@@ -203,7 +207,10 @@ class Planner:
             return self._whole(Q).vector(self.space.symbols)[None]
         if isinstance(Q, Sequence) and len(Q) and isinstance(Q[0], dict | State):
             return np.array([self._whole(q).vector(self.space.symbols) for q in Q])
-        points = np.atleast_2d(np.asarray(Q, dtype=float))
+        try:
+            points = np.atleast_2d(np.asarray(Q, dtype=float))
+        except (TypeError, ValueError):
+            raise InvalidValueError(f"{name} is a configuration, several, or states, not {Q!r}.") from None
         if points.ndim != 2 or points.shape[1] != n:
             raise ShapeError(
                 f"{name} has shape {np.shape(Q)}; wanted are configurations of {n} coordinates, in the order of "
@@ -211,6 +218,11 @@ class Planner:
             )
         if not np.isfinite(points).all():
             raise InvalidValueError(f"{name} has values that are not finite.")
+        if len(points) and np.abs(points).max() > _LARGEST:
+            raise InvalidValueError(
+                f"{name} has values beyond {_LARGEST:g}, which have no room in single precision. Choose an origin that "
+                "is nearer."
+            )
         return np.ascontiguousarray(points)
 
     # -- holds and solutions -------------------------------------------------------------------------------
@@ -325,6 +337,8 @@ class Planner:
                 return self._no_path(q, self._no_solution([*holds, *tasks]), begin)
         else:
             ends = self._configurations(goals, "goals")
+            if not len(ends):
+                raise ShapeError("There is no goal: goals has no rows.")
         self._set_bounds(q, ends)
         manifold = self._manifold(holds)
         touching = self._touching([*holds, *tasks])
