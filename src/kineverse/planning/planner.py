@@ -18,6 +18,8 @@ from kineverse.geometry.collision_filter import rigid_group
 from kineverse.geometry.objects import Exclusion
 from kineverse.geometry.prepared_query import flag_subtree
 from kineverse.lie import Array
+from kineverse.model.frame import WORLD
+from kineverse.model.kinematics import ancestors
 from kineverse.model.model_view import ModelView
 from kineverse.state import State, StateLike, as_state
 from kineverse.symbols import Symbol
@@ -232,7 +234,8 @@ class Planner:
     ) -> FrameHold:
         """Return the hold of a frame by another one, such as a grasp: see :func:`.hold_frames`.
 
-        While it lasts, the bodies at and below both frames may touch each other.
+        While it lasts, the bodies at and below both frames may touch each other. They may not if one frame carries
+        the other, as the world carries a hand that is kept upright.
         """
         return hold_frames(self.model, a, b, mask, offset)
 
@@ -293,7 +296,7 @@ class Planner:
         return frozenset(
             frozenset((a, b))
             for hold in holds
-            if isinstance(hold, FrameHold)
+            if isinstance(hold, FrameHold) and _are_apart(self.model, *hold.frames)
             for a in find_carried_bodies(self.model, bodies, hold.frames[0])
             for b in find_carried_bodies(self.model, bodies, hold.frames[1])
             if a != b
@@ -451,11 +454,22 @@ def _are_tasks(goals: Any) -> bool:
     return isinstance(goals, list | tuple) and len(goals) > 0 and isinstance(goals[0], Hold | Goal)
 
 
+def _are_apart(model: ModelView, a: str, b: str) -> bool:
+    """Return True if no one of two frames carries the other."""
+    lookup = model.frames.__getitem__
+    return WORLD not in (a, b) and a != b and a not in ancestors(b, lookup) and b not in ancestors(a, lookup)
+
+
 def find_carried_bodies(model: ModelView, bodies: Sequence[str], frame: str) -> tuple[str, ...]:
-    """Return the bodies at and below a frame; if there are none, those that are rigidly connected with it."""
+    """Return the bodies at and below a frame; if there are none, those that are rigidly connected with it.
+
+    Of a frame that stands still it is the nearest body above it alone.
+    """
     below = [body for body, flag in zip(bodies, flag_subtree(model, bodies, frame), strict=True) if flag]
     if below:
         return tuple(below)
     frames = dict(model.frames)
     group = rigid_group(frame, frames)
+    if group == WORLD:
+        return tuple([name for name in ancestors(frame, frames.__getitem__) if name in bodies][:1])
     return tuple(body for body in bodies if rigid_group(body, frames) == group)
