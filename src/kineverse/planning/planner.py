@@ -113,7 +113,7 @@ class Planner:
             scene = Scene(model, rules=(*self._rules, *self.excluded), **self._options)
         self.scene = scene
         self.checker = CollisionChecker(scene, space.symbols, space.conditions, self.margin, self._protrusion)
-        space.turning &= self.checker.find_periodic(space.turning)
+        self._candidates = space.turning.copy()
         self._manifolds: dict[tuple[Hold, ...], Manifold] = {}
         self._judges: dict[frozenset[frozenset[str]], SceneJudge] = {}
         self._version = model.version
@@ -164,6 +164,7 @@ class Planner:
     def _place(self, state: State) -> None:
         self._state = state
         self.checker.place(state)
+        self.space.turning[:] = self.checker.find_periodic(self._candidates)
         self._set_bounds(self._here, self._here[None])
 
     @property
@@ -342,6 +343,8 @@ class Planner:
             ends = self._configurations(goals, "goals")
             if not len(ends):
                 raise ShapeError("There is no goal: goals has no rows.")
+        # A goal that is full turns away is the nearest one that is the same.
+        ends = np.array([self.space.equivalents(end, q, most=1)[0] for end in ends])
         self._set_bounds(q, ends)
         manifold = self._manifold(holds)
         touching = self._touching([*holds, *tasks])
