@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
+from functools import partial
 from time import perf_counter
 from typing import Any
 
@@ -11,7 +12,7 @@ import numpy.typing as npt
 
 from kineverse._checks import as_count, as_tolerance, real_number
 from kineverse.control.tasks import Goal, Hold
-from kineverse.errors import InvalidValueError, ShapeError
+from kineverse.errors import InvalidValueError, NoSolutionError, ShapeError
 from kineverse.expressions.expression import ExpressionLike
 from kineverse.geometry import Rule, Scene
 from kineverse.geometry.collision_filter import rigid_group
@@ -21,6 +22,7 @@ from kineverse.lie import Array
 from kineverse.model.frame import WORLD
 from kineverse.model.kinematics import ancestors
 from kineverse.model.model_view import ModelView
+from kineverse.model.sampling import StateSamples
 from kineverse.state import State, StateLike, as_state
 from kineverse.symbols import Symbol
 
@@ -120,17 +122,16 @@ class Planner:
         self._place(model.default_state() if self._state is None else model.default_state() | self._state)
 
     def _find_overlapping(self, scene: Scene) -> tuple[Rule, ...]:
-        """Return rules for pairs of bodies that touch wherever the coordinates are."""
-        generator = np.random.default_rng(0)
+        """Return rules for pairs of bodies that touch wherever the coordinates are, those of the others as well.
+
+        So a robot that stands in a wall by default, and is placed elsewhere, does not lose the pairs with the wall.
+        """
         home = self.model.default_state()
-        start = home.vector(self.space.symbols)
-        low, high = self.space.bounds(start, start[None])
-        states = [
-            home.updated(dict(zip(self.space.symbols, generator.uniform(low, high).tolist(), strict=True)))
-            for _ in range(_SAMPLES)
-        ]
+        samples = StateSamples(self.model, count=_SAMPLES)
+        columns = {s: samples.values_of(s).tolist() for s in home if s.has_derivative and not s.order}
+        states = [home.updated({s: values[k] for s, values in columns.items()}) for k in range(samples.size)]
         pairs = {frozenset(pair) for pair in scene.pairs_affected_by(self.space.symbols)}
-        found = scene.find_always_colliding([home, *states])
+        found = scene.find_always_colliding(filter(partial(_has_poses, scene), states))
         return tuple(rule for rule in found if frozenset((rule.a, rule.b)) in pairs)
 
     @property
@@ -440,6 +441,15 @@ class Planner:
 
     def __repr__(self) -> str:
         return f"<Planner: {len(self.symbols)} coordinates, {len(self.checker.moving)} bodies that move>"
+
+
+def _has_poses(scene: Scene, state: State) -> bool:
+    """Return True if all loops close at a state."""
+    try:
+        scene.update(state)
+    except NoSolutionError:
+        return False
+    return True
 
 
 def as_holds(tasks: Any) -> tuple[Hold, ...]:
