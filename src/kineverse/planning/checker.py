@@ -30,6 +30,8 @@ from .obstacles import Floats32, ObstacleSet
 RESOLUTION = 32.0
 """Samples of an edge for each unit of its length, [1/rad] and [1/m]."""
 _SAME = 1e-4
+_ROUNDING = 2.5e-7
+"""Error of a pose in single precision, as a fraction of its distance from the origin."""
 LEAST_INFLATION = 2e-4
 """Growth of spheres below which a collision between two samples counts as one [m]."""
 
@@ -99,6 +101,7 @@ class CollisionChecker:
         self._place_static(dependence)
         self._place_moving(members, poses)
         self._choose_pairs(dependence)
+        self._margin = margin
         self._build_struct(margin)
 
     def _make_program(self, poses: list[Expression], conditions: Sequence[Expression]) -> VectorProgram:
@@ -145,6 +148,9 @@ class CollisionChecker:
         lanes = self.program.lanes
         self._sets: list[ObstacleSet] = []
         self._costs = []
+        table = self.scene.collision_world.table
+        numbers = [self.scene.collision_world.body_index(body) for body in self.moving]
+        self._carried = np.flatnonzero(np.isin(table.body, numbers))
         for k, items in enumerate(members):
             solids = [solid for _, solid, _ in items]
             found = ObstacleSet(
@@ -226,6 +232,8 @@ class CollisionChecker:
         self._world.place(self.scene.collision_world.table.poses[self._static])
         self._kept = self.program.prepare(state.vector(self.parameters))
         self.struct.kept = self._kept.ctypes.data
+        places = self.scene.collision_world.table.poses[self._carried, :, 3]
+        self.struct.margin = self._margin + _ROUNDING * float(np.abs(places).max(initial=0.0))
 
     @contextmanager
     def excepting(self, pairs: AbstractSet[frozenset[str]]) -> Iterator[None]:
