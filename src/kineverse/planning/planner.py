@@ -275,7 +275,7 @@ class Planner:
                 manifold,
                 self._here,
                 as_count("count", count, 1),
-                seconds,
+                as_tolerance(seconds, "seconds="),
                 as_count("seed", seed, 0),
             )
 
