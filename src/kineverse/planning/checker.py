@@ -30,6 +30,8 @@ from .obstacles import Floats32, ObstacleSet
 RESOLUTION = 32.0
 """Samples of an edge for each unit of its length, [1/rad] and [1/m]."""
 _SAME = 1e-4
+_FEW = 8
+"""Least number of samples from which it is concluded that spheres always touch."""
 _ROUNDING = 2.5e-7
 """Error of a pose in single precision, as a fraction of its distance from the origin."""
 LEAST_INFLATION = 2e-4
@@ -281,6 +283,39 @@ class CollisionChecker:
         s = self.struct
         s.allowed, s.pair, s.moving_pair = allowed.ctypes.data, pairs.ctypes.data, moving_pairs.ctypes.data
         s.pairs, s.moving_pairs = len(pairs), len(moving_pairs)
+
+    def leave_crowded(self, Q: Floats32) -> None:
+        """Leave pairs to the scene whose spheres touch at all of some configurations (N, n).
+
+        Such are links around a joint with a gap that is smaller than spheres protrude.
+        """
+        none, no_body = np.zeros((0, 2), dtype=np.int32), np.zeros_like(self._allowed)
+        self._use(no_body, none, none)
+        Q = np.ascontiguousarray(Q[self.valid(Q)])
+        if len(Q) >= _FEW:
+            kept = []
+            for k, pairs in enumerate((self.pairs, self.moving_pairs)):
+                free = []
+                for row in pairs:
+                    chosen = [none, none]
+                    chosen[k] = np.ascontiguousarray(row[None])
+                    self._use(no_body, *chosen)
+                    free.append(bool(self.valid(Q).any()))
+                    if not free[-1]:
+                        self.uncovered.append((self.moving[row[0]], self.moving[row[1]]))
+                kept.append(np.ascontiguousarray(pairs[np.array(free, dtype=bool)]))
+            self.pairs, self.moving_pairs = kept
+            for i, j in np.argwhere(self._allowed).tolist():
+                no_body[i, j] = 1
+                self._use(no_body, none, none)
+                if len(self.links.spheres[i]) and not self.valid(Q).any():
+                    pair = self.moving[i], self.standing[j]
+                    # What touches at this place may be free at another one.
+                    if self.scene.distance(*pair).distance > 0.0:
+                        self.uncovered.append(pair)
+                        self._allowed[i, j] = 0
+                no_body[i, j] = 0
+        self._use(self._allowed, self.pairs, self.moving_pairs)
 
     # -- configurations ------------------------------------------------------------------------------------
 

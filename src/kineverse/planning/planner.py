@@ -120,7 +120,11 @@ class Planner:
         self._manifolds: dict[tuple[Hold, ...], Manifold] = {}
         self._judges: dict[frozenset[frozenset[str]], SceneJudge] = {}
         self._version = model.version
-        self._place(model.default_state() if self._state is None else model.default_state() | self._state)
+        state = model.default_state() if self._state is None else model.default_state() | self._state
+        self._place(state)
+        low, high = self.checker.lower, self.checker.upper
+        samples = np.random.default_rng(0).uniform(low, high, (_SAMPLES, len(low)))
+        self.checker.leave_crowded(samples.astype(np.float32))
 
     def _find_overlapping(self, scene: Scene) -> tuple[Rule, ...]:
         """Return rules for pairs of bodies that touch wherever the coordinates are, those of the others as well.
