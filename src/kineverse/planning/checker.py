@@ -29,6 +29,8 @@ from .obstacles import Floats32, ObstacleSet
 
 RESOLUTION = 32.0
 """Samples of an edge for each unit of its length, [1/rad] and [1/m]."""
+_FINE_RESOLUTION = 2000.0
+"""Samples for each unit where conditions are checked, such as a latch that holds a door within 3 mm."""
 _SAME = 1e-4
 _FEW = 8
 """Least number of samples from which it is concluded that spheres always touch."""
@@ -103,7 +105,7 @@ class CollisionChecker:
         self._place_static(dependence)
         self._place_moving(members, poses)
         self._choose_pairs(dependence)
-        self._margin = margin
+        self._margin, self._constrained = margin, bool(conditions)
         self._build_struct(margin)
 
     def _make_program(self, poses: list[Expression], conditions: Sequence[Expression]) -> VectorProgram:
@@ -358,6 +360,10 @@ class CollisionChecker:
         )
         if found < -1:
             raise MemoryError("There is no memory for the check of a path.")
+        if found < 0 and self._constrained:
+            # No certificate bounds how conditions change: samples are finer instead.
+            fine = self.edges(points[:-1], points[1:], _FINE_RESOLUTION)
+            return None if fine.all() else (int(np.argmin(fine)), 0.5)
         return None if found < 0 else (int(found), where.value)
 
     def outputs(self, q: Floats32) -> tuple[Floats32, Floats32]:

@@ -41,6 +41,8 @@ class PlanningSpace:
     ----------
     symbols
         The n coordinates, in the order in which they are given, patterns in the order of the model.
+    lower, upper
+        (n,) limits that are numbers, ±inf for none.
     conditions
         Expressions that are at most 0 where the inequalities of the model hold; limits of single coordinates that
         are numbers are not among them.
@@ -61,8 +63,20 @@ class PlanningSpace:
                 "some of them with move=, as move='robot/*'."
             )
         ranges = self._read_constraints()
-        self._space = ConfigurationSpace(model, self.symbols, ranges)
-        self.turning = self._space.find_turning_candidates(ranges)
+        self.lower, self.upper = self._find_limits(ranges.values())
+        self.turning = ConfigurationSpace(model, self.symbols, ranges).find_turning_candidates(ranges)
+
+    def _find_limits(self, ranges: Iterable[Constraint]) -> tuple[Array, Array]:
+        """Return limits (n,) that are numbers; those that are expressions are conditions."""
+        lower, upper = np.full(len(self.symbols), -np.inf), np.full(len(self.symbols), np.inf)
+        place = {s: i for i, s in enumerate(self.symbols)}
+        for c in ranges:
+            i = place.get(c.expression) if isinstance(c.expression, Symbol) else None
+            if i is not None and not c.lower.symbols:
+                lower[i] = max(lower[i], float(c.lower))
+            if i is not None and not c.upper.symbols:
+                upper[i] = min(upper[i], float(c.upper))
+        return lower, np.maximum(lower, upper)
 
     def _read_constraints(self) -> dict[str, Constraint]:
         moved, rates = {*self.symbols}, self.model.rates
@@ -94,16 +108,6 @@ class PlanningSpace:
             if len(quaternion) == 4:
                 self.equalities.append(as_expression(sum((s * s for s in quaternion), as_expression(-1.0))))
         return ranges
-
-    @property
-    def lower(self) -> Array:
-        """Lower limits (n,), -inf for none."""
-        return self._space.lower
-
-    @property
-    def upper(self) -> Array:
-        """Upper limits (n,), inf for none."""
-        return self._space.upper
 
     def bounds(self, start: Array, points: Array) -> tuple[Array, Array]:
         """Return finite bounds (n,) of a search from a start (n,) to or about configurations (N, n).
