@@ -36,6 +36,8 @@ RESOLUTION = 32.0
 FINENESS = 2000.0
 """Samples of a unit of a coordinate by which a condition switches, such as that of a lock [1/rad], [1/m]."""
 _SAME = 1e-4
+_ROUNDING = 2.5e-7
+"""Error of a pose in single precision, as a fraction of its distance from the origin."""
 _SWITCHES = {ca.OP_LT, ca.OP_LE, ca.OP_EQ, ca.OP_NE, ca.OP_NOT, ca.OP_AND, ca.OP_OR, ca.OP_IF_ELSE_ZERO}
 LEAST_INFLATION = 2e-4
 """Growth of spheres below which a collision between two samples counts as one [m]."""
@@ -106,6 +108,7 @@ class CollisionChecker:
         self._place_static(dependence)
         self._place_moving(members, poses)
         self._choose_pairs(dependence)
+        self._margin = margin
         self._build_struct(margin)
 
     def _make_program(self, poses: list[Expression], conditions: Sequence[Expression]) -> VectorProgram:
@@ -153,6 +156,9 @@ class CollisionChecker:
         lanes = self.program.lanes
         self._sets: list[ObstacleSet] = []
         self._costs = []
+        table = self.scene.collision_world.table
+        numbers = [self.scene.collision_world.body_index(body) for body in self.moving]
+        self._carried = np.flatnonzero(np.isin(table.body, numbers))
         for k, items in enumerate(members):
             solids = [solid for _, solid, _ in items]
             found = ObstacleSet(
@@ -236,6 +242,8 @@ class CollisionChecker:
         self._world.place(self.scene.collision_world.table.poses[self._static])
         self._kept = self.program.prepare(state.vector(self.parameters))
         self.struct.kept = self._kept.ctypes.data
+        places = self.scene.collision_world.table.poses[self._carried, :, 3]
+        self.struct.margin = self._margin + _ROUNDING * float(np.abs(places).max(initial=0.0))
 
     @contextmanager
     def excepting(self, pairs: BodyPairs) -> Iterator[None]:
