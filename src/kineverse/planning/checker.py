@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import ctypes
+import itertools
 import math
 from collections.abc import Iterator, Sequence
 from collections.abc import Set as AbstractSet
@@ -30,6 +31,7 @@ from .obstacles import Floats32, ObstacleSet
 RESOLUTION = 32.0
 """Samples of an edge for each unit of its length, [1/rad] and [1/m]."""
 _SAME = 1e-4
+_placements = itertools.count()
 LEAST_INFLATION = 2e-4
 """Growth of spheres below which a collision between two samples counts as one [m]."""
 
@@ -100,6 +102,8 @@ class CollisionChecker:
         self._place_moving(members, poses)
         self._choose_pairs(dependence)
         self._build_struct(margin)
+        self._placement: tuple[bytes, bytes] | None = None
+        self._placed, self._excepted = next(_placements), frozenset[frozenset[str]]()
 
     def _make_program(self, poses: list[Expression], conditions: Sequence[Expression]) -> VectorProgram:
         outputs = [*poses, *conditions]
@@ -223,9 +227,21 @@ class CollisionChecker:
     def place(self, state: State) -> None:
         """Place everything as at a state: obstacles, and what the poses depend on beside the coordinates."""
         self.scene.update(state)
-        self._world.place(self.scene.collision_world.table.poses[self._static])
-        self._kept = self.program.prepare(state.vector(self.parameters))
+        poses, parameters = self.scene.collision_world.table.poses[self._static], state.vector(self.parameters)
+        self._world.place(poses)
+        self._kept = self.program.prepare(parameters)
         self.struct.kept = self._kept.ctypes.data
+        placement = poses.tobytes(), parameters.tobytes()
+        if placement != self._placement:
+            self._placement, self._placed = placement, next(_placements)
+
+    @property
+    def version(self) -> tuple[int, frozenset[frozenset[str]]]:
+        """The place of everything and the pairs that are left out: a validity holds, at one margin, until it changes.
+
+        Numbers of places differ between checkers too. Limits are apart.
+        """
+        return self._placed, self._excepted
 
     @contextmanager
     def excepting(self, pairs: AbstractSet[frozenset[str]]) -> Iterator[None]:
@@ -247,10 +263,12 @@ class CollisionChecker:
 
         spheres, shapes = keep(self.pairs), keep(self.moving_pairs)
         self._use(allowed, spheres, shapes)
+        self._excepted = frozenset(pairs)
         try:
             yield
         finally:
             self._use(self._allowed, self.pairs, self.moving_pairs)
+            self._excepted = frozenset()
 
     @contextmanager
     def widened(self, by: float, ends: Floats32) -> Iterator[None]:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterable, Sequence
 from time import perf_counter
 from typing import Any
@@ -29,6 +30,7 @@ from .endpoints import Endpoint, Endpoints
 from .judge import SceneJudge, describe_contacts
 from .manifold import FrameHold, Manifold, hold_frames
 from .path import Path
+from .roadmap import Roadmap
 from .solutions import find_solutions
 
 _JUDGED = 1.0
@@ -37,6 +39,7 @@ _SAMPLES = 64
 _TASK_GOALS = 32
 """Number of configurations that are looked for where tasks are the goal."""
 _MOST_MANIFOLDS = 16
+_METHODS = ("rrt-connect", "prm")
 
 
 class Planner:
@@ -95,13 +98,14 @@ class Planner:
         self._options: dict[str, Any] = {"decomposed": decomposed, "leave_out": leave_out}
         self._version: int | None = None
         self._state: State | None = None
+        self.roadmap: Roadmap | None = None
         self._synchronize()
 
     def _synchronize(self) -> None:
         """Build everything for the present version of the model."""
         if self._version == self.model.version:
             return
-        model = self.model
+        model, symbols = self.model, None if self._version is None else self.space.symbols
         self.space = space = PlanningSpace(model, self._move)
         scene = Scene(model, rules=self._rules, **self._options)
         self.excluded = self._find_overlapping(scene)
@@ -112,6 +116,8 @@ class Planner:
         space.turning &= self.checker.find_periodic(space.turning)
         self._manifolds: dict[tuple[Hold, ...], Manifold] = {}
         self._judges: dict[frozenset[frozenset[str]], SceneJudge] = {}
+        if symbols != space.symbols or (self.roadmap and (self.roadmap.turning != space.turning).any()):
+            self.roadmap = None
         self._version = model.version
         self._place(model.default_state() if self._state is None else model.default_state() | self._state)
 
@@ -297,6 +303,7 @@ class Planner:
         along: Hold | Iterable[Hold] = (),
         seconds: float = 1.0,
         seed: int = 0,
+        method: str = "rrt-connect",
     ) -> Path:
         """Return a path without collisions from a start to any of some goals.
 
@@ -312,11 +319,20 @@ class Planner:
             Largest time of the search [s]; checks of its result come on top.
         seed
             Seed of the search: the same one leads to the same path on one machine, unless the time is up.
+        method
+            ``"rrt-connect"`` grows new trees for each call; ``"prm"`` keeps a :class:`.Roadmap`, the attribute
+            ``roadmap``, so that its paths also depend on the calls before. It does not do holds along the path.
+
+        Raises
+        ------
+        InvalidValueError
+            For an unknown method, or one that cannot do holds.
         """
         self._synchronize()
         begin = perf_counter()
         seconds, seed = max(real_number(seconds), 0.0), as_count("seed", seed, 0)
         holds = as_holds(along)
+        self._check_method(method, holds)
         q = self._here if start is None else self._configurations(start, "start")[0]
         tasks = () if not _are_tasks(goals) else as_holds(goals)
         if tasks:
@@ -338,7 +354,16 @@ class Planner:
             usable = [goal for goal in last if not goal.reason]
             if not usable:
                 return self._no_path(q, " ".join(goal.reason for goal in last[:3]), begin)
-            return self._connect(first, usable, manifold, touching, seconds, seed, begin)
+            return self._connect(first, usable, manifold, touching, seconds, seed, method, begin)
+
+    def _check_method(self, method: str, holds: Sequence[Hold]) -> None:
+        if method not in _METHODS:
+            raise InvalidValueError(f"method is {method!r}; there are {', '.join(map(repr, _METHODS))}.")
+        if method == "prm" and (holds or self.space.equalities):
+            reason = "holds along the path" if holds else "equalities of the model"
+            raise InvalidValueError(
+                f"method='prm' plans in the whole space and cannot keep {reason}; use method='rrt-connect'."
+            )
 
     def _connect(
         self,
@@ -348,6 +373,7 @@ class Planner:
         touching: frozenset[frozenset[str]],
         seconds: float,
         seed: int,
+        method: str,
         begin: float,
     ) -> Path:
         q = first.inner
@@ -355,15 +381,19 @@ class Planner:
         targets = np.ascontiguousarray([v for _, v in variants], dtype=np.float32)
         starts = np.ascontiguousarray(q[None], dtype=np.float32)
         searched = perf_counter()
+        roadmap = self._require_roadmap() if method == "prm" else None
         if manifold is None:
-            found = connect(self.checker, starts, targets, seconds, seed)
+            found = connect(self.checker, starts, targets, seconds, seed, roadmap)
         else:
             found = connect_on_manifold(self.checker, manifold, starts, targets, seconds, seed)
         spent = perf_counter() - searched
         if found.problem:
             return self._no_path(found.points, found.problem, begin, spent, found.iterations)
         points = found.points
-        goal, variant = variants[int(np.argmin(np.abs(targets - points[-1]).max(axis=1)))]
+        # A roadmap may wind further than the variants do.
+        turns = np.where(self.space.turning, np.round((points[-1] - targets) / math.tau), 0.0) * math.tau
+        k = int(np.argmin(np.abs(targets + turns - points[-1]).max(axis=1)))
+        goal, variant = variants[k][0], variants[k][1] + turns[k]
         points[0], points[-1] = q, variant
         contact = self._judge(touching).first_contact(points, _JUDGED)
         if contact is not None:
@@ -371,8 +401,13 @@ class Planner:
             return self._no_path(points, problem, begin, spent, found.iterations)
         shift = variant - goal.inner
         whole = np.vstack([first.way[:-1], points, (goal.way[::-1] + shift)[1:]])
-        why = f"Found after {found.iterations} samples."
+        why = f"Found after {found.iterations} samples{'' if roadmap is None else roadmap.describe()}."
         return self._path(True, whole, why, begin, spent, found.iterations, touching)
+
+    def _require_roadmap(self) -> Roadmap:
+        if self.roadmap is None:
+            self.roadmap = Roadmap(self.space.turning)
+        return self.roadmap
 
     def _judge(self, touching: frozenset[frozenset[str]] = frozenset()) -> SceneJudge:
         """Return the judge of the scene in which some pairs may touch, at the present place."""

@@ -15,7 +15,7 @@ from .obstacles import Floats32
 RANGE = 1.0
 """Largest length of an edge of a tree [rad], [m]."""
 _MOST_NODES = 200_000
-_ROOM = 16_384
+PATH_ROOM = 16_384
 """Largest number of points of a path."""
 
 
@@ -47,7 +47,7 @@ class RrtConnect:
 
     def __init__(self, checker: CollisionChecker, manifold: Manifold | None = None) -> None:
         self._checker, self._manifold, self._code = checker, manifold, planning_functions()
-        self._path = np.zeros((_ROOM, len(checker.coordinates)), dtype=np.float32)
+        self._path = np.zeros((PATH_ROOM, len(checker.coordinates)), dtype=np.float32)
         self._struct = SearchStruct()
 
     def solve(
@@ -77,7 +77,7 @@ class RrtConnect:
         s = self._setup(seconds, seed, resolution, nodes)
         count = self._code.kineverse_rrt_connect(
             ctypes.addressof(s), starts.ctypes.data, len(starts), goals.ctypes.data, len(goals),
-            self._path.ctypes.data, _ROOM,
+            self._path.ctypes.data, PATH_ROOM,
         )  # fmt: skip
         points = self._path[: max(count, 0)].copy()
         return SearchResult(points, s.status, s.iterations, (s.count_start, s.count_goal), s.gap)
@@ -110,7 +110,7 @@ class RrtConnect:
         """
         s = self._setup(0.0, 0, resolution, 0)
         count = self._code.kineverse_walk(
-            ctypes.addressof(s), a.ctypes.data, b.ctypes.data, self._path.ctypes.data, _ROOM
+            ctypes.addressof(s), a.ctypes.data, b.ctypes.data, self._path.ctypes.data, PATH_ROOM
         )
         return None if count < 0 else self._path[:count].copy()
 
