@@ -15,7 +15,7 @@ from kineverse.compile.toolchain import NO_UNDEFINED_FLAGS
 from kineverse.compile.vector_program import vector_header
 from kineverse.errors import CompileError
 
-SOURCES = ("collision.c", "edges.c", "rrt_connect.c")
+SOURCES = ("collision.c", "edges.c", "rrt_connect.c", "roadmap.c")
 
 OBSTACLE = np.dtype(
     [
@@ -89,6 +89,17 @@ class SearchStruct(ctypes.Structure):
     )
 
 
+class RoadmapStruct(ctypes.Structure):
+    """Roadmap, a query and its results as C reads and writes them."""
+
+    _fields_ = _fields(
+        "pddddiiiipppppppppppppiiiiiiiiiiidd",
+        "checker resolution least greed seconds seed degree room first_batch period columns lengths targets incoming next "
+        "node edge passing visits_start visits_goal order_start order_goal count ends drawn round query "
+        "samples nodes_checked edges_checked reached_start reached_goal status elapsed gap",
+    )
+
+
 class PlanningLibrary(SourceLibrary):
     """Compiled planner, shared by all planners of the process."""
 
@@ -133,6 +144,7 @@ def _declare_signatures(code: Any) -> None:
         "kineverse_rrt_connect": (count, [pointer, pointer, count, pointer, count, pointer, count]),
         "kineverse_project": (ctypes.c_int, [pointer, pointer, pointer, count, pointer]),
         "kineverse_walk": (count, [pointer, pointer, pointer, pointer, count]),
+        "kineverse_roadmap": (count, [pointer, pointer, count, pointer, count, pointer, count]),
         "kineverse_shortcut": (count, [pointer, pointer, count, count, count, number]),
     }
     for name, (result, arguments) in signatures.items():

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import ctypes
+import itertools
 import math
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
@@ -39,6 +40,7 @@ _SAME = 1e-4
 _ROUNDING = 2.5e-7
 """Error of a pose in single precision, as a fraction of its distance from the origin."""
 _SWITCHES = {ca.OP_LT, ca.OP_LE, ca.OP_EQ, ca.OP_NE, ca.OP_NOT, ca.OP_AND, ca.OP_OR, ca.OP_IF_ELSE_ZERO}
+_placements = itertools.count()
 LEAST_INFLATION = 2e-4
 """Growth of spheres below which a collision between two samples counts as one [m]."""
 
@@ -110,6 +112,8 @@ class CollisionChecker:
         self._choose_pairs(dependence)
         self._margin = margin
         self._build_struct(margin)
+        self._placement: tuple[bytes, bytes] | None = None
+        self._placed, self._excepted = next(_placements), frozenset[frozenset[str]]()
 
     def _make_program(self, poses: list[Expression], conditions: Sequence[Expression]) -> VectorProgram:
         self._conditions = tuple(conditions)
@@ -239,11 +243,26 @@ class CollisionChecker:
     def place(self, state: State) -> None:
         """Place everything as at a state: obstacles, and what the poses depend on beside the coordinates."""
         self.scene.update(state)
-        self._world.place(self.scene.collision_world.table.poses[self._static])
-        self._kept = self.program.prepare(state.vector(self.parameters))
+        poses, parameters = (
+            self.scene.collision_world.table.poses[self._static],
+            state.vector(self.parameters),
+        )
+        self._world.place(poses)
+        self._kept = self.program.prepare(parameters)
         self.struct.kept = self._kept.ctypes.data
         places = self.scene.collision_world.table.poses[self._carried, :, 3]
         self.struct.margin = self._margin + _ROUNDING * float(np.abs(places).max(initial=0.0))
+        placement = poses.tobytes(), parameters.tobytes()
+        if placement != self._placement:
+            self._placement, self._placed = placement, next(_placements)
+
+    @property
+    def version(self) -> tuple[int, frozenset[frozenset[str]]]:
+        """The place of everything and the pairs that are left out: a validity holds, at one margin, until it changes.
+
+        Numbers of places differ between checkers too. Limits are apart.
+        """
+        return self._placed, self._excepted
 
     @contextmanager
     def excepting(self, pairs: BodyPairs) -> Iterator[None]:
@@ -253,10 +272,12 @@ class CollisionChecker:
             return
         allowed, spheres, shapes = self._without(pairs)
         self._use(allowed, spheres, shapes)
+        self._excepted = pairs
         try:
             yield
         finally:
             self._use(self._allowed, self.pairs, self.moving_pairs)
+            self._excepted = frozenset()
 
     def _without(
         self, pairs: BodyPairs

@@ -15,6 +15,7 @@ from .checker import RESOLUTION, CollisionChecker
 from .constrained_path import polish, shorten_on_manifold
 from .manifold import Manifold
 from .obstacles import Floats32
+from .roadmap import Roadmap
 from .search import MOST_EDGES, RrtConnect, SearchResult
 
 _SHORTCUTS = 60
@@ -53,18 +54,29 @@ def connect(
     seconds: float,
     seed: int,
     edges: int = MOST_EDGES,
+    roadmap: Roadmap | None = None,
 ) -> Connected:
     """Return a path from any of some starts (S, n) to any of some goals (G, n), certified between its samples.
 
     Edges of the search that collide between samples are planned anew, with more samples.
+
+    Parameters
+    ----------
+    roadmap
+        Roadmap that is searched; None for trees (RRT-Connect).
     """
     begin = perf_counter()
     search = RrtConnect(checker, edges=edges)
     with checker.widened(_WIDER, np.vstack([starts, goals])):
-        found = search.solve(starts, goals, seconds, seed)
+        if roadmap is None:
+            found = search.solve(starts, goals, seconds, seed)
+        else:
+            found = roadmap.solve(checker, starts, goals, seconds, seed)
     if not found.found:
         return Connected(found.points.astype(float), explain_failure(found, seconds), found.iterations)
-    points = search.shorten(found.points, seconds - (perf_counter() - begin), seed, _SHORTCUTS)
+    # Parts of a shortcut that just passes would not be certain by themselves.
+    with checker.widened(_WIDER / 2, np.vstack([starts, goals])):
+        points = search.shorten(found.points, seconds - (perf_counter() - begin), seed, _SHORTCUTS)
     resolution = RESOLUTION
     for _ in range(_REPAIRS):
         collision = checker.find_collision(points)

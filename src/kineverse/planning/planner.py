@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterable, Sequence
 from dataclasses import replace
 from functools import partial
@@ -35,6 +36,7 @@ from .judge import SceneJudge, describe_contacts
 from .manifold import FrameHold, Manifold, hold_frames, manifold_key
 from .modes import Mode, ModeSearch
 from .path import Path
+from .roadmap import Roadmap
 from .search import MOST_EDGES
 from .solutions import MOST_BATCHES, find_solutions
 
@@ -51,6 +53,7 @@ _MOST_MANIFOLDS = 16
 _NARROWINGS = 4
 _LARGEST = 1e6
 """Largest coordinate of a configuration [rad], [m]; edges are computed in single precision."""
+_METHODS = ("rrt-connect", "prm")
 
 
 class Planner:
@@ -110,6 +113,8 @@ class Planner:
         self._options: dict[str, Any] = {"decomposed": decomposed, "leave_out": leave_out}
         self._version: int | None = None
         self._state: State | None = None
+        self.roadmap: Roadmap | None = None
+        self._roadmap_symbols: tuple[Symbol, ...] = ()
         self._synchronize()
 
     def _synchronize(self) -> None:
@@ -380,6 +385,7 @@ class Planner:
         modes: Iterable[Mode] | None = None,
         seconds: float = 1.0,
         seed: int = 0,
+        method: str = "rrt-connect",
     ) -> Path:
         """Return a path without collisions from a start to any of some goals.
 
@@ -399,11 +405,20 @@ class Planner:
             Largest time of the search [s]; checks of its result come on top.
         seed
             Seed of the search: the same one leads to the same path on one machine, unless the time is up.
+        method
+            ``"rrt-connect"`` grows new trees for each call; ``"prm"`` keeps a :class:`.Roadmap`, the attribute
+            ``roadmap``, so that its paths also depend on the calls before. It does not do holds along the path.
+
+        Raises
+        ------
+        InvalidValueError
+            For an unknown method, or one that cannot do holds.
         """
         self._synchronize()
         begin = perf_counter()
         seconds, seed = max(real_number(seconds), 0.0), as_count("seed", seed, 0)
         holds = as_holds(along)
+        roadmap = self._choose_roadmap(method, holds)
         q = self._here if start is None else self._configurations(start, "start")[0]
         tasks = () if not _are_tasks(goals) else as_holds(goals)
         touching = self._touching([*holds, *tasks])
@@ -422,7 +437,7 @@ class Planner:
             ends = self._configurations(goals, "goals")
             if not len(ends):
                 raise ShapeError("There is no goal: goals has no rows.")
-        return self._between(q, ends, holds, touching, seconds, seed)
+        return self._between(q, ends, holds, touching, seconds, seed, roadmap=roadmap)
 
     def _plan_modes(self, search: ModeSearch, q: Array, begin: float) -> Path:
         """Return the path through modes that a search finds."""
@@ -450,6 +465,7 @@ class Planner:
         seed: int,
         still: Flags | None = None,
         edges: int = MOST_EDGES,
+        roadmap: Roadmap | None = None,
     ) -> Path:
         """Return a path from a configuration (n,) to any of some ends (K, n), along holds; see :meth:`plan`.
 
@@ -469,7 +485,9 @@ class Planner:
             if isinstance(usable, str):
                 return self._no_path(q, usable, begin)
             for _ in range(_NARROWINGS):
-                path, contact = self._connect(first, usable, manifold, touching, seconds, seed, begin, edges)
+                path, contact = self._connect(
+                    first, usable, manifold, touching, seconds, seed, begin, edges, roadmap
+                )
                 if contact is None or not self._narrow(contact, q, touching):
                     break
             return path
@@ -491,6 +509,23 @@ class Planner:
         self.checker.lower[i], self.checker.upper[i] = lower, upper
         return (lower, upper) != before
 
+    def _choose_roadmap(self, method: str, holds: Sequence[Hold]) -> Roadmap | None:
+        """Return the roadmap that a method searches; None for trees."""
+        if method not in _METHODS:
+            raise InvalidValueError(f"method is {method!r}; there are {', '.join(map(repr, _METHODS))}.")
+        if method == "rrt-connect":
+            return None
+        if holds or self.space.equalities:
+            reason = "holds along the path" if holds else "equalities of the model"
+            raise InvalidValueError(
+                f"method='prm' plans in the whole space and cannot keep {reason}; use method='rrt-connect'."
+            )
+        turning = self.space.turning
+        same = self._roadmap_symbols == self.space.symbols
+        if self.roadmap is None or not same or (self.roadmap.turning != turning).any():
+            self.roadmap, self._roadmap_symbols = Roadmap(turning.copy()), self.space.symbols
+        return self.roadmap
+
     def _connect(
         self,
         first: Endpoint,
@@ -501,6 +536,7 @@ class Planner:
         seed: int,
         begin: float,
         edges: int,
+        roadmap: Roadmap | None,
     ) -> tuple[Path, DistanceResult | None]:
         """Return a path between checked ends, and the contact that the scene finds on it."""
         q = first.inner
@@ -509,14 +545,17 @@ class Planner:
         starts = np.ascontiguousarray(q[None], dtype=np.float32)
         searched = perf_counter()
         if manifold is None:
-            found = connect(self.checker, starts, targets, seconds, seed, edges)
+            found = connect(self.checker, starts, targets, seconds, seed, edges, roadmap)
         else:
             found = connect_on_manifold(self.checker, manifold, starts, targets, seconds, seed, edges)
         spent = perf_counter() - searched
         if found.problem:
             return self._no_path(found.points, found.problem, begin, spent, found.iterations), None
         points = found.points
-        goal, variant = variants[int(np.argmin(np.abs(targets - points[-1]).max(axis=1)))]
+        # A roadmap may wind further than the variants do.
+        turns = np.where(self.space.turning, np.round((points[-1] - targets) / math.tau), 0.0) * math.tau
+        k = int(np.argmin(np.abs(targets + turns - points[-1]).max(axis=1)))
+        goal, variant = variants[k][0], variants[k][1] + turns[k]
         points[0], points[-1] = q, variant
         contact = self._judge(touching).first_contact(points, _JUDGED)
         if contact is not None:
@@ -524,7 +563,7 @@ class Planner:
             return self._no_path(points, problem, begin, spent, found.iterations), contact[1]
         shift = variant - goal.inner
         whole = np.vstack([first.way[:-1], points, (goal.way[::-1] + shift)[1:]])
-        why = f"Found after {found.iterations} samples."
+        why = f"Found after {found.iterations} samples{'' if roadmap is None else roadmap.describe()}."
         return self._path(True, whole, why, begin, spent, found.iterations, touching), None
 
     def _judge(self, touching: BodyPairs = frozenset()) -> SceneJudge:

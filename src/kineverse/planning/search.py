@@ -17,7 +17,7 @@ RANGE = 1.0
 _MOST_NODES = 200_000
 MOST_EDGES = 1 << 40
 """Number of edges of a search that only its time ends."""
-_ROOM = 16_384
+PATH_ROOM = 16_384
 """Largest number of points of a path."""
 
 
@@ -54,7 +54,7 @@ class RrtConnect:
     ) -> None:
         self._edges = edges
         self._checker, self._manifold, self._code = checker, manifold, planning_functions()
-        self._path = np.zeros((_ROOM, len(checker.coordinates)), dtype=np.float32)
+        self._path = np.zeros((PATH_ROOM, len(checker.coordinates)), dtype=np.float32)
         self._struct = SearchStruct()
 
     def solve(
@@ -84,7 +84,7 @@ class RrtConnect:
         s = self._setup(seconds, seed, resolution, nodes)
         count = self._code.kineverse_rrt_connect(
             ctypes.addressof(s), starts.ctypes.data, len(starts), goals.ctypes.data, len(goals),
-            self._path.ctypes.data, _ROOM,
+            self._path.ctypes.data, PATH_ROOM,
         )  # fmt: skip
         points = self._path[: max(count, 0)].copy()
         return SearchResult(points, s.status, s.iterations, (s.count_start, s.count_goal), s.gap)
@@ -117,7 +117,7 @@ class RrtConnect:
         """
         s = self._setup(0.0, 0, resolution, 0)
         count = self._code.kineverse_walk(
-            ctypes.addressof(s), a.ctypes.data, b.ctypes.data, self._path.ctypes.data, _ROOM
+            ctypes.addressof(s), a.ctypes.data, b.ctypes.data, self._path.ctypes.data, PATH_ROOM
         )
         return None if count < 0 else self._path[:count].copy()
 

@@ -1,0 +1,165 @@
+"""Roadmap that is kept between queries (PRM), whose nodes and edges are checked when a search comes to them."""
+
+from __future__ import annotations
+
+import ctypes
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+from kineverse._checks import as_count
+from kineverse.compile.batch import allocate_aligned
+from kineverse.errors import InvalidValueError
+
+from .bindings import RoadmapStruct, planning_functions
+from .checker import LEAST_INFLATION, RESOLUTION, CollisionChecker
+from .obstacles import Floats32
+from .search import PATH_ROOM, SearchResult
+
+MOST_NODES = 20_000
+"""Number of nodes of a roadmap for which there is memory, unless told otherwise."""
+_DEGREE, _MOST_DEGREE = 12, 64
+_GREED = 5.0
+"""Weight of the distance to the goal in the order of the search: shortcuts make up for longer ways."""
+_FIRST_BATCH = 32
+_UNKNOWN, _BLOCKED = 0, 2
+_PADDING = 64
+_VISIT = np.dtype(
+    [
+        ("closed", np.int64),
+        ("seen", np.int64),
+        ("cost", np.float32),
+        ("rest", np.float32),
+        ("from", np.int32),
+        ("edge", np.int32),
+    ]
+)
+
+
+class Roadmap:
+    """Lazy probabilistic roadmap in the whole space, kept between queries.
+
+    A query searches from both sides at once, and checks samples of an edge when it comes to it, and what is between them
+    when it is on a path. If the sides do not meet, nodes
+    are added: half of them anywhere, half about the side that reached fewer. What is known of nodes and edges is kept
+    as long as nothing moves but the coordinates; nodes stay even then. The same queries in the same order lead to the
+    same paths, unless the time is up.
+
+    Sources: Kavraki et al. 1996; Bohlin and Kavraki 2000 (lazy checks); Karaman and Frazzoli 2011 (number of
+    neighbours); Cohen, Phillips and Likhachev 2014 (edges checked in the order of A*).
+
+    Parameters
+    ----------
+    turning
+        Flags (n,) of coordinates of which a full turn changes nothing.
+    nodes
+        Largest number of nodes; one takes about 300 bytes. When there is no room, nodes that are blocked or beyond the
+        limits and ends of earlier queries give way; an eighth is kept for ends.
+    degree
+        Number of edges of a new node, at most 64.
+
+    Attributes
+    ----------
+    nodes_checked, edges_checked
+        Numbers of nodes and edges that the last query checked.
+    """
+
+    def __init__(
+        self, turning: npt.NDArray[np.bool_], nodes: int = MOST_NODES, degree: int = _DEGREE
+    ) -> None:
+        room, n = as_count("nodes", nodes, 256), len(turning)
+        if not 1 <= as_count("degree", degree, 1) <= _MOST_DEGREE:
+            raise InvalidValueError(f"degree is {degree}; it has to be at most {_MOST_DEGREE}.")
+        if room * degree >= 2**31:
+            raise InvalidValueError(
+                f"nodes is {nodes}; with {degree} edges each there may be {2**31 // degree}."
+            )
+        self.turning = turning.copy()
+        self._code = planning_functions()
+        self._path = np.zeros((PATH_ROOM, n), dtype=np.float32)
+        self._period = np.where(turning, 2 * np.pi, np.inf).astype(np.float32)
+        # Columns are read in whole vectors, the last one included.
+        columns = allocate_aligned((room + _PADDING) * n // 2 + 1).view(np.float32)
+        edges = room * degree
+        self._node, self._edge = np.zeros(room, dtype=np.uint8), np.zeros(edges, dtype=np.uint8)
+        self._arrays: dict[str, npt.NDArray[Any]] = {
+            "period": self._period,
+            "columns": columns,
+            "lengths": np.zeros(edges, dtype=np.float32),
+            "targets": np.zeros(edges, dtype=np.int32),
+            "incoming": np.zeros(room, dtype=np.int32),
+            "next": np.zeros(edges, dtype=np.int32),
+            "node": self._node,
+            "edge": self._edge,
+            "passing": np.zeros(room, dtype=np.uint8),
+            "visits_start": np.zeros(room, dtype=_VISIT),
+            "visits_goal": np.zeros(room, dtype=_VISIT),
+            "order_start": np.zeros(room, dtype=np.int32),
+            "order_goal": np.zeros(room, dtype=np.int32),
+        }
+        self._struct = s = RoadmapStruct(
+            resolution=RESOLUTION,
+            least=LEAST_INFLATION,
+            greed=_GREED,
+            degree=degree,
+            room=room,
+            first_batch=_FIRST_BATCH,
+        )
+        for name, array in self._arrays.items():
+            setattr(s, name, array.ctypes.data)
+        self._version: object = None
+        self._margin = 0.0
+        self.nodes_checked = self.edges_checked = 0
+
+    def __len__(self) -> int:
+        """Return the number of nodes."""
+        return int(self._struct.count)
+
+    def solve(
+        self, checker: CollisionChecker, starts: Floats32, goals: Floats32, seconds: float, seed: int
+    ) -> SearchResult:
+        """Search a path from any of (S, n) starts to any of (G, n) goals.
+
+        Coordinates that turn fully may end full turns away from a goal.
+
+        Parameters
+        ----------
+        checker
+            Checker of the coordinates of the roadmap.
+        starts, goals
+            Free configurations, contiguous.
+        seconds
+            Largest time [s].
+        seed
+            Seed of the samples that this query adds.
+        """
+        self._forget(checker)
+        s = self._struct
+        s.checker, s.seconds, s.seed = checker.address, seconds, seed
+        count = self._code.kineverse_roadmap(
+            ctypes.addressof(s), starts.ctypes.data, len(starts), goals.ctypes.data, len(goals),
+            self._path.ctypes.data, len(self._path),
+        )  # fmt: skip
+        self.nodes_checked, self.edges_checked = s.nodes_checked, s.edges_checked
+        points = self._path[: max(count, 0)].copy() if count else starts[:1]
+        return SearchResult(points, s.status, s.samples, (s.reached_start, s.reached_goal), s.gap)
+
+    def _forget(self, checker: CollisionChecker) -> None:
+        """Forget what another place, other pairs or another margin may have changed."""
+        margin, count = checker.struct.margin, len(self)
+        for states in (self._node[:count], self._edge[: count * self._struct.degree]):
+            if checker.version != self._version:
+                states[:] = _UNKNOWN
+            elif margin < self._margin:
+                states[states == _BLOCKED] = _UNKNOWN
+            elif margin > self._margin:
+                states[states != _BLOCKED] = _UNKNOWN
+        self._version, self._margin = checker.version, margin
+
+    def describe(self) -> str:
+        """Return how large the roadmap is and what the last query checked, as the end of a sentence."""
+        return f" in a roadmap of {len(self)} nodes, of which {self.edges_checked} edges were checked"
+
+    def __repr__(self) -> str:
+        return f"<Roadmap: {len(self)} nodes of at most {self._struct.room}>"
