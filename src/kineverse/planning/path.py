@@ -2,15 +2,26 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+import os
+from collections.abc import Iterator
 from dataclasses import dataclass, field
 from functools import cached_property
 
 import numpy as np
+import numpy.typing as npt
 
+from kineverse.errors import InvalidValueError
 from kineverse.lie import Array
 from kineverse.state import State
 from kineverse.symbols import Symbol
+
+from .path_checks import PathChecks
+from .path_rounding import parameterize_path, passing_times
+from .trajectories import BlendedPath, MotionLimits, Trajectory, motion_limits
+from .trajectories.motion_limits import RAMP
+
+DEVIATION = 0.1
+"""Largest distance of a trajectory from the corners of its path, where nothing is in the way [rad], [m]."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -46,7 +57,7 @@ class Path:
     search_seconds: float
     iterations: int
     state: State
-    measure: Callable[[Array], float] = field(repr=False)
+    checks: PathChecks = field(repr=False)
 
     @property
     def length(self) -> float:
@@ -62,7 +73,88 @@ class Path:
 
     @cached_property
     def _clearance(self) -> float:
-        return self.measure(self.points)
+        return self.checks.clearance(self.points)
+
+    def trajectory(
+        self,
+        *,
+        deviation: npt.ArrayLike = DEVIATION,
+        ramp: float = RAMP,
+        velocity: npt.ArrayLike | None = None,
+        acceleration: npt.ArrayLike | None = None,
+    ) -> Trajectory:
+        """Return the fastest motion along the path, from rest to rest.
+
+        Corners are rounded as far as the way stays free, by the same certificate as the path; where it does not, the
+        motion stops. Holds are met up to 1e-5 m or rad.
+
+        Parameters
+        ----------
+        deviation
+            Largest distance from the corners, in the norm of the coordinates [rad], [m]: a number, or one for each
+            point (N,); 0 to stop at all of them.
+        ramp
+            Time from rest to full speed [s], where the model states no acceleration; see :func:`.motion_limits`.
+        velocity, acceleration
+            Largest speeds and accelerations (n,), or numbers for all coordinates; None for those of the model.
+
+        Raises
+        ------
+        InvalidValueError
+            If the path was not found, or the model has been edited since; as :func:`.time_parameterize`.
+        ShapeError
+            For limits or deviations of another shape.
+        """
+        return self._parameterize(deviation, ramp, velocity, acceleration)[1]
+
+    @property
+    def times(self) -> Array:
+        """Times (N,) at which :meth:`trajectory` passes the points, or is nearest to them [s].
+
+        Raises
+        ------
+        InvalidValueError
+            As :meth:`trajectory`.
+        """
+        return self._times
+
+    @cached_property
+    def _times(self) -> Array:
+        found = passing_times(self.points, *self._parameterize(DEVIATION, RAMP, None, None))
+        found.flags.writeable = False
+        return found
+
+    def _parameterize(
+        self,
+        deviation: npt.ArrayLike,
+        ramp: float,
+        velocity: npt.ArrayLike | None,
+        acceleration: npt.ArrayLike | None,
+    ) -> tuple[BlendedPath, Trajectory]:
+        if not self.found:
+            raise InvalidValueError(f"There is no path to move along. {self.why}")
+        self.checks.ensure_current()
+        stated = motion_limits(self.checks.model, self.symbols, ramp=ramp, state=self.state)
+        given = (velocity, acceleration)
+        limits = MotionLimits(
+            *(
+                own if other is None else np.asarray(other, dtype=float)
+                for own, other in zip(stated, given, strict=True)
+            )
+        )
+        return parameterize_path(self.points, self.symbols, limits, deviation, self.checks)
+
+    def save(self, path: str | os.PathLike[str]) -> None:
+        """Write the :meth:`trajectory` to a JSON file, see :meth:`.Trajectory.save`.
+
+        Raises
+        ------
+        InvalidValueError
+            As :meth:`trajectory`.
+        FormatError
+            If the file cannot be written.
+        """
+        self.trajectory().save(path)
 
     def at(self, fraction: float) -> State:
         """Return the state at a fraction of the length, from 0 at the start to 1 at the end."""
@@ -87,15 +179,3 @@ class Path:
         if self.found:
             return f"<Path: {len(self.points)} points, length {self.length:.3g}, {1e3 * self.seconds:.3g} ms>"
         return f"<Path: not found. {self.why}>"
-
-
-def densify(points: Array, step: float) -> Array:
-    """Return the points of a polyline (N, n) with others between them, at most a step apart."""
-    if len(points) < 2:
-        return points
-    lengths = np.linalg.norm(np.diff(points, axis=0), axis=1)
-    counts = np.maximum(np.ceil(lengths / step), 1).astype(int)
-    at = np.concatenate(
-        [k + np.arange(c) / c for k, c in enumerate(counts)] + [np.array([len(points) - 1.0])]
-    )
-    return np.column_stack([np.interp(at, np.arange(len(points)), column) for column in points.T])

@@ -22,13 +22,14 @@ from kineverse.model.model_view import ModelView
 from kineverse.state import State, StateLike, as_state
 from kineverse.symbols import Symbol
 
-from .checker import RESOLUTION, CollisionChecker
+from .checker import CollisionChecker
 from .configuration import PlanningSpace
 from .connection import connect, connect_on_manifold
 from .endpoints import Endpoint, Endpoints
 from .judge import SceneJudge, describe_contacts
 from .manifold import FrameHold, Manifold, hold_frames
 from .path import Path
+from .path_checks import PathChecks
 from .solutions import find_solutions
 
 _JUDGED = 1.0
@@ -161,6 +162,11 @@ class Planner:
         self._state = state
         self.checker.place(state)
         self._set_bounds(self._here, self._here[None])
+
+    def _replace(self) -> None:
+        """Place the checker again where everything stands."""
+        assert self._state is not None
+        self.checker.place(self._state)
 
     @property
     def _here(self) -> Array:
@@ -372,7 +378,7 @@ class Planner:
         shift = variant - goal.inner
         whole = np.vstack([first.way[:-1], points, (goal.way[::-1] + shift)[1:]])
         why = f"Found after {found.iterations} samples."
-        return self._path(True, whole, why, begin, spent, found.iterations, touching)
+        return self._path(True, whole, why, begin, spent, found.iterations, touching, manifold)
 
     def _judge(self, touching: frozenset[frozenset[str]] = frozenset()) -> SceneJudge:
         """Return the judge of the scene in which some pairs may touch, at the present place."""
@@ -407,16 +413,13 @@ class Planner:
         spent: float,
         iterations: int,
         touching: frozenset[frozenset[str]] = frozenset(),
+        manifold: Manifold | None = None,
     ) -> Path:
         state, judge = self._state, self._judge(touching)
         assert state is not None
-
-        def measure(points: Array) -> float:
-            judge.place(state)
-            return judge.clearance(points, 1 / RESOLUTION)
-
+        checks = PathChecks(self.model, state, self.checker, judge, manifold, touching, self._replace)
         seconds = perf_counter() - begin
-        return Path(found, self.space.symbols, points, why, seconds, spent, iterations, state, measure)
+        return Path(found, self.space.symbols, points, why, seconds, spent, iterations, state, checks)
 
     def __repr__(self) -> str:
         return f"<Planner: {len(self.symbols)} coordinates, {len(self.checker.moving)} bodies that move>"
