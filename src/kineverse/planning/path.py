@@ -35,8 +35,8 @@ class Path:
     symbols
         The n coordinates, the columns of :attr:`points`.
     points
-        Configurations (N, n) that are joined by straight lines [m], [rad]. Without a way they are the best partial
-        path: from the start to the point of the search that is nearest to a goal.
+        Configurations (N, n) that are joined by straight lines [m], [rad]. Without a way they are the best
+        partial path: from the start to the point of the search that is nearest to a goal.
     why
         How the path was found, or why there is none.
     seconds
@@ -65,9 +65,9 @@ class Path:
         return float(np.linalg.norm(np.diff(self.points, axis=0), axis=1).sum())
 
     def clearance(self) -> float:
-        """Return the least signed distance of bodies along the path by the scene [m], sampled 32 times a unit.
+        """Return the least signed distance of bodies along the path by the scene [m].
 
-        Infinite if no pair is within .5 m.
+        It is sampled 32 times a unit. Infinite if no pair is within .5 m.
         """
         return self._clearance
 
@@ -85,18 +85,20 @@ class Path:
     ) -> Trajectory:
         """Return the fastest motion along the path, from rest to rest.
 
-        Corners are rounded as far as the way stays free, by the same certificate as the path; where it does not, the
-        motion stops. Holds are met up to 1e-5 m or rad.
+        Corners are rounded as far as the way stays free, by the same certificate as the path; where it does
+        not, the motion stops. Holds are met up to 1e-5 m or rad.
 
         Parameters
         ----------
         deviation
-            Largest distance from the corners, in the norm of the coordinates [rad], [m]: a number, or one for each
-            point (N,); 0 to stop at all of them.
+            Largest distance from the corners, in the norm of the coordinates [rad], [m]: a number, or one for
+            each point (N,); 0 to stop at all of them.
         ramp
-            Time from rest to full speed [s], where the model states no acceleration; see :func:`.motion_limits`.
+            Time from rest to full speed [s] where the model states no acceleration, see
+            :func:`.motion_limits`.
         velocity, acceleration
-            Largest speeds and accelerations (n,), or numbers for all coordinates; None for those of the model.
+            Largest speeds and accelerations (n,), or numbers for all coordinates; None for those of the
+            model.
 
         Raises
         ------

@@ -71,7 +71,7 @@ class PathChecks:
 
     @contextmanager
     def placed(self, points: Array) -> Iterator[None]:
-        """Place the checker for the path, with limits that contain configurations (N, n), while the context lasts."""
+        """Place the checker as for the path while the context lasts, within limits of configurations (N, n)."""
         checker = self._checker
         limits = checker.lower.copy(), checker.upper.copy()
         checker.place(self.state)
@@ -87,7 +87,7 @@ class PathChecks:
             self._restore()
 
     def valid(self, Q: Array, residual: float) -> npt.NDArray[np.bool_]:
-        """Return flags (N,) of configurations (N, n) that are free, and meet holds up to a residual [m], [rad]."""
+        """Return flags (N,) of configurations (N, n) that are free and meet holds up to a residual."""
         flags = self._checker.valid(np.ascontiguousarray(Q, dtype=np.float32))
         if self._manifold is not None:
             flags &= self._manifold.residuals(Q) <= residual

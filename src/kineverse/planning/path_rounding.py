@@ -65,7 +65,7 @@ def parameterize_path(
 
 
 def passing_times(points: Array, path: BlendedPath, trajectory: Trajectory) -> Array:
-    """Return the times (N,) at which a motion along a rounded path is nearest to the points of the path (N, n)."""
+    """Return the times (N,) at which a motion along a rounded path is nearest to its points (N, n)."""
     times = _fine_times(trajectory)
     travelled = _lengths(trajectory.positions_at(times))
     # The way along the rounded path to the middle of each blend, and along the polyline to its corner.

@@ -1,0 +1,261 @@
+"""Starts, goals, holds and robots of ``kineverse plan``, as they are written on the command line."""
+
+from __future__ import annotations
+
+import json
+import math
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from kineverse.cli.arguments import parse_assignments, parse_value
+from kineverse.errors import FormatError, InvalidValueError, UnknownNameError, suggest
+
+if TYPE_CHECKING:
+    import kineverse as kv
+    from kineverse.control import Hold
+    from kineverse.planning import Planner
+
+_ALL = "xyz rx ry rz"
+_BASE = ("x", "y", "angle")
+
+
+@dataclass(frozen=True)
+class FrameTarget:
+    """Pose of a frame that is asked for, ``A@B:MASK`` or ``A@X,Y,Z``.
+
+    Attributes
+    ----------
+    frame
+        The frame.
+    target
+        The other frame; the world for numbers.
+    numbers
+        Position, or position and roll, pitch, yaw, in the world [m], [rad]; empty for a frame.
+    mask
+        Directions, see :meth:`.Planner.hold`.
+    """
+
+    frame: str
+    target: str
+    numbers: tuple[float, ...]
+    mask: str
+
+    @property
+    def directions(self) -> set[str]:
+        """The directions of the mask, one by one."""
+        return {r for part in self.mask.split() for r in ([part] if part.startswith("r") else part)}
+
+
+@dataclass
+class Request:
+    """Words of an option: values by name, frames with their targets, names of states.
+
+    Attributes
+    ----------
+    values
+        Values of coordinates by name [m], [rad].
+    targets
+        Poses of frames.
+    names
+        Other words, which name states of the SRDF.
+    """
+
+    values: dict[str, float] = field(default_factory=dict)
+    targets: list[FrameTarget] = field(default_factory=list)
+    names: list[str] = field(default_factory=list)
+
+    def resolve(self, states: Mapping[str, Mapping[str, float]], option: str) -> None:
+        """Replace names by the values of these states; values that are given win.
+
+        Raises
+        ------
+        UnknownNameError
+            For a name that is no state.
+        """
+        for name in self.names:
+            if name not in states:
+                hint = suggest(name, states, "state") if states else "Names of states need --srdf."
+                raise UnknownNameError(
+                    f"{option} {name}: write NAME=VALUE, FRAME@FRAME, FRAME@X,Y,Z or a state of the SRDF. {hint}"
+                )
+            self.values = {**states[name], **self.values}
+
+
+def parse_request(words: Iterable[str], option: str, read_files: bool = False) -> Request:
+    """Return what the words of an option ask for.
+
+    Parameters
+    ----------
+    words
+        The words.
+    option
+        Name of the option, for messages.
+    read_files
+        True to take names that end with ``.json`` for files of values.
+
+    Raises
+    ------
+    KineverseError
+        For a word that cannot be read.
+    """
+    found, assignments = Request(), []
+    for word in words:
+        if "=" in word:
+            assignments.append(word)
+        elif "@" in word:
+            found.targets.append(parse_frame_target(word, option))
+        elif read_files and word.endswith(".json"):
+            found.values |= _read_values(word)
+        else:
+            found.names.append(word)
+    found.values |= parse_assignments(assignments, option)
+    return found
+
+
+def parse_frame_target(word: str, option: str) -> FrameTarget:
+    """Return the pose of a frame from ``A@B``, ``A@B:MASK``, ``A@X,Y,Z`` or ``A@X,Y,Z,ROLL,PITCH,YAW``.
+
+    Raises
+    ------
+    InvalidValueError
+        For another text.
+    """
+    frame, _, rest = word.partition("@")
+    target, _, mask = rest.partition(":")
+    parts = target.split(",")
+    if not frame or not target or len(parts) not in (1, 3, 6):
+        raise InvalidValueError(
+            f"{option} {word}: write FRAME@FRAME, or FRAME@X,Y,Z or FRAME@X,Y,Z,ROLL,PITCH,YAW with numbers."
+        )
+    if len(parts) == 1:
+        return FrameTarget(frame, target, (), mask.replace(",", " ") or _ALL)
+    numbers = tuple(parse_value(part) for part in parts)
+    return FrameTarget(
+        frame, "world", numbers, mask.replace(",", " ") or ("xyz" if len(parts) == 3 else _ALL)
+    )
+
+
+def parse_robot(text: str) -> tuple[str, tuple[float, float, float] | None]:
+    """Return the source of a robot and the x, y [m] and angle [rad] of its base from ``ROBOT@X,Y,ANGLE``.
+
+    Raises
+    ------
+    InvalidValueError
+        For another number of numbers.
+    """
+    source, at, place = text.rpartition("@")
+    if not at:
+        return text, None
+    parts = place.split(",")
+    if len(parts) != 3:
+        raise InvalidValueError(
+            f"--robot {text}: the place of a base is X,Y,ANGLE, such as fetch@1,0.5,90deg."
+        )
+    x, y, angle = map(parse_value, parts)
+    return source, (x, y, angle)
+
+
+def place_base(
+    model: kv.Model, joints: Iterable[str], place: tuple[float, float, float] | None
+) -> dict[kv.Symbol, float]:
+    """Return the values of the coordinates of a mobile base among some articulations; empty without a place.
+
+    Raises
+    ------
+    InvalidValueError
+        If there is no such base.
+    """
+    if place is None:
+        return {}
+    for name in joints:
+        coordinates = model.articulations[name].coordinates
+        if tuple(s.path.rpartition("/")[2] for s in coordinates) == _BASE:
+            return dict(zip(coordinates, place, strict=True))
+    raise InvalidValueError(
+        "The robot has no mobile base that could be placed (x, y, angle); its file says where it stands."
+    )
+
+
+def make_hold(planner: Planner, given: FrameTarget) -> Hold:
+    """Return the hold that a target stands for.
+
+    Raises
+    ------
+    KineverseError
+        For frames that the model does not have, and other masks.
+    """
+    import kineverse as kv
+    from kineverse.control import Hold
+
+    offset = None
+    if given.numbers:
+        offset = kv.translation(*given.numbers[:3]) @ kv.rpy(*(given.numbers[3:] or (0.0, 0.0, 0.0)))
+    hold = planner.hold(given.frame, given.target, given.mask, offset)
+    if given.target == "world":
+        # Nothing is held there, so that nothing may be touched.
+        return Hold(hold.expression, 0.0, name=hold.name)
+    return hold
+
+
+def make_grip(planner: Planner, given: FrameTarget, start: Iterable[FrameTarget], state: kv.State) -> Hold:
+    """Return a hold along a path: of frames that coincide if the start says so, else as they are at a state.
+
+    Raises
+    ------
+    InvalidValueError
+        For numbers in the place of a frame.
+    """
+    if given.numbers:
+        raise InvalidValueError("--along takes two frames, A@B or A@B:MASK; 'world' is a frame, too.")
+    if is_coincident(given, start):
+        return make_hold(planner, given)
+    offset = planner.model.fk(given.frame, given.target)(state)
+    return planner.hold(given.frame, given.target, given.mask, offset)
+
+
+def is_coincident(given: FrameTarget, start: Iterable[FrameTarget]) -> bool:
+    """Return True if two frames coincide at the start, in all directions of a hold."""
+    pairs = [t for t in start if (t.frame, t.target) == (given.frame, given.target)]
+    return any(given.directions <= t.directions for t in pairs)
+
+
+def choose_coordinates(
+    model: kv.Model,
+    names: Iterable[str],
+    targets: Iterable[FrameTarget],
+    holds: Iterable[FrameTarget],
+    still: Iterable[kv.Symbol],
+) -> list[kv.Symbol | str]:
+    """Return the coordinates to move where none are asked for.
+
+    These are the named ones, and the free ones that frames depend on, but for some that stay still.
+    """
+    from kineverse.planning.configuration import free_coordinates
+
+    frames = {t.frame for t in targets} | {frame for t in holds for frame in (t.frame, t.target)}
+    needed = {s for frame in frames for s in model.symbols_of(frame)}
+    found = [s for s in free_coordinates(model) if s in needed and s not in {*still}]
+    # The planner says why it cannot move a named one.
+    return [*found, *(name for name in names if model.symbol(name) not in found)]
+
+
+def _read_values(path: str) -> dict[str, float]:
+    """Return values by name from a JSON object, or from its part ``positions``.
+
+    Raises
+    ------
+    FormatError
+        If the file is none.
+    """
+    try:
+        document = json.loads(Path(path).read_text(encoding="utf-8"))
+    except ValueError as error:
+        raise FormatError(f"{path}: not JSON: {str(error)[:200]}.") from None
+    values = document.get("positions", document) if isinstance(document, dict) else None
+    if not isinstance(values, dict) or not all(
+        type(v) in (int, float) and math.isfinite(v) for v in values.values()
+    ):
+        raise FormatError(f'{path}: not an object of numbers by name, such as {{"door": 0.3}}.')
+    return {name: float(value) for name, value in values.items()}
