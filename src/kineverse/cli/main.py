@@ -66,7 +66,7 @@ examples:
   kineverse info kitchen                              its frames, degrees of freedom, constraints
   kineverse fk kitchen kitchen/fridge_door_handle --set kitchen/fridge_door=30deg
   kineverse reach fetch fetch/gripper_link --pose 0.7 0.2 0.9
-  kineverse plan shelf_door --to shelf_door/hinge=90deg
+  kineverse plan shelf_door --to shelf_door/door=80deg
   kineverse view kitchen                              move it in the browser
   kineverse convert kitchen kitchen.kv.json           write it in another format
   kineverse diff kitchen kitchen.kv.json              differences of two models

@@ -18,7 +18,7 @@ from kineverse.cli.plan_arguments import (
     FrameTarget,
     Request,
     choose_coordinates,
-    is_coincident,
+    find_same_grip,
     make_grip,
     make_hold,
     parse_frame_target,
@@ -43,22 +43,22 @@ if TYPE_CHECKING:
 
 HELP = """find a path without collisions
 
-A goal is values of coordinates (NAME=VALUE), the pose of a frame, or a state of an SRDF. A pose is another
-frame, FRAME@FRAME, in all directions or some (FRAME@FRAME:xyz, :xyz,rx,ry), or numbers in the world,
-FRAME@X,Y,Z or FRAME@X,Y,Z,ROLL,PITCH,YAW. A start is the same, or a file of values (the JSON of kineverse
-reach); what it does not say stands as in the default state.
+A goal is values of coordinates (NAME=VALUE), poses of frames, or a state of an SRDF. FRAME@FRAME brings a
+frame to another one, in all directions or some (FRAME@FRAME:xyz, :xyz,rx,ry), FRAME@FRAME+X,Y,Z to a place
+beside it, FRAME@X,Y,Z to a position in the world; ROLL,PITCH,YAW may follow. A start is the same, or a file of
+values (the JSON of kineverse reach); what it does not say stands as in the default state.
 
-What is named moves, and what the frames before @ depend on; --move says it otherwise. --along A@B holds
-frame A in B as it is at the start, such as a hand at a handle: then NAME=VALUE is reached with the hold kept,
-and bodies of both frames may touch.
+What is named moves, and what the frames before @ depend on, but no base that is placed; --move says it
+otherwise. --along A@B holds frame A in B as it is at the start, such as a hand at a handle: NAME=VALUE is
+reached with the hold kept, and bodies of both frames may touch.
 
 The first plan of a robot takes a while: its shapes are covered by spheres, and code is compiled. Both are
 kept. This needs a C compiler and the extra 'geometry'. The exit status is 1 if no path was found.
 
 examples:
-  kineverse plan shelf_door --to shelf_door/door=90deg
+  kineverse plan shelf_door --to shelf_door/door=80deg
   kineverse plan fetch --to fetch/gripper_link@0.6,0.2,0.9 --picture plan.png
-  kineverse plan kitchen --robot fetch@0.2,1.2,90deg --to fetch/gripper_link@kitchen/oven_door_handle:xyz
+  kineverse plan kitchen --robot fetch@0,1.3,0 --to fetch/gripper_link@kitchen/oven_door_handle+10cm,0,0:xyz
   kineverse plan pr2 --from pr2/r_elbow_flex_joint=-1 --to pr2/r_elbow_flex_joint=-2 --save path.json"""
 
 FOUND, NOT_FOUND = 0, 1
@@ -252,12 +252,12 @@ def _plan(problem: _Problem, seconds: float, seed: int) -> Path:
             starts = list(planner.solutions([*wanted, *fixed], _MOST_STARTS, seconds=seconds, seed=seed))
         if not starts:
             raise InvalidValueError(
-                f"--from {', '.join(f'{t.frame}@{t.target}' for t in start.targets)}: no configuration was found "
-                "there without collision. Out of reach, or always in contact? 'kineverse reach' says which."
+                f"--from {start.targets[0].frame}@{start.targets[0].target}: no configuration without "
+                "collision was found there. Out of reach, or always in contact? 'kineverse reach' says which."
             )
     standing = [_state(problem, q) for q in starts]
     # Holds as they are at a start are others at the next one.
-    if not all(is_coincident(t, start.targets) for t in problem.holds):
+    if any(find_same_grip(t, start.targets) is None for t in problem.holds):
         del standing[1:]
     along = [make_grip(planner, t, start.targets, standing[0]) for t in problem.holds]
     tasks = [make_hold(planner, t) for t in goal.targets]

@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 import math
 from collections.abc import Iterable, Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -23,7 +23,7 @@ _BASE = ("x", "y", "angle")
 
 @dataclass(frozen=True)
 class FrameTarget:
-    """Pose of a frame that is asked for, ``A@B:MASK`` or ``A@X,Y,Z``.
+    """Wanted pose of a frame: ``A@B``, ``A@B+X,Y,Z`` or ``A@X,Y,Z``, with or without ``:MASK``.
 
     Attributes
     ----------
@@ -32,7 +32,7 @@ class FrameTarget:
     target
         The other frame; the world for numbers.
     numbers
-        Position, or position and roll, pitch, yaw, in the world [m], [rad]; empty for a frame.
+        Position, or position and roll, pitch, yaw, in the other frame [m], [rad]; empty for its own pose.
     mask
         Directions, see :meth:`.Planner.hold`.
     """
@@ -78,7 +78,8 @@ class Request:
             if name not in states:
                 hint = suggest(name, states, "state") if states else "Names of states need --srdf."
                 raise UnknownNameError(
-                    f"{option} {name}: write NAME=VALUE, FRAME@FRAME, FRAME@X,Y,Z or a state of the SRDF. {hint}"
+                    f"{option} {name}: write NAME=VALUE, FRAME@FRAME, FRAME@X,Y,Z or a state of the SRDF. "
+                    f"{hint}"
                 )
             self.values = {**states[name], **self.values}
 
@@ -115,7 +116,7 @@ def parse_request(words: Iterable[str], option: str, read_files: bool = False) -
 
 
 def parse_frame_target(word: str, option: str) -> FrameTarget:
-    """Return the pose of a frame from ``A@B``, ``A@B:MASK``, ``A@X,Y,Z`` or ``A@X,Y,Z,ROLL,PITCH,YAW``.
+    """Return the pose of a frame from ``A@B``, ``A@B+X,Y,Z`` or ``A@X,Y,Z``, see :class:`FrameTarget`.
 
     Raises
     ------
@@ -123,18 +124,20 @@ def parse_frame_target(word: str, option: str) -> FrameTarget:
         For another text.
     """
     frame, _, rest = word.partition("@")
-    target, _, mask = rest.partition(":")
-    parts = target.split(",")
-    if not frame or not target or len(parts) not in (1, 3, 6):
+    where, _, mask = rest.partition(":")
+    mask = mask.replace(",", " ")
+    target, plus, offset = where.partition("+")
+    if not plus and "," in where:
+        target, offset = "world", where
+    parts = offset.split(",") if offset else []
+    if not frame or not target or len(parts) not in (0, 3, 6) or (plus and not parts):
         raise InvalidValueError(
-            f"{option} {word}: write FRAME@FRAME, or FRAME@X,Y,Z or FRAME@X,Y,Z,ROLL,PITCH,YAW with numbers."
+            f"{option} {word}: write FRAME@FRAME, FRAME@FRAME+X,Y,Z or FRAME@X,Y,Z, where ROLL,PITCH,YAW may "
+            "follow X,Y,Z."
         )
-    if len(parts) == 1:
-        return FrameTarget(frame, target, (), mask.replace(",", " ") or _ALL)
+    position_only = len(parts) == 3 and not plus
     numbers = tuple(parse_value(part) for part in parts)
-    return FrameTarget(
-        frame, "world", numbers, mask.replace(",", " ") or ("xyz" if len(parts) == 3 else _ALL)
-    )
+    return FrameTarget(frame, target, numbers, mask or ("xyz" if position_only else _ALL))
 
 
 def parse_robot(text: str) -> tuple[str, tuple[float, float, float] | None]:
@@ -200,25 +203,32 @@ def make_hold(planner: Planner, given: FrameTarget) -> Hold:
 
 
 def make_grip(planner: Planner, given: FrameTarget, start: Iterable[FrameTarget], state: kv.State) -> Hold:
-    """Return a hold along a path: of frames that coincide if the start says so, else as they are at a state.
+    """Return a hold along a path, as the start says; else of frames as they are at a state.
 
     Raises
     ------
     InvalidValueError
-        For numbers in the place of a frame.
+        For numbers that the start does not have.
     """
+    same = find_same_grip(given, start)
+    if same is not None:
+        return make_hold(planner, replace(same, mask=given.mask))
     if given.numbers:
-        raise InvalidValueError("--along takes two frames, A@B or A@B:MASK; 'world' is a frame, too.")
-    if is_coincident(given, start):
-        return make_hold(planner, given)
+        raise InvalidValueError(
+            f"--along {given.frame}@{given.target}: frames are held as they are at the start, so numbers are "
+            "given there, with --from."
+        )
     offset = planner.model.fk(given.frame, given.target)(state)
     return planner.hold(given.frame, given.target, given.mask, offset)
 
 
-def is_coincident(given: FrameTarget, start: Iterable[FrameTarget]) -> bool:
-    """Return True if two frames coincide at the start, in all directions of a hold."""
-    pairs = [t for t in start if (t.frame, t.target) == (given.frame, given.target)]
-    return any(given.directions <= t.directions for t in pairs)
+def find_same_grip(given: FrameTarget, start: Iterable[FrameTarget]) -> FrameTarget | None:
+    """Return what the start says of the frames of a hold, in all of its directions; None if it does not."""
+    same = [t for t in start if (t.frame, t.target) == (given.frame, given.target)]
+    return next(
+        (t for t in same if given.directions <= t.directions and given.numbers in ((), t.numbers)),
+        None,
+    )
 
 
 def choose_coordinates(

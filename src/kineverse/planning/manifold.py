@@ -36,7 +36,7 @@ _DAMPING = 1e-5
 _ROWS = ("x", "y", "z", "rx", "ry", "rz")
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True, eq=False, repr=False)
 class FrameHold(Hold):
     """Hold of two frames of a model by each other, see :meth:`.Planner.hold`.
 

@@ -71,7 +71,7 @@ class PathChecks:
 
     @contextmanager
     def placed(self, points: Array) -> Iterator[None]:
-        """Place the checker as for the path while the context lasts, within limits of configurations (N, n)."""
+        """Place the checker for a path, with limits about its points (N, n), while the context lasts."""
         checker = self._checker
         limits = checker.lower.copy(), checker.upper.copy()
         checker.place(self.state)
