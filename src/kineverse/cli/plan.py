@@ -45,8 +45,8 @@ HELP = """find a path without collisions
 
 A goal is values of coordinates (NAME=VALUE), poses of frames, or a state of an SRDF. FRAME@FRAME brings a
 frame to another one, in all directions or some (FRAME@FRAME:xyz, :xyz,rx,ry), FRAME@FRAME+X,Y,Z to a place
-beside it, FRAME@X,Y,Z to a position in the world; ROLL,PITCH,YAW may follow. A start is the same, or a file of
-values (the JSON of kineverse reach); what it does not say stands as in the default state.
+beside it, FRAME@X,Y,Z to a position in the world; ROLL,PITCH,YAW may follow. A start is the same, or a file
+of values (the JSON of kineverse reach); what it does not say stands as in the default state.
 
 What is named moves, and what the frames before @ depend on, but no base that is placed; --move says it
 otherwise. --along A@B holds frame A in B as it is at the start, such as a hand at a handle: NAME=VALUE is

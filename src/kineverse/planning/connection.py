@@ -23,6 +23,8 @@ _FINER = 8.0
 """Factor of the resolution where an edge collides between its samples."""
 _FINEST = 4000.0
 _ATTEMPTS = 4
+_TELLING = 100
+"""Number of samples after which a small tree says that its root cannot be left."""
 _WIDER = 1e-3
 """Margin beyond the one asked for, with which edges of a search are free between their samples too, mostly [m]."""
 
@@ -124,7 +126,8 @@ def explain_failure(found: SearchResult, seconds: float) -> str:
     """Return why a search has found no path, and how far it has come."""
     own, other = found.nodes
     reached = f"{own} configurations were reached from the start and {other} from the goals"
-    enclosed = [name for name, count in zip(("the start", "the goal"), found.nodes, strict=True) if count < 8]
+    names = ("the start", "the goal") if found.iterations >= _TELLING else ()
+    enclosed = [name for name, count in zip(names, found.nodes, strict=False) if count < 8]
     hint = f" It seems that {' and '.join(enclosed)} cannot be left." if enclosed else ""
     if found.status == TIME_IS_UP:
         return (

@@ -14,6 +14,7 @@ from kineverse.state import State
 from kineverse.symbols import Symbol
 
 from .checker import RESOLUTION
+from .path import densify
 
 FINE = 1 / 640
 """Step of samples where no certificate vouches for what lies between them [rad], [m]."""
@@ -109,15 +110,3 @@ def describe_contacts(found: Sequence[DistanceResult], most: int = 3) -> str:
     pairs = [f"'{f.a}' and '{f.b}' ({-1e3 * f.distance:.1f} mm deep)" for f in list(found)[:most]]
     more = f" and {len(found) - most} more pairs" if len(found) > most else ""
     return ", ".join(pairs) + more
-
-
-def densify(points: Array, step: float) -> Array:
-    """Return the points of a polyline (N, n) with others between them, at most a step apart."""
-    if len(points) < 2:
-        return points
-    lengths = np.linalg.norm(np.diff(points, axis=0), axis=1)
-    counts = np.maximum(np.ceil(lengths / step), 1).astype(int)
-    at = np.concatenate(
-        [k + np.arange(c) / c for k, c in enumerate(counts)] + [np.array([len(points) - 1.0])]
-    )
-    return np.column_stack([np.interp(at, np.arange(len(points)), column) for column in points.T])

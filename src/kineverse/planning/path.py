@@ -181,3 +181,15 @@ class Path:
         if self.found:
             return f"<Path: {len(self.points)} points, length {self.length:.3g}, {1e3 * self.seconds:.3g} ms>"
         return f"<Path: not found. {self.why}>"
+
+
+def densify(points: Array, step: float) -> Array:
+    """Return the points of a polyline (N, n) with others between them, at most a step apart."""
+    if len(points) < 2:
+        return points
+    lengths = np.linalg.norm(np.diff(points, axis=0), axis=1)
+    counts = np.maximum(np.ceil(lengths / step), 1).astype(int)
+    at = np.concatenate(
+        [k + np.arange(c) / c for k, c in enumerate(counts)] + [np.array([len(points) - 1.0])]
+    )
+    return np.column_stack([np.interp(at, np.arange(len(points)), column) for column in points.T])

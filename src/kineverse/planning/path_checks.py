@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
+from typing import TYPE_CHECKING
 
 import numpy as np
 import numpy.typing as npt
@@ -14,8 +15,10 @@ from kineverse.model.model_view import ModelView
 from kineverse.state import State
 
 from .checker import RESOLUTION, CollisionChecker
-from .judge import SceneJudge
-from .manifold import Manifold
+
+if TYPE_CHECKING:
+    from .judge import SceneJudge
+    from .manifold import Manifold
 
 
 class PathChecks:

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from kineverse._checks import as_count, as_tolerance, real_number
+from kineverse._checks import as_count, as_tolerance
 from kineverse.control.tasks import Goal, Hold
 from kineverse.errors import InvalidValueError, ShapeError
 from kineverse.expressions.expression import ExpressionLike
@@ -22,6 +22,7 @@ from kineverse.model.model_view import ModelView
 from kineverse.state import State, StateLike, as_state
 from kineverse.symbols import Symbol
 
+from .bindings import planning_functions
 from .checker import CollisionChecker
 from .configuration import PlanningSpace
 from .connection import connect, connect_on_manifold
@@ -89,6 +90,7 @@ class Planner:
         leave_out: Iterable[Exclusion] = (),
         protrusion: float | None = None,
     ) -> None:
+        planning_functions()  # says at once that there is no compiler
         self.model = model
         self.margin = as_tolerance(margin, "The margin")
         self._move = move if move is None or isinstance(move, Symbol | str) else tuple(move)
@@ -202,6 +204,15 @@ class Planner:
             raise ShapeError(f"A and B have the shapes {starts.shape} and {ends.shape}, which differ.")
         return self.checker.edges(starts.astype(np.float32), ends.astype(np.float32))
 
+    def _start(self, start: Any) -> Array:
+        """Return a start (n,) from a vector or a state."""
+        found = self._configurations(start, "start")
+        if len(found) > 1:
+            raise ShapeError(
+                f"start has {len(found)} configurations; there is one start. Goals may be several."
+            )
+        return np.asarray(found[0])
+
     def _configurations(self, Q: Any, name: str) -> Array:
         """Return configurations (N, n) from one or several vectors or states."""
         n = len(self.space.symbols)
@@ -209,12 +220,13 @@ class Planner:
             return self._whole(Q).vector(self.space.symbols)[None]
         if isinstance(Q, Sequence) and len(Q) and isinstance(Q[0], dict | State):
             return np.array([self._whole(q).vector(self.space.symbols) for q in Q])
-        points = np.atleast_2d(np.asarray(Q, dtype=float))
-        if points.ndim != 2 or points.shape[1] != n:
-            raise ShapeError(
-                f"{name} has shape {np.shape(Q)}; wanted are configurations of {n} coordinates, in the order of "
-                "planner.symbols, or states."
-            )
+        wanted = f"wanted are configurations of {n} coordinates, in the order of planner.symbols, or states"
+        try:
+            points = np.atleast_2d(np.asarray(Q, dtype=float))
+        except (TypeError, ValueError):
+            raise InvalidValueError(f"{name} is {Q!r:.80}; {wanted}.") from None
+        if points.ndim != 2 or points.shape[1] != n or not len(points):
+            raise ShapeError(f"{name} has shape {np.shape(Q)}; {wanted}.")
         if not np.isfinite(points).all():
             raise InvalidValueError(f"{name} has values that are not finite.")
         return np.ascontiguousarray(points)
@@ -263,7 +275,7 @@ class Planner:
                 manifold,
                 self._here,
                 as_count("count", count, 1),
-                seconds,
+                as_tolerance(seconds, "seconds="),
                 as_count("seed", seed, 0),
             )
 
@@ -321,9 +333,9 @@ class Planner:
         """
         self._synchronize()
         begin = perf_counter()
-        seconds, seed = max(real_number(seconds), 0.0), as_count("seed", seed, 0)
+        seconds, seed = as_tolerance(seconds, "seconds="), as_count("seed", seed, 0)
         holds = as_holds(along)
-        q = self._here if start is None else self._configurations(start, "start")[0]
+        q = self._here if start is None else self._start(start)
         tasks = () if not _are_tasks(goals) else as_holds(goals)
         if tasks:
             ends = self.solutions([*holds, *tasks], _TASK_GOALS, seconds=seconds, seed=seed)
