@@ -18,7 +18,6 @@ from kineverse.cli.plan_arguments import (
     FrameTarget,
     Request,
     choose_coordinates,
-    find_same_grip,
     make_grip,
     make_hold,
     parse_frame_target,
@@ -39,6 +38,7 @@ from kineverse.expressions.printing import format_number
 
 if TYPE_CHECKING:
     import kineverse as kv
+    from kineverse.control import Hold
     from kineverse.planning import Path, Planner
 
 HELP = """find a path without collisions
@@ -58,7 +58,7 @@ kept. This needs a C compiler and the extra 'geometry'. The exit status is 1 if 
 examples:
   kineverse plan shelf_door --to shelf_door/door=80deg
   kineverse plan fetch --to fetch/gripper_link@0.6,0.2,0.9 --picture plan.png
-  kineverse plan kitchen --robot fetch@0,1.3,0 --to fetch/gripper_link@kitchen/oven_door_handle+10cm,0,0:xyz
+  kineverse plan kitchen --robot fetch@0.45,0.7,90deg --to fetch/gripper_link@1,1.35,1.1
   kineverse plan pr2 --from pr2/r_elbow_flex_joint=-1 --to pr2/r_elbow_flex_joint=-2 --save path.json"""
 
 FOUND, NOT_FOUND = 0, 1
@@ -132,7 +132,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 @dataclass(frozen=True)
 class _Problem:
-    """What is to be planned.
+    """Planning problem.
 
     Attributes
     ----------
@@ -146,6 +146,10 @@ class _Problem:
         What the options say.
     holds
         Targets of ``--along``.
+    start_tasks, goal_tasks
+        Poses of frames at both ends.
+    grips
+        Holds along the path; None for those that depend on the start.
     """
 
     model: kv.Model
@@ -154,6 +158,9 @@ class _Problem:
     start: Request
     goal: Request
     holds: list[FrameTarget]
+    start_tasks: list[Hold]
+    goal_tasks: list[Hold]
+    grips: list[Hold | None]
 
 
 def run(arguments: argparse.Namespace) -> int:
@@ -223,6 +230,10 @@ def _prepare(
         targets = [*goal.targets, *start.targets]
         move = choose_coordinates(model, goal.values, targets, holds, standing)
     rules = [] if srdf is None else [Rule(*rule) for rule in srdf.rules]
+    # Made before the planner, so that mistakes are reported at once.
+    start_tasks = [make_hold(model, target) for target in start.targets]
+    goal_tasks = [make_hold(model, target) for target in goal.targets]
+    grips = [make_grip(model, target, start.targets, None) for target in holds]
     with show_activity("covering shapes by spheres and compiling; this is kept for the next time"):
         planner = Planner(model, move, rules=rules, margin=margin)
     still = [name for name in goal.values if model.symbol(name) not in planner.symbols]
@@ -230,7 +241,7 @@ def _prepare(
         raise InvalidValueError(f"--to says where '{still[0]}' goes, and --move does not say that it moves.")
     state = model.default_state().updated(standing).updated(start.values)
     planner.place(state)
-    return _Problem(model, planner, state, start, goal, holds)
+    return _Problem(model, planner, state, start, goal, holds, start_tasks, goal_tasks, grips)
 
 
 def _srdf_prefix(model: kv.Model, robot: str) -> str:
@@ -247,9 +258,10 @@ def _plan(problem: _Problem, seconds: float, seed: int) -> Path:
     starts: list[Any] = [None]
     if start.targets:
         fixed = [Hold(symbol(n), v, name=n) for n, v in start.values.items() if symbol(n) in planner.symbols]
-        wanted = [make_hold(planner, t) for t in start.targets]
         with show_activity("looking for a start"):
-            starts = list(planner.solutions([*wanted, *fixed], _MOST_STARTS, seconds=seconds, seed=seed))
+            starts = list(
+                planner.solutions([*problem.start_tasks, *fixed], _MOST_STARTS, seconds=seconds, seed=seed)
+            )
         if not starts:
             raise InvalidValueError(
                 f"--from {start.targets[0].frame}@{start.targets[0].target}: no configuration without "
@@ -257,16 +269,25 @@ def _plan(problem: _Problem, seconds: float, seed: int) -> Path:
             )
     standing = [_state(problem, q) for q in starts]
     # Holds as they are at a start are others at the next one.
-    if any(find_same_grip(t, start.targets) is None for t in problem.holds):
+    if None in problem.grips:
         del standing[1:]
-    along = [make_grip(planner, t, start.targets, standing[0]) for t in problem.holds]
-    tasks = [make_hold(planner, t) for t in goal.targets]
+    along = [
+        hold or make_grip(problem.model, given, start.targets, standing[0])
+        for hold, given in zip(problem.grips, problem.holds, strict=True)
+    ]
+    tasks = list(problem.goal_tasks)
     if tasks or along:
         tasks += [Hold(symbol(n), v, name=n) for n, v in goal.values.items()]
     for state in standing:
         goals: Any = tasks or state.updated(goal.values)
         with show_activity("planning"):
-            path = planner.plan(state, goals, along=along, seconds=seconds / len(standing), seed=seed)
+            path = planner.plan(
+                state,
+                goals,
+                along=[hold for hold in along if hold],
+                seconds=seconds / len(standing),
+                seed=seed,
+            )
         if path.found:
             break
     return path

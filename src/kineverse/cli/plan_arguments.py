@@ -15,7 +15,6 @@ from kineverse.errors import FormatError, InvalidValueError, UnknownNameError, s
 if TYPE_CHECKING:
     import kineverse as kv
     from kineverse.control import Hold
-    from kineverse.planning import Planner
 
 _ALL = "xyz rx ry rz"
 _BASE = ("x", "y", "angle")
@@ -181,7 +180,7 @@ def place_base(
     )
 
 
-def make_hold(planner: Planner, given: FrameTarget) -> Hold:
+def make_hold(model: kv.Model, given: FrameTarget) -> Hold:
     """Return the hold that a target stands for.
 
     Raises
@@ -191,35 +190,42 @@ def make_hold(planner: Planner, given: FrameTarget) -> Hold:
     """
     import kineverse as kv
     from kineverse.control import Hold
+    from kineverse.planning.manifold import hold_frames
 
     offset = None
     if given.numbers:
         offset = kv.translation(*given.numbers[:3]) @ kv.rpy(*(given.numbers[3:] or (0.0, 0.0, 0.0)))
-    hold = planner.hold(given.frame, given.target, given.mask, offset)
+    hold = hold_frames(model, given.frame, given.target, given.mask, offset)
     if given.target == "world":
         # Nothing is held there, so that nothing may be touched.
         return Hold(hold.expression, 0.0, name=hold.name)
     return hold
 
 
-def make_grip(planner: Planner, given: FrameTarget, start: Iterable[FrameTarget], state: kv.State) -> Hold:
+def make_grip(
+    model: kv.Model, given: FrameTarget, start: Iterable[FrameTarget], state: kv.State | None
+) -> Hold | None:
     """Return a hold along a path, as the start says; else of frames as they are at a state.
+
+    Without a state it is None where the start says nothing.
 
     Raises
     ------
     InvalidValueError
-        For numbers that the start does not have.
+        For numbers that the start does not have, and other masks.
     """
+    from kineverse.planning.manifold import hold_frames
+
     same = find_same_grip(given, start)
     if same is not None:
-        return make_hold(planner, replace(same, mask=given.mask))
+        return make_hold(model, replace(same, mask=given.mask))
     if given.numbers:
         raise InvalidValueError(
             f"--along {given.frame}@{given.target}: frames are held as they are at the start, so numbers are "
             "given there, with --from."
         )
-    offset = planner.model.fk(given.frame, given.target)(state)
-    return planner.hold(given.frame, given.target, given.mask, offset)
+    offset = model.fk(given.frame, given.target)
+    return None if state is None else hold_frames(model, given.frame, given.target, given.mask, offset(state))
 
 
 def find_same_grip(given: FrameTarget, start: Iterable[FrameTarget]) -> FrameTarget | None:

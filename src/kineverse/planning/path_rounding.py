@@ -19,6 +19,8 @@ RESIDUAL = 1e-5
 """Largest residual of holds on rounded corners [m], [rad]."""
 _SAGITTA = 1e-4
 """Distance between a blend and the chords that are checked in its place [m], [rad]."""
+_SAME = 1e-5
+"""Distance below which two points count as one [rad], [m]."""
 _ROUNDS, _LAST_ROUNDS = 8, 4
 _STEP = 0.02
 """Largest distance of samples of a trajectory [rad], [m]."""
@@ -47,7 +49,7 @@ def parameterize_path(
         Checks of configurations.
     """
     with checks.placed(points):
-        path = _round_valid(points, deviation, checks)
+        path = _round_valid(*_drop_near(points, deviation), checks)
         for attempt in range(_LAST_ROUNDS):
             trajectory = time_parameterize(path, *limits, symbols)
             corner = _find_collision(path, trajectory, checks)
@@ -77,6 +79,20 @@ def passing_times(points: Array, path: BlendedPath, trajectory: Trajectory) -> A
     found: Array = np.interp(_lengths(points), corners, at_corners)
     found[-1] = trajectory.duration
     return found
+
+
+def _drop_near(points: Array, deviation: npt.ArrayLike) -> tuple[Array, npt.ArrayLike]:
+    """Return points (N, n) and deviations without inner points that are as good as equal to the one before.
+
+    Such a short edge has a direction of its own, for which the motion would slow down.
+    """
+    keep = np.ones(len(points), dtype=bool)
+    keep[1:] = np.linalg.norm(np.diff(points, axis=0), axis=1) > _SAME
+    if len(points) > 2 and not keep[-1]:
+        keep[[-2, -1]] = False, True
+    keep[0] = True
+    given = np.asarray(deviation)
+    return points[keep], given[keep] if given.shape == keep.shape else deviation
 
 
 def _round_valid(points: Array, deviation: npt.ArrayLike, checks: PathChecks) -> BlendedPath:
