@@ -1,4 +1,4 @@
-"""A robot plans a way past the open door of a fridge into it, without collisions (extra ``geometry``, C compiler).
+"""A robot plans a way past the open door of a fridge and into it (extra ``geometry``, and a C compiler).
 
 The page in the browser plays it; with ``--headless`` the picture plan.png is written instead.
 """
