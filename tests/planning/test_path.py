@@ -181,3 +181,10 @@ def test_reasons_say_what_is_in_the_way(planner):
     short = planner.plan(LEFT, RIGHT, seconds=0.0)
     assert "The time of 0 s is up" in short.why
     assert "cannot be left" not in short.why
+
+
+def test_bodies_without_shapes_need_no_planner(tmp_path):
+    joint = '<joint name="j" type="continuous"><parent link="a"/><child link="b"/></joint>'
+    (tmp_path / "bare.urdf").write_text(f'<robot name="r"><link name="a"/><link name="b"/>{joint}</robot>')
+    with pytest.raises(InvalidValueError, match="No body of the model has a shape"):
+        Planner(kv.load(tmp_path / "bare.urdf"))

@@ -236,6 +236,10 @@ def _prepare(
     grips = [make_grip(model, target, start.targets, None) for target in holds]
     with show_activity("covering shapes by spheres and compiling; this is kept for the next time"):
         planner = Planner(model, move, rules=rules, margin=margin)
+    moving = {*planner.symbols}
+    bare = [b for b in model.bodies if b not in planner.scene.bodies and moving & {*model.symbols_of(b)}]
+    if bare:
+        print(f"kineverse: note: without shapes, and not checked: {', '.join(bare[:6])}", file=sys.stderr)
     still = [name for name in goal.values if model.symbol(name) not in planner.symbols]
     if still:
         raise InvalidValueError(f"--to says where '{still[0]}' goes, and --move does not say that it moves.")

@@ -107,6 +107,10 @@ class Planner:
         model = self.model
         self.space = space = PlanningSpace(model, self._move)
         scene = Scene(model, rules=self._rules, **self._options)
+        if not scene.bodies:
+            raise InvalidValueError(
+                "No body of the model has a shape, so nothing can collide: add collision or visual shapes."
+            )
         self.excluded = self._find_overlapping(scene)
         if self.excluded:
             scene = Scene(model, rules=(*self._rules, *self.excluded), **self._options)
