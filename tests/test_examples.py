@@ -53,12 +53,23 @@ notch at 0.8 m: height 0.755 m, level: True
     "17_operation_of_your_own": "[0.4 0. 0. ] [0.5 0. 0. ]\n['handle'] ['handle']",
     "18_reach": "pr2/r_gripper_tool_frame reaches 1.19 m far, ...",
     "19_open_a_door": "pr2 moves 12 joints, ...\nopen by 1.39 rad, ..., none violated",
+    "20_plan_a_motion": "8 joints, ... points, ... s\nnothing is nearer than ... mm",
 }
 
-NEEDED = {"12_collision_distances": "coal", "18_reach": "matplotlib", "19_open_a_door": "daqp"}
+NEEDED = {
+    "12_collision_distances": "coal",
+    "18_reach": "matplotlib",
+    "19_open_a_door": "daqp",
+    "20_plan_a_motion": "coal",
+}
 """The modules that examples need beyond the core."""
 
-PICTURES = {"01_load_and_view": "kitchen.png", "18_reach": "reach.png", "19_open_a_door": "open.png"}
+PICTURES = {
+    "01_load_and_view": "kitchen.png",
+    "18_reach": "reach.png",
+    "19_open_a_door": "open.png",
+    "20_plan_a_motion": "plan.png",
+}
 
 TIMEOUT = 300
 """The longest that an example may take [s]; the slowest takes three."""

@@ -21,6 +21,7 @@ from kineverse.cli import (
     fit,
     fk,
     info,
+    plan,
     reach,
     reproduce,
     spheres,
@@ -36,6 +37,7 @@ COMMANDS = {
         info,
         fk,
         reach,
+        plan,
         view,
         convert,
         diff,
@@ -64,6 +66,7 @@ examples:
   kineverse info kitchen                              its frames, degrees of freedom, constraints
   kineverse fk kitchen kitchen/fridge_door_handle --set kitchen/fridge_door=30deg
   kineverse reach fetch fetch/gripper_link --pose 0.7 0.2 0.9
+  kineverse plan shelf_door --to shelf_door/door=80deg
   kineverse view kitchen                              move it in the browser
   kineverse convert kitchen kitchen.kv.json           write it in another format
   kineverse diff kitchen kitchen.kv.json              differences of two models

@@ -127,8 +127,8 @@ def planning_functions() -> Any:
     if not library.prepare(wait=True):
         raise CompileError(
             f"Planning needs a C compiler, and {NO_COMPILER}. Install one (gcc or clang), or do without "
-            "planning: kv.control.inverse_kinematics finds configurations and kv.control.Controller moves "
-            "towards them; both work without a compiler."
+            "planning: kv.control.inverse_kinematics ('kineverse reach') finds configurations, and "
+            "kv.control.Controller moves towards them; both work without a compiler."
         )
     return library.code
 

@@ -52,7 +52,7 @@ class PlanningSpace:
 
     def __init__(self, model: ModelView, move: Iterable[Symbol | str] | Symbol | str | None) -> None:
         self.model = model
-        self.symbols = _free_coordinates(model) if move is None else _find_moving(model, move)
+        self.symbols = free_coordinates(model) if move is None else _find_moving(model, move)
         if not self.symbols:
             raise InvalidValueError(
                 "There is nothing to move: the model has no coordinates, or move= is empty."
@@ -151,7 +151,7 @@ def _is_bounded(excess: Expression) -> bool:
     return bool(excess.symbols) and not (excess.is_constant and not math.isfinite(float(excess)))
 
 
-def _free_coordinates(model: ModelView) -> tuple[Symbol, ...]:
+def free_coordinates(model: ModelView) -> tuple[Symbol, ...]:
     """Return the independent coordinates whose speeds are free: a wheeled base that rolls is not among them."""
     rolling = _rolling_coordinates(model)
     return tuple(s for s in model.degrees_of_freedom if s not in rolling)

@@ -23,7 +23,9 @@ _REPAIRS = 12
 _FINER = 8.0
 """Factor of the resolution where an edge collides between its samples."""
 _FINEST = 4000.0
-_ATTEMPTS = 4
+_ATTEMPTS, _NEXT_SEED = 16, 7919
+_TELLING = 100
+"""Number of samples after which a small tree says that its root cannot be left."""
 _WIDER = 1e-3
 """Margin beyond the one asked for, with which edges of a search are free between their samples too, mostly [m]."""
 
@@ -67,33 +69,49 @@ def connect(
     """
     begin = perf_counter()
     search = RrtConnect(checker, edges=edges)
-    with checker.widened(_WIDER, np.vstack([starts, goals])):
-        if roadmap is None:
-            found = search.solve(starts, goals, seconds, seed)
-        else:
-            found = roadmap.solve(checker, starts, goals, seconds, seed)
-    if not found.found:
-        return Connected(found.points.astype(float), explain_failure(found, seconds), found.iterations)
-    # Parts of a shortcut that just passes would not be certain by themselves.
-    with checker.widened(_WIDER / 2, np.vstack([starts, goals])):
-        points = search.shorten(found.points, seconds - (perf_counter() - begin), seed, _SHORTCUTS)
-    resolution = RESOLUTION
-    for _ in range(_REPAIRS):
-        collision = checker.find_collision(points)
-        if collision is None:
-            return Connected(points.astype(float), "", found.iterations)
-        k, _fraction = collision
+    iterations, points = 0, starts
+    for attempt in range(_ATTEMPTS):
         left = seconds - (perf_counter() - begin)
-        resolution = min(_FINER * resolution, _FINEST)
-        detour = search.solve(points[k : k + 1], points[k + 1 : k + 2], left, seed, resolution)
-        if not detour.found:
+        if attempt and left <= 0.0:
             break
-        points = np.ascontiguousarray(np.vstack([points[:k], detour.points, points[k + 2 :]]))
+        with checker.widened(_WIDER, np.vstack([starts, goals])):
+            if roadmap is None:
+                found = search.solve(starts, goals, left, seed + _NEXT_SEED * attempt)
+            else:
+                found = roadmap.solve(checker, starts, goals, left, seed + _NEXT_SEED * attempt)
+        iterations += found.iterations
+        if not found.found:
+            return Connected(found.points.astype(float), explain_failure(found, seconds), iterations)
+        # Parts of a shortcut that just passes would not be certain by themselves.
+        with checker.widened(_WIDER / 2, np.vstack([starts, goals])):
+            points = search.shorten(found.points, seconds - (perf_counter() - begin), seed, _SHORTCUTS)
+        certain = _repair(search, checker, points, begin + seconds, seed)
+        if certain is not None:
+            return Connected(certain.astype(float), "", iterations)
     problem = (
         "A path was found whose samples are free, but something thin lies between two of them, and no way around "
         "it was found in the time given. More seconds=, or another seed=, may find one."
     )
-    return Connected(points.astype(float), problem, found.iterations)
+    return Connected(points.astype(float), problem, iterations)
+
+
+def _repair(
+    search: RrtConnect, checker: CollisionChecker, points: Floats32, end: float, seed: int
+) -> Floats32 | None:
+    """Return a path that is certainly free: edges that are not are planned anew, with more samples."""
+    resolution = RESOLUTION
+    for _ in range(_REPAIRS):
+        collision = checker.find_collision(points)
+        if collision is None:
+            return points
+        k, _fraction = collision
+        resolution = min(_FINER * resolution, _FINEST)
+        left = end - perf_counter()
+        detour = search.solve(points[k : k + 1], points[k + 1 : k + 2], left, seed, resolution)
+        if not detour.found:
+            return None
+        points = np.ascontiguousarray(np.vstack([points[:k], detour.points, points[k + 2 :]]))
+    return None
 
 
 def connect_on_manifold(
@@ -119,7 +137,7 @@ def connect_on_manifold(
         if attempt and left <= 0.0:
             break
         with checker.widened(_WIDER, np.vstack([starts, goals])):
-            found = search.solve(starts, goals, left, seed + 7919 * attempt, resolution)
+            found = search.solve(starts, goals, left, seed + _NEXT_SEED * attempt, resolution)
         iterations += found.iterations
         if not found.found:
             return Connected(
@@ -142,7 +160,8 @@ def explain_failure(found: SearchResult, seconds: float) -> str:
     """Return why a search has found no path, and how far it has come."""
     own, other = found.nodes
     reached = f"{own} configurations were reached from the start and {other} from the goals"
-    enclosed = [name for name, count in zip(("the start", "the goal"), found.nodes, strict=True) if count < 8]
+    names = ("the start", "the goal") if found.iterations >= _TELLING else ()
+    enclosed = [name for name, count in zip(names, found.nodes, strict=False) if count < 8]
     hint = f" It seems that {' and '.join(enclosed)} cannot be left." if enclosed else ""
     if found.status == TIME_IS_UP:
         return (

@@ -122,7 +122,7 @@ class Endpoints:
     def _beyond_limits(self, q: Array) -> str:
         lower, upper = self._space.lower, self._space.upper
         wrong = [
-            f"'{s}' is {value:.4g}, and its range is {low:.4g} to {high:.4g}"
+            f"'{s}' is {value:.6g}, and its range is {low:.6g} to {high:.6g}"
             for s, value, low, high in zip(self._space.symbols, q, lower, upper, strict=True)
             if not low - _LIMIT <= value <= high + _LIMIT
         ]

@@ -36,7 +36,7 @@ _DAMPING = 1e-5
 _ROWS = ("x", "y", "z", "rx", "ry", "rz")
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True, eq=False, repr=False)
 class FrameHold(Hold):
     """Hold of two frames of a model by each other, see :meth:`.Planner.hold`.
 
@@ -140,6 +140,7 @@ class Manifold:
         self._exact = VectorProgram(outputs, (*symbols, *free), self.parameters, scalar="double")
         self._kept = self._program.prepare(np.zeros(len(self.parameters)))
         self._values = np.zeros(len(self.parameters))
+        self.targets = hold_targets(holds)
         self.struct = ProjectionStruct(
             self._program.compute_address, self._kept.ctypes.data, self._program.stored, TOLERANCE, _STEPS
         )
@@ -159,22 +160,18 @@ class Manifold:
         """Address of :attr:`struct`, valid as long as this object."""
         return ctypes.addressof(self.struct)
 
-    def place(self, state: State, holds: Sequence[Hold]) -> None:
+    def place(self, state: State, targets: Array) -> None:
         """Set the values of everything that the holds depend on beside the coordinates.
 
         Parameters
         ----------
         state
             The state.
-        holds
-            The holds, or others that differ by their targets.
+        targets
+            Numbers that holds have as targets, see :func:`hold_targets`.
         """
-        targets = [
-            np.broadcast_to(as_expression(hold.target)({}), hold.expression.shape).ravel()
-            for hold in holds
-            if not as_expression(hold.target).symbols
-        ]
-        self._values = np.concatenate([state.vector(self._others), *targets])
+        self.targets = targets
+        self._values = np.concatenate([state.vector(self._others), targets])
         self._kept = self._program.prepare(self._values)
         self.struct.kept = self._kept.ctypes.data
 
@@ -205,6 +202,16 @@ class Manifold:
         points = np.asarray(Q, dtype=float)
         found = self._exact.evaluate(np.hstack([points, np.ones_like(points)]), self._values)[1]
         return np.asarray(found)
+
+
+def hold_targets(holds: Sequence[Hold]) -> Array:
+    """Return the numbers that holds have as targets, of all holds one after the other."""
+    found = [
+        np.broadcast_to(as_expression(hold.target)({}), hold.expression.shape).ravel()
+        for hold in holds
+        if not as_expression(hold.target).symbols
+    ]
+    return np.concatenate([np.zeros(0), *found])
 
 
 def manifold_key(holds: Sequence[Hold]) -> tuple[object, ...]:

@@ -2,15 +2,26 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+import os
+from collections.abc import Iterator
 from dataclasses import dataclass, field
 from functools import cached_property
 
 import numpy as np
+import numpy.typing as npt
 
+from kineverse.errors import InvalidValueError
 from kineverse.lie import Array
 from kineverse.state import State
 from kineverse.symbols import Symbol
+
+from .path_checks import PathChecks
+from .path_rounding import parameterize_path, passing_times
+from .trajectories import BlendedPath, MotionLimits, Trajectory, motion_limits
+from .trajectories.motion_limits import RAMP
+
+DEVIATION = 0.1
+"""Largest distance of a trajectory from the corners of its path, where nothing is in the way [rad], [m]."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -24,8 +35,8 @@ class Path:
     symbols
         The n coordinates, the columns of :attr:`points`.
     points
-        Configurations (N, n) that are joined by straight lines [m], [rad]. Without a way they are the best partial
-        path: from the start to the point of the search that is nearest to a goal.
+        Configurations (N, n) that are joined by straight lines [m], [rad]. Without a way they are the best
+        partial path: from the start to the point of the search that is nearest to a goal.
     why
         How the path was found, or why there is none.
     seconds
@@ -48,7 +59,7 @@ class Path:
     search_seconds: float
     iterations: int
     state: State
-    measure: Callable[[Array], float] = field(repr=False)
+    checks: PathChecks = field(repr=False)
     modes: tuple[tuple[str, int, int], ...] = ()
 
     @property
@@ -57,15 +68,98 @@ class Path:
         return float(np.linalg.norm(np.diff(self.points, axis=0), axis=1).sum())
 
     def clearance(self) -> float:
-        """Return the least signed distance of bodies along the path by the scene [m], sampled 32 times a unit.
+        """Return the least signed distance of bodies along the path by the scene [m].
 
-        Infinite if no pair is within .5 m.
+        It is sampled 32 times a unit. Infinite if no pair is within .5 m.
         """
         return self._clearance
 
     @cached_property
     def _clearance(self) -> float:
-        return self.measure(self.points)
+        return self.checks.clearance(self.points)
+
+    def trajectory(
+        self,
+        *,
+        deviation: npt.ArrayLike = DEVIATION,
+        ramp: float = RAMP,
+        velocity: npt.ArrayLike | None = None,
+        acceleration: npt.ArrayLike | None = None,
+    ) -> Trajectory:
+        """Return the fastest motion along the path, from rest to rest.
+
+        Corners are rounded as far as the way stays free, by the same certificate as the path; where it does
+        not, the motion stops. Holds are met up to 1e-5 m or rad.
+
+        Parameters
+        ----------
+        deviation
+            Largest distance from the corners, in the norm of the coordinates [rad], [m]: a number, or one for
+            each point (N,); 0 to stop at all of them.
+        ramp
+            Time from rest to full speed [s] where the model states no acceleration, see
+            :func:`.motion_limits`.
+        velocity, acceleration
+            Largest speeds and accelerations (n,), or numbers for all coordinates; None for those of the
+            model.
+
+        Raises
+        ------
+        InvalidValueError
+            If the path was not found, or the model has been edited since; as :func:`.time_parameterize`.
+        ShapeError
+            For limits or deviations of another shape.
+        """
+        return self._parameterize(deviation, ramp, velocity, acceleration)[1]
+
+    @property
+    def times(self) -> Array:
+        """Times (N,) at which :meth:`trajectory` passes the points, or is nearest to them [s].
+
+        Raises
+        ------
+        InvalidValueError
+            As :meth:`trajectory`.
+        """
+        return self._times
+
+    @cached_property
+    def _times(self) -> Array:
+        found = passing_times(self.points, *self._parameterize(DEVIATION, RAMP, None, None))
+        found.flags.writeable = False
+        return found
+
+    def _parameterize(
+        self,
+        deviation: npt.ArrayLike,
+        ramp: float,
+        velocity: npt.ArrayLike | None,
+        acceleration: npt.ArrayLike | None,
+    ) -> tuple[BlendedPath, Trajectory]:
+        if not self.found:
+            raise InvalidValueError(f"There is no path to move along. {self.why}")
+        self.checks.ensure_current()
+        stated = motion_limits(self.checks.model, self.symbols, ramp=ramp, state=self.state)
+        given = (velocity, acceleration)
+        limits = MotionLimits(
+            *(
+                own if other is None else np.asarray(other, dtype=float)
+                for own, other in zip(stated, given, strict=True)
+            )
+        )
+        return parameterize_path(self.points, self.symbols, limits, deviation, self.checks)
+
+    def save(self, path: str | os.PathLike[str]) -> None:
+        """Write the :meth:`trajectory` to a JSON file, see :meth:`.Trajectory.save`.
+
+        Raises
+        ------
+        InvalidValueError
+            As :meth:`trajectory`.
+        FormatError
+            If the file cannot be written.
+        """
+        self.trajectory().save(path)
 
     def at(self, fraction: float) -> State:
         """Return the state at a fraction of the length, from 0 at the start to 1 at the end."""

@@ -12,7 +12,7 @@ from typing import Any, TypeAlias
 import numpy as np
 import numpy.typing as npt
 
-from kineverse._checks import as_count, as_tolerance, real_number
+from kineverse._checks import as_count, as_tolerance
 from kineverse.control.tasks import Goal, Hold
 from kineverse.errors import InvalidValueError, NoSolutionError, ShapeError
 from kineverse.expressions.expression import ExpressionLike
@@ -28,14 +28,16 @@ from kineverse.model.sampling import StateSamples
 from kineverse.state import State, StateLike, as_state
 from kineverse.symbols import Symbol
 
-from .checker import RESOLUTION, BodyPairs, CollisionChecker
+from .bindings import planning_functions
+from .checker import BodyPairs, CollisionChecker
 from .configuration import PlanningSpace
 from .connection import connect, connect_on_manifold
 from .endpoints import Endpoint, Endpoints
 from .judge import SceneJudge, describe_contacts
-from .manifold import FrameHold, Manifold, hold_frames, manifold_key
+from .manifold import FrameHold, Manifold, hold_frames, hold_targets, manifold_key
 from .modes import Mode, ModeSearch
 from .path import Path
+from .path_checks import PathChecks
 from .roadmap import Roadmap
 from .search import MOST_EDGES
 from .solutions import MOST_BATCHES, find_solutions
@@ -106,6 +108,7 @@ class Planner:
         leave_out: Iterable[Exclusion] = (),
         protrusion: float | None = None,
     ) -> None:
+        planning_functions()  # says at once that there is no compiler
         self.model = model
         self.margin = as_tolerance(margin, "The margin")
         self._move = move if move is None or isinstance(move, Symbol | str) else tuple(move)
@@ -124,6 +127,10 @@ class Planner:
         model = self.model
         self.space = space = PlanningSpace(model, self._move)
         scene = Scene(model, rules=self._rules, **self._options)
+        if not scene.bodies:
+            raise InvalidValueError(
+                "No body of the model has a shape, so nothing can collide: add collision or visual shapes."
+            )
         self.excluded = self._find_overlapping(scene)
         if self.excluded:
             scene = Scene(model, rules=(*self._rules, *self.excluded), **self._options)
@@ -220,6 +227,11 @@ class Planner:
         self.space.turning[:] = self.checker.find_periodic(self._candidates)
         self._set_bounds(self._here, self._here[None])
 
+    def _replace(self) -> None:
+        """Place the checker again where everything stands."""
+        assert self._state is not None
+        self.checker.place(self._state)
+
     @property
     def _here(self) -> Array:
         assert self._state is not None
@@ -260,6 +272,15 @@ class Planner:
             raise ShapeError(f"A and B have the shapes {starts.shape} and {ends.shape}, which differ.")
         return self.checker.edges(starts.astype(np.float32), ends.astype(np.float32))
 
+    def _start(self, start: Any) -> Array:
+        """Return a start (n,) from a vector or a state."""
+        found = self._configurations(start, "start")
+        if len(found) > 1:
+            raise ShapeError(
+                f"start has {len(found)} configurations; there is one start. Goals may be several."
+            )
+        return np.asarray(found[0])
+
     def _configurations(self, Q: Any, name: str) -> Array:
         """Return configurations (N, n) from one or several vectors or states."""
         n = len(self.space.symbols)
@@ -267,15 +288,13 @@ class Planner:
             return self._whole(Q).vector(self.space.symbols)[None]
         if isinstance(Q, Sequence) and len(Q) and isinstance(Q[0], dict | State):
             return np.array([self._whole(q).vector(self.space.symbols) for q in Q])
+        wanted = f"wanted are configurations of {n} coordinates, in the order of planner.symbols, or states"
         try:
             points = np.atleast_2d(np.asarray(Q, dtype=float))
         except (TypeError, ValueError):
-            raise InvalidValueError(f"{name} is a configuration, several, or states, not {Q!r}.") from None
+            raise InvalidValueError(f"{name} is {Q!r:.80}; {wanted}.") from None
         if points.ndim != 2 or points.shape[1] != n:
-            raise ShapeError(
-                f"{name} has shape {np.shape(Q)}; wanted are configurations of {n} coordinates, in the order of "
-                "planner.symbols, or states."
-            )
+            raise ShapeError(f"{name} has shape {np.shape(Q)}; {wanted}.")
         if not np.isfinite(points).all():
             raise InvalidValueError(f"{name} has values that are not finite.")
         if len(points) and np.abs(points).max() > _LARGEST:
@@ -355,7 +374,7 @@ class Planner:
             self._manifolds[key] = Manifold(self.checker, self.model, holds, self.space.equalities)
         manifold = self._manifolds[key]
         assert self._state is not None
-        manifold.place(self._state, holds)
+        manifold.place(self._state, hold_targets(holds))
         return manifold
 
     def _touching(self, holds: Iterable[Hold]) -> BodyPairs:
@@ -416,10 +435,10 @@ class Planner:
         """
         self._synchronize()
         begin = perf_counter()
-        seconds, seed = max(real_number(seconds), 0.0), as_count("seed", seed, 0)
+        seconds, seed = as_tolerance(seconds, "seconds="), as_count("seed", seed, 0)
         holds = as_holds(along)
         roadmap = self._choose_roadmap(method, holds)
-        q = self._here if start is None else self._configurations(start, "start")[0]
+        q = self._here if start is None else self._start(start)
         tasks = () if not _are_tasks(goals) else as_holds(goals)
         touching = self._touching([*holds, *tasks])
         if modes is not None:
@@ -564,7 +583,8 @@ class Planner:
         shift = variant - goal.inner
         whole = np.vstack([first.way[:-1], points, (goal.way[::-1] + shift)[1:]])
         why = f"Found after {found.iterations} samples{'' if roadmap is None else roadmap.describe()}."
-        return self._path(True, whole, why, begin, spent, found.iterations, touching), None
+        path = self._path(True, whole, why, begin, spent, found.iterations, touching, manifold)
+        return path, None
 
     def _judge(self, touching: BodyPairs = frozenset()) -> SceneJudge:
         """Return the judge of the scene in which some pairs may touch, at the present place."""
@@ -599,16 +619,13 @@ class Planner:
         spent: float,
         iterations: int,
         touching: BodyPairs = frozenset(),
+        manifold: Manifold | None = None,
     ) -> Path:
         state, judge = self._state, self._judge(touching)
         assert state is not None
-
-        def measure(points: Array) -> float:
-            judge.place(state)
-            return judge.clearance(points, 1 / RESOLUTION)
-
+        checks = PathChecks(self.model, state, self.checker, judge, manifold, touching, self._replace)
         seconds = perf_counter() - begin
-        return Path(found, self.space.symbols, points, why, seconds, spent, iterations, state, measure)
+        return Path(found, self.space.symbols, points, why, seconds, spent, iterations, state, checks)
 
     def __repr__(self) -> str:
         return f"<Planner: {len(self.symbols)} coordinates, {len(self.checker.moving)} bodies that move>"

@@ -26,13 +26,18 @@ def draw_cover(frame: str, cover: SphereCover, frame_T_solid: Floats) -> Drawabl
     frame_T_solid
         (4, 4) pose of the covered solid in the frame [m].
     """
+    surface = build_spheres(cover.centres, cover.radii).transform(frame_T_solid)
+    return Drawable(frame, surface, SPHERES, "collision")
+
+
+def build_spheres(centres: Floats, radii: Floats) -> TriangleMesh:
+    """Return the surfaces of spheres with centres (N, 3) and radii (N,) [m]."""
     unit = mesh_geometry(Sphere(1.0))
-    count, size = len(cover), len(unit.vertices)
-    vertices = cover.centres[:, None] + cover.radii[:, None, None] * unit.vertices
-    surface = TriangleMesh(
+    count, size = len(centres), len(unit.vertices)
+    vertices = centres[:, None] + radii[:, None, None] * unit.vertices
+    return TriangleMesh(
         vertices.reshape(-1, 3),
         (unit.faces + size * np.arange(count)[:, None, None]).reshape(-1, 3),
         np.tile(unit.normals, (count, 1)),
         closed=True,
     )
-    return Drawable(frame, surface.transform(frame_T_solid), SPHERES, "collision")

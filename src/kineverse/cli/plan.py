@@ -1,0 +1,409 @@
+"""``kineverse plan``: a path without collisions."""
+
+from __future__ import annotations
+
+import argparse
+import json
+import math
+import sys
+from dataclasses import dataclass
+from time import perf_counter
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from kineverse.cli.arguments import add_model_options, load_model, parse_length
+from kineverse.cli.output import format_table, show_activity
+from kineverse.cli.plan_arguments import (
+    FrameTarget,
+    Request,
+    choose_coordinates,
+    make_grip,
+    make_hold,
+    parse_frame_target,
+    parse_request,
+    parse_robot,
+    place_base,
+)
+from kineverse.cli.view import (
+    add_page_options,
+    handle_interrupts,
+    list_mesh_problems,
+    page_options,
+    print_address,
+    print_mesh_problems,
+)
+from kineverse.errors import InvalidValueError
+from kineverse.expressions.printing import format_number
+
+if TYPE_CHECKING:
+    import kineverse as kv
+    from kineverse.control import Hold
+    from kineverse.planning import Path, Planner
+
+HELP = """find a path without collisions
+
+A goal is values of coordinates (NAME=VALUE), poses of frames, or a state of an SRDF. FRAME@FRAME brings a
+frame to another one, in all directions or some (FRAME@FRAME:xyz, :xyz,rx,ry), FRAME@FRAME+X,Y,Z to a place
+beside it, FRAME@X,Y,Z to a position in the world; ROLL,PITCH,YAW may follow. A start is the same, or a file
+of values (the JSON of kineverse reach); what it does not say stands as in the default state.
+
+What is named moves, and what the frames before @ depend on, but no base that is placed; --move says it
+otherwise. --along A@B holds frame A in B as it is at the start, such as a hand at a handle: NAME=VALUE is
+reached with the hold kept, and bodies of both frames may touch.
+
+The first plan of a robot takes a while: its shapes are covered by spheres, and code is compiled. Both are
+kept. This needs a C compiler and the extra 'geometry'. The exit status is 1 if no path was found.
+
+examples:
+  kineverse plan shelf_door --to shelf_door/door=80deg
+  kineverse plan fetch --to fetch/gripper_link@0.6,0.2,0.9 --picture plan.png
+  kineverse plan kitchen --robot fetch@0.45,0.7,90deg --to fetch/gripper_link@1,1.35,1.1
+  kineverse plan pr2 --from pr2/r_elbow_flex_joint=-1 --to pr2/r_elbow_flex_joint=-2 --save path.json"""
+
+FOUND, NOT_FOUND = 0, 1
+_MOST_STARTS = 8
+_GOALS = 32
+_COLUMNS = 6
+_GHOSTS = 4
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """Declare the options."""
+    # Options that take several words come last, or they would take MODEL as well.
+    parser.usage = "%(prog)s MODEL --to (NAME=VALUE | FRAME@POSE | STATE) ... [options]"
+    parser.add_argument("model", metavar="MODEL", help="name of a shipped model, or path of a file")
+    parser.add_argument(
+        "--to",
+        nargs="+",
+        action="extend",
+        required=True,
+        metavar="GOAL",
+        help="values (door=30deg), a pose of a frame (hand@handle, hand@0.7,0,1) or a state of the SRDF",
+    )
+    parser.add_argument(
+        "--from",
+        nargs="+",
+        action="extend",
+        default=[],
+        metavar="START",
+        dest="start",
+        help="the same, or a JSON file of values; the default state",
+    )
+    parser.add_argument(
+        "--robot",
+        metavar="ROBOT[@X,Y,ANGLE]",
+        help="a robot that is put into the model, by name or file, and the place of its base",
+    )
+    parser.add_argument(
+        "--move",
+        nargs="+",
+        action="extend",
+        default=[],
+        metavar="NAME",
+        help="coordinates, articulations or patterns ('fetch/*') that move",
+    )
+    parser.add_argument(
+        "--along",
+        nargs="+",
+        action="extend",
+        default=[],
+        metavar="A@B[:MASK]",
+        help="holds all along the path",
+    )
+    parser.add_argument(
+        "--srdf", metavar="FILE", help="SRDF of the robot: pairs that are not checked, states"
+    )
+    parser.add_argument("--margin", metavar="M", default="0", help="least distance from everything (1cm); 0")
+    parser.add_argument(
+        "--seconds", type=float, default=5.0, metavar="S", help="largest time of the search (5)"
+    )
+    parser.add_argument("--seed", type=int, default=0, metavar="N", help="seed of the search (0)")
+    parser.add_argument("--save", metavar="FILE", help="write the trajectory to a file (.json)")
+    parser.add_argument("--picture", metavar="FILE", help="write a picture (.png) of the motion")
+    parser.add_argument("--view", action="store_true", help="play the trajectory in the browser")
+    parser.add_argument("--json", action="store_true", help="one JSON object on standard output")
+    parser.add_argument(
+        "--verbose", action="store_true", default=argparse.SUPPRESS, help="print the positions on the way"
+    )
+    add_model_options(parser)
+    add_page_options(parser)
+
+
+@dataclass(frozen=True)
+class _Problem:
+    """Planning problem.
+
+    Attributes
+    ----------
+    model
+        The model.
+    planner
+        The planner, placed at the start.
+    state
+        State at the start, but for what ``--from`` says of frames.
+    start, goal
+        What the options say.
+    holds
+        Targets of ``--along``.
+    start_tasks, goal_tasks
+        Poses of frames at both ends.
+    grips
+        Holds along the path; None for those that depend on the start.
+    """
+
+    model: kv.Model
+    planner: Planner
+    state: kv.State
+    start: Request
+    goal: Request
+    holds: list[FrameTarget]
+    start_tasks: list[Hold]
+    goal_tasks: list[Hold]
+    grips: list[Hold | None]
+
+
+def run(arguments: argparse.Namespace) -> int:
+    """Plan the path, print it, show it if wanted, and return the status."""
+    # Parsed before the model is loaded, so that a typing error is reported at once.
+    start = parse_request(arguments.start, "--from", read_files=True)
+    goal = parse_request(arguments.to, "--to")
+    holds = [parse_frame_target(word, "--along") for word in arguments.along]
+    margin = parse_length(arguments.margin)
+    if arguments.picture is not None:
+        from kineverse.view.pictures import check_png_name
+
+        check_png_name(arguments.picture)
+    if not arguments.seconds > 0 or math.isinf(arguments.seconds):
+        raise InvalidValueError(f"--seconds is a positive number, not {arguments.seconds:g}.")
+
+    from kineverse.planning.bindings import planning_functions
+
+    with show_activity("compiling the planner"):
+        planning_functions()  # says at once that there is no compiler
+    begin = perf_counter()
+    problem = _prepare(arguments, start, goal, holds, margin)
+    path = _plan(problem, arguments.seconds, arguments.seed)
+    trajectory = path.trajectory() if path.found else None
+    preparation = perf_counter() - begin - path.seconds
+    if arguments.save is not None and trajectory is not None:
+        trajectory.save(arguments.save)
+    if arguments.json:
+        print(json.dumps(_to_json(path, preparation), allow_nan=False))
+    else:
+        _print_path(arguments, path, preparation)
+    if arguments.picture is not None:
+        _write_picture(arguments.picture, problem, path)
+    if arguments.view:
+        _view(arguments, problem, path)
+    return FOUND if path.found else NOT_FOUND
+
+
+def _prepare(
+    arguments: argparse.Namespace, start: Request, goal: Request, holds: list[FrameTarget], margin: float
+) -> _Problem:
+    """Load the model and build the planner."""
+    from kineverse.formats import read_srdf
+    from kineverse.geometry import Rule
+    from kineverse.planning import Planner
+
+    with show_activity(f"reading {arguments.model}"):
+        model = load_model(arguments, arguments.model)
+        standing: dict[kv.Symbol, float] = {}
+        robot = next(iter(model.frames), "").partition("/")[0]
+        if arguments.robot is not None:
+            source, place = parse_robot(arguments.robot)
+            before = {*model.articulations}
+            names = model.include(source, root=arguments.root, strict=arguments.strict, loops=arguments.loops)
+            standing = place_base(model, [a for a in model.articulations if a not in before], place)
+            robot = next((n.partition(" ")[2].partition("/")[0] for n in names if "/" in n), "")
+    srdf = None if arguments.srdf is None else read_srdf(arguments.srdf, model, _srdf_prefix(model, robot))
+    for line in () if srdf is None else srdf.warnings[:3]:
+        print(f"kineverse: note: {arguments.srdf}: {line}", file=sys.stderr)
+    states = {} if srdf is None else srdf.states
+    start.resolve(states, "--from")
+    goal.resolve(states, "--to")
+    for name in (*start.values, *goal.values):
+        model.symbol(name)  # raises for unknown names, with similar ones
+    move: Any = arguments.move
+    if not move:
+        targets = [*goal.targets, *start.targets]
+        move = choose_coordinates(model, goal.values, targets, holds, standing)
+    rules = [] if srdf is None else [Rule(*rule) for rule in srdf.rules]
+    # Made before the planner, so that mistakes are reported at once.
+    start_tasks = [make_hold(model, target) for target in start.targets]
+    goal_tasks = [make_hold(model, target) for target in goal.targets]
+    grips = [make_grip(model, target, start.targets, None) for target in holds]
+    with show_activity("covering shapes by spheres and compiling; this is kept for the next time"):
+        planner = Planner(model, move, rules=rules, margin=margin)
+    moving = {*planner.symbols}
+    bare = [b for b in model.bodies if b not in planner.scene.bodies and moving & {*model.symbols_of(b)}]
+    if bare:
+        print(f"kineverse: note: without shapes, and not checked: {', '.join(bare[:6])}", file=sys.stderr)
+    still = [name for name in goal.values if model.symbol(name) not in planner.symbols]
+    if still:
+        raise InvalidValueError(f"--to says where '{still[0]}' goes, and --move does not say that it moves.")
+    state = model.default_state().updated(standing).updated(start.values)
+    planner.place(state)
+    return _Problem(model, planner, state, start, goal, holds, start_tasks, goal_tasks, grips)
+
+
+def _srdf_prefix(model: kv.Model, robot: str) -> str:
+    """Return the prefix of a robot's names; empty if the model's names have none."""
+    return robot if any(name.startswith(f"{robot}/") for name in model.frames) else ""
+
+
+def _plan(problem: _Problem, seconds: float, seed: int) -> Path:
+    """Return the path from the first of some starts from which there is one."""
+    from kineverse.control import Hold
+
+    planner, start, goal = problem.planner, problem.start, problem.goal
+    symbol = problem.model.symbol
+    starts: list[Any] = [None]
+    if start.targets:
+        fixed = [Hold(symbol(n), v, name=n) for n, v in start.values.items() if symbol(n) in planner.symbols]
+        with show_activity("looking for a start"):
+            starts = list(
+                planner.solutions([*problem.start_tasks, *fixed], _MOST_STARTS, seconds=seconds, seed=seed)
+            )
+        if not starts:
+            raise InvalidValueError(
+                f"--from {start.targets[0].frame}@{start.targets[0].target}: no configuration without "
+                "collision was found there. Out of reach, or always in contact? 'kineverse reach' says which."
+            )
+    standing = [_state(problem, q) for q in starts]
+    # Holds as they are at a start are others at the next one.
+    if None in problem.grips:
+        del standing[1:]
+    along = [
+        hold or make_grip(problem.model, given, start.targets, standing[0])
+        for hold, given in zip(problem.grips, problem.holds, strict=True)
+    ]
+    tasks = list(problem.goal_tasks)
+    if tasks or along:
+        tasks += [Hold(symbol(n), v, name=n) for n, v in goal.values.items()]
+    for state in standing:
+        goals: Any = tasks or state.updated(goal.values)
+        with show_activity("planning"):
+            path = planner.plan(
+                state,
+                goals,
+                along=[hold for hold in along if hold],
+                seconds=seconds / len(standing),
+                seed=seed,
+            )
+        if path.found:
+            break
+    return path
+
+
+def _state(problem: _Problem, q: Any) -> kv.State:
+    """Return the state at a start (n,), or where everything stands if that is None."""
+    if q is None:
+        return problem.state
+    return problem.state.updated(dict(zip(problem.planner.symbols, q.tolist(), strict=True)))
+
+
+def _print_path(arguments: argparse.Namespace, path: Path, preparation: float) -> None:
+    """Print what was found."""
+    goal = " ".join(arguments.to)
+    if not path.found:
+        print(f"{goal}: not found. {path.why}")
+        return
+    clearance = path.clearance()
+    near = "nothing within 50 cm" if math.isinf(clearance) else f"{format_number(1e3 * clearance, 4)} mm"
+    print(f"{goal}: found")
+    for name, value in (
+        ("points", str(len(path))),
+        ("length", f"{format_number(path.length, 4)} (rad, m)"),
+        ("duration", f"{format_number(float(path.times[-1]), 4)} s"),
+        ("clearance", near),
+        ("planned", _format_time(path.seconds)),
+        ("prepared", _format_time(preparation)),
+    ):
+        print(f"  {name:<9}  {value}")
+    if arguments.verbose:
+        print(_format_way(path))
+    if arguments.save is not None:
+        print(f"trajectory: {arguments.save}")
+
+
+def _format_time(seconds: float) -> str:
+    return f"{format_number(1e3 * seconds, 3)} ms" if seconds < 1 else f"{format_number(seconds, 3)} s"
+
+
+def _format_way(path: Path) -> str:
+    """Return a table of the positions at some points of a path."""
+    chosen = np.unique(np.linspace(0, len(path) - 1, _COLUMNS).round().astype(int))
+    head = ["time [s]", *(format_number(float(t), 3) for t in path.times[chosen])]
+    rows = [
+        [str(symbol), *(format_number(float(v), 4) for v in column[chosen])]
+        for symbol, column in zip(path.symbols, path.points.T, strict=True)
+    ]
+    return format_table(head, rows, "<" + ">" * len(chosen))
+
+
+def _to_json(path: Path, preparation: float) -> dict[str, Any]:
+    """Return a path as plain data."""
+    clearance = path.clearance() if path.found else math.inf
+    return {
+        "found": path.found,
+        "why": path.why,
+        "coordinates": [str(symbol) for symbol in path.symbols],
+        "points": path.points.tolist(),
+        "times": path.times.tolist() if path.found else None,
+        "length": path.length,
+        "clearance": clearance if math.isfinite(clearance) else None,
+        "seconds": path.seconds,
+        "preparation_seconds": preparation,
+        # The end, as 'kineverse reach' writes it: --from takes the file.
+        "positions": dict(zip(map(str, path.symbols), path.points[-1].tolist(), strict=True)),
+    }
+
+
+def _moved_frame(problem: _Problem) -> str:
+    """Return the frame that is asked for, else the body that depends on most coordinates."""
+    for target in (*problem.goal.targets, *problem.holds):
+        return target.frame
+    model = problem.model
+    moving = {*problem.planner.symbols}
+    return max(problem.planner.checker.moving, key=lambda body: len(moving & {*model.symbols_of(body)}))
+
+
+def _trace(problem: _Problem, path: Path) -> Any:
+    """Return the way of the moved frame as a drawable."""
+    from kineverse.view.motion_drawables import draw_frame_path
+
+    states = [path.at(fraction) for fraction in np.linspace(0.0, 1.0, 60)]
+    return draw_frame_path(problem.model, _moved_frame(problem), states)
+
+
+def _write_picture(file: str, problem: _Problem, path: Path) -> None:
+    """Write a picture of some configurations on the way."""
+    from kineverse.view import save_picture
+    from kineverse.view.motion_drawables import draw_ghosts
+
+    model, planner = problem.model, problem.planner
+    overlay = [_trace(problem, path)]
+    if len(path) > 1:
+        states = [path.at(k / _GHOSTS) for k in range(_GHOSTS)]
+        overlay += draw_ghosts(model, planner.checker.moving, states)
+    save_picture(file, model, path.at(1.0), overlay=overlay)
+    print_mesh_problems(list_mesh_problems(model))
+    print(f"picture: {file}", file=sys.stderr)
+
+
+def _view(arguments: argparse.Namespace, problem: _Problem, path: Path) -> None:
+    """Play the path in the browser; without one, show how far the search came."""
+    from kineverse.view.title import read_title
+    from kineverse.view.viewer import Viewer
+
+    label, model = read_title(arguments.model), problem.model
+    state = path.at(0.0 if path.found else 1.0)
+    with handle_interrupts(), Viewer(model, state, label=label, **page_options(arguments)) as page:
+        page.show_overlay([_trace(problem, path)])
+        print_mesh_problems(page.problems)
+        print_address(page, browser=not arguments.no_browser)
+        if path.found:
+            page.play(path.trajectory(), loop=True)
+        page.wait()

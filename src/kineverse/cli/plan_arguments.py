@@ -1,0 +1,277 @@
+"""Starts, goals, holds and robots of ``kineverse plan``, as they are written on the command line."""
+
+from __future__ import annotations
+
+import json
+import math
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from kineverse.cli.arguments import parse_assignments, parse_value
+from kineverse.errors import FormatError, InvalidValueError, UnknownNameError, suggest
+
+if TYPE_CHECKING:
+    import kineverse as kv
+    from kineverse.control import Hold
+
+_ALL = "xyz rx ry rz"
+_BASE = ("x", "y", "angle")
+
+
+@dataclass(frozen=True)
+class FrameTarget:
+    """Wanted pose of a frame: ``A@B``, ``A@B+X,Y,Z`` or ``A@X,Y,Z``, with or without ``:MASK``.
+
+    Attributes
+    ----------
+    frame
+        The frame.
+    target
+        The other frame; the world for numbers.
+    numbers
+        Position, or position and roll, pitch, yaw, in the other frame [m], [rad]; empty for its own pose.
+    mask
+        Directions, see :meth:`.Planner.hold`.
+    """
+
+    frame: str
+    target: str
+    numbers: tuple[float, ...]
+    mask: str
+
+    @property
+    def directions(self) -> set[str]:
+        """The directions of the mask, one by one."""
+        return {r for part in self.mask.split() for r in ([part] if part.startswith("r") else part)}
+
+
+@dataclass
+class Request:
+    """Words of an option: values by name, frames with their targets, names of states.
+
+    Attributes
+    ----------
+    values
+        Values of coordinates by name [m], [rad].
+    targets
+        Poses of frames.
+    names
+        Other words, which name states of the SRDF.
+    """
+
+    values: dict[str, float] = field(default_factory=dict)
+    targets: list[FrameTarget] = field(default_factory=list)
+    names: list[str] = field(default_factory=list)
+
+    def resolve(self, states: Mapping[str, Mapping[str, float]], option: str) -> None:
+        """Replace names by the values of these states; values that are given win.
+
+        Raises
+        ------
+        UnknownNameError
+            For a name that is no state.
+        """
+        for name in self.names:
+            if name not in states:
+                hint = suggest(name, states, "state") if states else "Names of states need --srdf."
+                raise UnknownNameError(
+                    f"{option} {name}: write NAME=VALUE, FRAME@FRAME, FRAME@X,Y,Z or a state of the SRDF. "
+                    f"{hint}"
+                )
+            self.values = {**states[name], **self.values}
+
+
+def parse_request(words: Iterable[str], option: str, read_files: bool = False) -> Request:
+    """Return what the words of an option ask for.
+
+    Parameters
+    ----------
+    words
+        The words.
+    option
+        Name of the option, for messages.
+    read_files
+        True to take names that end with ``.json`` for files of values.
+
+    Raises
+    ------
+    KineverseError
+        For a word that cannot be read.
+    """
+    found, assignments = Request(), []
+    for word in words:
+        if "=" in word:
+            assignments.append(word)
+        elif "@" in word:
+            found.targets.append(parse_frame_target(word, option))
+        elif read_files and word.endswith(".json"):
+            found.values |= _read_values(word)
+        else:
+            found.names.append(word)
+    found.values |= parse_assignments(assignments, option)
+    return found
+
+
+def parse_frame_target(word: str, option: str) -> FrameTarget:
+    """Return the pose of a frame from ``A@B``, ``A@B+X,Y,Z`` or ``A@X,Y,Z``, see :class:`FrameTarget`.
+
+    Raises
+    ------
+    InvalidValueError
+        For another text.
+    """
+    frame, _, rest = word.partition("@")
+    where, _, mask = rest.partition(":")
+    mask = mask.replace(",", " ")
+    target, plus, offset = where.partition("+")
+    if not plus and "," in where:
+        target, offset = "world", where
+    parts = offset.split(",") if offset else []
+    if not frame or not target or len(parts) not in (0, 3, 6) or (plus and not parts):
+        raise InvalidValueError(
+            f"{option} {word}: write FRAME@FRAME, FRAME@FRAME+X,Y,Z or FRAME@X,Y,Z, where ROLL,PITCH,YAW may "
+            "follow X,Y,Z."
+        )
+    position_only = len(parts) == 3 and not plus
+    numbers = tuple(parse_value(part) for part in parts)
+    return FrameTarget(frame, target, numbers, mask or ("xyz" if position_only else _ALL))
+
+
+def parse_robot(text: str) -> tuple[str, tuple[float, float, float] | None]:
+    """Return the source of a robot and the x, y [m] and angle [rad] of its base from ``ROBOT@X,Y,ANGLE``.
+
+    Raises
+    ------
+    InvalidValueError
+        For another number of numbers.
+    """
+    source, at, place = text.rpartition("@")
+    if not at:
+        return text, None
+    parts = place.split(",")
+    if len(parts) != 3:
+        raise InvalidValueError(
+            f"--robot {text}: the place of a base is X,Y,ANGLE, such as fetch@1,0.5,90deg."
+        )
+    x, y, angle = map(parse_value, parts)
+    return source, (x, y, angle)
+
+
+def place_base(
+    model: kv.Model, joints: Iterable[str], place: tuple[float, float, float] | None
+) -> dict[kv.Symbol, float]:
+    """Return the values of the coordinates of a mobile base among some articulations; empty without a place.
+
+    Raises
+    ------
+    InvalidValueError
+        If there is no such base.
+    """
+    if place is None:
+        return {}
+    for name in joints:
+        coordinates = model.articulations[name].coordinates
+        if tuple(s.path.rpartition("/")[2] for s in coordinates) == _BASE:
+            return dict(zip(coordinates, place, strict=True))
+    raise InvalidValueError(
+        "The robot has no mobile base that could be placed (x, y, angle); its file says where it stands."
+    )
+
+
+def make_hold(model: kv.Model, given: FrameTarget) -> Hold:
+    """Return the hold that a target stands for.
+
+    Raises
+    ------
+    KineverseError
+        For frames that the model does not have, and other masks.
+    """
+    import kineverse as kv
+    from kineverse.control import Hold
+    from kineverse.planning.manifold import hold_frames
+
+    offset = None
+    if given.numbers:
+        offset = kv.translation(*given.numbers[:3]) @ kv.rpy(*(given.numbers[3:] or (0.0, 0.0, 0.0)))
+    hold = hold_frames(model, given.frame, given.target, given.mask, offset)
+    if given.target == "world":
+        # Nothing is held there, so that nothing may be touched.
+        return Hold(hold.expression, 0.0, name=hold.name)
+    return hold
+
+
+def make_grip(
+    model: kv.Model, given: FrameTarget, start: Iterable[FrameTarget], state: kv.State | None
+) -> Hold | None:
+    """Return a hold along a path, as the start says; else of frames as they are at a state.
+
+    Without a state it is None where the start says nothing.
+
+    Raises
+    ------
+    InvalidValueError
+        For numbers that the start does not have, and other masks.
+    """
+    from kineverse.planning.manifold import hold_frames
+
+    same = find_same_grip(given, start)
+    if same is not None:
+        return make_hold(model, replace(same, mask=given.mask))
+    if given.numbers:
+        raise InvalidValueError(
+            f"--along {given.frame}@{given.target}: frames are held as they are at the start, so numbers are "
+            "given there, with --from."
+        )
+    offset = model.fk(given.frame, given.target)
+    return None if state is None else hold_frames(model, given.frame, given.target, given.mask, offset(state))
+
+
+def find_same_grip(given: FrameTarget, start: Iterable[FrameTarget]) -> FrameTarget | None:
+    """Return what the start says of the frames of a hold, in all of its directions; None if it does not."""
+    same = [t for t in start if (t.frame, t.target) == (given.frame, given.target)]
+    return next(
+        (t for t in same if given.directions <= t.directions and given.numbers in ((), t.numbers)),
+        None,
+    )
+
+
+def choose_coordinates(
+    model: kv.Model,
+    names: Iterable[str],
+    targets: Iterable[FrameTarget],
+    holds: Iterable[FrameTarget],
+    still: Iterable[kv.Symbol],
+) -> list[kv.Symbol | str]:
+    """Return the coordinates to move where none are asked for.
+
+    These are the named ones, and the free ones that frames depend on, but for some that stay still.
+    """
+    from kineverse.planning.configuration import free_coordinates
+
+    frames = {t.frame for t in targets} | {frame for t in holds for frame in (t.frame, t.target)}
+    needed = {s for frame in frames for s in model.symbols_of(frame)}
+    found = [s for s in free_coordinates(model) if s in needed and s not in {*still}]
+    # The planner says why it cannot move a named one.
+    return [*found, *(name for name in names if model.symbol(name) not in found)]
+
+
+def _read_values(path: str) -> dict[str, float]:
+    """Return values by name from a JSON object, or from its part ``positions``.
+
+    Raises
+    ------
+    FormatError
+        If the file is none.
+    """
+    try:
+        document = json.loads(Path(path).read_text(encoding="utf-8"))
+    except ValueError as error:
+        raise FormatError(f"{path}: not JSON: {str(error)[:200]}.") from None
+    values = document.get("positions", document) if isinstance(document, dict) else None
+    if not isinstance(values, dict) or not all(
+        type(v) in (int, float) and math.isfinite(v) for v in values.values()
+    ):
+        raise FormatError(f'{path}: not an object of numbers by name, such as {{"door": 0.3}}.')
+    return {name: float(value) for name, value in values.items()}

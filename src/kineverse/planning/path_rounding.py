@@ -1,0 +1,167 @@
+"""Trajectories of paths: corners are rounded as far as the way stays free."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+
+import numpy as np
+import numpy.typing as npt
+
+from kineverse.lie import Array
+from kineverse.symbols import Symbol
+
+from .path_checks import PathChecks
+from .trajectories import BlendedPath, Trajectory, round_corners, time_parameterize
+from .trajectories.motion_limits import MotionLimits
+
+RESIDUAL = 1e-5
+"""Largest residual of holds on rounded corners [m], [rad]."""
+_SAGITTA = 1e-4
+"""Distance between a blend and the chords that are checked in its place [m], [rad]."""
+_SAME = 1e-5
+"""Distance below which two points count as one [rad], [m]."""
+_ROUNDS, _LAST_ROUNDS = 8, 4
+_STEP = 0.02
+"""Largest distance of samples of a trajectory [rad], [m]."""
+
+
+def parameterize_path(
+    points: Array,
+    symbols: Sequence[Symbol],
+    limits: MotionLimits,
+    deviation: npt.ArrayLike,
+    checks: PathChecks,
+) -> tuple[BlendedPath, Trajectory]:
+    """Return the rounded path and its fastest motion, which is certainly free wherever the path is.
+
+    The motion is checked, and corners are rounded less where it collides, down to a stop.
+
+    Parameters
+    ----------
+    points
+        Path (N, n).
+    symbols, limits
+        The n coordinates, and the limits of their speeds and accelerations.
+    deviation
+        Largest distances from the corners, see :func:`.round_corners`.
+    checks
+        Checks of configurations.
+    """
+    with checks.placed(points):
+        path = _round_valid(*_drop_near(points, deviation), checks)
+        for attempt in range(_LAST_ROUNDS):
+            trajectory = time_parameterize(path, *limits, symbols)
+            corner = _find_collision(path, trajectory, checks)
+            if corner is None:
+                return path, trajectory
+            if attempt == 0:
+                path = _round_free(path, checks)
+            else:
+                allowed = _deviations(path)
+                allowed[corner] = 0.0
+                path = round_corners(path.points, allowed)
+    # The path itself, with a stop at each corner: nothing is left that has not been judged.
+    path = round_corners(points)
+    return path, time_parameterize(path, *limits, symbols)
+
+
+def passing_times(points: Array, path: BlendedPath, trajectory: Trajectory) -> Array:
+    """Return the times (N,) at which a motion along a rounded path is nearest to its points (N, n)."""
+    times = _fine_times(trajectory)
+    travelled = _lengths(trajectory.positions_at(times))
+    # The way along the rounded path to the middle of each blend, and along the polyline to its corner.
+    halves = np.array([_lengths(path.blend(k, 65))[32] for k in range(len(path.reach))])
+    cut = np.concatenate([[0.0], path.reach - halves, [0.0]])
+    way = np.concatenate([[0.0], np.cumsum(path.lengths - cut[:-1] - cut[1:])])
+    at_corners = np.interp(way * (travelled[-1] / max(way[-1], 1e-300)), travelled, times)
+    corners = np.concatenate([[0.0], np.cumsum(path.lengths)])
+    found: Array = np.interp(_lengths(points), corners, at_corners)
+    found[-1] = trajectory.duration
+    return found
+
+
+def _drop_near(points: Array, deviation: npt.ArrayLike) -> tuple[Array, npt.ArrayLike]:
+    """Return points (N, n) and deviations without inner points that are as good as equal to the one before.
+
+    Such a short edge has a direction of its own, for which the motion would slow down.
+    """
+    keep = np.ones(len(points), dtype=bool)
+    keep[1:] = np.linalg.norm(np.diff(points, axis=0), axis=1) > _SAME
+    if len(points) > 2 and not keep[-1]:
+        keep[[-2, -1]] = False, True
+    keep[0] = True
+    given = np.asarray(deviation)
+    return points[keep], given[keep] if given.shape == keep.shape else deviation
+
+
+def _round_valid(points: Array, deviation: npt.ArrayLike, checks: PathChecks) -> BlendedPath:
+    """Return a path whose blends are valid at samples."""
+    path = round_corners(points, deviation, lambda Q: checks.valid(Q, RESIDUAL))
+    if len(path.points) < 3:
+        return path
+    allowed = _deviations(path)
+    # Where the way itself is free by the scene only, nothing vouches for a shortcut.
+    for k in {0, len(path.lengths) - 1}:
+        if checks.find_collision(path.points[k : k + 2]) is not None:
+            allowed[[k, k + 1]] = 0.0
+    return round_corners(path.points, allowed)
+
+
+def _round_free(path: BlendedPath, checks: PathChecks) -> BlendedPath:
+    """Return a path with smaller blends, each of which is certainly free."""
+    allowed = _deviations(path)
+    unchecked = np.flatnonzero(allowed).tolist()
+    for attempt in range(_ROUNDS):
+        unchecked = [k for k in unchecked if checks.find_collision(_chords(path, k - 1)) is not None]
+        if not unchecked:
+            break
+        allowed[unchecked] = allowed[unchecked] / 3 if attempt < _ROUNDS - 1 else 0.0
+        path = round_corners(path.points, allowed)
+    return path
+
+
+def _find_collision(path: BlendedPath, trajectory: Trajectory, checks: PathChecks) -> int | None:
+    """Return the point whose blend is nearest to the first collision of a motion; None if there is none."""
+    corners = np.flatnonzero(path.reach) + 1
+    if not len(corners):
+        return None
+    positions = trajectory.positions_at(_fine_times(trajectory))
+    # Between the corners and beyond their blends the motion is on the path.
+    first = path.points[corners[0]] - path.reach[corners[0] - 1] * path.directions[corners[0] - 1]
+    last = path.points[corners[-1]] + path.reach[corners[-1] - 1] * path.directions[corners[-1]]
+    begin = int(np.linalg.norm(positions - first, axis=1).argmin())
+    end = int(np.linalg.norm(positions - last, axis=1).argmin())
+    positions = positions[begin : end + 1]
+    edge = checks.find_collision(positions)
+    if edge is None:
+        return None
+    return int(corners[np.linalg.norm(path.points[corners] - positions[edge], axis=1).argmin()])
+
+
+def _fine_times(trajectory: Trajectory) -> Array:
+    """Return the times of the knots, and of others between them that are far apart."""
+    steps = np.linalg.norm(np.diff(trajectory.positions, axis=0), axis=1)
+    counts = np.maximum(np.ceil(steps / _STEP), 1).astype(int)
+    parts = [k + np.arange(count) / count for k, count in enumerate(counts.tolist())]
+    at = np.concatenate([*parts, [float(len(counts))]])
+    found: Array = np.interp(at, np.arange(len(trajectory)), trajectory.times)
+    return found
+
+
+def _deviations(path: BlendedPath) -> Array:
+    """Return the distances between the points of a path (N,) and its blends."""
+    found: Array = np.zeros(len(path.points))
+    found[1:-1] = path.deviation
+    return found
+
+
+def _chords(path: BlendedPath, corner: int) -> Array:
+    """Return points on the blend of an inner corner whose chords are near to it."""
+    return path.blend(corner, 3 + math.ceil(math.sqrt(2 * path.deviation[corner] / _SAGITTA)))
+
+
+def _lengths(points: Array) -> Array:
+    """Return the lengths of a polyline (N, n) from its first point to each (N,)."""
+    found: Array = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(points, axis=0), axis=1))])
+    return found
