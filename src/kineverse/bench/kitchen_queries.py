@@ -77,6 +77,16 @@ KITCHENS: Mapping[str, str] = MappingProxyType(
 )
 """Kitchens by name."""
 
+FRIDGE_OPEN: Mapping[str, float] = MappingProxyType({f"{KITCHEN}/fridge_door": 1.4})
+"""Position of the door of the shipped fridge for the queries there [rad]."""
+
+FRIDGE_BASE = np.array([0.45, -1.65, 0.0])
+"""Place of the base there: x, y [m] and angle [rad]."""
+
+BESIDE_FRIDGE = np.array([[0.9, -1.2, 0.5], [1.1, -0.9, 1.3]])
+INSIDE_FRIDGE = np.array([[1.3, -1.8, 0.8], [1.5, -1.4, 1.5]])
+"""Corners of the boxes of points that the hand points at: starts and goals [m]."""
+
 OFFSET = 0.06, 0.12
 """Range of the distance of the fingertips from the handle [m]."""
 
@@ -102,13 +112,13 @@ class PlanningQuery:
     ----------
     start, goal
         Configurations of the arm, shape (n,) [m], [rad].
-    base
-        Position x, y [m] and angle [rad] of the base, shape (3,).
+    state
+        State of the model, with the arm at the start.
     """
 
     start: Array
     goal: Array
-    base: Array
+    state: State
 
 
 @dataclass(frozen=True, eq=False)
@@ -156,14 +166,6 @@ class KitchenArm:
         lower, upper = np.where(bounded, limits.T, [[-np.pi], [np.pi]])
         return lower, upper
 
-    def state(self, query: PlanningQuery) -> State:
-        """Return the state at the start of a query."""
-        here = dict(zip(self.symbols, query.start.tolist(), strict=True))
-        return self.model.default_state() | State(here | self._standing(query.base))
-
-    def _standing(self, base: Array) -> dict[Symbol, float]:
-        return dict(zip(self.base, base.tolist(), strict=True))
-
     def random_states(self, count: int, seed: int = 0) -> Iterator[State]:
         """Yield states with the arm anywhere within its limits, and all else at its default."""
         random, home = np.random.default_rng(seed), self.model.default_state()
@@ -172,11 +174,25 @@ class KitchenArm:
             yield home | State(dict(zip(self.symbols, q.tolist(), strict=True)))
 
     def queries(self, count: int, seed: int = 0) -> Iterator[PlanningQuery]:
-        """Yield queries, the same for equal arguments; the first ones of a larger count are those of a smaller."""
+        """Yield queries between handles, the same for equal arguments.
+
+        The first ones of a larger count are those of a smaller one.
+        """
         search = _QuerySearch(self)
         random = np.random.default_rng([seed, zlib.crc32(self.name.encode())])
         for _ in range(count):
             yield search.find(random)
+
+    def fridge_queries(self, count: int, seed: int = 0) -> Iterator[PlanningQuery]:
+        """Yield queries from beside the open fridge of the shipped kitchen to the inside of it."""
+        search = _QuerySearch(self, FRIDGE_OPEN)
+        random = np.random.default_rng(seed)
+        while count > 0:
+            start = search.reach(random.uniform(*BESIDE_FRIDGE, (4, 3)), FRIDGE_BASE, random)
+            goal = search.reach(random.uniform(*INSIDE_FRIDGE, (4, 3)), FRIDGE_BASE, random)
+            if start is not None and goal is not None:
+                yield search.query(start, goal, FRIDGE_BASE)
+                count -= 1
 
 
 def make_kitchen_arm(robot: str, kitchen: str) -> KitchenArm:
@@ -220,7 +236,7 @@ def _include_robot(edit: Edit, arm: KitchenRobotArm) -> None:
 class _QuerySearch:
     """Search for configurations of an arm at handles, without collisions."""
 
-    def __init__(self, arm: KitchenArm) -> None:
+    def __init__(self, arm: KitchenArm, state: Mapping[str, float] = MappingProxyType({})) -> None:
         self._arm = arm
         model = arm.model
         hand = model.fk(arm.tool)
@@ -231,8 +247,8 @@ class _QuerySearch:
             Keep(_CONE, approach @ self._direction.expression, np.inf, name="approach"),
         )
         self._solver = InverseKinematics(model, tasks, still=arm.base)
-        self._check = ConfigurationCheck(Scene(model), (*arm.base, *arm.symbols))
-        home = model.default_state()
+        self._home = home = model.default_state().updated(state)
+        self._check = ConfigurationCheck(Scene(model), (*arm.base, *arm.symbols), home)
         self._handles = np.array([model.fk(frame)(home)[:3, 3] for frame in arm.handles])
         self._samples = np.random.default_rng(0).uniform(*arm.limits, (_SAMPLES, len(arm.symbols)))
         pose = compile(model.fk(arm.tool, BASE), arm.symbols).batch(self._samples)
@@ -249,9 +265,15 @@ class _QuerySearch:
             if found is None:
                 continue
             start, base = found
-            goal = self._reach(others, base, random)
+            goal = self.reach(others, base, random)
             if goal is not None:
-                return PlanningQuery(start, goal, base)
+                return self.query(start, goal, base)
+
+    def query(self, start: Array, goal: Array, base: Array) -> PlanningQuery:
+        """Return a query with the base at a place x, y [m] and angle [rad], shape (3,)."""
+        coordinates = (*self._arm.base, *self._arm.symbols)
+        here = dict(zip(coordinates, (*base.tolist(), *start.tolist()), strict=True))
+        return PlanningQuery(start, goal, self._home | State(here))
 
     def _place(self, handle: Array, random: np.random.Generator) -> tuple[Array, Array] | None:
         """Return a configuration, and a base from which the hand is then beside a handle; None if not free."""
@@ -267,13 +289,13 @@ class _QuerySearch:
         start = self._samples[chosen]
         return (start, base) if self._check(np.concatenate([base, start])) else None
 
-    def _reach(self, handles: Iterable[Array], base: Array, random: np.random.Generator) -> Array | None:
-        """Return a configuration with the hand beside the first handle that can be reached; None for none."""
+    def reach(self, points: Iterable[Array], base: Array, random: np.random.Generator) -> Array | None:
+        """Return a configuration with the hand beside the first point that can be reached; None for none."""
         c, s = np.cos(base[2]), np.sin(base[2])
         turn = np.array([[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]])
         offset = self._arm.arm.length + random.uniform(*OFFSET)
         touched = self._points + offset * self._axes
-        for handle in handles:
+        for handle in points:
             there = turn.T @ (handle - [*base[:2], 0.0])
             near = np.flatnonzero(np.linalg.norm(touched - there, axis=1) < _NEAR)
             for chosen in random.permutation(near)[:_STARTS]:
