@@ -6,7 +6,8 @@ Robots are those of VAMP, covered by its spheres, with its SRDFs, so that everyb
 from __future__ import annotations
 
 import json
-from collections.abc import Iterator, Sequence
+import tempfile
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -97,10 +98,12 @@ def load_problem_sets(robot: str, most: int | None = None) -> Iterator[ProblemSe
     """
     file = locate_model(f"{FOLDER}/{robot}/{robot}_spherized.urdf").path
     content = json.loads(file.with_name("problems.json").read_text(encoding="utf-8"))
+    joints = content["joints"]
     for name, problems in content["problems"].items():
-        model = load(file, prefix="")
+        ends = [dict(zip(joints, entry[end], strict=True)) for entry in problems for end in ("start", "goal")]
+        model = _load_robot(file, ends)
         _add_obstacles(model, problems[0]["objects"], file.with_name(f"{robot}.srdf"))
-        symbols = tuple(model.symbol(joint) for joint in content["joints"])
+        symbols = tuple(model.symbol(joint) for joint in joints)
         found = [
             _read_problem(f"{name} {k}", model, symbols, entry) for k, entry in enumerate(problems[:most])
         ]
@@ -111,11 +114,7 @@ def _add_obstacles(model: Model, objects: Sequence[Sequence[Any]], srdf: Path) -
     """Add obstacles with free poses, and rules: those of the SRDF, and none among obstacles."""
     frames = {*model.frames}
     rules = [rule for rule in _disabled_pairs(srdf) if rule.a in frames and rule.b in frames]
-    # Meshes that are only drawn are not among the files.
-    drawn = [name for name, body in model.bodies.items() if not body.collisions]
     with model.edit() as edit:
-        for name in drawn:
-            edit.remove(f"body {name}")
         for name, kind, _, size in objects:
             *where, roll, pitch, yaw = _pose_symbols(name)
             shape = Shape(_make_geometry(kind, size))
@@ -123,6 +122,30 @@ def _add_obstacles(model: Model, objects: Sequence[Sequence[Any]], srdf: Path) -
             edit.add_frame(_frame(name), WORLD, pose, Body(collisions=(shape,)))
         rules.append(Rule(_frame("*"), _frame("*"), why="obstacles stand still"))
         edit.write(RULES, rules_as_data(rules))
+
+
+def _load_robot(file: Path, ends: Sequence[Mapping[str, float]]) -> Model:
+    """Return the robot with the limits of its joints, widened to hold given starts and goals.
+
+    Some are beyond the limits by digits of π. VAMP checks no start or goal against limits, and knows no soft ones.
+    Meshes that are only drawn are not among the files.
+    """
+    tree = ElementTree.parse(file)
+    for link in tree.iterfind("link"):
+        for visual in link.findall("visual"):
+            link.remove(visual)
+    for joint in tree.iterfind("joint"):
+        for soft in joint.findall("safety_controller"):
+            joint.remove(soft)
+        limit, name = joint.find("limit"), joint.get("name", "")
+        if limit is not None and name in ends[0]:
+            low, high = (float(limit.get(key, 0.0)) for key in ("lower", "upper"))
+            limit.set("lower", repr(min(low, *(end[name] for end in ends))))
+            limit.set("upper", repr(max(high, *(end[name] for end in ends))))
+    with tempfile.TemporaryDirectory(prefix="kineverse-bench-") as folder:
+        changed = Path(folder, file.name)
+        tree.write(changed, encoding="unicode")
+        return load(changed, prefix="")
 
 
 def _frame(obstacle: str) -> str:
