@@ -35,7 +35,7 @@ from .state import State, StateLike
 from .symbols import Symbol, parameter, position, velocity
 
 if TYPE_CHECKING:
-    from . import control, estimation, geometry, reasoning
+    from . import control, estimation, geometry, planning, reasoning
     from .view.show import show
 
 __all__ = [
@@ -79,6 +79,7 @@ __all__ = [
     "parameter",
     "position",
     "quaternion",
+    "planning",
     "reasoning",
     "rotation_x",
     "rotation_y",
@@ -95,7 +96,7 @@ __all__ = [
     "where",
 ]
 
-_LAZY = ("control", "estimation", "geometry", "reasoning")
+_LAZY = ("control", "estimation", "geometry", "planning", "reasoning")
 
 # Entries are texts: the packages are imported at first use.
 model.registry.register_collection(

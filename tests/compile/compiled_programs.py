@@ -2,14 +2,23 @@
 
 from __future__ import annotations
 
+import subprocess
+from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
+from pathlib import Path
 
 import casadi as ca
 import numpy as np
+import pytest
 from hypothesis import strategies as st
 
 import kineverse as kv
+from kineverse.compile.toolchain import toolchain
 from kineverse.expressions.expression import Expression, binary, unary
+
+# Machines with vectors of 64 bytes (if there are), of 32 with and without fused operations, and of 16; and what
+# the processor has to know. The last is one without instructions for vectors.
+MACHINES = {"native": "", "haswell": "avx2 fma", "sandybridge": "avx", "x86-64": "", "by lane": ""}
 
 UNARY = [
     ca.OP_NEG, ca.OP_SQ, ca.OP_TWICE, ca.OP_INV, ca.OP_SQRT, ca.OP_FABS, ca.OP_SIGN, ca.OP_FLOOR, ca.OP_CEIL,
@@ -110,6 +119,40 @@ def every_operation(depth: int = 4, seed: int = 0) -> RandomProgram:
     return RandomProgram(5, steps)
 
 
+def elements_of(values: Iterable[Expression]) -> dict[int, ca.SX]:
+    """The values and all that they are made from, operands first, each once, by their hashes."""
+    elements: dict[int, ca.SX] = {}
+
+    def collect(element: ca.SX) -> None:
+        if element.element_hash() not in elements:
+            for i in range(element.n_dep()):
+                collect(element.dep(i))
+            elements[element.element_hash()] = element
+
+    for value in values:
+        collect(value.casadi)
+    return elements
+
+
+def one_operation_each(
+    elements: dict[int, ca.SX], results: np.ndarray
+) -> Iterator[tuple[int, np.ndarray, np.ndarray]]:
+    """Yield each operation, its value at the operands that were computed, and the computed value.
+
+    ``results`` are the computed elements, shape (N, number of elements).
+    """
+    columns = dict(zip(elements, results.T, strict=True))
+    for place, element in elements.items():
+        if element.is_leaf():
+            continue
+        operands = [element.dep(i).element_hash() for i in range(element.n_dep())]
+        v = ca.SX.sym("v", len(operands))
+        arguments = [v[operands.index(operand)] for operand in operands]
+        single = (ca.SX.unary if len(operands) == 1 else ca.SX.binary)(element.op(), *arguments)
+        values = np.array([columns[o] for o in operands], dtype=np.float64)
+        yield element.op(), ca.Function("f", [v], [single])(values).full().ravel(), columns[place]
+
+
 def points(count: int, size: int, seed: int = 0) -> np.ndarray:
     """Numbers of all kinds, shape (count, size): ordinary, large, tiny, and those that are special."""
     rng = np.random.default_rng(seed)
@@ -134,3 +177,20 @@ def ulps(a: np.ndarray, b: np.ndarray) -> np.ndarray:
     with np.errstate(all="ignore"):
         apart = np.abs(a - b) / np.spacing(np.minimum(np.abs(a), 1.7e308))
     return np.where((a == b) | (np.isnan(a) & np.isnan(b)), 0.0, np.where(np.isnan(apart), np.inf, apart))
+
+
+def build_for(machine: str, source: str, folder: Path) -> str:
+    """Return the path of a library for one of MACHINES, or skip the test where it does not run."""
+    compiler = toolchain()
+    assert compiler is not None
+    available = Path("/proc/cpuinfo").read_text().split() if Path("/proc/cpuinfo").exists() else []
+    if machine != "native" and (
+        "sse2" not in available or not set(MACHINES[machine].split()) <= set(available)
+    ):
+        pytest.skip(f"this machine does not run code for {machine}")
+    if machine == "by lane":
+        source = source.replace("__SSE2__", "NOT_DEFINED")
+    library = str(folder / "library.so")
+    command = compiler.arguments(("-O2", f"-march={machine.replace('by lane', 'x86-64')}"), library)
+    subprocess.run(command, input=source.encode(), check=True, capture_output=True)
+    return library

@@ -5,14 +5,15 @@ from __future__ import annotations
 import gc
 import threading
 
-import casadi as ca
 import numpy as np
 import pytest
 from compiled_programs import (
     APPROXIMATED,
     RandomProgram,
     arm,
+    elements_of,
     every_operation,
+    one_operation_each,
     points,
     random_programs,
     same_bits,
@@ -22,7 +23,7 @@ from hypothesis import HealthCheck, given, settings
 
 import kineverse as kv
 from hypothesis_profiles import attempts
-from kineverse.compile import batch, batch_codegen, parallel
+from kineverse.compile import batch, parallel, vector_codegen
 from kineverse.compile import batch as memory
 from kineverse.expressions.expression import from_casadi
 
@@ -167,32 +168,14 @@ def check_every_value(program: RandomProgram, x: np.ndarray) -> None:
     of the program: it knows what x / -x is, whatever x is.
     """
     symbols, values = program.expressions()
-    elements: dict[int, ca.SX] = {}
-    for value in values:
-        collect(value.casadi, elements)
+    elements = elements_of(values)
     outputs = kv.array([from_casadi(element, (), frozenset()) for element in elements.values()])
     results = kv.compile(outputs, symbols, tier="c").batch(x)
-    columns = dict(zip(elements, results.T, strict=True))
-    for place, element in elements.items():
-        if element.is_leaf():
-            continue
-        operands = [element.dep(i).element_hash() for i in range(element.n_dep())]
-        v = ca.SX.sym("v", len(operands))
-        arguments = [v[operands.index(operand)] for operand in operands]
-        single = (ca.SX.unary if len(operands) == 1 else ca.SX.binary)(element.op(), *arguments)
-        wanted = ca.Function("f", [v], [single])(np.array([columns[o] for o in operands])).full().ravel()
-        if element.op() in APPROXIMATED:
-            assert ulps(wanted, columns[place]).max() <= 4
+    for op, wanted, column in one_operation_each(elements, results):
+        if op in APPROXIMATED:
+            assert ulps(wanted, column).max() <= 4
         else:
-            assert same_bits(wanted, columns[place])
-
-
-def collect(element: ca.SX, elements: dict[int, ca.SX]) -> None:
-    """Add an element and all that it is made from, operands first, each once."""
-    if element.element_hash() not in elements:
-        for i in range(element.n_dep()):
-            collect(element.dep(i), elements)
-        elements[element.element_hash()] = element
+            assert same_bits(wanted, column)
 
 
 @pytest.mark.compiler
@@ -209,7 +192,7 @@ def test_random_programs_equal_single_calls(program: RandomProgram) -> None:
 
 @pytest.mark.compiler
 def test_programs_longer_than_one_c_function(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(batch_codegen, "_PART_LENGTH", 7)
+    monkeypatch.setattr(vector_codegen, "PART_LENGTH", 7)
     # A constant of its own, for a library of its own.
     mechanism = arm()
     f = kv.compile([mechanism.pose, mechanism.jacobian * 1.03125], tier="c")

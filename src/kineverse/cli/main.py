@@ -23,6 +23,7 @@ from kineverse.cli import (
     info,
     reach,
     reproduce,
+    spheres,
     validate,
     view,
 )
@@ -31,7 +32,21 @@ from kineverse.errors import KineverseError, UnknownNameError, suggest
 
 COMMANDS = {
     module.__name__.rpartition(".")[2]: module
-    for module in (info, fk, reach, view, convert, diff, validate, decompose, fit, demo, bench, reproduce)
+    for module in (
+        info,
+        fk,
+        reach,
+        view,
+        convert,
+        diff,
+        validate,
+        decompose,
+        spheres,
+        fit,
+        demo,
+        bench,
+        reproduce,
+    )
 }
 
 ERROR, INTERRUPTED, PIPE_CLOSED = 2, 130, 141

@@ -20,12 +20,14 @@ from kineverse.errors import CompileError, NoSolutionError, ShapeError
 from kineverse.expressions.layout import ArrayShape
 from kineverse.lie import Array
 
-from .batch_codegen import BATCH_KIND, generate_batch_source, is_vectorizable
+from .batch_codegen import BATCH_KIND, generate_batch_source
 from .c_library import ProgramLibrary
 from .evaluator import bind
 from .parallel import cores, parallel_rows
 from .program import CasadiFunction, Program
 from .signature import Signature, as_doubles
+from .toolchain import vector_optimisation_level
+from .vector_codegen import missing_operations
 
 _CACHE_LINE = 64
 # The C library itself reuses smaller blocks.
@@ -134,8 +136,11 @@ class Batch:
         self._insist = tier == "c"
         self._spent = 0.0
         self._library: ProgramLibrary[BatchFunction] | None = None
-        if tier != "interpreter" and is_vectorizable(program):
-            self._library = ProgramLibrary(program, BATCH_KIND, lambda: generate_batch_source(program), _load)
+        if tier != "interpreter" and not missing_operations(program):
+            level = vector_optimisation_level(program.instructions)
+            self._library = ProgramLibrary(
+                program, BATCH_KIND, lambda: generate_batch_source(program), _load, level
+            )
 
     def __call__(self, x: npt.ArrayLike, out: Any, function: CasadiFunction) -> Any:
         """Return the outputs at all rows of ``x``, see :meth:`.CompiledFunction.batch`.

@@ -35,6 +35,10 @@ class ProgramLibrary(Generic[Code]):
         Function that generates the C, called in another thread.
     load
         Function from the path of a library to its code; raises if that fails.
+    level
+        The optimisation flag; None if the program is too large for a compiler.
+    flags
+        More flags of the compiler, that follow from the kind.
     ready
         Method to be called in another thread when the library is compiled. It is referenced weakly.
 
@@ -52,6 +56,8 @@ class ProgramLibrary(Generic[Code]):
         kind: str,
         source: Callable[[], str],
         load: Callable[[str], Code],
+        level: str | None,
+        flags: tuple[str, ...] = (),
         ready: Callable[[], object] | None = None,
     ) -> None:
         self.code: Code | None = None
@@ -62,8 +68,7 @@ class ProgramLibrary(Generic[Code]):
         self._ready = WeakMethod(ready) if ready is not None else None
         self._build: BuildJob | None = None
         self._toolchain: Toolchain | None = toolchain()
-        level = optimisation_level(program.instructions)
-        self._flags = (level or "", *NO_UNDEFINED_FLAGS)
+        self._flags = (level or "", *flags, *NO_UNDEFINED_FLAGS)
         if self._toolchain is None:
             self.error = NO_COMPILER
         elif level is None:

@@ -26,6 +26,7 @@ from .call_extension import MOST_OUTPUTS, call_extension
 from .evaluator import Evaluator, bind, make_pooled_call
 from .program import FUNCTION_NAME, SINGLE_KIND, CasadiFunction, Program
 from .signature import make_signature
+from .toolchain import optimisation_level
 
 if TYPE_CHECKING:
     from typing_extensions import TypeVar
@@ -177,7 +178,10 @@ class CompiledFunction(Generic[Results]):
         self._batch: Batch | None = None
         self._library: ProgramLibrary[_Code] | None = None
         if tier == "c" or (tier == "auto" and program.instructions >= _WORTH_COMPILING):
-            self._library = ProgramLibrary(program, SINGLE_KIND, program.source, _load, self._ready)
+            level = optimisation_level(program.instructions)
+            self._library = ProgramLibrary(
+                program, SINGLE_KIND, program.source, _load, level, ready=self._ready
+            )
             if tier == "c" and self._library.error:
                 raise CompileError(f"The function cannot be compiled: {self._library.error}.")
         if self._library is not None:

@@ -20,6 +20,8 @@ from kineverse.expressions.implicit import explain_no_solution, implicit_nodes
 from kineverse.lie import Array
 from kineverse.symbols import Symbol
 
+from .simd_functions import Scalar
+
 CasadiFunction: TypeAlias = Any
 Check: TypeAlias = Callable[[Array, Array | Sequence[Array]], None]
 
@@ -62,7 +64,7 @@ class Program:
         self._columns = ca.substitute(columns, [symbols], [self._vector])
         self._function: CasadiFunction = None
         # Common parts are shared later, since that takes time and an existing library does not need it.
-        graph = ca.Function(FUNCTION_NAME, [self._vector], self._columns)
+        graph = self._graph()
         self.instructions: int = graph.n_instructions()
         # Closed loops, which may have no solution.
         self.implicit = implicit_nodes(outputs)
@@ -109,11 +111,21 @@ class Program:
         return self.check if self.implicit else None
 
     @property
+    def operations(self) -> frozenset[int]:
+        """CasADi's codes of the operations of the program."""
+        graph = self._graph()
+        return frozenset(graph.instruction_id(k) for k in range(graph.n_instructions()))
+
+    @property
     def function(self) -> CasadiFunction:
         """CasADi's function of one input vector, common parts shared."""
         if self._function is None:
             self._function = ca.Function(FUNCTION_NAME, [self._vector], self._shared())
         return self._function
+
+    def _graph(self) -> CasadiFunction:
+        """Return CasADi's function with common parts as they are."""
+        return ca.Function(FUNCTION_NAME, [self._vector], self._columns)
 
     def _shared(self) -> list[ca.SX]:
         """Return the columns with common parts shared."""
@@ -182,13 +194,16 @@ def _remove_branches(main: re.Match[str], sizes: Sequence[int], tables: dict[int
     return data + declared + copies + body
 
 
-def c_literal(x: float) -> str:
-    """Return a number as a C literal, exactly."""
+def c_literal(x: float, scalar: Scalar = "double") -> str:
+    """Return a number as a C literal: exactly, or rounded to float."""
+    if scalar == "float":
+        with np.errstate(over="ignore"):
+            x = float(np.float32(x))
     if x != x:
         return "NAN"
     if x in (float("inf"), float("-inf")):
         return "INFINITY" if x > 0 else "-INFINITY"
-    return x.hex()
+    return x.hex() + ("f" if scalar == "float" else "")
 
 
 def _offsets(sizes: Sequence[int]) -> list[int]:

@@ -116,6 +116,20 @@ def optimisation_level(instructions: int) -> str | None:
     return None
 
 
+def vector_optimisation_level(instructions: int) -> str | None:
+    """Return the optimisation flag for a program of vectors; None if it is too large for a compiler.
+
+    Such programs are split into C functions, so time is proportional to length. gcc 12 takes 0.13 ms an
+    instruction at -O2 and 0.09 ms at -O1 (5 % slower code). -O3 is as -O2, and at -O0 compilation takes twice
+    and the code 20 times as long.
+    """
+    if instructions <= 60_000:
+        return "-O2"
+    if instructions <= 400_000:
+        return "-O1"
+    return None
+
+
 @functools.lru_cache(maxsize=16)
 def _find(preferred: str, path: str) -> Toolchain | None:
     for candidate in (preferred, "cc", "gcc", "clang"):

@@ -110,7 +110,9 @@ class ConfigurationSpace:
         np.minimum(np.maximum(q, self._least), self._largest, out=q)
 
 
-def find_coordinates(model: ModelView, names: Iterable[Symbol | str]) -> frozenset[Symbol]:
+def find_coordinates(
+    model: ModelView, names: Iterable[Symbol | str], argument: str = "still"
+) -> frozenset[Symbol]:
     """Return independent coordinates of a model, given as symbols or names.
 
     A dependent coordinate stands for those that determine it, an articulation for all of its coordinates, and
@@ -125,10 +127,10 @@ def find_coordinates(model: ModelView, names: Iterable[Symbol | str]) -> frozens
     """
     found: set[Symbol] = set()
     known = {*model.symbols, *model.rates.dependent, *model.speeds}
-    for symbol in find_symbols(model, names, "still"):
+    for symbol in find_symbols(model, names, argument):
         if symbol not in known and symbol.position not in known:
             raise UnknownNameError(
-                f"still=: the model has no '{symbol}'. {suggest(str(symbol), map(str, known), 'symbol')}"
+                f"{argument}=: the model has no '{symbol}'. {suggest(str(symbol), map(str, known), 'symbol')}"
             )
         dependent = model.rates.dependent.get(symbol.position)
         if dependent is not None:

@@ -40,6 +40,9 @@ if TYPE_CHECKING:
 RESIDUAL_TOLERANCE = 1e-10
 """The largest norm of a residual at a solution, in its own unit [m] or [rad]."""
 
+FLOAT_RESIDUAL_TOLERANCE = 1e-4
+"""The largest norm of a residual at a solution in float, where rounding leaves 1e-6 in a loop of metres."""
+
 
 @dataclass(frozen=True, eq=False)
 class ImplicitFunction:

@@ -150,14 +150,14 @@ def adjacent_pairs(model: ModelView, bodies: Sequence[str]) -> Flags:
     are joined to each other.
     """
     frames = dict(model.frames)
-    groups = {name: _rigid_group(name, frames) for name in bodies}
+    groups = {name: rigid_group(name, frames) for name in bodies}
     numbers = {group: k for k, group in enumerate(dict.fromkeys(groups.values()))}
     number = np.array([numbers[groups[name]] for name in bodies], dtype=int)
     table: Flags = (number[:, None] == number[None, :]).astype(np.uint8)
     index = {name: k for k, name in enumerate(bodies)}
 
     def bodies_at(frame: str) -> npt.NDArray[np.bool_]:
-        group = _rigid_group(frame, frames)
+        group = rigid_group(frame, frames)
         if group == WORLD:
             return np.asarray(np.arange(len(bodies)) == _supporting_body(frame, frames, index))
         return np.asarray(number == numbers.get(group, -1))
@@ -179,7 +179,7 @@ def _joined_frames(
         yield from loop.ends
 
 
-def _rigid_group(name: str, frames: Mapping[str, Frame]) -> str:
+def rigid_group(name: str, frames: Mapping[str, Frame]) -> str:
     """Return the root of a frame's rigid group: its frame that moves in its parent, or the world."""
     while name != WORLD and all(isinstance(factor, Pose) for factor in frames[name].factors):
         name = frames[name].parent

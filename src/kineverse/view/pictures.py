@@ -100,6 +100,7 @@ def picture(
     collisions: bool = False,
     near: float | None = None,
     decomposed: bool = False,
+    overlay: Sequence[Drawable] = (),
 ) -> npt.NDArray[np.uint8]:
     """Return a picture of a model as (height, width, 3) bytes.
 
@@ -123,6 +124,8 @@ def picture(
         arrows at contacts; through the bodies. None for no lines.
     decomposed
         True to use the hulls of decomposed meshes for collision shapes and lines.
+    overlay
+        Further parts on frames of the model, such as spheres, as transparent as their colours.
 
     Raises
     ------
@@ -140,6 +143,7 @@ def picture(
     at = dict(zip(poses.names, poses.evaluate(values), strict=True))
     found = None if near is None else ProximityQuery(model, decomposed).evaluate(values, near)
     items = collect_drawables(model, "collision" if collisions else "visual", decomposed)
+    items += overlay
     scene = TriangleSoup.from_drawables(items, at)
     if camera is None:
         camera = choose_camera(scene, weigh_drawables(model, items), at, width / height)

@@ -5,7 +5,7 @@ from __future__ import annotations
 import threading
 from collections.abc import Callable, Iterable, Mapping
 from functools import partial
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 
@@ -67,6 +67,7 @@ class ViewerScene:
         self._frames_shown, self._labels_shown, self._filter = False, False, ""
         self._visuals_shown, self._collisions_shown, self._ground_shown = True, False, True
         self._decomposed, self._transparent = False, False
+        self._overlay: tuple[Drawable, ...] = ()
         backdrop.set_up(server)
         self.refresh(model, values)
 
@@ -83,10 +84,12 @@ class ViewerScene:
                 self._server.scene.remove_by_name(ROOT)
                 self._nodes: dict[str, Any] = {}
                 self._visuals, self._collisions = self._add(visuals, "visual"), list[Any]()
+                self._overlay_nodes: list[Any] = []
                 self._place_camera(visuals)
                 self.show_ground(self._ground_shown)
                 self.show_visuals(self._visuals_shown)
                 self.show_collisions(self._collisions_shown)
+                self.show_overlay(self._overlay)
                 self.show_frames(self._frames_shown, self._labels_shown, self._filter)
             # A model without bodies would be an empty page.
             if not visuals:
@@ -157,6 +160,18 @@ class ViewerScene:
             for node in self._collisions:
                 node.visible = shown
 
+    def show_overlay(self, items: Iterable[Drawable]) -> None:
+        """Show further parts, which move with their frames, in place of those of an earlier call.
+
+        Parts of frames that the model does not have any more are left out.
+        """
+        with self._lock:
+            self._overlay = tuple(items)
+            for node in self._overlay_nodes:
+                node.remove()
+            added = self._add((part for part in self._overlay if part.frame in self.names), "overlay")
+            self._overlay_nodes = [node for node, _ in added]
+
     def decompose(self, wanted: bool) -> None:
         """Show collision meshes as the hulls of their decomposition, or as one hull again."""
         with self._lock:
@@ -201,7 +216,9 @@ class ViewerScene:
                 # Shadows ignore opacity: half transparent bodies would cast black ones onto themselves.
                 node.cast_shadow = node.receive_shadow = not transparent
 
-    def _add(self, items: Iterable[Drawable], kind: Kind) -> list[tuple[Any, float | None]]:
+    def _add(
+        self, items: Iterable[Drawable], kind: Kind | Literal["overlay"]
+    ) -> list[tuple[Any, float | None]]:
         """Add shapes below the nodes of their frames; return their nodes and opacities."""
         added = []
         for number, part in enumerate(items):

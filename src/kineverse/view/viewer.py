@@ -15,6 +15,7 @@ from kineverse.state import State, StateLike
 from kineverse.view import server as web
 from kineverse.view.animation import RangeAnimation, select_animated
 from kineverse.view.camera import Camera
+from kineverse.view.drawables import Drawable
 from kineverse.view.drive import VelocityDrive
 from kineverse.view.hypertext import element
 from kineverse.view.panel import Panel
@@ -144,6 +145,10 @@ class Viewer:
     def pose(self, frame: str) -> Floats:
         """Return the pose of a frame in the world that was drawn last, 4×4."""
         return self._scene.pose(frame)
+
+    def show_overlay(self, items: Iterable[Drawable]) -> None:
+        """Show further parts over the model, such as spheres; they move with their frames."""
+        self._scene.show_overlay(items)
 
     def move(self, values: StateLike) -> None:
         """Set the values of some symbols, by symbol or name, as their sliders do.

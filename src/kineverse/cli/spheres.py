@@ -1,0 +1,292 @@
+"""``kineverse spheres``: collision shapes covered by spheres."""
+
+from __future__ import annotations
+
+import argparse
+import json
+import sys
+import time
+from collections.abc import Iterable, Iterator, Sequence
+from dataclasses import dataclass, field
+from typing import TYPE_CHECKING, Any
+
+from kineverse.cli.arguments import (
+    add_model_options,
+    add_set_option,
+    load_model,
+    parse_assignments,
+    parse_length,
+)
+from kineverse.cli.output import colorize, format_table, join_lines, show_activity, show_progress
+from kineverse.cli.view import add_page_options, handle_interrupts, page_options, print_address
+from kineverse.errors import InvalidValueError, KineverseError, UnknownNameError, suggest
+from kineverse.expressions.printing import format_number
+
+if TYPE_CHECKING:
+    import kineverse as kv
+    from kineverse.geometry.objects import CollisionObject
+    from kineverse.planning.spheres import SphereCover
+
+HELP = """cover collision shapes by spheres, and show how far these stick out
+
+Every point of a shape lies in a sphere. Meshes are covered as the convex hulls that distances are computed to.
+The spheres are stored in the user's cache by the content of the shape and the settings.
+
+"protrusion" is the largest distance of a sphere's points from the shape, "excess" the volume of the spheres
+over that of the shapes, minus 1. By default spheres stick out by a tenth of the size of a shape, from 5 mm to
+25 mm, or by more where the largest number of spheres would not do.
+
+The exit status is 0 if all went well, 1 if a shape could not be covered.
+
+examples:
+  kineverse spheres fetch
+  kineverse spheres robot.urdf --links gripper palm --protrusion 5mm --most 64
+  kineverse spheres fetch --view
+  kineverse spheres --list"""
+
+WRONG_SHAPE = 1
+
+
+@dataclass
+class LinkCovers:
+    """Covers of the shapes of a link.
+
+    Attributes
+    ----------
+    covers
+        Covered shapes.
+    errors
+        Reasons of shapes that cannot be covered.
+    seconds
+        Computation time [s]; 0 if all covers were cached.
+    """
+
+    link: str
+    covers: list[tuple[CollisionObject, SphereCover]] = field(default_factory=list)
+    errors: list[str] = field(default_factory=list)
+    seconds: float = 0.0
+
+    @property
+    def count(self) -> int:
+        """Number of spheres."""
+        return sum(len(cover) for _, cover in self.covers)
+
+    @property
+    def protrusion(self) -> float:
+        """Largest protrusion [m]."""
+        return max((cover.protrusion for _, cover in self.covers), default=0.0)
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """Declare the options."""
+    parser.add_argument("model", metavar="MODEL", nargs="?", help="name or path of a model")
+    add_model_options(parser)
+    parser.add_argument("--links", metavar="LINK", nargs="+", help="only the shapes of these links")
+    parser.add_argument("--protrusion", metavar="M", help="how far spheres may stick out: 0.005, 5mm")
+    parser.add_argument("--most", metavar="N", type=int, help="largest number of spheres of a shape (32)")
+    parser.add_argument("--decomposed", action="store_true", help="cover the hulls of kineverse decompose")
+    parser.add_argument("--force", action="store_true", help="compute cached covers again")
+    parser.add_argument("--json", action="store_true", help="everything, as one JSON object")
+    parser.add_argument("--list", action="store_true", help="list the cache and exit")
+    parser.add_argument("--clear", action="store_true", help="empty the cache and exit")
+    parser.add_argument("--view", action="store_true", help="show model and spheres in the browser")
+    parser.add_argument("--picture", metavar="PATH", help="write a picture (.png) of model and spheres")
+    add_set_option(parser)
+    add_page_options(parser)
+
+
+def run(arguments: argparse.Namespace) -> int:
+    """Cover the shapes, print the results, show them if wanted, and return the status."""
+    if arguments.list or arguments.clear:
+        return _manage_cache(arguments)
+    if arguments.model is None:
+        raise UnknownNameError("Name a model; see kineverse spheres --help.")
+    from kineverse.planning.spheres.sphere_cover import MOST, check_cover_settings
+
+    protrusion = None if arguments.protrusion is None else parse_length(arguments.protrusion)
+    most = MOST if arguments.most is None else arguments.most
+    check_cover_settings(protrusion, most)
+    state = parse_assignments(arguments.assignments)
+    with show_activity(f"reading {arguments.model}"):
+        model = load_model(arguments, arguments.model)
+    objects = _objects(model, arguments)
+    links: dict[str, LinkCovers] = {}
+    for item in show_progress(objects, "covering", "shape"):
+        _cover(item, links.setdefault(item.body, LinkCovers(item.body)), protrusion, most, arguments.force)
+    status = WRONG_SHAPE if any(link.errors for link in links.values()) else 0
+    if arguments.json:
+        print(json.dumps(_to_json(links.values(), status), allow_nan=False))
+    else:
+        print("\n\n".join(_format_links(list(links.values()))), flush=True)
+    if arguments.picture is not None:
+        _write_picture(arguments.picture, model, state, links.values())
+    if arguments.view:
+        _view(arguments, model, state, links.values())
+    return status
+
+
+def _objects(model: kv.Model, arguments: argparse.Namespace) -> list[CollisionObject]:
+    """Return the collision objects of the wanted links."""
+    from kineverse.geometry.objects import CollisionObjects
+    from kineverse.geometry.shapes import import_coal
+
+    import_coal()
+    source = CollisionObjects((), ("*",) if arguments.decomposed else (), ())
+    source.synchronize(model)
+    if not source.by_body:
+        raise InvalidValueError(f"{arguments.model} has no shapes that spheres could cover.")
+    for link in arguments.links or ():
+        if link not in source.by_body:
+            raise UnknownNameError(f"No link {link!r} has shapes. {suggest(link, source.by_body, 'link')}")
+    return [
+        item
+        for body, items in source.by_body.items()
+        for item in items
+        if not arguments.links or body in arguments.links
+    ]
+
+
+def _cover(item: CollisionObject, link: LinkCovers, protrusion: float | None, most: int, force: bool) -> None:
+    """Add the cover of an object to those of its link, or the reason why there is none."""
+    from kineverse.planning.spheres import cover_object
+    from kineverse.planning.spheres.object_covers import is_covered
+
+    begin = time.perf_counter()
+    try:
+        cached = not force and is_covered(item, protrusion, most)
+        begin = time.perf_counter()
+        link.covers.append((item, cover_object(item, protrusion, most, force=force)))
+        link.seconds += 0.0 if cached else time.perf_counter() - begin
+    except KineverseError as error:
+        link.errors.append(join_lines(error))
+
+
+HEAD = ("link", "shapes", "spheres", "protrusion [mm]", "excess", "time")
+
+
+def _format_links(links: Sequence[LinkCovers]) -> list[str]:
+    rows = [_format_row(link.link, [link]) for link in links if link.covers]
+    if len(rows) > 1:
+        rows.append(_format_row("total", links))
+    sections = [format_table(HEAD, rows, "<>>>>>")] if rows else []
+    errors = [f"  {reason}" for link in links for reason in link.errors]
+    return sections + (["\n".join([colorize("not covered", "!"), *errors])] if errors else [])
+
+
+def _format_row(name: str, links: Sequence[LinkCovers]) -> tuple[str, ...]:
+    seconds = sum(link.seconds for link in links)
+    return (
+        name,
+        str(sum(len(link.covers) for link in links)),
+        str(sum(link.count for link in links)),
+        format_number(1e3 * max(link.protrusion for link in links), 3),
+        f"{_excess(links):.0%}",
+        f"{seconds:.1f} s" if seconds else "cached",
+    )
+
+
+def _excess(links: Iterable[LinkCovers]) -> float:
+    """Return the volume of all spheres over that of the shapes, minus 1; overlaps of shapes count twice."""
+    from kineverse.planning.spheres.union_volume import union_volume
+
+    covers = [cover for link in links for _, cover in link.covers]
+    volumes = [union_volume(cover.centres, cover.radii) for cover in covers]
+    inside = sum(volume / (1.0 + cover.excess) for volume, cover in zip(volumes, covers, strict=True))
+    return sum(volumes) / inside - 1.0 if inside else 0.0
+
+
+def _to_json(links: Iterable[LinkCovers], status: int) -> dict[str, Any]:
+    return {
+        "status": status,
+        "links": [
+            {
+                "link": link.link,
+                "seconds": link.seconds,
+                "excess": _excess([link]),
+                "shapes": [
+                    {
+                        "number": item.number,
+                        "pose": _pose(item).tolist(),
+                        "protrusion": cover.protrusion,
+                        "excess": cover.excess,
+                        "centres": cover.centres.tolist(),
+                        "radii": cover.radii.tolist(),
+                    }
+                    for item, cover in link.covers
+                ],
+                "errors": link.errors,
+            }
+            for link in links
+        ],
+    }
+
+
+def _pose(item: CollisionObject) -> Any:
+    """Return the pose of a shape in the frame of its body, 4×4 [m]."""
+    return item.shape.origin.matrix
+
+
+def _drawables(links: Iterable[LinkCovers]) -> Iterator[Any]:
+    from kineverse.view.sphere_drawables import draw_cover
+
+    for link in links:
+        for item, cover in link.covers:
+            yield draw_cover(link.link, cover, _pose(item))
+
+
+def _write_picture(path: str, model: kv.Model, state: dict[str, float], links: Iterable[LinkCovers]) -> None:
+    from kineverse.view.pictures import save_picture
+
+    save_picture(path, model, state, overlay=list(_drawables(links)))
+    print(f"picture: {path}", file=sys.stderr)
+
+
+def _view(
+    arguments: argparse.Namespace, model: kv.Model, state: dict[str, float], links: Iterable[LinkCovers]
+) -> None:
+    from kineverse.view.title import read_title
+    from kineverse.view.viewer import Viewer
+
+    label = read_title(arguments.model)
+    with handle_interrupts(), Viewer(model, state, label=label, **page_options(arguments)) as page:
+        page.show_overlay(_drawables(links))
+        print_address(page, browser=not arguments.no_browser)
+        page.wait()
+
+
+def _manage_cache(arguments: argparse.Namespace) -> int:
+    from kineverse.planning.spheres.sphere_cache import clear_covers, cover_folder, list_covers
+
+    if arguments.model is not None or (arguments.list and arguments.clear):
+        raise InvalidValueError("--list and --clear are about the whole cache, and one at a time.")
+    if arguments.clear:
+        count = clear_covers()
+        print(json.dumps({"removed": count}) if arguments.json else f"{count} removed from {cover_folder()}")
+        return 0
+    kept = list_covers()
+    if arguments.json:
+        entries = [
+            {
+                "name": one.name,
+                "spheres": len(one.cover),
+                "protrusion": one.cover.protrusion,
+                "excess": one.cover.excess,
+                "bytes": one.bytes,
+            }
+            for one in kept
+        ]
+        print(json.dumps({"folder": str(cover_folder()), "covers": entries}, allow_nan=False))
+    elif kept:
+        rows = [
+            (
+                one.name,
+                str(len(one.cover)),
+                format_number(1e3 * one.cover.protrusion, 3),
+                f"{one.cover.excess:.0%}",
+            )
+            for one in kept
+        ]
+        print(format_table(("shape", "spheres", "protrusion [mm]", "excess"), rows, "<>>>"))
+    else:
+        print(f"There are no covers in {cover_folder()}.")
+    return 0

@@ -1,0 +1,136 @@
+"""Bindings of the compiled planner: structures as C reads them, and its functions."""
+
+from __future__ import annotations
+
+import ctypes
+from functools import lru_cache
+from importlib import resources
+from typing import Any
+
+import numpy as np
+
+from kineverse._extras import install_command  # noqa: F401
+from kineverse.compile.c_library import NO_COMPILER, SourceLibrary
+from kineverse.compile.toolchain import NO_UNDEFINED_FLAGS
+from kineverse.compile.vector_program import vector_header
+from kineverse.errors import CompileError
+
+SOURCES = ("collision.c", "edges.c", "rrt_connect.c")
+
+OBSTACLE = np.dtype(
+    [
+        ("rotation", np.float32, 9),
+        ("translation", np.float32, 3),
+        ("size", np.float32, 3),
+        ("kind", np.int32),
+        ("body", np.int32),
+        ("first", np.int32),
+        ("planes", np.int32),
+        ("aligned", np.int32),
+    ]
+)
+LINK = np.dtype(
+    [
+        ("ball", np.float32, 4),
+        ("low", np.float32, 3),
+        ("high", np.float32, 3),
+        ("pose", np.int32),
+        ("first", np.int32),
+        ("coarse", np.int32),
+        ("body", np.int32),
+    ]
+)
+COARSE = np.dtype([("sphere", np.float32, 4), ("first", np.int32), ("count", np.int32)])
+
+BOX, CYLINDER, CAPSULE, SPHERE, HULL = range(5)
+"""Kinds of obstacles."""
+
+FOUND, TIME_IS_UP, TOO_MANY_NODES, NO_MEMORY = range(4)
+"""Outcomes of a search."""
+
+
+def _fields(kinds: str, names: str) -> list[tuple[str, Any]]:
+    types = {"p": ctypes.c_void_p, "i": ctypes.c_longlong, "d": ctypes.c_double}
+    return [(name, types[kind]) for kind, name in zip(kinds, names.split(), strict=True)]
+
+
+class ObstacleSetStruct(ctypes.Structure):
+    """Set of obstacles as C reads it."""
+
+    _fields_ = _fields("pppiiiii", "items boxes chunks count padded padded_chunks pose link")
+
+
+class CheckerStruct(ctypes.Structure):
+    """Tables of a collision checker as C reads them."""
+
+    _fields_ = _fields(
+        "iiiippppiippppppppiippd",
+        "coordinates poses conditions stored compute kept lower upper links bodies link coarse fine planes "
+        "allowed world moving unused pairs moving_pairs pair moving_pair margin",
+    )
+
+
+class ProjectionStruct(ctypes.Structure):
+    """Projection onto a manifold as C reads it."""
+
+    _fields_ = _fields("ppidi", "step kept stored tolerance steps")
+
+
+class SearchStruct(ctypes.Structure):
+    """Search and its results as C reads and writes them."""
+
+    _fields_ = _fields(
+        "ppdddiiiiiiidd",
+        "checker projection range resolution seconds nodes seed "
+        "iterations edges count_start count_goal status elapsed gap",
+    )
+
+
+class PlanningLibrary(SourceLibrary):
+    """Compiled planner, shared by all planners of the process."""
+
+    def __init__(self) -> None:
+        folder = resources.files("kineverse.planning") / "c_source"
+        source = "\n".join([vector_header("float"), *((folder / name).read_text() for name in SOURCES)])
+        flags = ("-O3", "-ffp-contract=fast", "-fno-rounding-math", *NO_UNDEFINED_FLAGS)
+        super().__init__(source, _declare_signatures, flags)
+
+
+@lru_cache(maxsize=1)
+def _library() -> PlanningLibrary:
+    return PlanningLibrary()
+
+
+def planning_functions() -> Any:
+    """Return the compiled functions of the planner, built first if necessary.
+
+    Raises
+    ------
+    CompileError
+        Without a C compiler.
+    """
+    library = _library()
+    if not library.prepare(wait=True):
+        raise CompileError(
+            f"Planning needs a C compiler, and {NO_COMPILER}. Install one (gcc or clang), or do without "
+            "planning: kv.control.inverse_kinematics finds configurations and kv.control.Controller moves "
+            "towards them; both work without a compiler."
+        )
+    return library.code
+
+
+def _declare_signatures(code: Any) -> None:
+    pointer, count, number = ctypes.c_void_p, ctypes.c_longlong, ctypes.c_double
+    signatures = {
+        "kineverse_valid": (ctypes.c_int, [pointer, pointer, count, pointer]),
+        "kineverse_edges": (ctypes.c_int, [pointer, pointer, pointer, count, number, number, pointer]),
+        "kineverse_certify": (count, [pointer, pointer, count, number, number, pointer]),
+        "kineverse_poses": (ctypes.c_int, [pointer, pointer, pointer]),
+        "kineverse_rrt_connect": (count, [pointer, pointer, count, pointer, count, pointer, count]),
+        "kineverse_project": (ctypes.c_int, [pointer, pointer, pointer, count, pointer]),
+        "kineverse_walk": (count, [pointer, pointer, pointer, pointer, count]),
+        "kineverse_shortcut": (count, [pointer, pointer, count, count, count, number]),
+    }
+    for name, (result, arguments) in signatures.items():
+        function = getattr(code, name)
+        function.restype, function.argtypes = result, arguments

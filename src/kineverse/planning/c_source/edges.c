@@ -1,0 +1,238 @@
+/* Edges between configurations: sampled, certified between the samples, or projected onto a manifold. */
+
+#define MOST_COORDINATES 64
+
+INLINE V ramp(void) {
+  V r;
+  for (int i = 0; i < W; i++) r[i] = (float)i;
+  return r;
+}
+
+static float distance(const float *a, const float *b, int n) {
+  float sum = 0.0f;
+  for (int i = 0; i < n; i++) sum += (b[i] - a[i]) * (b[i] - a[i]);
+  return sqrtf(sum);
+}
+
+INLINE void evaluate(const Checker *c, Work *w) { c->compute(w->x, c->kept, w->store, w->o); }
+
+/* The block at the fractions t of the way from a to b. */
+INLINE void interpolate(const Checker *c, Work *w, const float *a, const float *b, V t) {
+  for (int i = 0; i < c->coordinates; i++) w->x[i] = fused(t, splat(b[i] - a[i]), splat(a[i]));
+}
+
+/* Return 1 if no sample on the way from a, exclusive, to b, inclusive, collides. Every block sees the whole edge. */
+static int edge_is_free(const Checker *c, Work *w, const float *a, const float *b, float resolution) {
+  const int blocks = (int)ceilf(fmaxf(distance(a, b, c->coordinates) * resolution, 1.0f) / W);
+  const float step = 1.0f / (blocks * W);
+  for (int k = 0; k < blocks; k++) {
+    interpolate(c, w, a, b, (ramp() * splat((float)blocks) + splat(blocks - k)) * splat(step));
+    evaluate(c, w);
+    if (collides(c, w)) return 0;
+  }
+  return 1;
+}
+
+/* Largest number of intervals of an edge that are looked at on one level. */
+#define MOST_INTERVALS 4096
+
+/* Write for every link the largest way of a point between the present block and another one at x + half, and return
+   the largest of all. The ways of the corners of a box around the centres bound those of all centres, since
+   displacements are affine. */
+static float inflate(const Checker *c, Work *w, const V *before) {
+  float largest = 0.0f;
+  for (int k = 0; k < c->links; k++) {
+    const Link *l = c->link + k;
+    const V *S = before + 12 * l->pose, *T = w->o + 12 * l->pose;
+    V way = splat(0.0f);
+    for (int corner = 0; corner < 8; corner++) {
+      float p[3];
+      for (int i = 0; i < 3; i++) p[i] = corner >> i & 1 ? l->high[i] : l->low[i];
+      V q[3], r[3];
+      transform_point(S, p, q);
+      transform_point(T, p, r);
+      const V x = r[0] - q[0], y = r[1] - q[1], z = r[2] - q[2];
+      way = larger(way, fused(x, x, fused(y, y, z * z)));
+    }
+    w->inflation[k] = 1.05f * sqrtf(largest_lane(way)) + 1e-6f;
+    largest = fmaxf(largest, w->inflation[k]);
+  }
+  return largest;
+}
+
+/* Return 1 if nothing collides on the way from a to b, not only at samples. The way is cut into intervals. In each,
+   no point of a link is further from where it is in the middle than half of the way that it goes, up to second order,
+   for which 5 % are added: spheres that are larger by that cover the interval. Where larger spheres collide, the
+   interval is cut into four, until spheres grow by less than `least`. On failure the fraction is written. */
+static int edge_is_certain(const Checker *c, Work *w, const float *a, const float *b, float resolution, float least,
+                           float *where) {
+  float middle[MOST_INTERVALS];
+  int count = (int)ceilf(fmaxf(distance(a, b, (int)c->coordinates) * resolution, 1.0f));
+  count = (count + W - 1) / W * W;
+  if (count > MOST_INTERVALS / 4) count = MOST_INTERVALS / 4;
+  float width = 1.0f / count;
+  for (int k = 0; k < count; k++) middle[k] = (k + 0.5f) * width;
+  while (count) {
+    int hits = 0;
+    float grown = 0.0f;
+    for (int first = 0; first < count; first += W) {
+      V t;
+      for (int j = 0; j < W; j++) t[j] = middle[first + j < count ? first + j : count - 1];
+      interpolate(c, w, a, b, t + splat(0.5f * width));
+      evaluate(c, w);
+      memcpy(w->before, w->o, 12 * c->poses * sizeof(V));
+      interpolate(c, w, a, b, t);
+      evaluate(c, w);
+      grown = fmaxf(grown, inflate(c, w, w->before));
+      unsigned bits = lane_bits(collisions(c, w));
+      for (; bits; bits &= bits - 1) {
+        const int lane = __builtin_ctz(bits);
+        /* Intervals before this one have been read. */
+        if (first + lane < count) middle[hits++] = t[lane];
+      }
+    }
+    memset(w->inflation, 0, c->links * sizeof(float));
+    if (!hits) return 1;
+    *where = middle[0];
+    if (grown <= least || hits > MOST_INTERVALS / 4 || width < 1e-6f) return 0;
+    width *= 0.25f;
+    for (int k = hits - 1; k >= 0; k--)
+      for (int j = 3; j >= 0; j--) middle[4 * k + j] = middle[k] + (j - 1.5f) * width;
+    count = 4 * hits;
+  }
+  return 1;
+}
+
+/* Newton's step onto a manifold: outputs are the changes of the coordinates, then the largest residual. */
+typedef struct {
+  Compute *step;
+  const V *kept;
+  long long stored;
+  double tolerance;
+  long long steps;
+} Projection;
+
+/* Project all lanes of w->x; return the lanes that arrive within limits. `o` and `store` are work space. */
+static I project(const Checker *c, const Projection *p, Work *w, V *store, V *o) {
+  const int n = (int)c->coordinates;
+  for (int k = 0;; k++) {
+    p->step(w->x, p->kept, store, o);
+    const I done = o[n] <= splat((float)p->tolerance);
+    if (k == p->steps || !any(~done)) {
+      I good = done;
+      for (int i = 0; i < n; i++)
+        good &= (w->x[i] >= splat(c->lower[i])) & (w->x[i] <= splat(c->upper[i]));
+      return good;
+    }
+    for (int i = 0; i < n; i++) {
+      const V x = w->x[i] + select_(done, splat(0.0f), o[i]);
+      w->x[i] = smaller(larger(x, splat(c->lower[i])), splat(c->upper[i]));
+    }
+  }
+}
+
+/* Go from a towards b on the manifold as far as possible; write the points reached, (count, n), and return their
+   number. `full` is set if nothing stops the way. */
+static int edge_on_manifold(const Checker *c, const Projection *p, Work *w, V *store, V *o, const float *a,
+                            const float *b, float resolution, float *points, int *full) {
+  const int n = (int)c->coordinates;
+  const float length = distance(a, b, n);
+  const int blocks = (int)ceilf(fmaxf(length * resolution, 1.0f) / W);
+  const float step = 1.0f / (blocks * W), gap = 2.5f * length * step + 1e-4f;
+  const float *last = a;
+  int count = 0;
+  *full = 0;
+  for (int k = 0; k < blocks; k++) {
+    interpolate(c, w, a, b, (ramp() + splat(k * W + 1.0f)) * splat(step));
+    I good = project(c, p, w, store, o);
+    V gaps = splat(0.0f);
+    for (int i = 0; i < n; i++) {
+      V before;
+      before[0] = last[i];
+      for (int j = 1; j < W; j++) before[j] = w->x[i][j - 1];
+      gaps = fused(w->x[i] - before, w->x[i] - before, gaps);
+    }
+    good &= gaps <= splat(gap * gap);
+    if (!good[0]) return count;
+    evaluate(c, w);
+    good &= ~collisions(c, w);
+    for (int j = 0; j < W; j++) {
+      if (!good[j]) return count;
+      for (int i = 0; i < n; i++) points[count * n + i] = w->x[i][j];
+      last = points + count++ * n;
+    }
+  }
+  *full = 1;
+  return count;
+}
+
+#define EXPORT __attribute__((visibility("default")))
+
+/* Read rows (count, n) into lanes; lanes behind the last row repeat it. */
+static void read_lanes(const Checker *c, Work *w, const float *rows, long long count) {
+  const int n = (int)c->coordinates;
+  for (int j = 0; j < W; j++) {
+    const float *row = rows + (j < count ? j : count - 1) * n;
+    for (int i = 0; i < n; i++) w->x[i][j] = row[i];
+  }
+}
+
+/* Write 1 for every configuration (count, n) that is within limits, holds all conditions and does not collide. */
+EXPORT int kineverse_valid(const Checker *c, const float *rows, long long count, unsigned char *valid) {
+  Work w;
+  if (work_begin(&w, c)) return -1;
+  for (long long first = 0; first < count; first += W) {
+    read_lanes(c, &w, rows + first * c->coordinates, count - first);
+    I good = splat(0.0f) <= splat(0.0f);
+    for (int i = 0; i < c->coordinates; i++)
+      good &= (w.x[i] >= splat(c->lower[i])) & (w.x[i] <= splat(c->upper[i]));
+    evaluate(c, &w);
+    good &= ~collisions(c, &w);
+    for (int j = 0; j < W && first + j < count; j++) valid[first + j] = good[j] != 0;
+  }
+  work_end(&w);
+  return 0;
+}
+
+/* Write 1 for every edge that is free: sampled if `least` is 0, else certain between the samples too. */
+EXPORT int kineverse_edges(const Checker *c, const float *from, const float *to, long long count, double resolution,
+                           double least, unsigned char *valid) {
+  Work w;
+  if (work_begin(&w, c)) return -1;
+  for (long long k = 0; k < count; k++) {
+    const float *a = from + k * c->coordinates, *b = to + k * c->coordinates;
+    float where;
+    valid[k] = (unsigned char)(least > 0 ? edge_is_certain(c, &w, a, b, resolution, least, &where)
+                                         : edge_is_free(c, &w, a, b, resolution));
+  }
+  work_end(&w);
+  return 0;
+}
+
+/* Find the first collision on a polyline (count, n): return the number of its edge and write the fraction of the
+   way along it, or return -1. */
+EXPORT long long kineverse_certify(const Checker *c, const float *points, long long count, double resolution,
+                                   double least, double *where) {
+  Work w;
+  if (work_begin(&w, c)) return -2;
+  long long found = -1;
+  float fraction = 0.0f;
+  for (long long k = 0; k + 1 < count && found < 0; k++) {
+    const float *a = points + k * c->coordinates;
+    if (!edge_is_certain(c, &w, a, a + c->coordinates, resolution, least, &fraction)) found = k;
+  }
+  *where = fraction;
+  work_end(&w);
+  return found;
+}
+
+/* Write the poses of one configuration (12 each) and the conditions; for messages and tests. */
+EXPORT int kineverse_poses(const Checker *c, const float *row, float *outputs) {
+  Work w;
+  if (work_begin(&w, c)) return -1;
+  read_lanes(c, &w, row, 1);
+  evaluate(c, &w);
+  for (int k = 0; k < 12 * c->poses + c->conditions; k++) outputs[k] = w.o[k][0];
+  work_end(&w);
+  return 0;
+}

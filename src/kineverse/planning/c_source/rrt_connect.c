@@ -1,0 +1,392 @@
+/* RRT-Connect (Kuffner and LaValle 2000) with dynamic domains (Yershova et al. 2005), on the whole space or on a
+   manifold, and shortcuts. */
+#include <time.h>
+
+static double now(void) {
+  struct timespec t;
+  clock_gettime(CLOCK_MONOTONIC, &t);
+  return t.tv_sec + 1e-9 * t.tv_nsec;
+}
+
+/* splitmix64 */
+typedef unsigned long long Random;
+INLINE Random random_bits(Random *state) {
+  Random z = (*state += 0x9e3779b97f4a7c15ULL);
+  z = (z ^ (z >> 30)) * 0xbf58476d1ce4e5b9ULL;
+  z = (z ^ (z >> 27)) * 0x94d049bb133111ebULL;
+  return z ^ (z >> 31);
+}
+INLINE float random_unit(Random *state) { return (random_bits(state) >> 40) * 0x1p-24f; }
+
+/* A tree of configurations, W of them in a chunk of columns. */
+typedef struct {
+  float *columns;
+  float *aims; /* on a manifold, where the edge to each node was aimed at, (room, n) */
+  int *parent;
+  float *domain; /* radius of the dynamic domain; infinite until an extension fails */
+  long long count, room;
+} Tree;
+
+static int tree_grow(Tree *t, int n) {
+  const long long room = t->room ? 2 * t->room : 1024;
+  float *columns = aligned_alloc(64, room * n * sizeof(float));
+  float *aims = realloc(t->aims, room * n * sizeof(float));
+  if (aims) t->aims = aims;
+  int *parent = realloc(t->parent, room * sizeof(int));
+  if (parent) t->parent = parent;
+  float *domain = realloc(t->domain, room * sizeof(float));
+  if (domain) t->domain = domain;
+  if (!columns || !aims || !parent || !domain) {
+    free(columns);
+    return 1;
+  }
+  if (t->count) memcpy(columns, t->columns, t->room * n * sizeof(float));
+  free(t->columns);
+  t->columns = columns;
+  t->room = room;
+  return 0;
+}
+
+static int tree_add(Tree *t, int n, const float *q, const float *aim, int parent) {
+  if (t->count == t->room && tree_grow(t, n)) return -1;
+  const long long k = t->count++;
+  for (int i = 0; i < n; i++) t->columns[(k / W * n + i) * W + k % W] = q[i];
+  memcpy(t->aims + k * n, aim, n * sizeof(float));
+  t->parent[k] = parent;
+  t->domain[k] = INFINITY;
+  return (int)k;
+}
+
+static void tree_read(const Tree *t, int n, long long k, float *q) {
+  for (int i = 0; i < n; i++) q[i] = t->columns[(k / W * n + i) * W + k % W];
+}
+
+static void tree_free(Tree *t) {
+  free(t->columns);
+  free(t->aims);
+  free(t->parent);
+  free(t->domain);
+}
+
+static int nearest(const Tree *t, int n, const float *q, float *away) {
+  const long long chunks = (t->count + W - 1) / W;
+  V best = splat(INFINITY);
+  I place = (I)splat(0.0f);
+  for (long long c = 0; c < chunks; c++) {
+    const V *column = (const V *)(t->columns + c * n * W);
+    V d = column[0] - splat(q[0]), sum = d * d;
+    for (int i = 1; i < n; i++) {
+      d = column[i] - splat(q[i]);
+      sum = fused(d, d, sum);
+    }
+    if ((c + 1) * W > t->count)
+      for (int j = (int)(t->count - c * W); j < W; j++) sum[j] = INFINITY;
+    const I closer = sum < best;
+    best = select_(closer, sum, best);
+    place = (closer & splat_bits((int)c)) | (~closer & place);
+  }
+  int found = 0;
+  float least = INFINITY;
+  for (int j = 0; j < W; j++) {
+    const int k = (int)place[j] * W + j;
+    if (best[j] < least || (best[j] == least && k < found)) least = best[j], found = k;
+  }
+  *away = sqrtf(least);
+  return found;
+}
+
+/* What a search is about, and what it has done. Times in seconds. */
+typedef struct {
+  const Checker *checker;
+  const Projection *projection; /* null: the whole space */
+  double range, resolution, seconds;
+  long long nodes, seed;
+  /* results */
+  long long iterations, edges, count_start, count_goal, status;
+  double elapsed, gap;
+} Search;
+
+enum { FOUND, TIME_IS_UP, TOO_MANY_NODES, NO_MEMORY };
+
+typedef struct {
+  Search *s;
+  Work w;
+  V *store, *o;
+  float *points; /* of one edge on the manifold */
+  int room;
+  void *memory;
+} Walk;
+
+static int walk_begin(Walk *k, Search *s) {
+  memset(k, 0, sizeof *k);
+  k->s = s;
+  const int n = (int)s->checker->coordinates;
+  if (work_begin(&k->w, s->checker)) return 1;
+  if (s->projection) {
+    const size_t vectors = s->projection->stored + n + 4;
+    k->room = (int)ceil(s->range * s->resolution) + 4 * W;
+    k->memory = malloc(vectors * sizeof(V) + 64 + (size_t)k->room * n * sizeof(float));
+    if (!k->memory) return 1;
+    k->o = (V *)(((size_t)k->memory + 63) & ~(size_t)63);
+    k->store = k->o + n + 2;
+    k->points = (float *)(k->store + s->projection->stored + 1);
+  }
+  return 0;
+}
+
+static void walk_end(Walk *k) {
+  work_end(&k->w);
+  free(k->memory);
+}
+
+/* Go from a to b, at most `range` apart; write the configuration that is reached. Return 0 where nothing is, 1 on the
+   way, 2 at b. */
+static int extend(Walk *k, const float *a, const float *b, float *reached) {
+  const Checker *c = k->s->checker;
+  const int n = (int)c->coordinates;
+  k->s->edges++;
+  if (!k->s->projection) {
+    if (!edge_is_free(c, &k->w, a, b, (float)k->s->resolution)) return 0;
+    memcpy(reached, b, n * sizeof(float));
+    return 2;
+  }
+  int full;
+  const int count = edge_on_manifold(c, k->s->projection, &k->w, k->store, k->o, a, b, (float)k->s->resolution,
+                                     k->points, &full);
+  if (!count || (!full && distance(a, k->points + (count - 1) * n, n) < 1e-3f)) return 0;
+  memcpy(reached, k->points + (count - 1) * n, n * sizeof(float));
+  return full ? 2 : 1;
+}
+
+static void towards(const float *a, const float *b, int n, float range, float *out) {
+  const float d = distance(a, b, n), t = d > range ? range / d : 1.0f;
+  for (int i = 0; i < n; i++) out[i] = t < 1.0f ? a[i] + t * (b[i] - a[i]) : b[i];
+}
+
+/* Write the configurations from a root to node j, or backwards; return their number, or -1 without room. On a manifold
+   the edges are gone again, with all their points. */
+static long long branch(Walk *k, const Tree *t, int j, int backwards, float *out, long long room) {
+  const Checker *c = k->s->checker;
+  const int n = (int)c->coordinates;
+  long long depth = 0, count = 0;
+  for (int i = j; i >= 0; i = t->parent[i]) depth++;
+  int *nodes = malloc(depth * sizeof(int));
+  if (!nodes) return -1;
+  for (long long i = depth - 1; i >= 0; i--, j = t->parent[j]) nodes[i] = j;
+  for (long long i = 0; i < depth; i++) {
+    int points = 1, full;
+    float from[MOST_COORDINATES];
+    if (k->s->projection && i) {
+      tree_read(t, n, nodes[i - 1], from);
+      points = edge_on_manifold(c, k->s->projection, &k->w, k->store, k->o, from, t->aims + (long long)nodes[i] * n,
+                                (float)k->s->resolution, k->points, &full);
+    }
+    if (count + points > room) {
+      count = -1;
+      break;
+    }
+    if (k->s->projection && i)
+      memcpy(out + count * n, k->points, points * n * sizeof(float));
+    else
+      tree_read(t, n, nodes[i], out + count * n);
+    count += points;
+  }
+  free(nodes);
+  for (long long a = 0, b = count - 1; backwards && a < b; a++, b--)
+    for (int i = 0; i < n; i++) {
+      const float swap = out[a * n + i];
+      out[a * n + i] = out[b * n + i], out[b * n + i] = swap;
+    }
+  return count;
+}
+
+/* Search a path from any start to any goal; write its configurations (room, n) and return their number. Without a
+   path those from a start to the node nearest to a goal are written, and the status says why. */
+EXPORT long long kineverse_rrt_connect(Search *s, const float *starts, long long start_count, const float *goals,
+                                       long long goal_count, float *path, long long room) {
+  const Checker *c = s->checker;
+  const int n = (int)c->coordinates;
+  const double begin = now();
+  Tree trees[2] = {{0}, {0}};
+  Random random = (Random)s->seed * 0x2545f4914f6cdd1dULL + 0x9e3779b97f4a7c15ULL;
+  Walk k;
+  float sample[MOST_COORDINATES], from[MOST_COORDINATES], to[MOST_COORDINATES], reached[MOST_COORDINATES];
+  const float range = (float)s->range;
+  long long count = -1, best = 0;
+  float best_gap = INFINITY;
+  s->iterations = s->edges = 0;
+  s->status = NO_MEMORY;
+  if (walk_begin(&k, s)) return -1;
+  for (long long i = 0; i < start_count; i++)
+    if (tree_add(&trees[0], n, starts + i * n, starts + i * n, -1) < 0) goto end;
+  for (long long i = 0; i < goal_count; i++)
+    if (tree_add(&trees[1], n, goals + i * n, goals + i * n, -1) < 0) goto end;
+  for (long long i = 0; i < start_count; i++) {
+    float away;
+    nearest(&trees[1], n, starts + i * n, &away);
+    if (away < best_gap) best_gap = away, best = i;
+  }
+  /* The straight way first. */
+  int grown = 0;
+  s->status = TIME_IS_UP;
+  for (;; s->iterations++) {
+    if ((s->iterations & 15) == 0 && now() - begin > s->seconds) break;
+    if (trees[0].count + trees[1].count > s->nodes) {
+      s->status = TOO_MANY_NODES;
+      break;
+    }
+    /* The smaller tree grows. */
+    if (s->iterations) grown = trees[0].count > trees[1].count;
+    Tree *own = &trees[grown], *other = &trees[1 - grown];
+    float away;
+    if (s->iterations < start_count) {
+      tree_read(own, n, s->iterations, from);
+      tree_read(other, n, nearest(other, n, from, &away), sample);
+    } else {
+      for (int i = 0; i < n; i++) sample[i] = c->lower[i] + random_unit(&random) * (c->upper[i] - c->lower[i]);
+    }
+    const int parent = nearest(own, n, sample, &away);
+    if (away > own->domain[parent] || away == 0.0f) continue;
+    tree_read(own, n, parent, from);
+    towards(from, sample, n, range, to);
+    if (!extend(&k, from, to, reached)) {
+      const float d = own->domain[parent];
+      own->domain[parent] = d == INFINITY ? 4.0f * range : fmaxf(d * 0.9999f, range);
+      continue;
+    }
+    if (own->domain[parent] < INFINITY) own->domain[parent] *= 1.0001f;
+    const int fresh = tree_add(own, n, reached, to, parent);
+    if (fresh < 0) {
+      s->status = NO_MEMORY;
+      break;
+    }
+    /* Connect the other tree to the new node. */
+    float goal[MOST_COORDINATES];
+    memcpy(goal, reached, n * sizeof(float));
+    int last = nearest(other, n, goal, &away);
+    if (grown == 0 && away < best_gap) best_gap = away, best = fresh;
+    int met = 0;
+    for (int steps = 0; steps < 1000; steps++) {
+      tree_read(other, n, last, from);
+      const float before = distance(from, goal, n);
+      towards(from, goal, n, range, to);
+      const int outcome = extend(&k, from, to, reached);
+      if (!outcome) break;
+      /* Points between two points of a manifold are off it, and their projections are not where they were. */
+      met = outcome == 2 && before <= range && distance(reached, goal, n) < 1e-3f;
+      if (met && !s->projection) break;
+      if (!met && distance(reached, goal, n) > before - 0.1f * fminf(range, before)) break;
+      last = tree_add(other, n, reached, to, last);
+      if (last < 0 || met || outcome == 1) break;
+    }
+    if (last < 0) {
+      s->status = NO_MEMORY;
+      break;
+    }
+    if (met) {
+      const int a = grown ? last : fresh, b = grown ? fresh : last;
+      const long long first = branch(&k, &trees[0], a, 0, path, room);
+      const long long rest = first < 0 ? -1 : branch(&k, &trees[1], b, 1, path + first * n, room - first);
+      s->status = rest < 0 ? NO_MEMORY : FOUND;
+      if (rest >= 0) count = first + rest;
+      best_gap = 0.0f;
+      break;
+    }
+  }
+  if (s->status != FOUND && trees[0].count) count = branch(&k, &trees[0], (int)best, 0, path, room);
+end:
+  s->gap = best_gap;
+  s->count_start = trees[0].count;
+  s->count_goal = trees[1].count;
+  tree_free(&trees[0]);
+  tree_free(&trees[1]);
+  walk_end(&k);
+  s->elapsed = now() - begin;
+  return count;
+}
+
+/* Shorten a polyline (count, n) in place: random points on it are connected where the way between them is certain,
+   until `rounds` tries have failed or the time is up. Return the new number of points. */
+EXPORT long long kineverse_shortcut(Search *s, float *path, long long count, long long room, long long rounds,
+                                    double least) {
+  const Checker *c = s->checker;
+  const int n = (int)c->coordinates;
+  const double begin = now();
+  Random random = (Random)s->seed * 0x2545f4914f6cdd1dULL + 0x9e3779b97f4a7c15ULL;
+  Work w;
+  if (work_begin(&w, c)) return count;
+  float *along = malloc((room + 2) * sizeof(float));
+  for (long long round = 0; along && round < rounds && count > 2; round++) {
+    if ((round & 7) == 0 && now() - begin > s->seconds) break;
+    along[0] = 0.0f;
+    for (long long k = 1; k < count; k++)
+      along[k] = along[k - 1] + distance(path + (k - 1) * n, path + k * n, n);
+    float one = random_unit(&random) * along[count - 1], other = random_unit(&random) * along[count - 1];
+    if (one > other) {
+      const float swap = one;
+      one = other, other = swap;
+    }
+    /* Ends near a node are the node: so nodes vanish. */
+    long long i = 0, j = 0;
+    while (i + 2 < count && along[i + 1] <= one) i++;
+    while (j + 2 < count && along[j + 1] <= other) j++;
+    if (i == j) continue;
+    float a[MOST_COORDINATES], b[MOST_COORDINATES], where;
+    const float u = (one - along[i]) / fmaxf(along[i + 1] - along[i], 1e-9f);
+    const float v = (other - along[j]) / fmaxf(along[j + 1] - along[j], 1e-9f);
+    for (int e = 0; e < n; e++) {
+      a[e] = path[i * n + e] + u * (path[(i + 1) * n + e] - path[i * n + e]);
+      b[e] = path[j * n + e] + v * (path[(j + 1) * n + e] - path[j * n + e]);
+    }
+    const float gain = other - one - distance(a, b, n);
+    if (gain < 1e-3f * (other - one) || (j == i + 1 && count + 1 > room)) continue;
+    if (!edge_is_free(c, &w, a, b, (float)s->resolution) ||
+        !edge_is_certain(c, &w, a, b, (float)s->resolution, (float)least, &where))
+      continue;
+    /* Nodes i + 1 ... j give way to a and b. */
+    memmove(path + (i + 3) * n, path + (j + 1) * n, (count - j - 1) * n * sizeof(float));
+    memcpy(path + (i + 1) * n, a, n * sizeof(float));
+    memcpy(path + (i + 2) * n, b, n * sizeof(float));
+    count += i + 2 - j;
+  }
+  free(along);
+  work_end(&w);
+  s->elapsed = now() - begin;
+  return count;
+}
+
+/* Project configurations (count, n) in place; write 1 for those that arrive within limits. */
+EXPORT int kineverse_project(const Checker *c, const Projection *p, float *rows, long long count,
+                             unsigned char *arrived) {
+  Search s = {.checker = c, .projection = p, .range = 1.0, .resolution = 1.0};
+  Walk k;
+  const int n = (int)c->coordinates;
+  if (walk_begin(&k, &s)) {
+    walk_end(&k);
+    return -1;
+  }
+  for (long long first = 0; first < count; first += W) {
+    read_lanes(c, &k.w, rows + first * n, count - first);
+    const I good = project(c, p, &k.w, k.store, k.o);
+    for (int j = 0; j < W && first + j < count; j++) {
+      arrived[first + j] = good[j] != 0;
+      for (int i = 0; i < n; i++) rows[(first + j) * n + i] = k.w.x[i][j];
+    }
+  }
+  walk_end(&k);
+  return 0;
+}
+
+/* Go from a to b on the manifold; write the points reached (room, n) and return their number, or -1 if the way ends
+   before b. */
+EXPORT long long kineverse_walk(Search *s, const float *a, const float *b, float *points, long long room) {
+  Walk k;
+  const int n = (int)s->checker->coordinates;
+  s->range = distance(a, b, n);
+  long long count = -1;
+  int full = 0;
+  if (!walk_begin(&k, s) && k.room <= room)
+    count = edge_on_manifold(s->checker, s->projection, &k.w, k.store, k.o, a, b, (float)s->resolution, points, &full);
+  walk_end(&k);
+  return full && distance(points + (count - 1) * n, b, n) < 1e-3f ? count : -1;
+}

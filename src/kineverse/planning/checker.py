@@ -1,0 +1,335 @@
+"""Collision checker of a planner: the bodies that move against everything else, W configurations at a time."""
+
+from __future__ import annotations
+
+import ctypes
+import math
+from collections.abc import Iterator, Sequence
+from collections.abc import Set as AbstractSet
+from contextlib import contextmanager
+from itertools import combinations, permutations
+
+import numpy as np
+import numpy.typing as npt
+
+from kineverse.compile.vector_program import VectorProgram
+from kineverse.expressions.expression import Expression, as_expression
+from kineverse.geometry import Scene
+from kineverse.geometry.collision_filter import rigid_group
+from kineverse.geometry.objects import CollisionObject
+from kineverse.geometry.shapes import Solid
+from kineverse.lie import Array
+from kineverse.model.frame_dependence import FrameDependence
+from kineverse.state import State
+from kineverse.symbols import Symbol
+
+from .bindings import CheckerStruct, ObstacleSetStruct, planning_functions
+from .links import LinkTable, is_thin
+from .obstacles import Floats32, ObstacleSet
+
+RESOLUTION = 32.0
+"""Samples of an edge for each unit of its length, [1/rad] and [1/m]."""
+_SAME = 1e-4
+LEAST_INFLATION = 2e-4
+"""Growth of spheres below which a collision between two samples counts as one [m]."""
+
+
+class CollisionChecker:
+    """Collision check of many configurations of some coordinates; everything else stands still.
+
+    Parameters
+    ----------
+    scene
+        Scene of the model, whose rules say which pairs of bodies are checked.
+    coordinates
+        The n coordinates that move.
+    conditions
+        Expressions that are at most 0 where a configuration is allowed.
+    margin
+        Least distance of pairs of bodies [m].
+    protrusion
+        Largest distance of a sphere from the shape that it covers [m]; None for what suits the shape.
+
+    Attributes
+    ----------
+    moving
+        Names of the bodies that move.
+    uncovered
+        Pairs of bodies that are not checked here, but by the scene: spheres are too coarse for them.
+    lower, upper
+        (n,) limits, which are written in place.
+    struct
+        The tables as C reads them.
+    """
+
+    def __init__(
+        self,
+        scene: Scene,
+        coordinates: Sequence[Symbol],
+        conditions: Sequence[Expression],
+        margin: float,
+        protrusion: float | None = None,
+    ) -> None:
+        self._code = planning_functions()
+        self.scene, self.coordinates = scene, tuple(coordinates)
+        model, world = scene.model, scene.collision_world
+        scene.update(model.default_state())
+        world.prepare()
+        dependence = FrameDependence(model, coordinates)
+        frames = dict(model.frames)
+        self.moving = tuple(body for body in scene.bodies if dependence.moves(body))
+        groups = {body: rigid_group(body, frames) for body in self.moving}
+        self.groups = tuple(dict.fromkeys(groups.values()))
+        poses = [self.groups.index(groups[body]) for body in self.moving]
+        self.program = self._make_program([model.fk(g)[:3] for g in self.groups], conditions)
+        members = [
+            [
+                (world.objects[k], world.solid(k), self._in_group(groups[body], k))
+                for k in world.members[world.body_index(body)]
+            ]
+            for body in self.moving
+        ]
+        # A plate that one joint moves, such as a door: spheres would fill the gaps beside it.
+        covered = [
+            len(dependence.moving_ancestors(body)) > 1 or not any(is_thin(solid) for _, solid, _ in items)
+            for body, items in zip(self.moving, members, strict=True)
+        ]
+        self.links = LinkTable(members, poses, covered, protrusion)
+        self._planes: list[Array] = []
+        self._place_static(dependence)
+        self._place_moving(members, poses)
+        self._choose_pairs(dependence)
+        self._build_struct(margin)
+
+    def _make_program(self, poses: list[Expression], conditions: Sequence[Expression]) -> VectorProgram:
+        outputs = [*poses, *conditions]
+        # Loops that do not close have no pose: the sum of all entries is NaN then, and so is no condition.
+        if any(e.nodes for e in outputs):
+            outputs.append(as_expression(sum((p.sum() for p in poses), as_expression(0.0)) * 0.0))
+        moving = {*self.coordinates}
+        found = {s for e in outputs for s in e.symbols} - moving
+        self.parameters = tuple(sorted(found, key=lambda s: s.sort_key))
+        self.conditions = len(outputs) - len(poses)
+        return VectorProgram(outputs, self.coordinates, self.parameters, scalar="float")
+
+    def _in_group(self, group: str, index: int) -> Array:
+        """Return the pose of an object in the frame of its rigid group, (4, 4)."""
+        item = self.scene.collision_world.objects[index]
+        offset = self.scene.model.fk(item.body, group)
+        return np.asarray(offset({}) @ item.shape.origin.matrix, dtype=float)
+
+    def _place_static(self, dependence: FrameDependence) -> None:
+        """Collect the obstacles of the world: all objects that stand still."""
+        world = self.scene.collision_world
+        self._static = np.array(
+            [k for k, o in enumerate(world.objects) if not dependence.moves(o.body)], dtype=int
+        )
+        owners = world.table.body[self._static]
+        used, numbers = np.unique(owners, return_inverse=True)
+        self.standing = tuple(world.bodies[k] for k in used)
+        moving = np.array([world.body_index(body) for body in self.moving], dtype=int)
+        self._allowed = np.ascontiguousarray(world.table.allowed[np.ix_(moving, used)], dtype=np.uint8)
+        self.uncovered = [
+            (body, self.standing[j])
+            for i, body in enumerate(self.moving)
+            if not len(self.links.spheres[i])
+            for j in np.flatnonzero(self._allowed[i]).tolist()
+        ]
+        solids = [world.solid(k) for k in self._static]
+        self._world = ObstacleSet(solids, numbers.astype(np.int32), self._planes, self.program.lanes)
+
+    def _place_moving(
+        self, members: Sequence[Sequence[tuple[CollisionObject, Solid, Array]]], poses: Sequence[int]
+    ) -> None:
+        """Collect the shapes of the bodies that move, each body in a set of its own."""
+        lanes = self.program.lanes
+        self._sets: list[ObstacleSet] = []
+        self._costs = []
+        for k, items in enumerate(members):
+            solids = [solid for _, solid, _ in items]
+            found = ObstacleSet(
+                solids, np.zeros(len(solids), dtype=np.int32), self._planes, lanes, poses[k], k
+            )
+            found.place(np.array([T[:3] for _, _, T in items]))
+            self._sets.append(found)
+            self._costs.append(found.cost)
+
+    def _choose_pairs(self, dependence: FrameDependence) -> None:
+        """Choose for each pair of moving bodies whether shapes or spheres stand for the second one.
+
+        Pairs without any spheres are left to the scene.
+        """
+        world = self.scene.collision_world
+        number = [world.body_index(body) for body in self.moving]
+        spheres = [len(s) for s in self.links.spheres]
+        pairs: list[tuple[int, int]] = []
+        moving_pairs: list[tuple[int, int]] = []
+        for (i, a), (j, b) in combinations(enumerate(self.moving), 2):
+            if not world.table.allowed[number[i], number[j]] or not dependence.moves_between(a, b):
+                continue
+            # Shapes are exact, but spheres have a hierarchy.
+            costs = {
+                0: spheres[i] * spheres[j] / 2,
+                1: spheres[i] * self._costs[j],
+                2: spheres[j] * self._costs[i],
+            }
+            possible = [k for k, cost in costs.items() if cost > 0]
+            if not possible:
+                self.uncovered.append((a, b))
+                continue
+            choice = min(possible, key=lambda k: costs[k])
+            (moving_pairs if choice else pairs).append((j, i) if choice == 2 else (i, j))
+        self.pairs = np.array(pairs, dtype=np.int32).reshape(-1, 2)
+        self.moving_pairs = np.array(moving_pairs, dtype=np.int32).reshape(-1, 2)
+
+    def _build_struct(self, margin: float) -> None:
+        n = len(self.coordinates)
+        self.lower, self.upper = np.zeros(n, dtype=np.float32), np.zeros(n, dtype=np.float32)
+        self._plane_table = np.concatenate(self._planes or [np.zeros((1, 4))]).astype(np.float32)
+        self._set_structs = (ObstacleSetStruct * max(len(self._sets), 1))(*(s.struct for s in self._sets))
+        program, links = self.program, self.links
+        self._kept = program.prepare(np.zeros(len(self.parameters)))
+        self.struct = CheckerStruct(
+            n,
+            len(self.groups),
+            self.conditions,
+            program.stored,
+            program.compute_address,
+            self._kept.ctypes.data,
+            self.lower.ctypes.data,
+            self.upper.ctypes.data,
+            len(links.links),
+            len(self.standing),
+            links.links.ctypes.data,
+            links.coarse.ctypes.data,
+            links.fine.ctypes.data,
+            self._plane_table.ctypes.data,
+            self._allowed.ctypes.data,
+            ctypes.addressof(self._world.struct),
+            ctypes.addressof(self._set_structs),
+            None,
+            len(self.pairs),
+            len(self.moving_pairs),
+            self.pairs.ctypes.data,
+            self.moving_pairs.ctypes.data,
+            margin,
+        )
+
+    @property
+    def address(self) -> int:
+        """Address of :attr:`struct`, valid as long as this object."""
+        return ctypes.addressof(self.struct)
+
+    def place(self, state: State) -> None:
+        """Place everything as at a state: obstacles, and what the poses depend on beside the coordinates."""
+        self.scene.update(state)
+        self._world.place(self.scene.collision_world.table.poses[self._static])
+        self._kept = self.program.prepare(state.vector(self.parameters))
+        self.struct.kept = self._kept.ctypes.data
+
+    @contextmanager
+    def excepting(self, pairs: AbstractSet[frozenset[str]]) -> Iterator[None]:
+        """Leave out pairs of bodies, {a, b} each, while the context lasts."""
+        if not pairs:
+            yield
+            return
+        standing = {body: k for k, body in enumerate(self.standing)}
+        numbers = {body: k for k, body in enumerate(self.moving)}
+        allowed = self._allowed.copy()
+        for pair in pairs:
+            for a, b in permutations(pair):
+                if a in numbers and b in standing:
+                    allowed[numbers[a], standing[b]] = 0
+
+        def keep(rows: npt.NDArray[np.int32]) -> npt.NDArray[np.int32]:
+            names = [frozenset((self.moving[i], self.moving[j])) for i, j in rows.tolist()]
+            return np.ascontiguousarray(rows[[name not in pairs for name in names]].reshape(-1, 2))
+
+        spheres, shapes = keep(self.pairs), keep(self.moving_pairs)
+        self._use(allowed, spheres, shapes)
+        try:
+            yield
+        finally:
+            self._use(self._allowed, self.pairs, self.moving_pairs)
+
+    @contextmanager
+    def widened(self, by: float, ends: Floats32) -> Iterator[None]:
+        """Widen the margin by a length [m] while the context lasts, if configurations (N, n) stay valid with it."""
+        margin = self.struct.margin
+        self.struct.margin = margin + by
+        if not self.valid(np.ascontiguousarray(ends)).all():
+            self.struct.margin = margin
+        try:
+            yield
+        finally:
+            self.struct.margin = margin
+
+    def _use(
+        self,
+        allowed: npt.NDArray[np.uint8],
+        pairs: npt.NDArray[np.int32],
+        moving_pairs: npt.NDArray[np.int32],
+    ) -> None:
+        s = self.struct
+        s.allowed, s.pair, s.moving_pair = allowed.ctypes.data, pairs.ctypes.data, moving_pairs.ctypes.data
+        s.pairs, s.moving_pairs = len(pairs), len(moving_pairs)
+
+    # -- configurations ------------------------------------------------------------------------------------
+
+    def valid(self, Q: Floats32) -> npt.NDArray[np.bool_]:
+        """Return flags (N,) of the configurations (N, n) that are within limits, allowed and free."""
+        found = np.zeros(len(Q), dtype=np.uint8)
+        self._code.kineverse_valid(self.address, Q.ctypes.data, len(Q), found.ctypes.data)
+        return found.astype(bool)
+
+    def edges(
+        self, A: Floats32, B: Floats32, resolution: float = RESOLUTION, least: float = 0.0
+    ) -> npt.NDArray[np.bool_]:
+        """Return flags (N,) of the straight edges between configurations (N, n) that are free.
+
+        Parameters
+        ----------
+        A, B
+            The ends.
+        resolution
+            Samples for each unit of length [1/rad], [1/m].
+        least
+            0 to check samples only; otherwise what happens between them as well, to this length [m].
+        """
+        found = np.zeros(len(A), dtype=np.uint8)
+        self._code.kineverse_edges(
+            self.address, A.ctypes.data, B.ctypes.data, len(A), resolution, least, found.ctypes.data
+        )
+        return found.astype(bool)
+
+    def find_collision(self, points: Floats32, resolution: float = RESOLUTION) -> tuple[int, float] | None:
+        """Return the first edge of a polyline (N, n) that is not certainly free, and the fraction along it."""
+        where = ctypes.c_double()
+        found = self._code.kineverse_certify(
+            self.address,
+            points.ctypes.data,
+            len(points),
+            resolution,
+            LEAST_INFLATION,
+            ctypes.addressof(where),
+        )
+        return None if found < 0 else (int(found), where.value)
+
+    def outputs(self, q: Floats32) -> tuple[Floats32, Floats32]:
+        """Return the poses (K, 3, 4) of the rigid groups and the conditions at a configuration (n,)."""
+        count = 12 * len(self.groups)
+        found = np.zeros(count + self.conditions, dtype=np.float32)
+        self._code.kineverse_poses(self.address, q.ctypes.data, found.ctypes.data)
+        return found[:count].reshape(-1, 3, 4), found[count:]
+
+    def find_periodic(self, candidates: npt.NDArray[np.bool_]) -> npt.NDArray[np.bool_]:
+        """Return flags (n,) of the coordinates among some whose full turns change no pose and no condition."""
+        generator = np.random.default_rng(0)
+        found = candidates.copy()
+        for i in np.flatnonzero(candidates).tolist():
+            for q in generator.uniform(-1.0, 1.0, (3, len(candidates))).astype(np.float32):
+                turned = q.copy()
+                turned[i] += math.tau
+                pairs = zip(self.outputs(q), self.outputs(turned), strict=True)
+                found[i] &= all(np.allclose(a, b, atol=_SAME, equal_nan=True) for a, b in pairs)
+        return found

@@ -1,0 +1,184 @@
+"""Coordinates of a planner: what moves, within which limits and under which conditions."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterable
+from fnmatch import fnmatchcase
+
+import numpy as np
+
+from kineverse.control.configuration_space import ConfigurationSpace, find_coordinates
+from kineverse.errors import InvalidValueError, UnknownNameError, suggest
+from kineverse.expressions.expression import Expression, as_expression
+from kineverse.expressions.functions import maximum
+from kineverse.lie import Array
+from kineverse.model.constraint import Constraint
+from kineverse.model.model_view import ModelView
+from kineverse.model.projection import is_equality
+from kineverse.symbols import Symbol
+
+_WILDCARDS = "*?["
+_HALF_TURN, _BEYOND = math.pi + 0.3, 2.0
+CONDITION_TOLERANCE = 1e-5
+"""Largest excess of a constraint that counts as satisfied; float has seven digits."""
+
+
+class PlanningSpace:
+    """Coordinates that a planner moves, with the constraints of the model on them.
+
+    Parameters
+    ----------
+    model
+        The model.
+    move
+        Coordinates as symbols, names or patterns; an articulation stands for its coordinates. None for all that may
+        move freely.
+
+    Attributes
+    ----------
+    symbols
+        The n coordinates, in the order in which they are given, patterns in the order of the model.
+    conditions
+        Expressions that are at most 0 where the inequalities of the model hold; limits of single coordinates that
+        are numbers are not among them.
+    equalities
+        Expressions that are 0 where the equalities of the model hold.
+    """
+
+    def __init__(self, model: ModelView, move: Iterable[Symbol | str] | Symbol | str | None) -> None:
+        self.model = model
+        self.symbols = _free_coordinates(model) if move is None else _find_moving(model, move)
+        if not self.symbols:
+            raise InvalidValueError(
+                "There is nothing to move: the model has no coordinates, or move= is empty."
+            )
+        ranges = self._read_constraints()
+        self._space = ConfigurationSpace(model, self.symbols, ranges)
+        self.turning = self._space.find_turning_candidates(ranges)
+
+    def _read_constraints(self) -> dict[str, Constraint]:
+        moved, rates = {*self.symbols}, self.model.rates
+        self.conditions: list[Expression] = []
+        self.condition_names: list[str] = []
+        self.equalities: list[Expression] = []
+        ranges: dict[str, Constraint] = {}
+        for name, c in self.model.plain_constraints().items():
+            if any(s.order for s in c.symbols):
+                continue
+            low, middle, high = (rates.resolve(e) for e in (c.lower, c.expression, c.upper))
+            symbols = {s for e in (low, middle, high) for s in e.symbols}
+            if moved.isdisjoint(symbols):
+                continue
+            whole = Constraint(low, middle, high)
+            ranges[name] = whole
+            if is_equality(whole):
+                self.equalities.append(middle - low)
+            elif not (isinstance(middle, Symbol) and not low.symbols and not high.symbols):
+                excess = [e for e in (low - middle, middle - high) if _is_bounded(e)]
+                if excess:
+                    worst = excess[0] if len(excess) == 1 else as_expression(maximum(*excess))
+                    self.conditions.append(worst - CONDITION_TOLERANCE)
+                    self.condition_names.append(name)
+        for four in (record.coordinates for record in self.model.articulations.values()):
+            quaternion = [
+                s for s in four if s in moved and s.path.rpartition("/")[2] in ("qx", "qy", "qz", "qw")
+            ]
+            if len(quaternion) == 4:
+                self.equalities.append(as_expression(sum((s * s for s in quaternion), as_expression(-1.0))))
+        return ranges
+
+    @property
+    def lower(self) -> Array:
+        """Lower limits (n,), -inf for none."""
+        return self._space.lower
+
+    @property
+    def upper(self) -> Array:
+        """Upper limits (n,), inf for none."""
+        return self._space.upper
+
+    def bounds(self, start: Array, points: Array) -> tuple[Array, Array]:
+        """Return finite bounds (n,) of a search from a start (n,) to or about configurations (N, n).
+
+        A joint that turns fully, without limits, may turn by a little more than half a turn to either side of the
+        start; another coordinate without limits may go beyond the start and the given ones by 2 m or rad.
+        """
+        given = np.vstack([start[None], points])
+        low = np.where(self.turning, start - _HALF_TURN, given.min(axis=0) - _BEYOND)
+        high = np.where(self.turning, start + _HALF_TURN, given.max(axis=0) + _BEYOND)
+        finite = np.isfinite(self.lower), np.isfinite(self.upper)
+        return np.where(finite[0], self.lower, low), np.where(finite[1], self.upper, high)
+
+    def equivalents(self, q: Array, start: Array, most: int = 32) -> Array:
+        """Return configurations (K, n) within the bounds about a start that are q but for full turns of joints.
+
+        The nearest to the start come first. Without any there is q itself.
+        """
+        low, high = self.bounds(start, q[None])
+        found = [q]
+        for i in np.flatnonzero(self.turning).tolist():
+            first = math.ceil((low[i] - q[i]) / math.tau - 1e-9)
+            last = math.floor((high[i] - q[i]) / math.tau + 1e-9)
+            found = [_shifted(p, i, k * math.tau) for p in found for k in range(first, last + 1)] or found
+            found.sort(key=lambda p: float(np.linalg.norm(p - start)))
+            del found[most:]
+        return np.array(found)
+
+
+def _shifted(q: Array, i: int, by: float) -> Array:
+    moved = q.copy()
+    moved[i] += by
+    return moved
+
+
+def _is_bounded(excess: Expression) -> bool:
+    return bool(excess.symbols) and not (excess.is_constant and not math.isfinite(float(excess)))
+
+
+def _free_coordinates(model: ModelView) -> tuple[Symbol, ...]:
+    """Return the independent coordinates whose speeds are free: a wheeled base that rolls is not among them."""
+    rolling = _rolling_coordinates(model)
+    return tuple(s for s in model.degrees_of_freedom if s not in rolling)
+
+
+def _rolling_coordinates(model: ModelView) -> set[Symbol]:
+    """Return the coordinates that fewer speeds drive than there are coordinates: they do not move independently."""
+    driven: dict[Symbol, set[Symbol]] = {
+        x: {*row} for x, row in model.rates.items() if x not in model.rates.dependent
+    }
+    found: set[Symbol] = set()
+    groups: list[tuple[set[Symbol], set[Symbol]]] = []
+    for x, speeds in driven.items():
+        joined = [g for g in groups if g[1] & speeds]
+        groups = [g for g in groups if not g[1] & speeds]
+        groups.append(({x}.union(*(g[0] for g in joined)), speeds.union(*(g[1] for g in joined))))
+    for coordinates, speeds in groups:
+        if len(speeds) < len(coordinates):
+            found |= coordinates
+    return found
+
+
+def _find_moving(model: ModelView, move: Iterable[Symbol | str] | Symbol | str) -> tuple[Symbol, ...]:
+    given = (move,) if isinstance(move, Symbol | str) else tuple(move)
+    names = {str(s): s for s in model.degrees_of_freedom}
+    found: dict[Symbol, None] = {}
+    for item in given:
+        if isinstance(item, str) and any(sign in item for sign in _WILDCARDS):
+            matching = [s for name, s in names.items() if fnmatchcase(name, item)]
+            if not matching:
+                raise UnknownNameError(
+                    f"move=: no coordinate matches '{item}'. {suggest(item, names, 'coordinate')}"
+                )
+            found.update(dict.fromkeys(matching))
+        else:
+            chosen = find_coordinates(model, [item], "move")
+            found.update(dict.fromkeys(sorted(chosen, key=lambda s: s.sort_key)))
+    rolling = [s for s in found if s in _rolling_coordinates(model)]
+    if rolling:
+        raise InvalidValueError(
+            f"move=: {', '.join(map(repr, map(str, rolling[:6])))} cannot move independently: wheels that roll drive "
+            "them, and a straight way between two configurations would slip. Leave them out and place the base with "
+            "place(), or give it a base that moves freely."
+        )
+    return tuple(found)

@@ -1,0 +1,143 @@
+"""Connection of a start with goals: search, shortcuts, certificate; in the whole space or on a manifold."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from time import perf_counter
+
+import numpy as np
+
+from kineverse.lie import Array
+
+from .bindings import TIME_IS_UP
+from .checker import RESOLUTION, CollisionChecker
+from .constrained_path import polish, shorten_on_manifold
+from .manifold import Manifold
+from .obstacles import Floats32
+from .search import RrtConnect, SearchResult
+
+_SHORTCUTS = 60
+_REPAIRS = 12
+_FINER = 8.0
+"""Factor of the resolution where an edge collides between its samples."""
+_FINEST = 4000.0
+_ATTEMPTS = 4
+_WIDER = 1e-3
+"""Margin beyond the one asked for, with which edges of a search are free between their samples too, mostly [m]."""
+
+
+@dataclass(frozen=True, slots=True)
+class Connected:
+    """Outcome of a connection.
+
+    Attributes
+    ----------
+    points
+        Configurations (N, n) of the path, or of the best partial one.
+    problem
+        Why it does not lead to a goal; empty if it does.
+    iterations
+        Number of samples.
+    """
+
+    points: Array
+    problem: str
+    iterations: int
+
+
+def connect(
+    checker: CollisionChecker, starts: Floats32, goals: Floats32, seconds: float, seed: int
+) -> Connected:
+    """Return a path from any of some starts (S, n) to any of some goals (G, n), certified between its samples.
+
+    Edges of the search that collide between samples are planned anew, with more samples.
+    """
+    begin = perf_counter()
+    search = RrtConnect(checker)
+    with checker.widened(_WIDER, np.vstack([starts, goals])):
+        found = search.solve(starts, goals, seconds, seed)
+    if not found.found:
+        return Connected(found.points.astype(float), explain_failure(found, seconds), found.iterations)
+    points = search.shorten(found.points, seconds - (perf_counter() - begin), seed, _SHORTCUTS)
+    resolution = RESOLUTION
+    for _ in range(_REPAIRS):
+        collision = checker.find_collision(points)
+        if collision is None:
+            return Connected(points.astype(float), "", found.iterations)
+        k, _fraction = collision
+        left = seconds - (perf_counter() - begin)
+        resolution = min(_FINER * resolution, _FINEST)
+        detour = search.solve(points[k : k + 1], points[k + 1 : k + 2], left, seed, resolution)
+        if not detour.found:
+            break
+        points = np.ascontiguousarray(np.vstack([points[:k], detour.points, points[k + 2 :]]))
+    problem = (
+        "A path was found whose samples are free, but something thin lies between two of them, and no way around "
+        "it was found in the time given. More seconds=, or another seed=, may find one."
+    )
+    return Connected(points.astype(float), problem, found.iterations)
+
+
+def connect_on_manifold(
+    checker: CollisionChecker,
+    manifold: Manifold,
+    starts: Floats32,
+    goals: Floats32,
+    seconds: float,
+    seed: int,
+) -> Connected:
+    """Return a path on a manifold from any of some starts (S, n) to any of some goals (G, n).
+
+    Its points are in double precision on the manifold, and lines between them keep to it; see :func:`.polish`. A
+    path that collides between samples is searched again, with another seed and more samples.
+    """
+    begin = perf_counter()
+    search = RrtConnect(checker, manifold)
+    iterations, resolution, problem = 0, RESOLUTION, ""
+    points = starts
+    for attempt in range(_ATTEMPTS):
+        left = seconds - (perf_counter() - begin)
+        if attempt and left <= 0.0:
+            break
+        with checker.widened(_WIDER, np.vstack([starts, goals])):
+            found = search.solve(starts, goals, left, seed + 7919 * attempt, resolution)
+        iterations += found.iterations
+        if not found.found:
+            return Connected(
+                found.points.astype(float), problem or explain_failure(found, seconds), iterations
+            )
+        points = found.points
+        whole = shorten_on_manifold(search, found.points, left, seed, _SHORTCUTS)
+        exact = polish(manifold, whole.astype(float))
+        if exact is None:
+            problem = "A path was found, but it leaves the limits where the holds are met exactly."
+            continue
+        if checker.find_collision(np.ascontiguousarray(exact, dtype=np.float32)) is None:
+            return Connected(exact, "", iterations)
+        problem = "A path was found whose samples are free, but something thin lies between two of them."
+        resolution *= 2.0
+    return Connected(points.astype(float), problem, iterations)
+
+
+def explain_failure(found: SearchResult, seconds: float) -> str:
+    """Return why a search has found no path, and how far it has come."""
+    own, other = found.nodes
+    reached = f"{own} configurations were reached from the start and {other} from the goals"
+    enclosed = [name for name, count in zip(("the start", "the goal"), found.nodes, strict=True) if count < 8]
+    hint = f" It seems that {' and '.join(enclosed)} cannot be left." if enclosed else ""
+    if found.status == TIME_IS_UP:
+        return (
+            f"The time of {seconds:g} s is up: {reached}, and the nearest pair is {found.gap:.3g} apart.{hint} Give "
+            "more seconds=, or other goals."
+        )
+    return f"The search ended: {reached}, and the nearest pair is {found.gap:.3g} apart.{hint}"
+
+
+def unique_rows(Q: Array, apart: float) -> Sequence[int]:
+    """Return the indices of rows (N, n) none of which is nearer to an earlier one than a distance."""
+    kept: list[int] = []
+    for k, q in enumerate(Q):
+        if not kept or np.linalg.norm(Q[kept] - q, axis=1).min() > apart:
+            kept.append(k)
+    return kept

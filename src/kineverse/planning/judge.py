@@ -1,0 +1,112 @@
+"""Judgement of configurations and paths by the collision scene, in double precision."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+
+from kineverse.geometry import PreparedQuery, Rule, Scene
+from kineverse.geometry.prepared_query import PairFlags
+from kineverse.geometry.results import DistanceResult, DistanceResults
+from kineverse.lie import Array
+from kineverse.state import State
+from kineverse.symbols import Symbol
+
+from .checker import RESOLUTION
+from .path import densify
+
+FINE = 1 / 640
+"""Step of samples where no certificate vouches for what lies between them [rad], [m]."""
+
+
+class SceneJudge:
+    """Contacts of configurations of some coordinates, by the scene.
+
+    Parameters
+    ----------
+    scene
+        The scene; it is left at the last configuration.
+    coordinates
+        The n coordinates that move.
+    rules
+        Rules about pairs that do not count.
+    uncovered
+        Pairs of bodies that nobody else checks: they are looked at more often.
+    """
+
+    def __init__(
+        self,
+        scene: Scene,
+        coordinates: Sequence[Symbol],
+        rules: Sequence[Rule],
+        uncovered: Sequence[tuple[str, str]],
+    ) -> None:
+        self._scene = scene
+        excepted = {frozenset(rule[:2]) for rule in rules}
+        left = [pair for pair in uncovered if frozenset(pair) not in excepted]
+        moving = {
+            s for body in {name for pair in left for name in pair} for s in scene.model.fk(body).symbols
+        }
+        self._concerned = np.array([s in moving for s in coordinates], dtype=bool)
+        self._uncovered = PreparedQuery(scene.collision_world, lambda: self._flag(left), 0.0)
+        self._query = scene.watch(moving=coordinates, rules=rules, radius=0.0)
+        place = {s: k for k, s in enumerate(scene.inputs)}
+        self._columns = np.array([place.get(s, -1) for s in coordinates], dtype=int)
+        self._moved = self._columns >= 0
+        self._values = np.zeros(len(scene.inputs))
+
+    def place(self, state: State) -> None:
+        """Set the values of everything else."""
+        self._values[:] = state.vector(self._scene.inputs)
+
+    def contacts(self, q: Array, radius: float = 0.0) -> DistanceResults:
+        """Return the pairs of bodies within a radius [m] at a configuration (n,), deepest first."""
+        self._update(q)
+        return self._query(radius)
+
+    def _update(self, q: Array) -> None:
+        self._values[self._columns[self._moved]] = q[self._moved]
+        self._scene.update(self._values)
+
+    def _flag(self, pairs: Sequence[tuple[str, str]]) -> PairFlags:
+        world = self._scene.collision_world
+        flags = np.zeros_like(world.table.allowed)
+        for a, b in pairs:
+            i, j = world.body_index(a), world.body_index(b)
+            flags[i, j] = flags[j, i] = 1
+        return flags
+
+    def first_contact(self, points: Array, step: float) -> tuple[Array, DistanceResult] | None:
+        """Return the first sample of a polyline (N, n) with a contact, and the contact.
+
+        Pairs that nobody else checks are looked at 32 times a unit at least.
+        """
+        for q in densify(points, step):
+            found = self.contacts(q)
+            if len(found):
+                return q, found[0]
+        if not np.ptp(points[:, self._concerned], axis=0).any():
+            return None
+        for q in densify(points, min(step, 1 / RESOLUTION)):
+            self._update(q)
+            found = self._uncovered()
+            if len(found):
+                return q, found[0]
+        return None
+
+    def clearance(self, points: Array, step: float, radius: float = 0.5) -> float:
+        """Return the least distance of a pair at samples of a polyline [m]; infinite beyond a radius."""
+        least = np.inf
+        for q in densify(points, step):
+            found = self.contacts(q, min(radius, least))
+            if len(found):
+                least = float(found.distances[0])
+        return float(least)
+
+
+def describe_contacts(found: Sequence[DistanceResult], most: int = 3) -> str:
+    """Return the names of touching pairs of bodies, and how deep they penetrate [mm]."""
+    pairs = [f"'{f.a}' and '{f.b}' ({-1e3 * f.distance:.1f} mm deep)" for f in list(found)[:most]]
+    more = f" and {len(found) - most} more pairs" if len(found) > most else ""
+    return ", ".join(pairs) + more

@@ -1,0 +1,103 @@
+"""Links of a planner: bodies that move, covered by spheres, as tables for the compiled collision check."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Sequence
+
+import numpy as np
+
+from kineverse.geometry.objects import CollisionObject
+from kineverse.geometry.shapes import Solid
+from kineverse.lie import Array
+
+from .bindings import COARSE, LINK
+from .spheres import cover_object, default_protrusion, make_sphere_tree
+
+_MANY = 64
+"""Number of spheres beyond which a shape counts as thin."""
+
+
+class LinkTable:
+    """Spheres of the bodies that move, each in the frame of its pose.
+
+    Parameters
+    ----------
+    members
+        Of each body, its objects with their solids and their poses in the frame, (4, 4).
+    poses
+        Of each body, the number of its pose.
+    covered
+        Of each body, whether it has spheres.
+    protrusion
+        Largest distance of a sphere from the shape that it covers [m]; None for what suits the shape.
+
+    Attributes
+    ----------
+    links, coarse, fine
+        Tables as C reads them.
+    spheres
+        Of each body, the centres in the frame and radii of its spheres, (N, 4) [m].
+    """
+
+    def __init__(
+        self,
+        members: Sequence[Sequence[tuple[CollisionObject, Solid, Array]]],
+        poses: Sequence[int],
+        covered: Sequence[bool],
+        protrusion: float | None,
+    ) -> None:
+        self.links = np.zeros(len(members), dtype=LINK)
+        coarse: list[tuple[Array, int, int]] = []
+        fine: list[Array] = []
+        self.spheres: list[Array] = []
+        count = 0
+        for k, (items, pose) in enumerate(zip(members, poses, strict=True)):
+            link = self.links[k]
+            link["pose"], link["body"], link["first"] = pose, k, len(coarse)
+            corners = np.concatenate([_placed_corners(solid, T) for _, solid, T in items])
+            link["low"], link["high"] = corners.min(axis=0), corners.max(axis=0)
+            link["ball"] = *(corners.min(axis=0) + corners.max(axis=0)) / 2, 0.0
+            link["ball"][3] = np.linalg.norm(corners - link["ball"][:3], axis=1).max() + 1e-6
+            self.spheres.append(np.zeros((0, 4)))
+            if not covered[k]:
+                continue
+            spheres = np.concatenate([_placed_cover(item, T, protrusion) for item, _, T in items])
+            tree = make_sphere_tree(spheres[:, :3], spheres[:, 3])
+            link["coarse"] = len(tree.coarse_radii)
+            link["ball"] = *tree.ball_centre, tree.ball_radius
+            ends = tree.first.tolist()
+            for j, (centre, radius) in enumerate(zip(tree.coarse_centres, tree.coarse_radii, strict=True)):
+                coarse.append((np.array([*centre, radius]), count + ends[j], ends[j + 1] - ends[j]))
+            self.spheres[-1] = np.column_stack([tree.centres, tree.radii])
+            fine.append(self.spheres[-1])
+            count += len(tree.radii)
+        self.coarse = np.zeros(max(len(coarse), 1), dtype=COARSE)
+        for j, (sphere, first, number) in enumerate(coarse):
+            self.coarse[j] = sphere, first, number
+        self.fine = np.concatenate(fine or [np.zeros((1, 4))]).astype(np.float32)
+
+
+def is_thin(solid: Solid) -> bool:
+    """Return True for a solid like a plate, for which many spheres are needed.
+
+    A sphere that sticks out by e covers a disc of area π (2 c e + e²) of a plate of the thickness 2 c.
+    """
+    least, *others = sorted(solid.half.tolist())
+    e = default_protrusion(solid)
+    return bool(2.0 * others[0] * others[1] > _MANY * (2.0 * least * e + e * e))
+
+
+def _placed_cover(item: CollisionObject, T: Array, protrusion: float | None) -> Array:
+    cover = cover_object(item, protrusion)
+    centres = cover.centres @ T[:3, :3].T + T[:3, 3]
+    return np.column_stack([centres, cover.radii])
+
+
+def _placed_corners(solid: Solid, T: Array) -> Array:
+    corners = box_corners(solid.centre - solid.half, solid.centre + solid.half)
+    return np.asarray(corners @ T[:3, :3].T + T[:3, 3])
+
+
+def box_corners(low: Iterable[float], high: Iterable[float]) -> Array:
+    """Return the corners (8, 3) of a box."""
+    return np.array(np.meshgrid(*zip(low, high, strict=True))).reshape(3, -1).T

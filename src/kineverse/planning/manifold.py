@@ -1,0 +1,205 @@
+"""Manifold of configurations: holds and closures as equations, with Newton's step onto it."""
+
+from __future__ import annotations
+
+import ctypes
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+
+import numpy as np
+import numpy.typing as npt
+
+from kineverse.compile.vector_program import VectorProgram
+from kineverse.control.task_functions import look_at
+from kineverse.control.tasks import Hold
+from kineverse.errors import InvalidValueError
+from kineverse.expressions.expression import Expression, ExpressionLike, array, as_expression
+from kineverse.expressions.functions import maximum, sqrt
+from kineverse.expressions.gradient import stack_columns
+from kineverse.lie import Array
+from kineverse.model.model_view import ModelView
+from kineverse.spatial import as_transform, inverse, log_so3
+from kineverse.state import State
+from kineverse.symbols import Symbol
+
+from .bindings import ProjectionStruct, planning_functions
+from .checker import CollisionChecker
+from .obstacles import Floats32
+
+TOLERANCE = 1e-4
+"""Largest residual of a projection in float [m], [rad]."""
+EXACT = 1e-9
+"""Largest residual of a polished configuration [m], [rad]."""
+_STEPS, _POLISHING = 8, 12
+_DAMPING = 1e-5
+"""Damping of Newton's step where rows depend on each other, beside squares of derivatives [m²], [rad²]."""
+_ROWS = ("x", "y", "z", "rx", "ry", "rz")
+
+
+@dataclass(frozen=True, eq=False)
+class FrameHold(Hold):
+    """Hold of two frames of a model by each other, see :meth:`.Planner.hold`.
+
+    Attributes
+    ----------
+    frames
+        Names of both frames; what carries them may touch while the hold lasts.
+    """
+
+    frames: tuple[str, str] = field(default=("", ""), kw_only=True)
+
+
+def hold_frames(
+    model: ModelView, a: str, b: str, mask: str = "xyz rx ry rz", offset: ExpressionLike | None = None
+) -> FrameHold:
+    """Return the hold of a frame by another one in some directions.
+
+    Parameters
+    ----------
+    model
+        The model.
+    a, b
+        The frames, such as a hand and a handle.
+    mask
+        Directions that are held, of ``x``, ``y``, ``z`` (positions) and ``rx``, ``ry``, ``rz`` (rotations), in
+        any order and in the axes of the pose that is held: ``"xyz rx ry"`` lets the hand turn about its z axis.
+    offset
+        b_T_a, 4×4, the pose of a in b that is held; None for frames that coincide.
+
+    Raises
+    ------
+    InvalidValueError
+        For another mask.
+    """
+    rows = mask.replace(",", " ").split()
+    names = [r for part in rows for r in ([part] if part in _ROWS else part)]
+    if not names or len(set(names)) < len(names) or not set(names) <= set(_ROWS):
+        raise InvalidValueError(f"mask= lists some of {', '.join(_ROWS)}, as 'xyz rx ry', not {mask!r}.")
+    world_T_b = model.fk(b)
+    world_T_held = world_T_b if offset is None else world_T_b @ as_transform(offset)
+    held_T_a = inverse(world_T_held) @ model.fk(a)
+    parts = [held_T_a[i, 3] for i, name in enumerate("xyz") if name in names]
+    turns = [i for i, name in enumerate(_ROWS[3:]) if name in names]
+    if len(turns) == 2:
+        # The free axis of a points where that of b does: no singularity at half a turn about it.
+        (axis,) = {0, 1, 2}.difference(turns)
+        direction = np.eye(3)[axis]
+        turn = look_at(np.eye(4), held_T_a[:3, axis], direction)
+        parts += [turn[i] for i in turns]
+    elif turns:
+        vector = log_so3(held_T_a[:3, :3])
+        parts += [vector[i] for i in turns]
+    return FrameHold(array(parts), 0.0, name=f"{a} on {b}", frames=(a, b))
+
+
+class Manifold:
+    """Configurations at which some expressions are zero.
+
+    Parameters
+    ----------
+    checker
+        Collision checker, which has the coordinates and limits.
+    model
+        The model.
+    holds
+        Holds.
+    equalities
+        Further expressions that are zero.
+
+    Raises
+    ------
+    InvalidValueError
+        If no coordinate changes a hold, or there are more rows than coordinates.
+    """
+
+    def __init__(
+        self,
+        checker: CollisionChecker,
+        model: ModelView,
+        holds: Sequence[Hold],
+        equalities: Sequence[Expression] = (),
+    ) -> None:
+        self._checker, self._code = checker, planning_functions()
+        symbols = checker.coordinates
+        errors = [model.rates.resolve(e) for hold in holds for e in hold.error.ravel()]
+        self.rows = as_expression(array([*errors, *equalities]))
+        jacobian = _jacobian(self.rows, symbols)
+        for hold in holds:
+            moved = {s.position for s in model.rates.resolve(hold.error).gradient(heuristic=False)}
+            if moved.isdisjoint(symbols):
+                raise InvalidValueError(f"{hold!r} depends on nothing that the planner moves.")
+        outputs = [newton_step(self.rows, jacobian), largest(self.rows)]
+        found = {s for e in outputs for s in e.symbols} - {*symbols}
+        self.parameters = tuple(sorted(found, key=lambda s: s.sort_key))
+        self._program = VectorProgram(outputs, symbols, self.parameters, scalar="float")
+        self._exact = VectorProgram(outputs, symbols, self.parameters, scalar="double")
+        self._kept = self._program.prepare(np.zeros(len(self.parameters)))
+        self._values = np.zeros(len(self.parameters))
+        self.struct = ProjectionStruct(
+            self._program.compute_address, self._kept.ctypes.data, self._program.stored, TOLERANCE, _STEPS
+        )
+
+    @property
+    def address(self) -> int:
+        """Address of :attr:`struct`, valid as long as this object."""
+        return ctypes.addressof(self.struct)
+
+    def place(self, state: State) -> None:
+        """Set the values of everything that the holds depend on beside the coordinates."""
+        self._values = state.vector(self.parameters)
+        self._kept = self._program.prepare(self._values)
+        self.struct.kept = self._kept.ctypes.data
+
+    def project(self, Q: Floats32) -> npt.NDArray[np.bool_]:
+        """Project configurations (N, n) in place; return flags (N,) of those that arrive within limits."""
+        arrived = np.zeros(len(Q), dtype=np.uint8)
+        self._code.kineverse_project(
+            self._checker.address, self.address, Q.ctypes.data, len(Q), arrived.ctypes.data
+        )
+        return arrived.astype(bool)
+
+    def polish(self, Q: Array) -> tuple[Array, Array]:
+        """Return configurations (N, n) on the manifold and within limits in double precision, and residuals (N,)."""
+        x = np.array(Q, dtype=float)
+        lower, upper = self._checker.lower.astype(float), self._checker.upper.astype(float)
+        for _ in range(_POLISHING):
+            steps, residuals = self._exact.evaluate(x, self._values)
+            if (residuals <= EXACT).all():
+                break
+            x = np.clip(x + np.where((residuals > EXACT)[:, None], steps, 0.0), lower, upper)
+        return x, np.asarray(self._exact.evaluate(x, self._values)[1])
+
+    def residuals(self, Q: Array) -> Array:
+        """Return the largest residual (N,) of configurations (N, n) [m], [rad]."""
+        return np.asarray(self._exact.evaluate(np.asarray(Q, dtype=float), self._values)[1])
+
+
+def _jacobian(rows: Expression, symbols: Sequence[Symbol]) -> Expression:
+    gradient = rows.gradient(heuristic=False)
+    return stack_columns([gradient.get(s.derivative()) for s in symbols], rows.shape)
+
+
+def newton_step(rows: Expression, jacobian: Expression) -> Expression:
+    """Return the damped step -Jᵀ (J Jᵀ + λ)⁻¹ r that brings rows r (k,) with the Jacobian (k, n) to zero."""
+    k = rows.size
+    gram = jacobian @ jacobian.T
+    entries = [[gram[i, j] + (_DAMPING if i == j else 0.0) for j in range(k)] for i in range(k)]
+    L: list[list[Expression]] = [[as_expression(0.0)] * k for _ in range(k)]
+    for i in range(k):
+        for j in range(i + 1):
+            left = entries[i][j] - sum((L[i][m] * L[j][m] for m in range(j)), as_expression(0.0))
+            L[i][j] = as_expression(sqrt(left) if i == j else left / L[j][j])
+    y: list[Expression] = []
+    for i in range(k):
+        y.append((rows[i] - sum((L[i][m] * y[m] for m in range(i)), as_expression(0.0))) / L[i][i])
+    for i in reversed(range(k)):
+        y[i] = (y[i] - sum((L[m][i] * y[m] for m in range(i + 1, k)), as_expression(0.0))) / L[i][i]
+    return -(jacobian.T @ array(y))
+
+
+def largest(rows: Expression) -> Expression:
+    """Return the largest magnitude of some rows (k,)."""
+    found = abs(rows[0])
+    for k in range(1, rows.size):
+        found = as_expression(maximum(found, abs(rows[k])))
+    return found

@@ -1,0 +1,200 @@
+"""Obstacles of a planner: shapes as tables for the compiled collision check."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from itertools import pairwise
+
+import numpy as np
+import numpy.typing as npt
+
+from kineverse.geometry.shapes import Core, Hull, Solid
+from kineverse.lie import Array
+from kineverse.model.body import Box, Capsule, Cylinder, Sphere
+
+from .bindings import BOX, CAPSULE, CYLINDER, HULL, OBSTACLE, SPHERE, ObstacleSetStruct
+
+_SAME_PLANE = 6
+"""Digits to which planes of a hull are told apart."""
+_ALIGNED = 1e-6
+_COSTS = np.array([2.0, 3.0, 1.5, 1.0, 0.0])
+_EMPTY = 1e30
+"""Coordinate of the boxes that fill the last chunk: nothing meets them."""
+
+Floats32 = npt.NDArray[np.float32]
+
+
+class ObstacleSet:
+    """Solids in one frame, as C reads them.
+
+    Parameters
+    ----------
+    solids
+        Convex solids.
+    bodies
+        (M,) number of the body of each solid.
+    planes
+        Table that the planes of hulls are added to; rows of a normal and an offset.
+    lanes
+        Number of obstacles in a chunk.
+    pose, link
+        Numbers of the pose and of the link that carries the set; 0 for the world.
+
+    Attributes
+    ----------
+    struct
+        The set as C reads it.
+    cost
+        Time that a sphere takes against all of them, as a multiple of that against a sphere.
+    """
+
+    def __init__(
+        self,
+        solids: Sequence[Solid],
+        bodies: npt.NDArray[np.int32],
+        planes: list[Array],
+        lanes: int,
+        pose: int = 0,
+        link: int = 0,
+    ) -> None:
+        self._lanes, count = lanes, len(solids)
+        self._items = np.zeros(count, dtype=OBSTACLE)
+        self._items["body"] = bodies
+        self._sizes = np.zeros((count, 3))
+        self._order: npt.NDArray[np.intp] | None = None
+        for k, solid in enumerate(solids):
+            self._describe(k, solid, planes)
+        # About the numbers of operations.
+        planes_each = self._items["planes"]
+        self.cost = float(np.where(planes_each > 0, planes_each / 2, _COSTS[self._items["kind"]]).sum())
+        self._centre = np.array([solid.centre for solid in solids]).reshape(-1, 3)
+        self._half = np.array([solid.half for solid in solids]).reshape(-1, 3)
+        chunks = -(-max(count, 1) // lanes)
+        padded_chunks = -(-chunks // lanes) * lanes
+        self._boxes = aligned_floats((6, chunks * lanes))
+        self._chunks = aligned_floats((6, padded_chunks))
+        self._sorted = np.zeros(chunks * lanes, dtype=OBSTACLE)
+        self.struct = ObstacleSetStruct(
+            self._sorted.ctypes.data,
+            self._boxes.ctypes.data,
+            self._chunks.ctypes.data,
+            count,
+            chunks * lanes,
+            padded_chunks,
+            pose,
+            link,
+        )
+        self.place(np.tile(np.eye(4)[:3], (count, 1, 1)))
+
+    def _describe(self, k: int, solid: Solid, planes: list[Array]) -> None:
+        item, shape = self._items[k], solid.surface
+        if isinstance(shape, Box):
+            item["kind"], self._sizes[k] = BOX, solid.half
+        elif isinstance(shape, Sphere):
+            item["kind"], self._sizes[k] = SPHERE, (shape.radius, 0.0, 0.0)
+        elif isinstance(shape, Cylinder | Capsule):
+            item["kind"] = CYLINDER if isinstance(shape, Cylinder) else CAPSULE
+            self._sizes[k] = shape.radius, shape.length / 2, 0.0
+        else:
+            rows = _hull_planes(solid)
+            item["kind"], item["first"], item["planes"] = HULL, sum(map(len, planes)), len(rows)
+            planes.append(rows)
+
+    def place(self, poses: Array) -> None:
+        """Place all solids in the frame of the set.
+
+        Parameters
+        ----------
+        poses
+            (M, 3, 4) poses [m].
+        """
+        items, lanes, count = self._items, self._lanes, len(self._items)
+        rotation, translation = poses[:, :, :3], poses[:, :, 3]
+        extent = np.einsum("kij,kj->ki", np.abs(rotation), self._half)
+        centre = np.einsum("kij,kj->ki", rotation, self._centre) + translation
+        if self._order is None:
+            self._order = _spatial_order(centre, lanes)
+        order = self._order
+        # A box along the axes is the same box with its edges in another order.
+        turned = np.all(np.any(np.abs(rotation) > 1 - _ALIGNED, axis=2), axis=1)
+        boxes = items["kind"] == BOX
+        upright = np.abs(rotation[:, 2, 2]) > 1 - _ALIGNED
+        round_ = (items["kind"] == CYLINDER) | (items["kind"] == CAPSULE)
+        items["aligned"] = (turned & boxes) | (upright & round_)
+        sizes = self._sizes
+        if turned.any():
+            sizes = np.where((turned & boxes)[:, None], extent, sizes)
+        items["rotation"], items["translation"], items["size"] = rotation.reshape(-1, 9), translation, sizes
+        self._sorted[:count] = items[order]
+        self._boxes[:3], self._boxes[3:] = _EMPTY, -_EMPTY
+        # The largest rounding of float at these places.
+        slack = 1e-6 * (1.0 + np.abs(centre) + extent)
+        self._boxes[:3, :count] = (centre - extent - slack)[order].T
+        self._boxes[3:, :count] = (centre + extent + slack)[order].T
+        chunks = self._boxes.reshape(6, -1, lanes)
+        self._chunks[:3], self._chunks[3:] = _EMPTY, -_EMPTY
+        self._chunks[:3, : chunks.shape[1]] = chunks[:3].min(axis=2)
+        self._chunks[3:, : chunks.shape[1]] = chunks[3:].max(axis=2)
+
+
+def aligned_floats(shape: tuple[int, ...]) -> Floats32:
+    """Return zeros that begin at a cache line."""
+    size = int(np.prod(shape))
+    block = np.zeros(size + 16, dtype=np.float32)
+    start = -block.ctypes.data % 64 // 4
+    return block[start : start + size].reshape(shape)
+
+
+def _hull_planes(solid: Solid) -> Array:
+    """Return the planes of a hull, or of a polytope around another solid: rows of a normal and an offset [m].
+
+    Planes that are equal up to rounding are one, as those of triangles in one face. Large faces come first, since
+    they separate most.
+    """
+    surface = solid.surface
+    if isinstance(surface, Hull):
+        rows = np.column_stack([surface.normals, surface.offsets])
+    else:
+        assert solid.core is not None
+        normals = _directions()
+        rows = np.column_stack([normals, _support(solid.core, normals)])
+    _, first, count = np.unique(np.round(rows, _SAME_PLANE), axis=0, return_index=True, return_counts=True)
+    return np.asarray(rows[first[np.argsort(-count, kind="stable")]])
+
+
+def _directions() -> Array:
+    """Return 26 unit vectors: towards the faces, edges and corners of a cube."""
+    grid = np.array([(x, y, z) for x in (-1, 0, 1) for y in (-1, 0, 1) for z in (-1, 0, 1) if x or y or z])
+    return np.asarray(grid / np.linalg.norm(grid, axis=1)[:, None])
+
+
+def _support(core: Core, normals: Array) -> Array:
+    """Return the largest n·x over a core, for each of (N, 3) normals."""
+    if core.corners.shape[1]:
+        return np.asarray((normals @ core.corners).max(axis=1))
+    if core.tip:
+        base = np.linalg.norm(normals[:, :2], axis=1) * core.radii[0] - normals[:, 2] * core.tip
+        return np.asarray(np.maximum(base, normals[:, 2] * core.tip))
+    return np.asarray(
+        np.abs(normals) @ core.half + np.linalg.norm(normals * core.radii, axis=1) + core.radius
+    )
+
+
+def _spatial_order(points: Array, size: int) -> npt.NDArray[np.intp]:
+    """Return an order of points in which those of a chunk are near to each other.
+
+    The points are halved along the axis of their largest spread, at multiples of the size, until they are chunks.
+    """
+    done: list[npt.NDArray[np.intp]] = []
+    waiting = [np.arange(len(points))]
+    while waiting:
+        group = waiting.pop()
+        if len(group) <= size:
+            done.append(group)
+            continue
+        axis = int(np.argmax(np.ptp(points[group], axis=0)))
+        group = group[np.argsort(points[group, axis], kind="stable")]
+        half = -(-len(group) // (2 * size)) * size
+        cuts = [0, half, len(group)]
+        waiting += [group[a:b] for a, b in reversed(list(pairwise(cuts))) if b > a]
+    return np.concatenate(done) if done else np.zeros(0, dtype=np.intp)

@@ -1,0 +1,101 @@
+"""Path of a planner: a polyline of configurations, or the reason why there is none."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass, field
+from functools import cached_property
+
+import numpy as np
+
+from kineverse.lie import Array
+from kineverse.state import State
+from kineverse.symbols import Symbol
+
+
+@dataclass(frozen=True, eq=False)
+class Path:
+    """Result of :meth:`.Planner.plan`.
+
+    Attributes
+    ----------
+    found
+        True if the path leads to a goal and the collision scene has found no contact on it.
+    symbols
+        The n coordinates, the columns of :attr:`points`.
+    points
+        Configurations (N, n) that are joined by straight lines [m], [rad]. Without a way they are the best partial
+        path: from the start to the point of the search that is nearest to a goal.
+    why
+        How the path was found, or why there is none.
+    seconds
+        Time of planning, the judgement by the scene included [s].
+    search_seconds
+        Time of search and shortcuts alone [s].
+    iterations
+        Number of samples of the search.
+    state
+        State in which everything else stands.
+    """
+
+    found: bool
+    symbols: tuple[Symbol, ...]
+    points: Array
+    why: str
+    seconds: float
+    search_seconds: float
+    iterations: int
+    state: State
+    measure: Callable[[Array], float] = field(repr=False)
+
+    @property
+    def length(self) -> float:
+        """Length of the polyline in the space of coordinates [m], [rad]."""
+        return float(np.linalg.norm(np.diff(self.points, axis=0), axis=1).sum())
+
+    def clearance(self) -> float:
+        """Return the least signed distance of bodies along the path by the scene [m], sampled 32 times a unit.
+
+        Infinite if no pair is within .5 m.
+        """
+        return self._clearance
+
+    @cached_property
+    def _clearance(self) -> float:
+        return self.measure(self.points)
+
+    def at(self, fraction: float) -> State:
+        """Return the state at a fraction of the length, from 0 at the start to 1 at the end."""
+        lengths = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(self.points, axis=0), axis=1))])
+        along = min(max(float(fraction), 0.0), 1.0) * lengths[-1]
+        return self._state(np.array([np.interp(along, lengths, column) for column in self.points.T]))
+
+    def states(self) -> Iterator[State]:
+        """Yield the states at all points."""
+        return map(self._state, self.points)
+
+    def _state(self, q: Array) -> State:
+        return self.state.updated(dict(zip(self.symbols, q.tolist(), strict=True)))
+
+    def __bool__(self) -> bool:
+        return self.found
+
+    def __len__(self) -> int:
+        return len(self.points)
+
+    def __repr__(self) -> str:
+        if self.found:
+            return f"<Path: {len(self.points)} points, length {self.length:.3g}, {1e3 * self.seconds:.3g} ms>"
+        return f"<Path: not found. {self.why}>"
+
+
+def densify(points: Array, step: float) -> Array:
+    """Return the points of a polyline (N, n) with others between them, at most a step apart."""
+    if len(points) < 2:
+        return points
+    lengths = np.linalg.norm(np.diff(points, axis=0), axis=1)
+    counts = np.maximum(np.ceil(lengths / step), 1).astype(int)
+    at = np.concatenate(
+        [k + np.arange(c) / c for k, c in enumerate(counts)] + [np.array([len(points) - 1.0])]
+    )
+    return np.column_stack([np.interp(at, np.arange(len(points)), column) for column in points.T])

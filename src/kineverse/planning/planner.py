@@ -1,0 +1,447 @@
+"""Planner: paths without collisions for any coordinates of any model."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Sequence
+from time import perf_counter
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+from kineverse._checks import as_count, as_tolerance, real_number
+from kineverse.control.tasks import Goal, Hold
+from kineverse.errors import InvalidValueError, ShapeError
+from kineverse.expressions.expression import ExpressionLike
+from kineverse.geometry import Rule, Scene
+from kineverse.geometry.collision_filter import rigid_group
+from kineverse.geometry.objects import Exclusion
+from kineverse.geometry.prepared_query import flag_subtree
+from kineverse.lie import Array
+from kineverse.model.model_view import ModelView
+from kineverse.state import State, StateLike, as_state
+from kineverse.symbols import Symbol
+
+from .checker import RESOLUTION, CollisionChecker
+from .configuration import PlanningSpace
+from .connection import connect, connect_on_manifold
+from .endpoints import Endpoint, Endpoints
+from .judge import SceneJudge, describe_contacts
+from .manifold import FrameHold, Manifold, hold_frames
+from .path import Path
+from .solutions import find_solutions
+
+_JUDGED = 1.0
+"""Longest step between judged configurations of a path that is certified [rad], [m]."""
+_SAMPLES = 64
+_TASK_GOALS = 32
+"""Number of configurations that are looked for where tasks are the goal."""
+_MOST_MANIFOLDS = 16
+
+
+class Planner:
+    """Planner of paths without collisions, for any coordinates of a model.
+
+    Bodies that move are covered by spheres, everything else is obstacles. A generated function computes the poses of
+    many configurations at once, and compiled code checks edges of trees (RRT-Connect). A path is certified between its
+    samples too, and judged by the collision scene before it is returned.
+
+    Everything is computed from the model: an edit of the model is followed at the next call. A planner is for one
+    thread at a time.
+
+    Parameters
+    ----------
+    model
+        The model of everything: robot and surroundings.
+    move
+        Coordinates that move, as symbols, names or patterns (``"fetch/*"``); a name of an articulation stands for its
+        coordinates. None for all that may move freely; a base on rolling wheels does not.
+    rules
+        Rules of the collision filter, see :class:`.Scene`, such as those of an SRDF.
+    margin
+        Least distance of bodies that move from everything [m].
+    decomposed
+        Bodies, or patterns, whose meshes are unions of convex hulls, see :class:`.Scene`.
+    leave_out
+        Excluded bodies, or patterns, or shapes, see :class:`.Scene`.
+    protrusion
+        Largest distance by which spheres stick out of the shape that they cover [m]; None for what suits the shape.
+
+    Raises
+    ------
+    CompileError
+        Without a C compiler.
+    UnknownNameError
+        For names or patterns in ``move`` or ``rules`` that the model does not have.
+    InvalidValueError
+        If nothing moves, or a coordinate cannot move independently.
+    """
+
+    def __init__(
+        self,
+        model: ModelView,
+        move: Iterable[Symbol | str] | Symbol | str | None = None,
+        *,
+        rules: Iterable[Rule] = (),
+        margin: float = 0.0,
+        decomposed: Iterable[str] = (),
+        leave_out: Iterable[Exclusion] = (),
+        protrusion: float | None = None,
+    ) -> None:
+        self.model = model
+        self.margin = as_tolerance(margin, "The margin")
+        self._move = move if move is None or isinstance(move, Symbol | str) else tuple(move)
+        self._rules, self._protrusion = tuple(rules), protrusion
+        self._options: dict[str, Any] = {"decomposed": decomposed, "leave_out": leave_out}
+        self._version: int | None = None
+        self._state: State | None = None
+        self._synchronize()
+
+    def _synchronize(self) -> None:
+        """Build everything for the present version of the model."""
+        if self._version == self.model.version:
+            return
+        model = self.model
+        self.space = space = PlanningSpace(model, self._move)
+        scene = Scene(model, rules=self._rules, **self._options)
+        self.excluded = self._find_overlapping(scene)
+        if self.excluded:
+            scene = Scene(model, rules=(*self._rules, *self.excluded), **self._options)
+        self.scene = scene
+        self.checker = CollisionChecker(scene, space.symbols, space.conditions, self.margin, self._protrusion)
+        space.turning &= self.checker.find_periodic(space.turning)
+        self._manifolds: dict[tuple[Hold, ...], Manifold] = {}
+        self._judges: dict[frozenset[frozenset[str]], SceneJudge] = {}
+        self._version = model.version
+        self._place(model.default_state() if self._state is None else model.default_state() | self._state)
+
+    def _find_overlapping(self, scene: Scene) -> tuple[Rule, ...]:
+        """Return rules for pairs of bodies that touch wherever the coordinates are."""
+        generator = np.random.default_rng(0)
+        home = self.model.default_state()
+        start = home.vector(self.space.symbols)
+        low, high = self.space.bounds(start, start[None])
+        states = [
+            home.updated(dict(zip(self.space.symbols, generator.uniform(low, high).tolist(), strict=True)))
+            for _ in range(_SAMPLES)
+        ]
+        pairs = {frozenset(pair) for pair in scene.pairs_affected_by(self.space.symbols)}
+        found = scene.find_always_colliding([home, *states])
+        return tuple(rule for rule in found if frozenset((rule.a, rule.b)) in pairs)
+
+    @property
+    def symbols(self) -> tuple[Symbol, ...]:
+        """The n coordinates that move, in the order of the columns of configurations."""
+        return self.space.symbols
+
+    # -- the state -----------------------------------------------------------------------------------------
+
+    def place(self, state: StateLike) -> None:
+        """Place everything that the planner does not move, and the obstacles with it.
+
+        Parameters
+        ----------
+        state
+            A state or a mapping; what is missing keeps its place.
+
+        Raises
+        ------
+        UnknownNameError, InvalidValueError
+            For unknown names and values that are not finite.
+        """
+        self._synchronize()
+        self._place(self._whole(state))
+
+    def _whole(self, state: StateLike) -> State:
+        known = (*self.model.symbols, *self.model.speeds)
+        base = self._state if self._state is not None else self.model.default_state()
+        return base | (state if isinstance(state, State) else as_state(state, known))
+
+    def _place(self, state: State) -> None:
+        self._state = state
+        self.checker.place(state)
+        self._set_bounds(self._here, self._here[None])
+
+    @property
+    def _here(self) -> Array:
+        assert self._state is not None
+        return self._state.vector(self.space.symbols)
+
+    def _set_bounds(self, start: Array, points: Array) -> None:
+        self.checker.lower[:], self.checker.upper[:] = self.space.bounds(start, points)
+
+    # -- configurations ------------------------------------------------------------------------------------
+
+    def valid(self, Q: npt.ArrayLike) -> npt.NDArray[np.bool_]:
+        """Return flags (N,) of configurations (N, n) that are within limits and free of collisions.
+
+        Bodies are covered by spheres, so that a configuration near a contact may count as invalid.
+        """
+        self._synchronize()
+        points = self._configurations(Q, "Q")
+        # Any turn of a joint without limits is allowed.
+        lower, upper = self.space.bounds(self._here, points)
+        self.checker.lower[:] = np.where(self.space.turning, np.minimum(lower, points.min(axis=0)), lower)
+        self.checker.upper[:] = np.where(self.space.turning, np.maximum(upper, points.max(axis=0)), upper)
+        return self.checker.valid(points.astype(np.float32))
+
+    def edges(self, A: npt.ArrayLike, B: npt.ArrayLike) -> npt.NDArray[np.bool_]:
+        """Return flags (N,) of straight ways from A to B, (N, n) each, that are free at 32 samples a unit.
+
+        Starts are not checked.
+        """
+        self._synchronize()
+        starts, ends = self._configurations(A, "A"), self._configurations(B, "B")
+        if starts.shape != ends.shape:
+            raise ShapeError(f"A and B have the shapes {starts.shape} and {ends.shape}, which differ.")
+        return self.checker.edges(starts.astype(np.float32), ends.astype(np.float32))
+
+    def _configurations(self, Q: Any, name: str) -> Array:
+        """Return configurations (N, n) from one or several vectors or states."""
+        n = len(self.space.symbols)
+        if isinstance(Q, dict | State):
+            return self._whole(Q).vector(self.space.symbols)[None]
+        if isinstance(Q, Sequence) and len(Q) and isinstance(Q[0], dict | State):
+            return np.array([self._whole(q).vector(self.space.symbols) for q in Q])
+        points = np.atleast_2d(np.asarray(Q, dtype=float))
+        if points.ndim != 2 or points.shape[1] != n:
+            raise ShapeError(
+                f"{name} has shape {np.shape(Q)}; wanted are configurations of {n} coordinates, in the order of "
+                "planner.symbols, or states."
+            )
+        if not np.isfinite(points).all():
+            raise InvalidValueError(f"{name} has values that are not finite.")
+        return np.ascontiguousarray(points)
+
+    # -- holds and solutions -------------------------------------------------------------------------------
+
+    def hold(
+        self, a: str, b: str, mask: str = "xyz rx ry rz", offset: ExpressionLike | None = None
+    ) -> FrameHold:
+        """Return the hold of a frame by another one, such as a grasp: see :func:`.hold_frames`.
+
+        While it lasts, the bodies at and below both frames may touch each other.
+        """
+        return hold_frames(self.model, a, b, mask, offset)
+
+    def solutions(
+        self,
+        tasks: Hold | Goal | Iterable[Hold | Goal],
+        count: int = 16,
+        *,
+        seconds: float = 1.0,
+        seed: int = 0,
+    ) -> Array:
+        """Return different configurations (K, n), free of collisions, at which holds and goals are met.
+
+        Parameters
+        ----------
+        tasks
+            Holds and goals; targets of goals are met exactly, and their weights have no meaning.
+        count
+            Largest number of configurations; those near to where the coordinates are placed come first.
+        seconds
+            Largest time [s], spent only if there are fewer.
+        seed
+            Seed of the random starts.
+        """
+        self._synchronize()
+        given = as_holds(tasks)
+        self._set_bounds(self._here, self._here[None])
+        manifold = self._manifold(given)
+        if manifold is None:
+            raise InvalidValueError("There is no hold and no goal, so every configuration is a solution.")
+        with self.checker.excepting(self._touching(given)):
+            return find_solutions(
+                self.checker,
+                manifold,
+                self._here,
+                as_count("count", count, 1),
+                seconds,
+                as_count("seed", seed, 0),
+            )
+
+    def _manifold(self, holds: Sequence[Hold]) -> Manifold | None:
+        """Return the manifold of holds and equalities of the model, at the present place."""
+        if not holds and not self.space.equalities:
+            return None
+        key = tuple(holds)
+        if key not in self._manifolds:
+            if len(self._manifolds) >= _MOST_MANIFOLDS:
+                self._manifolds.clear()
+            self._manifolds[key] = Manifold(self.checker, self.model, key, self.space.equalities)
+        manifold = self._manifolds[key]
+        assert self._state is not None
+        manifold.place(self._state)
+        return manifold
+
+    def _touching(self, holds: Iterable[Hold]) -> frozenset[frozenset[str]]:
+        """Return the pairs of bodies that may touch while holds last."""
+        bodies = self.scene.bodies
+        return frozenset(
+            frozenset((a, b))
+            for hold in holds
+            if isinstance(hold, FrameHold)
+            for a in find_carried_bodies(self.model, bodies, hold.frames[0])
+            for b in find_carried_bodies(self.model, bodies, hold.frames[1])
+            if a != b
+        )
+
+    # -- paths ---------------------------------------------------------------------------------------------
+
+    def plan(
+        self,
+        start: StateLike | npt.ArrayLike | None,
+        goals: StateLike | npt.ArrayLike | Sequence[StateLike] | Sequence[Hold | Goal],
+        *,
+        along: Hold | Iterable[Hold] = (),
+        seconds: float = 1.0,
+        seed: int = 0,
+    ) -> Path:
+        """Return a path without collisions from a start to any of some goals.
+
+        Parameters
+        ----------
+        start
+            A configuration (n,) or a state; None for where the coordinates are placed.
+        goals
+            A configuration (n,), several (K, n), states, or holds and goals that are met together at the end.
+        along
+            Holds that are met all along the path. Start and goals have to meet them up to 1 cm or .01 rad.
+        seconds
+            Largest time of the search [s]; checks of its result come on top.
+        seed
+            Seed of the search: the same one leads to the same path on one machine, unless the time is up.
+        """
+        self._synchronize()
+        begin = perf_counter()
+        seconds, seed = max(real_number(seconds), 0.0), as_count("seed", seed, 0)
+        holds = as_holds(along)
+        q = self._here if start is None else self._configurations(start, "start")[0]
+        tasks = () if not _are_tasks(goals) else as_holds(goals)
+        if tasks:
+            ends = self.solutions([*holds, *tasks], _TASK_GOALS, seconds=seconds, seed=seed)
+            if not len(ends):
+                return self._no_path(q, self._no_solution([*holds, *tasks]), begin)
+        else:
+            ends = self._configurations(goals, "goals")
+        self._set_bounds(q, ends)
+        manifold = self._manifold(holds)
+        touching = self._touching([*holds, *tasks])
+        with self.checker.excepting(touching):
+            endpoints = Endpoints(self.space, self.checker, self._judge(touching), manifold)
+            first = endpoints.check("The start", q)
+            if first.reason:
+                return self._no_path(q, first.reason, begin)
+            names = ["The goal"] if len(ends) == 1 else [f"Goal {k}" for k in range(len(ends))]
+            last = [endpoints.check(name, end) for name, end in zip(names, ends, strict=True)]
+            usable = [goal for goal in last if not goal.reason]
+            if not usable:
+                return self._no_path(q, " ".join(goal.reason for goal in last[:3]), begin)
+            return self._connect(first, usable, manifold, touching, seconds, seed, begin)
+
+    def _connect(
+        self,
+        first: Endpoint,
+        goals: Sequence[Endpoint],
+        manifold: Manifold | None,
+        touching: frozenset[frozenset[str]],
+        seconds: float,
+        seed: int,
+        begin: float,
+    ) -> Path:
+        q = first.inner
+        variants = [(goal, v) for goal in goals for v in self.space.equivalents(goal.inner, q)]
+        targets = np.ascontiguousarray([v for _, v in variants], dtype=np.float32)
+        starts = np.ascontiguousarray(q[None], dtype=np.float32)
+        searched = perf_counter()
+        if manifold is None:
+            found = connect(self.checker, starts, targets, seconds, seed)
+        else:
+            found = connect_on_manifold(self.checker, manifold, starts, targets, seconds, seed)
+        spent = perf_counter() - searched
+        if found.problem:
+            return self._no_path(found.points, found.problem, begin, spent, found.iterations)
+        points = found.points
+        goal, variant = variants[int(np.argmin(np.abs(targets - points[-1]).max(axis=1)))]
+        points[0], points[-1] = q, variant
+        contact = self._judge(touching).first_contact(points, _JUDGED)
+        if contact is not None:
+            problem = f"The scene finds a contact on the path: {describe_contacts([contact[1]])}."
+            return self._no_path(points, problem, begin, spent, found.iterations)
+        shift = variant - goal.inner
+        whole = np.vstack([first.way[:-1], points, (goal.way[::-1] + shift)[1:]])
+        why = f"Found after {found.iterations} samples."
+        return self._path(True, whole, why, begin, spent, found.iterations, touching)
+
+    def _judge(self, touching: frozenset[frozenset[str]] = frozenset()) -> SceneJudge:
+        """Return the judge of the scene in which some pairs may touch, at the present place."""
+        if touching not in self._judges:
+            if len(self._judges) >= _MOST_MANIFOLDS:
+                self._judges.clear()
+            rules = [Rule(a, b, False, "held") for a, b in map(sorted, touching)]
+            self._judges[touching] = SceneJudge(self.scene, self.space.symbols, rules, self.checker.uncovered)
+        judge = self._judges[touching]
+        assert self._state is not None
+        judge.place(self._state)
+        return judge
+
+    def _no_solution(self, tasks: Sequence[Hold]) -> str:
+        names = ", ".join(repr(task) for task in tasks)
+        return (
+            f"No configuration without collision was found at which {names} are met. Out of reach, or always in "
+            "contact? kv.control.inverse_kinematics says which; another place of the base may help."
+        )
+
+    def _no_path(
+        self, points: Array, why: str, begin: float, spent: float = 0.0, iterations: int = 0
+    ) -> Path:
+        return self._path(False, np.atleast_2d(points), why, begin, spent, iterations)
+
+    def _path(
+        self,
+        found: bool,
+        points: Array,
+        why: str,
+        begin: float,
+        spent: float,
+        iterations: int,
+        touching: frozenset[frozenset[str]] = frozenset(),
+    ) -> Path:
+        state, judge = self._state, self._judge(touching)
+        assert state is not None
+
+        def measure(points: Array) -> float:
+            judge.place(state)
+            return judge.clearance(points, 1 / RESOLUTION)
+
+        seconds = perf_counter() - begin
+        return Path(found, self.space.symbols, points, why, seconds, spent, iterations, state, measure)
+
+    def __repr__(self) -> str:
+        return f"<Planner: {len(self.symbols)} coordinates, {len(self.checker.moving)} bodies that move>"
+
+
+def as_holds(tasks: Any) -> tuple[Hold, ...]:
+    """Return holds from holds and goals, one or several."""
+    given = (tasks,) if isinstance(tasks, Hold | Goal) else tuple(tasks)
+    for task in given:
+        if not isinstance(task, Hold | Goal):
+            raise InvalidValueError(f"Expected kv.control.Hold or Goal, not {task!r}.")
+    return tuple(t if isinstance(t, Hold) else Hold(t.expression, t.target, name=t.name) for t in given)
+
+
+def _are_tasks(goals: Any) -> bool:
+    if isinstance(goals, Hold | Goal):
+        return True
+    return isinstance(goals, list | tuple) and len(goals) > 0 and isinstance(goals[0], Hold | Goal)
+
+
+def find_carried_bodies(model: ModelView, bodies: Sequence[str], frame: str) -> tuple[str, ...]:
+    """Return the bodies at and below a frame; if there are none, those that are rigidly connected with it."""
+    below = [body for body, flag in zip(bodies, flag_subtree(model, bodies, frame), strict=True) if flag]
+    if below:
+        return tuple(below)
+    frames = dict(model.frames)
+    group = rigid_group(frame, frames)
+    return tuple(body for body in bodies if rigid_group(body, frames) == group)

@@ -1,0 +1,122 @@
+"""Compiled searches: RRT-Connect and shortcuts over a collision checker."""
+
+from __future__ import annotations
+
+import ctypes
+from typing import NamedTuple
+
+import numpy as np
+
+from .bindings import FOUND, SearchStruct, planning_functions
+from .checker import LEAST_INFLATION, RESOLUTION, CollisionChecker
+from .manifold import Manifold
+from .obstacles import Floats32
+
+RANGE = 1.0
+"""Largest length of an edge of a tree [rad], [m]."""
+_MOST_NODES = 200_000
+_ROOM = 16_384
+"""Largest number of points of a path."""
+
+
+class SearchResult(NamedTuple):
+    """Outcome of a search: points (N, n), whether they lead to a goal, and what was done."""
+
+    points: Floats32
+    status: int
+    iterations: int
+    nodes: tuple[int, int]
+    gap: float
+
+    @property
+    def found(self) -> bool:
+        """True if the points lead to a goal."""
+        return self.status == FOUND
+
+
+class RrtConnect:
+    """RRT-Connect over a checker, in the whole space or on a manifold.
+
+    Parameters
+    ----------
+    checker
+        Collision checker.
+    manifold
+        The manifold; None for the whole space.
+    """
+
+    def __init__(self, checker: CollisionChecker, manifold: Manifold | None = None) -> None:
+        self._checker, self._manifold, self._code = checker, manifold, planning_functions()
+        self._path = np.zeros((_ROOM, len(checker.coordinates)), dtype=np.float32)
+        self._struct = SearchStruct()
+
+    def solve(
+        self,
+        starts: Floats32,
+        goals: Floats32,
+        seconds: float,
+        seed: int,
+        resolution: float = RESOLUTION,
+        nodes: int = _MOST_NODES,
+    ) -> SearchResult:
+        """Search a path from any of (S, n) starts to any of (G, n) goals.
+
+        Parameters
+        ----------
+        starts, goals
+            Free configurations, contiguous.
+        seconds
+            Largest time [s].
+        seed
+            Seed of the samples.
+        resolution
+            Samples for each unit of length of an edge.
+        nodes
+            Largest number of nodes of both trees.
+        """
+        s = self._setup(seconds, seed, resolution, nodes)
+        count = self._code.kineverse_rrt_connect(
+            ctypes.addressof(s), starts.ctypes.data, len(starts), goals.ctypes.data, len(goals),
+            self._path.ctypes.data, _ROOM,
+        )  # fmt: skip
+        points = self._path[: max(count, 0)].copy()
+        return SearchResult(points, s.status, s.iterations, (s.count_start, s.count_goal), s.gap)
+
+    def shorten(self, points: Floats32, seconds: float, seed: int, rounds: int) -> Floats32:
+        """Return a shorter path: points on it are joined where the way between them is certainly free."""
+        s = self._setup(seconds, seed, RESOLUTION, 0)
+        room = len(points) + 64
+        work = np.zeros((room, points.shape[1]), dtype=np.float32)
+        work[: len(points)] = points
+        count = self._code.kineverse_shortcut(
+            ctypes.addressof(s), work.ctypes.data, len(points), room, rounds, LEAST_INFLATION
+        )
+        found = work[:count]
+        apart = np.abs(np.diff(found, axis=0)).max(axis=1, initial=0.0) > 1e-6
+        # The ends stay exact, whatever is dropped.
+        keep = np.concatenate([[True], apart])
+        keep[-1] = True
+        return np.ascontiguousarray(found[keep])
+
+    def walk(self, a: Floats32, b: Floats32, resolution: float = RESOLUTION) -> Floats32 | None:
+        """Return points (N, n) on the manifold from a to b, without a and with b; None if the way ends before.
+
+        Parameters
+        ----------
+        a, b
+            (n,) configurations on the manifold, contiguous.
+        resolution
+            Points for each unit of length.
+        """
+        s = self._setup(0.0, 0, resolution, 0)
+        count = self._code.kineverse_walk(
+            ctypes.addressof(s), a.ctypes.data, b.ctypes.data, self._path.ctypes.data, _ROOM
+        )
+        return None if count < 0 else self._path[:count].copy()
+
+    def _setup(self, seconds: float, seed: int, resolution: float, nodes: int) -> SearchStruct:
+        s = self._struct
+        s.checker = self._checker.address
+        s.projection = None if self._manifold is None else self._manifold.address
+        s.range, s.resolution, s.seconds, s.nodes, s.seed = RANGE, resolution, seconds, nodes, seed
+        return s

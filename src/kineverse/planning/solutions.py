@@ -1,0 +1,58 @@
+"""Configurations that meet holds and goals: projections of random ones, all lanes at once."""
+
+from __future__ import annotations
+
+from time import perf_counter
+
+import numpy as np
+
+from kineverse.lie import Array
+
+from .checker import CollisionChecker
+from .connection import unique_rows
+from .manifold import EXACT, Manifold
+
+_BATCH = 2048
+_APART = 0.05
+"""Least distance of two solutions that count as different [rad], [m]."""
+
+
+def find_solutions(
+    checker: CollisionChecker, manifold: Manifold, near: Array, count: int, seconds: float, seed: int
+) -> Array:
+    """Return different configurations (K, n) on a manifold, free of collisions, at most some number of them.
+
+    Parameters
+    ----------
+    checker, manifold
+        Checker with the limits of the search, and manifold.
+    near
+        A configuration (n,): the nearest solutions come first, and the first batch is drawn around it.
+    count
+        Largest number of solutions.
+    seconds
+        Largest time [s].
+    seed
+        Seed of the random configurations.
+    """
+    generator = np.random.default_rng(seed)
+    begin = perf_counter()
+    lower, upper = checker.lower.astype(float), checker.upper.astype(float)
+    found = np.zeros((0, len(near)))
+    for k in range(1_000_000):
+        if k == 0:
+            tries = near + generator.standard_normal((_BATCH, len(near))) * (upper - lower) / 8
+            tries[0] = near
+        else:
+            tries = generator.uniform(lower, upper, (_BATCH, len(near)))
+        rows = np.ascontiguousarray(np.clip(tries, lower, upper), dtype=np.float32)
+        rows = np.ascontiguousarray(rows[manifold.project(rows)])
+        rows = rows[checker.valid(rows)]
+        if len(rows):
+            exact, residuals = manifold.polish(rows[: 4 * count].astype(float))
+            inside = (exact >= lower - 1e-9).all(axis=1) & (exact <= upper + 1e-9).all(axis=1)
+            found = np.vstack([found, exact[inside & (residuals <= EXACT)]])
+            found = found[unique_rows(found, _APART)]
+        if len(found) >= count or perf_counter() - begin > seconds:
+            break
+    return found[np.argsort(np.linalg.norm(found - near, axis=1), kind="stable")][:count]

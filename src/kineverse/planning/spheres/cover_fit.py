@@ -1,0 +1,263 @@
+"""Few spheres that cover a polytope within a protrusion.
+
+A ball about a point c inside of a convex solid sticks out of it by its radius less the depth d(c), exactly. A
+point p therefore needs the protrusion min_i |p - c_i| - d(c_i), and a cover with N spheres is the location
+problem that minimises the largest need over the centres. The needs are largest at corners of the power cells of
+the spheres. So rounds alternate, as in Lloyd's iteration: the power diagram gives corners, and with it a cover
+that is proved; the needs of the corners, smoothed, are descended over the centres.
+
+The first centres come from a greedy set cover, or from a lattice. As covers with N spheres lie in many local
+minima, and the protrusion of either start is known only after the descent, the number of spheres is found by
+trying.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+
+from kineverse.geometry.mesh_files import Floats, Integers
+
+from .certificate import distances, find_uncovered
+from .cover_mesh import CoverMesh
+from .cover_starts import CoverStarts
+from .polytope import CoverPolytope
+
+_ROUNDS, _FEW_ROUNDS, _STEPS = 24, 12, 6
+"""Power diagrams of a descent and of a short one, and steps between two of them."""
+
+_WARM, _COLD = 0.2, 0.015
+"""First and last temperature of the smoothed maximum, as a fraction of the protrusion."""
+
+_MOMENTUM = 0.6
+_SAMPLES, _HARD = 600, 0.6
+_TRIALS = 4
+_REMOVALS, _FEW_SPHERES = 3, 12
+_PROOF, _ALLOWANCE, _ATTEMPTS = 0.01, 1.04, 4
+"""Growth of radii for the sake of the proof, as a fraction of the protrusion."""
+
+_ROUNDING = 1e-9
+"""Growth of radii for the sake of rounding, as a fraction."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class FittedSpheres:
+    """Spheres that cover a polytope: (N, 3) centres, (N,) radii and their largest protrusion."""
+
+    centres: Floats
+    radii: Floats
+    protrusion: float
+
+    def is_better(self, other: FittedSpheres, aim: float) -> bool:
+        """Return True if it reaches an aim with fewer spheres than another cover, or else protrudes less."""
+        if self.protrusion > aim or other.protrusion > aim:
+            return self.protrusion < other.protrusion
+        return (len(self.radii), self.protrusion) < (len(other.radii), other.protrusion)
+
+
+class _Problem:
+    """Polytope, with the points of it that a cover is fitted to."""
+
+    def __init__(self, polytope: CoverPolytope, protrusion: float) -> None:
+        self.polytope = polytope.simplify()
+        a, b, c = np.moveaxis(polytope.corners[polytope.faces], 1, 0)
+        area = float(np.linalg.norm(np.cross(b - a, c - a), axis=1).sum()) / 2
+        self.mesh = CoverMesh(self.polytope, max(protrusion, math.sqrt(area / _SAMPLES)))
+        self.gaps: Floats = np.zeros((0, 3))
+
+    def find_critical(self, centres: Floats, radii: Floats) -> tuple[Floats, Integers]:
+        """Return the points that are hardest to cover by spheres, and the sphere of each."""
+        points, owners = self.mesh.find_critical(centres, radii)
+        if not len(self.gaps):
+            return points, owners
+        powers = np.square(distances(self.gaps, centres)) - radii**2
+        return np.concatenate([points, self.gaps]), np.concatenate([owners, powers.argmin(axis=1)])
+
+
+def fit_spheres(polytope: CoverPolytope, protrusion: float, most: int) -> FittedSpheres:
+    """Return few spheres that cover a polytope.
+
+    Parameters
+    ----------
+    polytope
+        Polytopes of a solid about the origin, whose extent is of order 1.
+    protrusion
+        Largest protrusion; it is exceeded where ``most`` spheres are not enough.
+    most
+        Largest number of spheres.
+    """
+    problem = _Problem(polytope, protrusion)
+    aim = protrusion / _ALLOWANCE
+    for _ in range(_ATTEMPTS):
+        fitted = _fit_to_points(problem, aim, most)
+        proved, gaps = prove(polytope, fitted)
+        if len(gaps) and proved.protrusion > _ALLOWANCE * fitted.protrusion:
+            # The proof found points between those of the mesh.
+            problem.gaps = gaps[:: len(gaps) // _SAMPLES + 1]
+            fitted = descend(problem, fitted.centres, aim)
+            mended, _ = prove(polytope, fitted)
+            proved = min(proved, mended, key=lambda cover: cover.protrusion)
+        if proved.protrusion <= protrusion or fitted.protrusion > aim:
+            break
+        aim *= 0.99 * protrusion / proved.protrusion
+    return proved
+
+
+def _fit_to_points(problem: _Problem, aim: float, most: int) -> FittedSpheres:
+    """Return few spheres that cover the points of a problem."""
+    best = descend(problem, np.zeros((1, 3)), aim, _FEW_ROUNDS)
+    if best.protrusion <= aim or most == 1:
+        return best
+    best = _search_start(problem, CoverStarts(problem.polytope, aim), aim, most, best)
+    polished = descend(problem, best.centres, aim)
+    return _remove(problem, polished if polished.is_better(best, aim) else best, aim)
+
+
+def _search_start(
+    problem: _Problem, start: CoverStarts, aim: float, most: int, best: FittedSpheres
+) -> FittedSpheres:
+    """Return the best of several short descents, each from a start for another protrusion."""
+    least = start.least_greedy(most)
+    wanted = max(1.2 * aim, least)
+    tried: set[int] = set()
+    for _ in range(_TRIALS):
+        centres = start.greedy(wanted)
+        if len(centres) in tried:
+            break
+        tried.add(len(centres))
+        found = descend(problem, centres, aim, _FEW_ROUNDS)
+        best = found if found.is_better(best, aim) else best
+        # The protrusion after the descent is about proportional to that of the start.
+        wanted = max(wanted * aim / found.protrusion, least)
+    for factor in (1.3, 1.1):
+        centres = start.lattice(factor * aim, most)
+        reached = best.protrusion <= aim
+        if len(centres) in tried or len(centres) > (len(best.radii) if reached else most):
+            continue
+        tried.add(len(centres))
+        found = descend(problem, centres, aim, _FEW_ROUNDS)
+        best = found if found.is_better(best, aim) else best
+    return best
+
+
+def descend(problem: _Problem, centres: Floats, aim: float, rounds: int = _ROUNDS) -> FittedSpheres:
+    """Return the cover with the least protrusion on the way down from some centres (N, 3)."""
+    polytope = problem.polytope
+    best = FittedSpheres(centres, np.zeros(0), math.inf)
+    estimate = aim
+    for k in range(rounds):
+        centres = _pull_inside(polytope, centres)
+        depths = polytope.depths(centres)
+        points, owners = problem.find_critical(centres, depths + estimate)
+        lengths = np.linalg.norm(points - centres[owners], axis=1)
+        radii = np.zeros(len(centres))
+        np.maximum.at(radii, owners, lengths)
+        protrusions = radii - depths
+        used = radii > 0.0
+        protrusion = float(protrusions[used].max())
+        if protrusion < best.protrusion:
+            best = FittedSpheres(centres[used], radii[used], protrusion)
+        estimate = min(protrusion, best.protrusion)
+        if k == rounds - 1:
+            break
+        hard = lengths - depths[owners] > _HARD * protrusion
+        if not used.all():
+            centres = _relocate(centres, radii, protrusions, points)
+        temperature = estimate * _WARM * (_COLD / _WARM) ** (k / (rounds - 1))
+        centres = _relax(polytope, centres, points[hard], owners[hard], temperature)
+    return best
+
+
+def _pull_inside(polytope: CoverPolytope, centres: Floats) -> Floats:
+    """Return the centres, those outside of the solid moved towards the origin up to its surface.
+
+    The depth is a concave function along the way.
+    """
+    depths = polytope.depths(centres)
+    middle = float(polytope.depths(np.zeros((1, 3)))[0])
+    part = np.where(depths < 0.0, -depths / np.maximum(middle - depths, 1e-300), 0.0)
+    return centres * (1.0 - np.minimum(1.0001 * part, 1.0))[:, None]
+
+
+def _relocate(centres: Floats, radii: Floats, protrusions: Floats, corners: Floats) -> Floats:
+    """Return the centres with those without a cell beside the worst ones, towards their furthest corner."""
+    moved = centres.copy()
+    unused = np.flatnonzero(radii <= 0.0)
+    worst = np.argsort(np.where(radii > 0.0, -protrusions, np.inf), kind="stable")[: len(unused)]
+    for free, crowded in zip(unused.tolist(), worst.tolist(), strict=False):
+        gaps = np.abs(np.linalg.norm(corners - centres[crowded], axis=1) - radii[crowded])
+        moved[free] = 0.4 * centres[crowded] + 0.6 * corners[gaps.argmin()]
+    return moved
+
+
+def _relax(
+    polytope: CoverPolytope, centres: Floats, points: Floats, owners: Integers, temperature: float
+) -> Floats:
+    """Return centres after gradient steps on the smoothed largest need of the points of each sphere."""
+    order = np.argsort(owners, kind="stable")
+    points, owners = points[order], owners[order]
+    first = np.flatnonzero(np.diff(owners, prepend=-1))
+    moving = owners[first]
+    group = np.cumsum(np.diff(owners, prepend=-1) > 0) - 1
+    found = centres.copy()
+    centres, speed = centres[moving], np.zeros((len(moving), 3))
+    for _ in range(_STEPS):
+        slack = polytope.offsets - centres @ polytope.normals.T
+        apart = centres[group] - points
+        lengths = np.sqrt(np.einsum("ij,ij->i", apart, apart))
+        weights = np.exp((lengths - np.maximum.reduceat(lengths, first)[group]) / temperature)
+        pulls = apart * (weights / np.maximum(lengths, 1e-12))[:, None]
+        gradient = np.add.reduceat(pulls, first) / np.add.reduceat(weights, first)[:, None]
+        near = np.exp((slack.min(axis=1, keepdims=True) - slack) / temperature)
+        gradient += (near @ polytope.normals) / near.sum(axis=1, keepdims=True)
+        speed = _MOMENTUM * speed - temperature * gradient
+        centres = centres + speed
+    found[moving] = centres
+    return found
+
+
+def _remove(problem: _Problem, cover: FittedSpheres, aim: float) -> FittedSpheres:
+    """Return the cover without spheres that the others can replace within the aim."""
+    failures = 0
+    while cover.protrusion <= aim and len(cover.radii) > 1 and failures < _REMOVALS:
+        # Protrusions shrink about as the number of spheres to the power -0.7.
+        count = int(len(cover.radii) * (1.0 - (cover.protrusion / aim) ** 1.4))
+        if count == 0 and len(cover.radii) > _FEW_SPHERES:
+            break
+        count = max(count >> failures, 1)
+        dropped = np.argsort(_removal_losses(problem, cover), kind="stable")[:count]
+        found = descend(problem, np.delete(cover.centres, dropped, axis=0), aim)
+        if found.protrusion <= aim:
+            cover = found
+        elif count == 1:
+            break
+        else:
+            failures += 1
+    return cover
+
+
+def _removal_losses(problem: _Problem, cover: FittedSpheres) -> Floats:
+    """Return for each sphere the protrusion (N,) that the others would need for what it covers."""
+    depths = problem.polytope.depths(cover.centres)
+    points = problem.find_critical(cover.centres, depths + cover.protrusion)[0]
+    needs = distances(points, cover.centres) - depths
+    rows, owners = np.arange(len(points)), needs.argmin(axis=1)
+    needs[rows, owners] = np.inf
+    losses = np.full(len(depths), -np.inf)
+    np.maximum.at(losses, owners, needs.min(axis=1))
+    return losses
+
+
+def prove(polytope: CoverPolytope, cover: FittedSpheres) -> tuple[FittedSpheres, Floats]:
+    """Return a cover whose radii have grown as far as the proof by subdivision needs.
+
+    Further, points (n, 3) that the given spheres do not cover.
+    """
+    tolerance = _PROOF * cover.protrusion
+    radii = cover.radii + tolerance
+    uncovered = find_uncovered(polytope, cover.centres, radii, 0.5 * tolerance)
+    radii = (radii + uncovered.growth) * (1.0 + _ROUNDING)
+    protrusion = float((radii - polytope.depths(cover.centres)).max())
+    return FittedSpheres(cover.centres, radii, protrusion), uncovered.points

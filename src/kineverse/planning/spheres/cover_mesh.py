@@ -1,0 +1,92 @@
+"""Points of a polytope that are hardest to cover by given spheres.
+
+The power of a point x for a sphere is |x - c|² - r². Spheres cover a solid if and only if each one covers the
+part where its own power is least. These parts are convex, so that what is hardest to cover are their corners: on
+the surface, points of equal power for three spheres; on an edge, for two. A triangle whose corners belong to
+different spheres is likely to have one.
+
+Source: F. Aurenhammer, Power diagrams: properties, algorithms and applications, SIAM J. Comput. 16 (1987).
+"""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+
+from kineverse.geometry.mesh_files import Floats, Integers
+
+from .polytope import CoverPolytope
+
+_LAYERS, _INNER_TRIANGLES = (0.75, 0.5, 0.25), 150
+"""Sizes of the inner surfaces beside the outer one, and the number of their triangles."""
+
+
+class CoverMesh:
+    """Triangles on the surface of a polytope about the origin, and coarser ones on smaller copies inside.
+
+    Attributes
+    ----------
+    points
+        (M, 3) corners of the triangles and the origin [m].
+    """
+
+    def __init__(self, polytope: CoverPolytope, spacing: float) -> None:
+        surface = split_triangles(polytope.corners[polytope.faces], spacing)
+        inner = split_triangles(polytope.corners[polytope.faces], 2 * spacing)
+        inner = inner[:: len(inner) // _INNER_TRIANGLES + 1]
+        triangles = np.concatenate([surface, *(size * inner for size in _LAYERS)]).reshape(-1, 3)
+        # Corners are merged, so that each counts once.
+        marks = np.round(triangles @ np.array([1.0, math.sqrt(2.0), math.pi]), 9)
+        _, first, which = np.unique(marks, return_index=True, return_inverse=True)
+        self.points: Floats = np.concatenate([triangles[first], np.zeros((1, 3))])
+        self._triangles: Integers = which.reshape(-1, 3)
+        pairs = np.concatenate([self._triangles[:, [i, j]] for i, j in ((0, 1), (1, 2), (2, 0))])
+        pairs.sort(axis=1)
+        keys = np.unique(pairs[:, 0] * len(self.points) + pairs[:, 1])
+        self._edges = np.column_stack(np.divmod(keys, len(self.points)))
+
+    def find_critical(self, centres: Floats, radii: Floats) -> tuple[Floats, Integers]:
+        """Return points (n, 3) of the polytope that may be the hardest to cover, and the sphere (n,) of each.
+
+        They are all corners of triangles, and points of equal power on edges and in triangles.
+        """
+        # Powers without the common |x|² are linear.
+        powers = (centres**2).sum(axis=1) - radii**2 - 2.0 * self.points @ centres.T
+        owners = powers.argmin(axis=1)
+        a, b = self._edges.T
+        cut = owners[a] != owners[b]
+        a, b = a[cut], b[cut]
+        before = powers[a, owners[b]] - powers[a, owners[a]]
+        after = powers[b, owners[a]] - powers[b, owners[b]]
+        part = before / np.maximum(before + after, 1e-300)
+        on_edges = self.points[a] + part[:, None] * (self.points[b] - self.points[a])
+        own = owners[self._triangles]
+        mixed = (own[:, 0] != own[:, 1]) & (own[:, 1] != own[:, 2]) & (own[:, 2] != own[:, 0])
+        corners, own = self._triangles[mixed], own[mixed]
+        u, v = (powers[corners, own[:, :1]] - powers[corners, own[:, k : k + 1]] for k in (1, 2))
+        weights = np.cross(u, v)
+        weights = np.maximum(weights * np.sign(weights.sum(axis=1, keepdims=True)), 0.0) + 1e-300
+        weights /= weights.sum(axis=1, keepdims=True)
+        inside = np.einsum("nk,nkj->nj", weights, self.points[corners])
+        points = np.concatenate([self.points, on_edges, inside])
+        # Points between two triangles may belong to yet another sphere.
+        added = points[len(self.points) :]
+        others = (centres**2).sum(axis=1) - radii**2 - 2.0 * added @ centres.T
+        return points, np.concatenate([owners, others.argmin(axis=1)])
+
+
+def split_triangles(triangles: Floats, longest: float) -> Floats:
+    """Return (n, 3, 3) triangles cut at the middle of their longest edges, until none is too long."""
+    done: list[Floats] = []
+    while len(triangles):
+        edges = np.linalg.norm(triangles - np.roll(triangles, -1, axis=1), axis=2)
+        first = edges.argmax(axis=1)
+        long = edges[np.arange(len(triangles)), first] > longest
+        done.append(triangles[~long])
+        triangles, first = triangles[long], first[long]
+        rows = np.arange(len(triangles))
+        a, b, c = (triangles[rows, (first + k) % 3] for k in range(3))
+        middle = (a + b) / 2
+        triangles = np.concatenate([np.stack([a, middle, c], axis=1), np.stack([middle, b, c], axis=1)])
+    return np.concatenate(done)

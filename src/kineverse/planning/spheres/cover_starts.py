@@ -1,0 +1,111 @@
+"""First centres for sphere covers: a greedy set cover, and lattices."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+
+from kineverse.geometry.mesh_files import Floats, Integers
+
+from .certificate import distances
+from .cover_mesh import split_triangles
+from .polytope import CoverPolytope
+
+_SAMPLES, _CANDIDATES = 300, 1500
+_MOST_IN_A_ROW = 24
+
+
+class CoverStarts:
+    """Points of a polytope, and candidates for centres, for a protrusion.
+
+    Candidates lie below the surface at several depths, where balls that touch it on both sides have their
+    centres.
+    """
+
+    def __init__(self, polytope: CoverPolytope, protrusion: float) -> None:
+        self._polytope = polytope
+        triangles = polytope.corners[polytope.faces]
+        a, b, c = np.moveaxis(triangles, 1, 0)
+        area = float(np.linalg.norm(np.cross(b - a, c - a), axis=1).sum()) / 2
+        spacing = max(1.1 * protrusion, math.sqrt(area / _SAMPLES))
+        triangles = split_triangles(triangles, spacing)
+        surface = _thin(triangles.reshape(-1, 3), 0.6 * spacing)[0]
+        self._points = np.concatenate([surface, 0.7 * surface, 0.35 * surface])
+        middles, kept = _thin(triangles.mean(axis=1), spacing)
+        a, b, c = np.moveaxis(triangles[kept], 1, 0)
+        normals = np.cross(b - a, c - a)
+        normals /= np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), 1e-300)
+        deepest = max(float(polytope.depths(np.zeros((1, 3)))[0]), protrusion)
+        levels = protrusion * np.geomspace(0.7, max(1.2 * deepest / protrusion, 1.5), 5)
+        candidates = np.concatenate(
+            [
+                np.zeros((1, 3)),
+                *(f * surface for f in (0.3, 0.6, 0.8, 0.9)),
+                *(middles - t * normals for t in levels),
+            ]
+        )
+        candidates = candidates[polytope.depths(candidates) > 0.0]
+        self._candidates = candidates[:: len(candidates) // _CANDIDATES + 1]
+        self._depths = polytope.depths(self._candidates)
+        self._apart = distances(self._points, self._candidates)
+        self._protrusion = protrusion
+
+    def least_greedy(self, most: int) -> float:
+        """Return the least protrusion for which :meth:`greedy` chooses at most so many spheres."""
+        low = high = self._protrusion
+        while len(self.greedy(high)) > most:
+            low, high = high, 2.0 * high
+        while high > 1.05 * low:
+            middle = math.sqrt(low * high)
+            low, high = (middle, high) if len(self.greedy(middle)) > most else (low, middle)
+        return high if high > self._protrusion else 0.5 * high
+
+    def greedy(self, protrusion: float) -> Floats:
+        """Return centres whose balls cover the points, each chosen because it covers most new ones."""
+        covers = self._apart <= self._depths + protrusion
+        gains = covers.sum(axis=0)
+        left = np.ones(len(self._points), dtype=bool)
+        chosen: list[int] = []
+        while gains.any():
+            best = int(gains.argmax())
+            chosen.append(best)
+            new = left & covers[:, best]
+            left &= ~new
+            gains -= covers[new].sum(axis=0)
+        # What no candidate reaches, such as a sharp corner, is left to the descent.
+        return self._candidates[chosen]
+
+    def lattice(self, protrusion: float, most: int) -> Floats:
+        """Return the centres of equal boxes along the principal axes.
+
+        They are the fewest whose balls protrude no further, or at most so many with the least protrusion.
+        """
+        corners = self._polytope.corners
+        axes = _principal_axes(corners)
+        low, high = (corners @ axes.T).min(axis=0), (corners @ axes.T).max(axis=0)
+        counts = np.stack(np.meshgrid(*3 * [np.arange(1, _MOST_IN_A_ROW + 1)], indexing="ij"), axis=-1)
+        counts = counts.reshape(-1, 3)
+        counts = counts[counts.prod(axis=1) <= most]
+        half = (high - low) / 2 / counts
+        protrusions = np.linalg.norm(half, axis=1) - half.min(axis=1)
+        numbers = np.where(protrusions <= protrusion, counts.prod(axis=1), np.inf)
+        best = counts[numbers.argmin() if np.isfinite(numbers).any() else protrusions.argmin()]
+        ticks = [low[k] + (high[k] - low[k]) * (np.arange(best[k]) + 0.5) / best[k] for k in range(3)]
+        centres = np.stack(np.meshgrid(*ticks, indexing="ij"), axis=-1).reshape(-1, 3) @ axes
+        inside: Floats = centres[self._polytope.depths(centres) > -protrusion]
+        return inside if len(inside) else np.zeros((1, 3))
+
+
+def _principal_axes(corners: Floats) -> Floats:
+    """Return axes (3, 3) as rows: the given ones, or those of the corners where their box is smaller."""
+    principal = np.linalg.svd(corners - corners.mean(axis=0), full_matrices=False)[2]
+    boxes = [float(np.ptp(corners @ axes.T, axis=0).prod()) for axes in (np.eye(3), principal)]
+    return principal if boxes[1] < 0.99 * boxes[0] else np.eye(3)
+
+
+def _thin(points: Floats, spacing: float) -> tuple[Floats, Integers]:
+    """Return one point of each cell of a grid, and the indices of these."""
+    cells = np.floor(points / spacing + 0.137).astype(np.int64)
+    kept = np.unique(cells @ np.array([1, 100_003, 10_000_019_933]), return_index=True)[1]
+    return points[kept], kept

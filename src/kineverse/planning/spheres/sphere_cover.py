@@ -1,0 +1,148 @@
+"""Covers of convex solids by few spheres."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+
+from kineverse.errors import InvalidValueError
+from kineverse.geometry.mesh_files import Faces, Floats
+from kineverse.geometry.shapes import Solid
+from kineverse.model.body import Capsule, Sphere
+
+from .cover_fit import FittedSpheres, fit_spheres
+from .polytope import bound_solid
+from .union_volume import union_volume
+
+MOST = 32
+"""Default largest number of spheres of a cover."""
+
+PROTRUSION_OF_SIZE, LEAST_PROTRUSION, LARGEST_PROTRUSION = 0.1, 5e-3, 25e-3
+"""Default protrusion, as a fraction of the edge of a cube with the volume of the solid; its bounds [m]."""
+
+_MOST_OF_ALL = 1024
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class SphereCover:
+    """Spheres whose union contains a solid.
+
+    Attributes
+    ----------
+    centres, radii
+        (N, 3) and (N,) in the frame of the solid [m]; read-only.
+    protrusion
+        Upper bound of the distance of any point of a sphere from the solid [m].
+    excess
+        Volume of the union of the spheres over that of the solid, minus 1.
+    """
+
+    centres: Floats
+    radii: Floats
+    protrusion: float
+    excess: float
+
+    def __len__(self) -> int:
+        """Return the number of spheres."""
+        return len(self.radii)
+
+
+def cover_solid(solid: Solid, protrusion: float | None = None, most: int = MOST) -> SphereCover:
+    """Return few spheres that cover a convex solid.
+
+    Every point of the solid lies in a sphere: subdivision proves it, up to rounding. The same solid has the
+    same cover in every run on one machine.
+
+    Parameters
+    ----------
+    solid
+        The solid.
+    protrusion
+        Largest distance of a point of a sphere from the solid [m]; None for :func:`default_protrusion`. It is
+        exceeded where ``most`` spheres are not enough; :attr:`SphereCover.protrusion` has what was reached.
+    most
+        Largest number of spheres.
+
+    Raises
+    ------
+    InvalidValueError
+        For a triangle mesh, which has no inside; or if the protrusion is not a positive length, or ``most`` not
+        between 1 and 1024.
+    """
+    if isinstance(solid.surface, Faces):
+        raise InvalidValueError(
+            "A triangle mesh has no inside to be covered by spheres: use its hull or its decomposition."
+        )
+    if protrusion is None:
+        protrusion = default_protrusion(solid)
+    check_cover_settings(protrusion, most)
+    # A hull may be longer than any sensible protrusion, and one ball is then enough.
+    protrusion = min(protrusion, 2.0 * solid.radius)
+    if isinstance(solid.surface, Sphere):
+        return _make_cover(np.zeros((1, 3)), np.array([float(solid.surface.radius)]), 0.0, _volume(solid))
+    if isinstance(solid.surface, Capsule):
+        centres, radii, reached = _capsule_chain(solid.surface, protrusion, most)
+        return _make_cover(centres, radii, reached, _volume(solid))
+    polytope = bound_solid(solid, protrusion)
+    origin = polytope.find_deepest_point()
+    unit = solid.radius
+    fitted: FittedSpheres = fit_spheres(polytope.normalize(origin, unit), protrusion / unit, most)
+    return _make_cover(
+        fitted.centres * unit + origin, fitted.radii * unit, fitted.protrusion * unit, polytope.volume
+    )
+
+
+def default_protrusion(solid: Solid) -> float:
+    """Return the protrusion of covers where none is asked for: a tenth of the size, from 5 mm to 25 mm [m].
+
+    The size is the edge of a cube with the volume of the solid.
+    """
+    size = math.cbrt(_volume(solid))
+    return min(max(PROTRUSION_OF_SIZE * size, LEAST_PROTRUSION), LARGEST_PROTRUSION)
+
+
+def check_cover_settings(protrusion: float | None, most: int) -> None:
+    """Raise InvalidValueError for a protrusion [m] or a number of spheres that no cover can have."""
+    if protrusion is not None and not (math.isfinite(protrusion) and protrusion > 0.0):
+        raise InvalidValueError(f"A protrusion of {protrusion:g} m: spheres stick out by a positive length.")
+    if not 1 <= most <= _MOST_OF_ALL:
+        raise InvalidValueError(f"most={most}: a cover has 1 to {_MOST_OF_ALL} spheres.")
+
+
+def _volume(solid: Solid) -> float:
+    return bound_solid(solid, 0.1 * solid.radius).volume
+
+
+def _make_cover(centres: Floats, radii: Floats, protrusion: float, volume: float) -> SphereCover:
+    centres.flags.writeable = radii.flags.writeable = False
+    excess = max(union_volume(centres, radii) / volume - 1.0, 0.0)
+    return SphereCover(centres, radii, protrusion, excess)
+
+
+def _capsule_chain(capsule: Capsule, protrusion: float, most: int) -> tuple[Floats, Floats, float]:
+    """Return equal spheres along the axis of a capsule, and their protrusion [m].
+
+    With radius r + e they reach beyond both ends by e if the outermost are e inside of the ends of the axis, and
+    cover the side as long as neighbours are no further than 2 √((r + e)² - r²) apart.
+    """
+    radius, length = float(capsule.radius), float(capsule.length)
+
+    def count_spheres(e: float) -> int:
+        span = max(length - 2 * e, 0.0)
+        return 1 + math.ceil(span / (2 * math.sqrt(e * (2 * radius + e))))
+
+    low, high = 0.0, max(protrusion, length / 2)
+    count = count_spheres(protrusion)
+    if count > most:
+        low, count = protrusion, most
+    # The least protrusion for that many spheres.
+    for _ in range(60):
+        middle = (low + high) / 2
+        low, high = (low, middle) if middle > 0.0 and count_spheres(middle) <= count else (middle, high)
+    span = max(length / 2 - high, 0.0)
+    centres = np.zeros((count, 3))
+    centres[:, 2] = np.linspace(-span, span, count) if count > 1 else 0.0
+    reached = high * (1.0 + 1e-9) + 1e-9 * radius
+    return centres, np.full(count, radius + reached), reached
