@@ -29,7 +29,8 @@ SECONDS, SOON = 10.0, 0.1
 MEDIAN, LEAST_SOON, RESIDUAL = 1e-3, 95.0, 1e-5
 """Targets: median time [s], share solved in :data:`SOON` of what is solved [%], residual of holds [m], [rad]."""
 
-_GOALS, _TRIES = 64, 2000
+_GOALS, _TRIES, _PATIENCE = 64, 300, 0.2
+"""Number of goals, largest number of places of the base, and time of the search for grasps at each [s]."""
 
 
 @dataclass(frozen=True)
@@ -96,13 +97,13 @@ MOTIONS: Mapping[str, HeldMotion] = MappingProxyType(
             0.02,
             0.3,
             {
-                "pr2/l_gripper_tool_frame": (0.02, 0.12, 0.0, np.pi / 2, 0.0, np.pi),
-                "pr2/r_gripper_tool_frame": (0.02, -0.12, 0.0, np.pi / 2, 0.0, np.pi),
+                "pr2/l_gripper_tool_frame": (0.04, -0.12, 0.0, np.pi / 2, 0.0, np.pi),
+                "pr2/r_gripper_tool_frame": (0.04, 0.12, 0.0, np.pi / 2, 0.0, np.pi),
             },
             "kitchen/island_middle_upper_drawer_handle",
             ("pr2/torso_lift_joint", "pr2/?_shoulder*", "pr2/?_upper*", "pr2/?_elbow*", "pr2/?_forearm*")
             + ("pr2/?_wrist*",),
-            ((-0.8, -0.3, -0.4), (-0.4, 0.3, 0.4)),
+            ((-0.3, -0.2, np.pi - 0.3), (0.1, 0.2, np.pi + 0.3)),
         ),
     }
 )
@@ -163,8 +164,8 @@ def run_held_motion(name: str, starts: int, progress: Progress, seed: int = 0) -
     holds = [
         planner.hold(hand, f"grasp{k}", mask="xyz rx ry") for k, hand in enumerate(motion.hands)
     ]
-    residuals = [compile(hold.expression, planner.symbols) for hold in holds]
     base = [model.symbol(f"{motion.robot}/base/{c}") for c in ("x", "y", "angle")]
+    residuals = [compile(hold.expression, (*base, *planner.symbols)) for hold in holds]
     random = np.random.default_rng(seed)
     for number in progress(range(starts), f"planning, {name}", "start"):
         found = None
@@ -180,7 +181,8 @@ def run_held_motion(name: str, starts: int, progress: Progress, seed: int = 0) -
             Attempt(path.found, path.search_seconds, path.seconds, path.points, path.why)
         )
         if path.found:
-            worst = max(float(np.abs(f.batch(path.points)).max()) for f in residuals)
+            rows = np.hstack([np.tile(place, (len(path.points), 1)), path.points])
+            worst = max(float(np.abs(f.batch(rows)).max()) for f in residuals)
             results.residual = max(results.residual, worst)
     return results
 
@@ -189,8 +191,8 @@ def _find_ends(
     planner: Planner, holds: list[Hold], closed: Hold, opened: Hold, seed: int
 ) -> tuple[Array, Array] | None:
     """Return grasps at the start and the goal, (K, n) each; None if there are none of one of them."""
-    starts = planner.solutions([*holds, closed], count=1, seed=seed)
+    starts = planner.solutions([*holds, closed], count=1, seconds=_PATIENCE, seed=seed)
     if not len(starts):
         return None
-    goals = planner.solutions([*holds, opened], count=_GOALS, seed=seed)
+    goals = planner.solutions([*holds, opened], count=_GOALS, seconds=_PATIENCE, seed=seed)
     return (starts, goals) if len(goals) else None
