@@ -95,6 +95,9 @@ goal = kv.control.Goal(a, 0.5, weight=2.0)
 controller = kv.control.Controller(model, [goal, kv.control.Keep(0, 2 * a, 1)], dt=0.02)
 assert_type(controller.step(home).residuals["goal a"], float)
 found: kv.reasoning.Interlocks
+motion = kv.planning.time_parameterize([[0.0, 0.0], [1.0, 2.0]], 1.0, [2.0, 3.0], [a, b])
+assert_type(motion.at(0.5), kv.State)
+assert_type(motion.positions_at([0.0, 0.5]), Numbers)
 shower = kv.show
 version: str = kv.__version__
 assert kv.loops.CloseLoop is kv.CloseLoop

@@ -3,8 +3,8 @@
 ``import kineverse as kv`` gives what most programs need. The rest is in the packages below it:
 :mod:`kineverse.articulations` (joints, mechanisms, locks), :mod:`kineverse.model` (operations, edits, data),
 :mod:`kineverse.errors`, :mod:`kineverse.logic`, :mod:`kineverse.spatial`, :mod:`kineverse.loops` and
-:mod:`kineverse.formats`. :mod:`kineverse.geometry`, :mod:`kineverse.estimation`, :mod:`kineverse.reasoning`
-and the viewer (:func:`show`) are imported on first use.
+:mod:`kineverse.formats`. :mod:`kineverse.geometry`, :mod:`kineverse.estimation`, :mod:`kineverse.reasoning`,
+:mod:`kineverse.planning` and the viewer (:func:`show`) are imported on first use.
 """
 
 from typing import TYPE_CHECKING
@@ -77,6 +77,7 @@ __all__ = [
     "model",
     "norm",
     "parameter",
+    "planning",
     "position",
     "quaternion",
     "planning",

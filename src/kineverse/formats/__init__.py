@@ -12,8 +12,18 @@ from .locate import locate_model, shipped_models
 
 if TYPE_CHECKING:
     from .document import document_hash, from_bytes, to_bytes
+    from .srdf import read_srdf
 
-__all__ = ["document_hash", "from_bytes", "load", "locate_model", "shipped_models", "to_bytes", "urdf"]
+__all__ = [
+    "document_hash",
+    "from_bytes",
+    "load",
+    "locate_model",
+    "read_srdf",
+    "shipped_models",
+    "to_bytes",
+    "urdf",
+]
 
 register_file_formats()
 
@@ -24,4 +34,6 @@ def __getattr__(name: str) -> object:
 
     if name in ("document_hash", "from_bytes", "to_bytes"):
         return getattr(importlib.import_module("kineverse.formats.document"), name)
+    if name == "read_srdf":
+        return importlib.import_module("kineverse.formats.srdf").read_srdf
     raise unknown_attribute_error("The package kineverse.formats", name, __all__, MODULE_SYNONYMS)

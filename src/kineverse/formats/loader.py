@@ -44,7 +44,10 @@ _ADVICE = {
         "is a model that MuJoCo has compiled, which is not read. Load the MJCF it was made of, or write one: "
         "mujoco.mj_saveLastXML('model.xml', model)."
     ),
-    ".srdf": "is an SRDF, which names groups of joints of a robot that a URDF describes. Load the URDF.",
+    ".srdf": (
+        "is an SRDF, which names groups of joints of a robot that a URDF describes. Load the URDF, then "
+        "kv.formats.read_srdf(path, model)."
+    ),
     ".erb": "is a template. Expand it first: erb model.sdf.erb > model.sdf",
     ".config": "is the manifest of a model. Load the .sdf that it names.",
     ".launch": "is a launch file. Load the description that it starts.",

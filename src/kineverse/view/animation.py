@@ -26,7 +26,14 @@ class RangeAnimation:
         Lower and upper limit of each degree of freedom to move, finite.
     now
         The time of the beginning [s].
+
+    Attributes
+    ----------
+    finished
+        False: it goes on until it is stopped.
     """
+
+    finished = False
 
     def __init__(
         self, start: Mapping[str, float], limits: Mapping[str, tuple[float, float]], now: float

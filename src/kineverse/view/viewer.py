@@ -11,6 +11,7 @@ from collections.abc import Iterable, Mapping
 from kineverse.errors import InvalidValueError, KineverseError, UnknownNameError, suggest
 from kineverse.model.model import Model
 from kineverse.model.model_view import ModelView
+from kineverse.planning.trajectories.trajectory import Trajectory
 from kineverse.state import State, StateLike
 from kineverse.view import server as web
 from kineverse.view.animation import RangeAnimation, select_animated
@@ -19,6 +20,7 @@ from kineverse.view.drawables import Drawable
 from kineverse.view.drive import VelocityDrive
 from kineverse.view.hypertext import element
 from kineverse.view.panel import Panel
+from kineverse.view.playback import TrajectoryPlayback
 from kineverse.view.poses import complete, keep_known
 from kineverse.view.proximity_panel import ProximityPanel
 from kineverse.view.scene import ViewerScene
@@ -101,7 +103,8 @@ class Viewer:
         self._stopping, self._edited = False, False
         self._driven: set[str] = set()
         self._ended = threading.Event()
-        self._animation: RangeAnimation | None = None
+        self._animation: RangeAnimation | TrajectoryPlayback | None = None
+        self._playback: TrajectoryPlayback | None = None
         self._drawn = 0.0
         self._server = web.start(port, label or choose_title(model), host)
         try:
@@ -191,21 +194,73 @@ class Viewer:
     def reset(self) -> None:
         """Go back to the initial state, and stop."""
         with self._change:
-            self._animation = None
+            self._stop_animation()
             self._drive.stop()
             self._values = dict(self._initial)
             self._quaternions.update(self._values)
             self._request_update(self._values)
         self._panel.playing.value = False
 
-    def play(self, running: bool = True) -> None:
-        """Start or stop the animation of all degrees of freedom through their ranges."""
+    def play(self, motion: bool | Trajectory = True, *, speed: float = 1.0, loop: bool = False) -> None:
+        """Start or stop an animation.
+
+        Parameters
+        ----------
+        motion
+            A trajectory, which gets a slider for its time on the page; True for all degrees of freedom
+            through their ranges, False to stop.
+        speed
+            Time of the trajectory per time of the clock.
+        loop
+            True to play the trajectory again and again; else it stops at its end.
+
+        Raises
+        ------
+        UnknownNameError
+            If the model does not have a coordinate of the trajectory; nothing has changed then.
+        InvalidValueError
+            For a speed that is not positive.
+        """
+        if isinstance(motion, Trajectory):
+            complete(_freeze(self.model), dict(motion.at(0.0)))  # raises for unknown names
+            playback = TrajectoryPlayback(
+                self._server.gui, motion, speed=speed, loop=loop, on_seek=self._seek, on_run=self._run
+            )
+            if self._playback is not None:
+                self._playback.remove()
+            self._playback = playback
+            self._run(True)
+            return
         with self._change:
             start = {**self._values, **self._quaternions.angles}
             ranges = self._animated_ranges()
-            self._animation = RangeAnimation(start, ranges, time.monotonic()) if running else None
+            self._stop_animation()
+            self._animation = RangeAnimation(start, ranges, time.monotonic()) if motion else None
             self._request_update()
-        self._panel.playing.value = running
+        self._panel.playing.value = motion
+
+    def _run(self, running: bool) -> None:
+        """Start or stop the trajectory that was played last."""
+        with self._change:
+            self._stop_animation()
+            if running and self._playback is not None:
+                self._playback.start(time.monotonic())
+                self._animation = self._playback
+            self._request_update()
+        self._panel.playing.value = False
+
+    def _seek(self, time: float) -> None:
+        """Show the trajectory that was played last at one of its times [s], and stop there."""
+        with self._change:
+            self._stop_animation()
+            values = {} if self._playback is None else self._playback.seek(time)
+        self.move(values)
+
+    def _stop_animation(self) -> None:
+        """Stop all animations; the lock has to be held."""
+        self._animation = None
+        if self._playback is not None:
+            self._playback.pause()
 
     def refresh(self) -> None:
         """Show the present model; values of symbols that remain are kept.
@@ -348,6 +403,10 @@ class Viewer:
                 changed = self._quaternions.set_angle(name, value) if turns else {name: value}
                 self._values.update(changed)
                 self._driven.update(changed)
+            if isinstance(self._animation, TrajectoryPlayback):
+                self._quaternions.update(self._values)
+            if self._animation.finished:
+                self._stop_animation()
         if self._drive.running:
             moved = self._drive.step(self._values, now - self._drawn)
             self._values.update(moved)
@@ -365,7 +424,12 @@ class Viewer:
             self._values = {**self._values, **current} if self._edited else dict(current)
             self._initial = complete(model, keep_known(model, self._initial))
             self._shown = model
-            self._animation = None
+            self._stop_animation()
+            if self._playback is not None and not {*map(str, self._playback.trajectory.symbols)} <= {
+                *current
+            }:
+                self._playback.remove()
+                self._playback = None
         self._scene.refresh(model, current)
         self._panel.remove()
         self._panel = self._build_panel(self._panel.degrees)

@@ -1,0 +1,164 @@
+"""Links and joints of a semantic description, found in a model."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping
+
+from kineverse.errors import UnknownNameError, suggest
+from kineverse.formats.xml_reader import Element, ElementError, label, quote
+from kineverse.model.articulation import Articulation
+from kineverse.model.frame import WORLD
+from kineverse.model.model_view import ModelView
+
+_MOST_SUGGESTIONS = 50
+"""Number of unknown names for which similar ones are looked up: that takes a while in large models."""
+
+
+class ModelNames:
+    """Frames and articulations of a robot in a model, by their names in its files.
+
+    Parameters
+    ----------
+    model
+        The model, in its present version.
+    prefix
+        Prefix of the robot, without the slash; empty for none.
+    """
+
+    def __init__(self, model: ModelView, prefix: str) -> None:
+        self._frames = dict(model.frames)
+        self._prefix = f"{prefix}/" if prefix else ""
+        self._free = {str(s) for s in model.degrees_of_freedom}
+        self.articulations: Mapping[str, Articulation] = dict(model.articulations)
+        self._above = {a.child: name for name, a in self.articulations.items()}
+        self._near: dict[tuple[str, str], str] = {}
+        self._sought: dict[str, bool] = {}
+
+    def link(self, element: Element, key: str) -> str:
+        """Return the frame of the link that an attribute names.
+
+        Raises
+        ------
+        ElementError
+            If the attribute is missing, or the model has no such frame.
+        """
+        said = required(element, key)
+        name = self._prefix + said
+        self._sought[said] = self._sought.get(said, False) or name in self._frames
+        if name not in self._frames:
+            raise self._unknown(element, said, "link", self._frames)
+        return name
+
+    def joint(self, element: Element, key: str = "name") -> str:
+        """Return the articulation of the joint that an attribute names.
+
+        Raises
+        ------
+        ElementError
+            If the attribute is missing, or the model has no such articulation.
+        """
+        said = required(element, key)
+        name = self._prefix + said
+        self._sought[said] = self._sought.get(said, False) or name in self.articulations
+        if name not in self.articulations:
+            raise self._unknown(element, said, "joint", self.articulations)
+        return name
+
+    def joint_above(self, link: str) -> str | None:
+        """Return the articulation that has a frame as its child; None if there is none."""
+        return self._above.get(link)
+
+    def moving_joint_above(self, link: str) -> str | None:
+        """Return the nearest articulation that moves a frame; None if there is none."""
+        for frame in self._ancestors(link):
+            joint = self._above.get(frame)
+            if joint is not None and self.is_moving(joint):
+                return joint
+        return None
+
+    def is_moving(self, joint: str) -> bool:
+        """Return whether an articulation moves: it has coordinates, or follows others."""
+        record = self.articulations[joint]
+        return bool(record.coordinates or record.speeds or record.follows is not None)
+
+    def free_coordinates(self, joint: str) -> list[str]:
+        """Return the names of the free coordinates of an articulation."""
+        return [str(s) for s in self.articulations[joint].coordinates if str(s) in self._free]
+
+    def chain(self, base: str, tip: str) -> tuple[list[str], list[str]]:
+        """Return the frames between two frames, both included, and the articulations between them.
+
+        The way goes up from the base to the common ancestor and down to the tip.
+
+        Raises
+        ------
+        UnknownNameError
+            If nothing but the world carries both.
+        """
+        up, down = self._ancestors(base), self._ancestors(tip)
+        on_the_way_up = set(up)
+        shared = next((frame for frame in down if frame in on_the_way_up), None)
+        if shared is None:
+            raise UnknownNameError(f"'{base}' and '{tip}' are joined by nothing but the world")
+        rising, falling = up[: up.index(shared)], down[: down.index(shared)][::-1]
+        frames = [*rising, shared, *falling]
+        joints = [j for frame in (*rising, *falling) if (j := self._above.get(frame)) is not None]
+        return frames, joints
+
+    def child_links(self, joints: Iterable[str]) -> list[str]:
+        """Return the frames that articulations move."""
+        return [self.articulations[joint].child for joint in joints]
+
+    def links_pattern(self) -> str:
+        """Return the pattern of the bodies of the robot."""
+        return f"{self._prefix}*"
+
+    def check_robot(self, source: str) -> None:
+        """Raise an UnknownNameError if nothing that was sought is in the model: the prefix is another one."""
+        if not self._sought or any(self._sought.values()):
+            return
+        first, known = next(iter(self._sought)), {*self._frames, *self.articulations}
+        prefixes = sorted(name.removesuffix(f"/{first}") for name in known if name.endswith(f"/{first}"))
+        prefixes += [""] if first in known else []
+        hint = (
+            f"There is one below prefix {' and below '.join(map(repr, prefixes[:4]))}: give it as prefix=."
+            if prefixes
+            else suggest(self._prefix + first, known, "link or joint")
+        )
+        raise UnknownNameError(
+            f"{source}: the model has no link or joint of this description below the prefix "
+            f"'{self._prefix.rstrip('/')}', such as {quote(first)}. {hint}"
+        )
+
+    def _ancestors(self, frame: str) -> list[str]:
+        found = []
+        while frame != WORLD:
+            found.append(frame)
+            frame = self._frames[frame].parent
+        return found
+
+    def _unknown(self, element: Element, said: str, what: str, known: Mapping[str, object]) -> ElementError:
+        if (what, said) not in self._near and len(self._near) < _MOST_SUGGESTIONS:
+            below = [name[len(self._prefix) :] for name in known if name.startswith(self._prefix)]
+            self._near[what, said] = f" ({suggest(said, below, what).rstrip('.')})"
+        hint = self._near.get((what, said), "")
+        return ElementError(element, f"{quote(said)} is no {what} of the model{hint}.")
+
+
+def optional(element: Element, key: str) -> str:
+    """Return an attribute of an element without blanks around it, as MoveIt takes names; empty if missing."""
+    return element[1].get(key, "").strip()
+
+
+def required(element: Element, key: str) -> str:
+    """Return an attribute of an element without blanks around it.
+
+    Raises
+    ------
+    ElementError
+        If it is missing or empty.
+    """
+    said = optional(element, key)
+    if not said:
+        raise ElementError(element, f"has no {key}; {label(element).split()[0].strip('<>')} needs one.")
+    return said

@@ -1,0 +1,271 @@
+"""SRDF files and text as checked descriptions.
+
+Specification: http://wiki.ros.org/srdf/review and the parser of MoveIt (ros-planning/srdfdom). Elements that
+name unknown links or joints are passed over with a warning, since one SRDF often serves several variants of
+a robot.
+"""
+
+from __future__ import annotations
+
+import os
+from dataclasses import replace
+from pathlib import Path
+
+from kineverse.errors import FormatError
+from kineverse.formats.files import read_file
+from kineverse.formats.names import check_prefix
+from kineverse.formats.reader_warnings import ReaderWarnings
+from kineverse.formats.srdf.description import CollisionRule, EndEffector, Srdf, SrdfGroup, VirtualJoint
+from kineverse.formats.srdf.groups import MOST_GROUPS, PASSED_OVER, GroupResolver, add_unique
+from kineverse.formats.srdf.model_names import ModelNames, optional, required
+from kineverse.formats.xml_reader import Element, ElementError, label, parse_xml, quote
+from kineverse.formats.xml_values import parse_number
+from kineverse.model.model_view import ModelView
+
+_IGNORED = frozenset(("link_sphere_approximation", "joint_property"))
+_VIRTUAL_KINDS = ("fixed", "planar", "floating")
+_URDF_ONLY = frozenset(("link", "joint"))
+
+
+def read_srdf(
+    path: str | os.PathLike[str], model: ModelView, prefix: str = "", *, strict: bool = False
+) -> Srdf:
+    """Read an SRDF file about a robot of a model; see :func:`parse_srdf`.
+
+    Raises
+    ------
+    FormatError
+        If the file cannot be read or is no SRDF; the message names file, line, element and reason.
+    UnknownNameError
+        If none of its links is in the model below the prefix.
+    """
+    path = Path(path)
+    return parse_srdf(read_file(path), model, prefix, source=path.name, strict=strict)
+
+
+def parse_srdf(
+    text: str | bytes, model: ModelView, prefix: str = "", *, source: str = "<srdf>", strict: bool = False
+) -> Srdf:
+    """Read an SRDF about a robot of a model from text.
+
+    Parameters
+    ----------
+    text
+        Text of the document.
+    model
+        Model that contains the robot, in its present version.
+    prefix
+        Prefix of the robot's names in the model, without the slash.
+    source
+        Name of the document in messages.
+    strict
+        If True, mistakes in single elements are errors. Otherwise they are warnings, and the element is
+        passed over.
+
+    Raises
+    ------
+    FormatError
+        If the text is no SRDF, or the prefix is none; the message names source, line, element and reason.
+    UnknownNameError
+        If none of its links is in the model below the prefix.
+    """
+    check_prefix(prefix)
+    remarks = ReaderWarnings(source, strict=strict)
+    root = parse_xml(text, source, mend=None if strict else remarks.fault)
+    try:
+        _check_root(root)
+        document = _SemanticDocument(root, ModelNames(model, prefix or ""), remarks)
+    except ElementError as mistake:
+        where = f"{source}, line {mistake.element[3]}, {label(mistake.element)}"
+        raise FormatError(f"{where}: {mistake.message}") from None
+    return document.result
+
+
+def _check_root(root: Element) -> None:
+    if root[0] != "robot":
+        raise ElementError(root, "is not <robot>, the root element of an SRDF.")
+    tags = {part[0] for part in root[2]}
+    if _URDF_ONLY & tags and not {"group", "disable_collisions"} & tags:
+        raise ElementError(
+            root, "is a URDF: it has links and joints. Load it as a model, and read the SRDF beside it."
+        )
+
+
+class _SemanticDocument:
+    """Elements of a document, read in the order in which they need each other."""
+
+    def __init__(self, root: Element, names: ModelNames, remarks: ReaderWarnings) -> None:
+        self._names, self._remarks = names, remarks
+        self._by_tag: dict[str, list[Element]] = {}
+        for element in root[2]:
+            self._by_tag.setdefault(element[0], []).append(element)
+        if len(self._by_tag.get("group", ())) > MOST_GROUPS:
+            raise ElementError(root, f"has more than {MOST_GROUPS} groups; no robot needs that.")
+        virtual = self._virtual_joints()
+        passive = self._passive_joints()
+        groups = self._groups(virtual, passive)
+        rules = self._rules()
+        end_effectors = self._end_effectors(groups)
+        names.check_robot(remarks.source)
+        states = self._states(groups)
+        self._warn_unknown()
+        self.result = Srdf(
+            root[1].get("name", ""),
+            rules,
+            groups,
+            end_effectors,
+            states,
+            virtual,
+            passive,
+            tuple(remarks.texts),
+        )
+
+    def _elements(self, tag: str) -> list[Element]:
+        return self._by_tag.pop(tag, [])
+
+    def _virtual_joints(self) -> dict[str, VirtualJoint]:
+        found: dict[str, VirtualJoint] = {}
+        seen: dict[str, Element] = {}
+        for element in self._elements("virtual_joint"):
+            try:
+                if not add_unique(seen, element, self._remarks):
+                    continue
+                name, kind = required(element, "name"), required(element, "type")
+                if kind not in _VIRTUAL_KINDS:
+                    raise ElementError(element, f"type={quote(kind)} is none of {', '.join(_VIRTUAL_KINDS)}.")
+                child = self._names.link(element, "child_link")
+                found[name] = VirtualJoint(name, kind, required(element, "parent_frame"), child)
+            except ElementError as mistake:
+                self._remarks.mend(mistake, PASSED_OVER)
+        return found
+
+    def _passive_joints(self) -> tuple[str, ...]:
+        found: dict[str, None] = {}
+        for element in self._elements("passive_joint"):
+            try:
+                found[self._names.joint(element)] = None
+            except ElementError as mistake:
+                self._remarks.mend(mistake, PASSED_OVER)
+        return tuple(found)
+
+    def _groups(self, virtual: dict[str, VirtualJoint], passive: tuple[str, ...]) -> dict[str, SrdfGroup]:
+        elements: dict[str, Element] = {}
+        for element in self._elements("group"):
+            try:
+                add_unique(elements, element, self._remarks)
+            except ElementError as mistake:
+                self._remarks.mend(mistake, PASSED_OVER)
+        return GroupResolver(elements, self._names, virtual, self._remarks).resolve(passive)
+
+    def _rules(self) -> tuple[CollisionRule, ...]:
+        """Return the collision rules; of several about a pair the last one counts, as MoveIt orders them."""
+        rules: list[CollisionRule] = []
+        warned: set[str] = set()
+        for element in self._elements("disable_default_collisions"):
+            try:
+                link = self._names.link(element, "link")
+                rules.append((link, self._names.links_pattern(), False, "off by default"))
+            except ElementError as mistake:
+                self._remarks.mend(mistake, PASSED_OVER)
+        for tag, check in (("enable_collisions", True), ("disable_collisions", False)):
+            for element in self._elements(tag):
+                try:
+                    a, b = self._names.link(element, "link1"), self._names.link(element, "link2")
+                    if a == b:
+                        raise ElementError(element, f"names {quote(a)} twice; a pair has two links.")
+                    rules.append((a, b, check, optional(element, "reason")))
+                except ElementError as mistake:
+                    # A link that this variant of the robot lacks may have a rule with each of the others.
+                    if mistake.message not in warned:
+                        self._remarks.mend(mistake, "all rules like this are passed over")
+                    warned.add(mistake.message)
+        return tuple(rules)
+
+    def _end_effectors(self, groups: dict[str, SrdfGroup]) -> dict[str, EndEffector]:
+        found: dict[str, EndEffector] = {}
+        seen: dict[str, Element] = {}
+        for element in self._elements("end_effector"):
+            try:
+                if not add_unique(seen, element, self._remarks):
+                    continue
+                name, group = required(element, "name"), required(element, "group")
+                parent = self._names.link(element, "parent_link")
+                above = optional(element, "parent_group")
+                for key, said in (("group", group), ("parent_group", above)):
+                    if said and said not in groups:
+                        raise ElementError(element, f"{key}={quote(said)} is no group of this file.")
+                if parent in groups[group].links:
+                    self._remarks.add(
+                        element,
+                        f"has its parent_link {quote(parent)} in its own group, which MoveIt refuses.",
+                    )
+                found[name] = EndEffector(name, group, parent, above)
+            except ElementError as mistake:
+                self._remarks.mend(mistake, PASSED_OVER)
+        return found
+
+    def _states(self, groups: dict[str, SrdfGroup]) -> dict[str, dict[str, float]]:
+        """Add the named states to their groups, and return them by name for all groups together."""
+        states: dict[str, dict[str, float]] = {}
+        by_group: dict[str, dict[str, dict[str, float]]] = {}
+        for element in self._elements("group_state"):
+            try:
+                name, group = required(element, "name"), required(element, "group")
+                if group not in groups:
+                    raise ElementError(element, f"group={quote(group)} is no group of this file.")
+                own = by_group.setdefault(group, {})
+                if name in own:
+                    raise ElementError(element, f"is a state of the group {quote(group)} already.")
+            except ElementError as mistake:
+                self._remarks.mend(mistake, PASSED_OVER)
+                continue
+            own[name] = values = self._values(element)
+            together = states.setdefault(name, {})
+            differing = [c for c, value in values.items() if together.setdefault(c, value) != value]
+            if differing:
+                self._remarks.add(
+                    element,
+                    f"differs from the state of that name of another group, about {quote(differing[0])}; "
+                    "in states the first one counts.",
+                )
+        for group, own in by_group.items():
+            groups[group] = replace(groups[group], states=own)
+        return states
+
+    def _values(self, state: Element) -> dict[str, float]:
+        """Return the values of a named state by the name of the coordinate."""
+        values: dict[str, float] = {}
+        for part in state[2]:
+            if part[0] != "joint":
+                self._remarks.add(part, "is ignored: a state has joints only.", state)
+                continue
+            try:
+                joint = self._names.joint(part)
+                values.update(self._joint_values(part, joint))
+            except ElementError as mistake:
+                self._remarks.mend(mistake, PASSED_OVER, state)
+        return values
+
+    def _joint_values(self, part: Element, joint: str) -> dict[str, float]:
+        record = self._names.articulations[joint]
+        words = required(part, "value").split()
+        try:
+            numbers = [parse_number(word) for word in words]
+        except ValueError as error:
+            raise ElementError(part, f"value={quote(part[1]['value'])} {error}.") from None
+        if record.follows is not None and not record.coordinates:
+            return {}  # a mimic joint: its value follows from that of another joint
+        names = [str(symbol) for symbol in record.coordinates]
+        if not names:
+            raise ElementError(part, "is fixed in the model, and has no value.")
+        if len(numbers) != len(names):
+            raise ElementError(
+                part, f"has {len(numbers)} values, and the model has {len(names)}: {', '.join(names)}."
+            )
+        return dict(zip(names, numbers, strict=True))
+
+    def _warn_unknown(self) -> None:
+        for tag, elements in self._by_tag.items():
+            if tag not in _IGNORED:
+                for element in elements:
+                    self._remarks.add(element, "is ignored: SRDF does not know it.")

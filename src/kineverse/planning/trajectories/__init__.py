@@ -1,0 +1,17 @@
+"""Trajectories: paths with times, within limits of speed and acceleration."""
+
+from .blends import BlendedPath, round_corners
+from .follower import TrajectoryFollower
+from .motion_limits import MotionLimits, motion_limits
+from .time_parameterization import time_parameterize
+from .trajectory import Trajectory
+
+__all__ = [
+    "BlendedPath",
+    "MotionLimits",
+    "Trajectory",
+    "TrajectoryFollower",
+    "motion_limits",
+    "round_corners",
+    "time_parameterize",
+]

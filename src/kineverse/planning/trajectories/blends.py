@@ -1,0 +1,182 @@
+"""Polylines with rounded corners: parabolic blends between straight segments.
+
+A corner c between segments of the directions d₁ and d₂ is replaced by the quadratic Bézier curve with the
+control points c - l·d₁, c, c + l·d₂. With the parameter s, which grows by 2·l on it and by their length on
+straight segments, the derivative q'(s) is continuous and piecewise linear, and q''(s) is piecewise constant:
+0 on segments, (d₂ - d₁)/(2·l) on the blend. The curve stays in the triangle of its control points, and is
+nearest to the corner in its middle, at the distance l·|d₂ - d₁|/4.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import TypeAlias
+
+import numpy as np
+import numpy.typing as npt
+
+from kineverse.errors import InvalidValueError, ShapeError
+from kineverse.lie import Array
+
+Validity: TypeAlias = Callable[[Array], npt.NDArray[np.bool_]]
+"""Function that returns (N,) flags for configurations (N, n): True for those that are valid."""
+
+_HALVINGS = 8
+"""Number of times that a blend is halved before the path stops at the corner."""
+
+_STRAIGHT = 1e-9
+"""Norm of d₂ - d₁ below which there is no corner."""
+
+_RESOLUTION = 1 / 32
+"""Largest distance between two configurations of a blend that are checked [rad], [m]."""
+
+
+@dataclass(frozen=True, eq=False)
+class BlendedPath:
+    """Polyline in configuration space with parabolic blends at its corners.
+
+    Attributes
+    ----------
+    points
+        Corners, first and last point (N, n), no two successive ones equal.
+    directions
+        Unit vectors of the segments (N-1, n), in the Euclidean norm of the coordinates.
+    lengths
+        Lengths of the segments (N-1,).
+    reach
+        Distances l from the inner corners at which their blends begin and end (N-2,); 0 for none.
+    """
+
+    points: Array
+    directions: Array
+    lengths: Array
+    reach: Array
+
+    @property
+    def turns(self) -> npt.NDArray[np.bool_]:
+        """Flags of the inner corners where the direction changes (N-2,)."""
+        turn = np.linalg.norm(np.diff(self.directions, axis=0), axis=1)
+        turns: npt.NDArray[np.bool_] = turn > _STRAIGHT
+        return turns
+
+    @property
+    def deviation(self) -> Array:
+        """Distances between the inner corners and their blends (N-2,)."""
+        found: Array = self.reach * np.linalg.norm(np.diff(self.directions, axis=0), axis=1) / 4
+        return found
+
+    @property
+    def curvature(self) -> Array:
+        """Second derivatives q'' of the blends (N-2, n); 0 where there is none."""
+        change: Array = np.diff(self.directions, axis=0)
+        reach = self.reach[:, None]
+        found: Array = np.where(reach > 0, change / np.where(reach > 0, 2 * reach, 1.0), 0.0)
+        return found
+
+    def blend(self, corner: int, count: int) -> Array:
+        """Return ``count`` configurations on the blend of an inner corner, both ends included."""
+        points: Array = _blend_points(self, np.array([corner]), count)[0]
+        return points
+
+
+def round_corners(
+    points: npt.ArrayLike,
+    deviation: npt.ArrayLike = 0.0,
+    valid: Validity | None = None,
+    *,
+    resolution: float = _RESOLUTION,
+) -> BlendedPath:
+    """Return a polyline with rounded corners.
+
+    Successive equal points count once. A blend takes at most half of an inner segment. It is halved until all
+    its configurations are valid, at most 8 times; after that, the path goes through the corner, and has to
+    stop there.
+
+    Parameters
+    ----------
+    points
+        Polyline (N, n) [rad], [m].
+    deviation
+        Largest distances between path and corners, in the Euclidean norm of the coordinates: a number, or
+        one for each point of the polyline (N,), of which the first and last do not count. 0 for no blend.
+    valid
+        Function that says which of (K, n) configurations are valid; None to accept all blends.
+    resolution
+        Largest distance between two configurations that are checked.
+
+    Raises
+    ------
+    ShapeError, InvalidValueError
+        For points that are no (N, n) array of finite numbers with N >= 1, or a deviation that is no number
+        from 0 or of another shape.
+    """
+    polyline = np.array(points, dtype=float)
+    if polyline.ndim != 2 or not polyline.size:
+        raise ShapeError(f"A path is an array (N, n) of N >= 1 points, not of shape {polyline.shape}.")
+    if not np.isfinite(polyline).all():
+        raise InvalidValueError("The points of a path are finite; there is a NaN or an infinity among them.")
+    allowed = np.asarray(deviation, dtype=float)
+    if allowed.shape not in ((), polyline.shape[:1]):
+        raise ShapeError(
+            f"deviation= is a number or an array of one for each of the {len(polyline)} points, not of shape "
+            f"{allowed.shape}."
+        )
+    if not (allowed >= 0).all():
+        raise InvalidValueError(f"deviation= is a distance from 0, not {deviation!r}.")
+    steps = np.linalg.norm(np.diff(polyline, axis=0), axis=1)
+    # A step below the rounding of the points has no direction.
+    keep = np.concatenate(([True], steps > 8 * np.finfo(float).eps * (1 + np.abs(polyline).max())))
+    kept = polyline[keep]
+    if len(kept) == 1:
+        return _frozen(kept, np.zeros((0, kept.shape[1])), np.zeros(0), np.zeros(0))
+    kept[-1] = polyline[-1]
+    segments = np.diff(kept, axis=0)
+    lengths = np.linalg.norm(segments, axis=1)
+    directions = segments / lengths[:, None]
+    turn = np.linalg.norm(np.diff(directions, axis=0), axis=1)
+    room = lengths / 2
+    room[[0, -1]] = lengths[[0, -1]]  # no blend takes the other half
+    inner = np.broadcast_to(allowed, polyline.shape[:1])[keep][1:-1]
+    reach = np.minimum(room[:-1], room[1:])
+    wide = np.where(turn > _STRAIGHT, turn, 1.0)
+    reach = np.where(turn > _STRAIGHT, np.minimum(reach, 4 * inner / wide), 0.0)
+    path = _frozen(kept, directions, lengths, reach)
+    return path if valid is None else _shrink(path, valid, resolution)
+
+
+def _shrink(path: BlendedPath, valid: Validity, resolution: float) -> BlendedPath:
+    """Return a path whose blends have been halved until they are valid."""
+    reach = path.reach.copy()
+    open_corners = np.flatnonzero(reach > 0)
+    for _ in range(_HALVINGS + 1):
+        if not len(open_corners):
+            return path
+        count = 1 + int(np.ceil(2 * path.reach[open_corners].max() / resolution))
+        samples = _blend_points(path, open_corners, max(count, 3))
+        flags = np.asarray(valid(samples.reshape(-1, path.points.shape[1])), dtype=bool)
+        if flags.shape != (samples.shape[0] * samples.shape[1],):
+            raise ShapeError(
+                f"valid= returns a flag for each of the {samples.shape[0] * samples.shape[1]} "
+                f"configurations, not an array of shape {flags.shape}."
+            )
+        open_corners = open_corners[~flags.reshape(samples.shape[:2]).all(axis=1)]
+        reach[open_corners] /= 2
+        path = _frozen(path.points, path.directions, path.lengths, reach.copy())
+    reach[open_corners] = 0.0
+    return _frozen(path.points, path.directions, path.lengths, reach)
+
+
+def _blend_points(path: BlendedPath, corners: npt.NDArray[np.intp], count: int) -> Array:
+    """Return configurations on the blends of inner corners (len(corners), count, n)."""
+    u = np.linspace(0.0, 1.0, count)[:, None]
+    reach = path.reach[corners, None, None]
+    before, after = path.directions[corners, None], path.directions[corners + 1, None]
+    moved = path.points[corners + 1, None] + reach * (u**2 * after - (1 - u) ** 2 * before)
+    return np.asarray(moved)
+
+
+def _frozen(points: Array, directions: Array, lengths: Array, reach: Array) -> BlendedPath:
+    for part in (points, directions, lengths, reach):
+        part.flags.writeable = False
+    return BlendedPath(points, directions, lengths, reach)

@@ -1,0 +1,239 @@
+"""Time-optimal path parameterisation within speed and acceleration limits.
+
+A path q(s) is followed with the squared path speed x = ṡ² and the path acceleration u = s̈, so that
+q̇ = q'·√x and q̈ = q'·u + q''·x. The limits are linear in (u, x). A backward pass over a grid finds the
+largest controllable x at each node, and a forward pass takes the largest x that is reachable from the start:
+reachability analysis, TOPP-RA (Pham & Pham 2018, IEEE T-RO 34(3), section IV).
+
+On a :class:`.BlendedPath` this needs few nodes. A straight segment is one cell, whose profile is a trapezoid
+in closed form. On a cell of a blend, u is constant, so that q̈ is linear in s, and its limits hold
+everywhere in the cell if they hold at both ends: a linear program in the values (x₀, x₁) at the ends.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import NamedTuple
+
+import numpy as np
+import numpy.typing as npt
+
+from kineverse._checks import as_count
+from kineverse.errors import InvalidValueError, ShapeError
+from kineverse.lie import Array
+from kineverse.symbols import Symbol
+
+from .blends import BlendedPath, Validity, round_corners
+from .path_grid import PathGrid, divide_path
+from .reachability import maximal_squared_speeds
+from .trajectory import Trajectory
+
+_CELLS = 250
+"""Cells of all blends together, where none is asked for."""
+
+_FEWEST = 4
+"""Fewest cells of a blend."""
+
+_EXCESS = 1e-3
+"""Error of the accelerations of cubics between knots, relative to the limits."""
+
+_MOST_PHASES = 50
+"""Most knots of a cell."""
+
+_ROUNDING = 1e-9
+"""Relative excess of a limit that is rounding."""
+
+_SHORTEST = 4 * np.finfo(float).eps
+"""Shortest time between two knots, relative to the duration: times increase."""
+
+
+def time_parameterize(
+    points: npt.ArrayLike | BlendedPath,
+    velocity_limits: npt.ArrayLike,
+    acceleration_limits: npt.ArrayLike,
+    symbols: Sequence[Symbol],
+    *,
+    deviation: npt.ArrayLike = 0.0,
+    valid: Validity | None = None,
+    cells: int = _CELLS,
+) -> Trajectory:
+    """Return the fastest motion along a path, from rest to rest, within limits of each coordinate.
+
+    The corners of the path are rounded by :func:`.round_corners`. Where they are not, the motion stops. On a
+    straight path the duration is that of the trapezoidal profile. Blends are followed with a path
+    acceleration that is constant in each cell, so the duration falls a little with more of them.
+
+    Parameters
+    ----------
+    points
+        Polyline (N, n) [rad], [m], or a path whose corners have been rounded.
+    velocity_limits
+        Largest speeds (n,) [rad/s], [m/s], or a number for all; infinite for none.
+    acceleration_limits
+        Largest accelerations (n,) [rad/s²], [m/s²], or a number for all.
+    symbols
+        Coordinates (n,), the columns of the points.
+    deviation
+        Largest distances between the path and the corners of the polyline; see :func:`.round_corners`.
+    valid
+        Function that says which configurations (K, n) are valid, for the blends.
+    cells
+        Number of cells of all blends together, of which each has at least 4.
+
+    Raises
+    ------
+    ShapeError
+        For limits or symbols of another number than the columns of the points.
+    InvalidValueError
+        For a limit that is not positive, or an acceleration that is not finite, of a coordinate that moves;
+        as :func:`.round_corners`.
+    """
+    path = points if isinstance(points, BlendedPath) else round_corners(points, deviation, valid)
+    n = path.points.shape[1]
+    if len(symbols) != n:
+        raise ShapeError(f"The path has {n} columns, and there are {len(symbols)} symbols.")
+    if len(path.points) == 1:
+        return Trajectory(tuple(symbols), np.zeros(1), path.points, np.zeros((1, n)))
+    speeds, accelerations = _limits(path, velocity_limits, acceleration_limits, symbols)
+    blends = max(int(np.count_nonzero(path.reach)), 1)
+    grid = divide_path(path, max(as_count("cells", cells, 0) // blends, _FEWEST))
+    times, positions, velocities = _motion(
+        grid, maximal_squared_speeds(grid, speeds, accelerations), speeds, accelerations
+    )
+    positions[[0, -1]], velocities[-1] = path.points[[0, -1]], 0.0
+    return Trajectory(tuple(symbols), times, positions, velocities)
+
+
+def _limits(
+    path: BlendedPath, velocity: npt.ArrayLike, acceleration: npt.ArrayLike, symbols: Sequence[Symbol]
+) -> tuple[Array, Array]:
+    """Return the limits of the coordinates (n,), checked; infinite speeds become those that none reaches."""
+    n = path.points.shape[1]
+    travel = np.abs(np.diff(path.points, axis=0)).sum(axis=0)
+    found = []
+    for noun, given in (("speed", velocity), ("acceleration", acceleration)):
+        limits = np.array(given, dtype=float)
+        if limits.shape not in ((), (n,)):
+            raise ShapeError(f"The {noun} limits are a number or {n} numbers, not of shape {limits.shape}.")
+        limits = np.broadcast_to(limits, (n,)).copy()
+        good = (limits > 0) & ((noun == "speed") | np.isfinite(limits))
+        for k in np.flatnonzero(~good & (travel > 0)):
+            wanted = "positive" if noun == "speed" else "positive and finite"
+            raise InvalidValueError(
+                f"The {noun} limit of '{symbols[int(k)]}', which moves, is {wanted}, not {limits[k]:g}."
+            )
+        limits[~good] = 1.0
+        found.append(limits)
+    speeds, accelerations = found
+    # With the acceleration a over the travel S the speed stays below √(2·a·S).
+    return np.minimum(speeds, 2 * np.sqrt(accelerations * travel) + np.finfo(float).tiny), accelerations
+
+
+class _Phases(NamedTuple):
+    """Parts of cells in which the path speed is linear in time, (P,) each.
+
+    Attributes
+    ----------
+    cells
+        Indices of the cells.
+    durations
+        Durations [s].
+    begins, lengths
+        Beginning in the cell and length, in s.
+    before, after
+        Path speeds ṡ at both ends.
+    """
+
+    cells: npt.NDArray[np.intp]
+    durations: Array
+    begins: Array
+    lengths: Array
+    before: Array
+    after: Array
+
+
+def _straight_phases(grid: PathGrid, x: Array, speeds: Array, accelerations: Array) -> _Phases:
+    """Return three phases of each straight segment: up to its largest speed, along at that, down from it."""
+    cells = np.flatnonzero(grid.straight)
+    first, last, length = x[cells], x[cells + 1], grid.lengths[cells]
+    with np.errstate(divide="ignore", over="ignore"):
+        cap = ((speeds / np.abs(grid.first[cells])) ** 2).min(axis=1)
+        slope = (accelerations / np.abs(grid.first[cells])).min(axis=1)
+    peak = np.minimum(cap, (first + last) / 2 + slope * length)
+    peak = np.maximum(peak, np.maximum(first, last))
+    before, fast, after = np.sqrt(first), np.sqrt(peak), np.sqrt(last)
+    up, down = (peak - first) / (2 * slope), (peak - last) / (2 * slope)
+    along = np.maximum(length - up - down, 0.0)
+    return _Phases(
+        np.repeat(cells, 3),
+        np.stack([(fast - before) / slope, along / fast, (fast - after) / slope], axis=1).ravel(),
+        np.stack([0 * up, up, up + along], axis=1).ravel(),
+        np.stack([up, along, down], axis=1).ravel(),
+        np.stack([before, fast, fast], axis=1).ravel(),
+        np.stack([fast, fast, after], axis=1).ravel(),
+    )
+
+
+def _blend_phases(grid: PathGrid, x: Array, accelerations: Array) -> _Phases:
+    """Return phases of the cells of blends, so short that cubics are near to the motion.
+
+    The motion has the fourth derivative 3·q''·u² in time. At the ends of a phase of duration T, the second
+    derivative of the cubic with the same ends differs by that times T²/12.
+    """
+    cells = np.flatnonzero(~grid.straight)
+    rate, following = np.sqrt(x[cells]), np.sqrt(x[cells + 1])
+    duration = 2 * grid.lengths[cells] / (rate + following)
+    bend = np.abs(grid.curvature[cells]) / (4 * accelerations)
+    error = bend.max(axis=1, initial=0.0) * (following - rate) ** 2
+    counts = np.clip(np.ceil(np.sqrt(error / _EXCESS)), 1, _MOST_PHASES).astype(int)
+    owner = np.repeat(np.arange(len(cells)), counts)
+    number = np.arange(len(owner)) - np.repeat(np.cumsum(counts) - counts, counts)
+    step = (duration / counts)[owner]
+    change = ((following - rate) / duration)[owner]
+    before = rate[owner] + change * step * number
+    after = before + change * step
+    begins = (rate[owner] + before) / 2 * step * number
+    return _Phases(cells[owner], step, begins, (before + after) / 2 * step, before, after)
+
+
+def _motion(grid: PathGrid, x: Array, speeds: Array, accelerations: Array) -> tuple[Array, Array, Array]:
+    """Return times (T,), positions and velocities (T, n) of the motion with the squared path speeds x."""
+    blends = _blend_phases(grid, x, accelerations)
+    slower = _excess(grid, blends, speeds, accelerations)
+    straight = _straight_phases(grid, x, speeds, accelerations)
+    phases = _Phases(*(np.concatenate(pair) for pair in zip(straight, blends, strict=True)))
+    order = np.argsort(phases.cells, kind="stable")
+    order = order[(phases.durations > _SHORTEST * phases.durations.sum())[order]]
+    cells, s = phases.cells[order], (phases.begins + phases.lengths)[order, None]
+    tangents = grid.first[cells] + grid.curvature[cells] * s
+    positions = grid.start[cells] + (grid.first[cells] + tangents) / 2 * s
+    velocities = tangents * phases.after[order, None] / slower
+    times = slower * np.cumsum(phases.durations[order])
+    start = grid.start[:1]
+    return (
+        np.concatenate([[0.0], times]),
+        np.concatenate([start, positions]),
+        np.concatenate([0 * start, velocities]),
+    )
+
+
+def _excess(grid: PathGrid, phases: _Phases, speeds: Array, accelerations: Array) -> float:
+    """Return the factor on all times with which the cubics of phases of blends keep the limits, at least 1.
+
+    On straight segments the cubics are the motion.
+    """
+    if not len(phases.cells):
+        return 1.0
+    first, bend = grid.first[phases.cells], grid.curvature[phases.cells]
+    begin, length, dt = (values[:, None] for values in (phases.begins, phases.lengths, phases.durations))
+    mean = (first + bend * (begin + length / 2)) * length / dt
+    before = (first + bend * begin) * phases.before[:, None]
+    after = (first + bend * (begin + length)) * phases.after[:, None]
+    initial = (6 * mean - 4 * before - 2 * after) / dt
+    final = (2 * before + 4 * after - 6 * mean) / dt
+    factor = np.sqrt((np.maximum(np.abs(initial), np.abs(final)) / accelerations).max())
+    jerk = final - initial
+    inside = np.abs(initial + final) < np.abs(jerk)
+    turning = np.where(inside, before - initial**2 * dt / (2 * np.where(inside, jerk, 1.0)), 0.0)
+    factor = max(float(factor), float((np.abs(turning) / speeds).max()))
+    return factor if factor > 1 + _ROUNDING else 1.0

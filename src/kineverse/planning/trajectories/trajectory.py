@@ -1,0 +1,288 @@
+"""Trajectory: a timed motion of coordinates as a value."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import numpy.typing as npt
+
+from kineverse._checks import finite_number
+from kineverse.errors import FormatError, InvalidValueError, ShapeError
+from kineverse.lie import Array
+from kineverse.model.model_view import ModelView
+from kineverse.state import State
+from kineverse.symbols import Symbol
+
+from .trajectory_file import TrajectoryData, parse_coordinates, read_trajectory_file, write_trajectory_file
+
+_JUMP = 1e-6
+"""Largest difference of positions and velocities at which two trajectories are joined [rad], [m], per s."""
+
+
+@dataclass(frozen=True, eq=False, repr=False)
+class Trajectory:
+    """Motion of coordinates over time: knots with positions and velocities, and cubics between them.
+
+    Trajectories are immutable values. The arrays are copies and cannot be written.
+
+    Attributes
+    ----------
+    symbols
+        Coordinates (n,), the columns of the arrays.
+    times
+        Times of the knots (T,) [s], from 0, increasing.
+    positions
+        Positions at the knots (T, n) [rad], [m].
+    velocities
+        Velocities at the knots (T, n) [rad/s], [m/s].
+
+    Raises
+    ------
+    ShapeError
+        For arrays whose shapes do not match.
+    InvalidValueError
+        For times that do not begin at 0 or do not increase, numbers that are not finite, a symbol that is
+        there twice, or one that is no coordinate.
+    """
+
+    symbols: tuple[Symbol, ...]
+    times: Array
+    positions: Array
+    velocities: Array
+
+    def __post_init__(self) -> None:
+        symbols = tuple(self.symbols)
+        times, positions, velocities = (
+            np.array(values, dtype=float) for values in (self.times, self.positions, self.velocities)
+        )
+        shape = (times.size, len(symbols))
+        if times.ndim != 1 or not times.size or positions.shape != shape or velocities.shape != shape:
+            raise ShapeError(
+                f"A trajectory of {len(symbols)} coordinates has times (T,) with T >= 1, and positions and "
+                f"velocities (T, {len(symbols)}); these have the shapes {times.shape}, {positions.shape} and "
+                f"{velocities.shape}."
+            )
+        if not all(np.isfinite(values).all() for values in (times, positions, velocities)):
+            raise InvalidValueError("The numbers of a trajectory are finite; there is a NaN or an infinity.")
+        if times[0] != 0 or (np.diff(times) <= 0).any():
+            raise InvalidValueError("The times of a trajectory begin at 0 and increase from knot to knot.")
+        for symbol in symbols:
+            if not isinstance(symbol, Symbol) or symbol.order or symbol.role != "dof":
+                raise InvalidValueError(f"A trajectory is about coordinates of a model, not {symbol!r}.")
+        if len(set(symbols)) < len(symbols):
+            twice = next(s for s in symbols if symbols.count(s) > 1)
+            raise InvalidValueError(f"The trajectory has two columns for '{twice}'.")
+        for name, values in (("times", times), ("positions", positions), ("velocities", velocities)):
+            values.flags.writeable = False
+            object.__setattr__(self, name, values)
+        object.__setattr__(self, "symbols", symbols)
+
+    @property
+    def duration(self) -> float:
+        """Time of the last knot [s]."""
+        return float(self.times[-1])
+
+    def at(self, time: float) -> State:
+        """Return the state at a time [s], with the time as its stamp.
+
+        Before the beginning it is the first state, and after the end the last one.
+        """
+        values = self.positions_at(_time(time))
+        return State(dict(zip(self.symbols, values.tolist(), strict=True)), stamp=float(time))
+
+    def positions_at(self, times: npt.ArrayLike) -> Array:
+        """Return the positions at times of shape (...), with the shape (..., n) [rad], [m].
+
+        Before the beginning they are the first ones, and after the end the last ones.
+        """
+        k, u, dt = self._locate(times)
+        p, q = self.positions[k], self.positions[k + 1 - self._single]
+        v, w = self.velocities[k] * dt, self.velocities[k + 1 - self._single] * dt
+        # Cubic Hermite polynomial, about the nearer end so that knots are met exactly.
+        change = q - p
+        near = p + u * (v + u * ((3 * change - 2 * v - w) + u * (v + w - 2 * change)))
+        r = u - 1
+        far = q + r * (w + r * ((2 * w + v - 3 * change) + r * (v + w - 2 * change)))
+        return np.asarray(np.where(u < 0.5, near, far))
+
+    def velocities_at(self, times: npt.ArrayLike) -> Array:
+        """Return the velocities at times of shape (...), with the shape (..., n) [rad/s], [m/s].
+
+        Before the beginning and after the end they are 0.
+        """
+        given = np.asarray(times, dtype=float)
+        k, u, dt = self._locate(given)
+        p, q = self.positions[k], self.positions[k + 1 - self._single]
+        v, w = self.velocities[k], self.velocities[k + 1 - self._single]
+        mean = (q - p) / np.where(dt > 0, dt, 1.0)
+        speed = (1 - u) * (1 - 3 * u) * v + u * (3 * u - 2) * w + 6 * u * (1 - u) * mean
+        outside = (given < 0) | (given > self.duration)
+        return np.where(outside[..., None], 0.0, speed)
+
+    def sample(self, rate: float) -> Trajectory:
+        """Return the trajectory with knots at a rate [Hz], and one at the end.
+
+        Raises
+        ------
+        InvalidValueError
+            For a rate that is not positive.
+        """
+        number = finite_number(rate)
+        if number is None or number <= 0:
+            raise InvalidValueError(f"A rate is a positive number of knots per second, not {rate!r}.")
+        count = int(np.floor(self.duration * number * (1 - 1e-12)))
+        times = np.append(np.arange(count + 1) / number, self.duration) if self.duration else self.times
+        return self._at_knots(times)
+
+    def between(self, start: float, end: float) -> Trajectory:
+        """Return the part between two times [s]; its times begin at 0.
+
+        Raises
+        ------
+        InvalidValueError
+            Unless ``0 <= start <= end <= duration``.
+        """
+        first, last = _time(start), _time(end)
+        if not 0 <= first <= last <= self.duration:
+            raise InvalidValueError(
+                f"A part is between two times from 0 to {self.duration:g} s, the first one first; not "
+                f"between {start!r} and {end!r}."
+            )
+        inner = self.times[(self.times > first) & (self.times < last)]
+        return self._at_knots(np.concatenate(([first], inner, [last] if last > first else [])))
+
+    def then(self, other: Trajectory) -> Trajectory:
+        """Return this motion with another one after it.
+
+        Raises
+        ------
+        InvalidValueError
+            If the other one is about other coordinates, or begins at another position or velocity.
+        """
+        if self.symbols != other.symbols:
+            missing = [str(s) for s in {*self.symbols} ^ {*other.symbols}]
+            about = f": '{missing[0]}' is in one of them" if missing else ", in another order"
+            raise InvalidValueError(f"Trajectories that are joined have the same coordinates{about}.")
+        for noun, end, begin in (
+            ("position", self.positions[-1], other.positions[0]),
+            ("velocity", self.velocities[-1], other.velocities[0]),
+        ):
+            jump = np.abs(end - begin)
+            if jump.max(initial=0.0) > _JUMP:
+                k = int(jump.argmax())
+                raise InvalidValueError(
+                    f"The {noun} of '{self.symbols[k]}' would jump from {end[k]:g} to {begin[k]:g}. "
+                    "Plan from the state at the end of the first trajectory."
+                )
+        return Trajectory(
+            self.symbols,
+            np.concatenate([self.times, self.duration + other.times[1:]]),
+            np.concatenate([self.positions, other.positions[1:]]),
+            np.concatenate([self.velocities, other.velocities[1:]]),
+        )
+
+    def reversed(self) -> Trajectory:
+        """Return the motion backwards in time."""
+        return Trajectory(
+            self.symbols,
+            self.duration - self.times[::-1],
+            self.positions[::-1],
+            -self.velocities[::-1],
+        )
+
+    def save(self, path: str | os.PathLike[str]) -> None:
+        """Write the trajectory to a JSON file; all numbers are exact.
+
+        Raises
+        ------
+        FormatError
+            If the file cannot be written.
+        """
+        names = [str(symbol) for symbol in self.symbols]
+        write_trajectory_file(path, TrajectoryData(names, self.times, self.positions, self.velocities))
+
+    @staticmethod
+    def load(path: str | os.PathLike[str], model: ModelView | None = None) -> Trajectory:
+        """Read a trajectory from a JSON file.
+
+        Parameters
+        ----------
+        path
+            Path of the file.
+        model
+            Model to which the coordinates belong; None to accept all names.
+
+        Raises
+        ------
+        FormatError
+            If the file cannot be read or is no trajectory; the message says what is wrong.
+        UnknownNameError
+            For a coordinate that the model does not have.
+        """
+        data, source = read_trajectory_file(path), Path(path).name
+        if model is None:
+            symbols = parse_coordinates(data.names, source)
+        else:
+            symbols = tuple(model.symbol(name) for name in data.names)
+        try:
+            return Trajectory(symbols, *data[1:])
+        except (InvalidValueError, ShapeError) as error:
+            raise FormatError(f"{source}: {error}") from None
+
+    def __len__(self) -> int:
+        return len(self.times)
+
+    def __iter__(self) -> Iterator[State]:
+        """Yield the states at the knots, with their times as stamps."""
+        for time, values in zip(self.times.tolist(), self.positions.tolist(), strict=True):
+            yield State(dict(zip(self.symbols, values, strict=True)), stamp=time)
+
+    def __eq__(self, other: object) -> bool:
+        if not isinstance(other, Trajectory):
+            return NotImplemented
+        return self.symbols == other.symbols and all(
+            np.array_equal(a, b) for a, b in zip(self._arrays, other._arrays, strict=True)
+        )
+
+    def __hash__(self) -> int:
+        return hash((self.symbols, *(values.tobytes() for values in self._arrays)))
+
+    def __repr__(self) -> str:
+        names = ", ".join(map(str, self.symbols[:4])) + (", ..." if len(self.symbols) > 4 else "")
+        return (
+            f"<Trajectory: {self.duration:g} s, {len(self)} knots, {len(self.symbols)} coordinates: {names}>"
+        )
+
+    @property
+    def _arrays(self) -> tuple[Array, Array, Array]:
+        # Adding 0 makes -0.0 and 0.0, which are equal, the same bytes.
+        return self.times + 0.0, self.positions + 0.0, self.velocities + 0.0
+
+    @property
+    def _single(self) -> int:
+        """1 if there is a single knot, else 0."""
+        return int(len(self.times) == 1)
+
+    def _locate(self, times: npt.ArrayLike) -> tuple[npt.NDArray[np.intp], Array, Array]:
+        """Return the knots before times, and the fractions and lengths of their intervals (..., 1)."""
+        t = np.clip(np.asarray(times, dtype=float), 0.0, self.duration)
+        if np.isnan(t).any():
+            raise InvalidValueError("A time of a trajectory is a number, not NaN.")
+        k = np.clip(np.searchsorted(self.times, t, side="right") - 1, 0, max(len(self.times) - 2, 0))
+        dt = self.times[k + 1 - self._single] - self.times[k]
+        u = np.divide(t - self.times[k], dt, out=np.zeros_like(t), where=dt > 0)
+        return k, np.asarray(u)[..., None], np.asarray(dt)[..., None]
+
+    def _at_knots(self, times: Array) -> Trajectory:
+        return Trajectory(self.symbols, times - times[0], self.positions_at(times), self.velocities_at(times))
+
+
+def _time(given: float) -> float:
+    number = finite_number(given)
+    if number is None:
+        raise InvalidValueError(f"A time is a finite number of seconds, not {given!r}.")
+    return number
