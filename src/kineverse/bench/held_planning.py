@@ -97,8 +97,8 @@ MOTIONS: Mapping[str, HeldMotion] = MappingProxyType(
             0.02,
             0.3,
             {
-                "pr2/l_gripper_tool_frame": (0.04, -0.12, 0.0, np.pi / 2, 0.0, np.pi),
-                "pr2/r_gripper_tool_frame": (0.04, 0.12, 0.0, np.pi / 2, 0.0, np.pi),
+                "pr2/l_gripper_palm_link": (0.22, -0.12, 0.0, np.pi / 2, 0.0, np.pi),
+                "pr2/r_gripper_palm_link": (0.22, 0.12, 0.0, np.pi / 2, 0.0, np.pi),
             },
             "kitchen/island_middle_upper_drawer_handle",
             ("pr2/torso_lift_joint", "pr2/?_shoulder*", "pr2/?_upper*", "pr2/?_elbow*", "pr2/?_forearm*")

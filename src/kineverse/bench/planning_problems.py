@@ -17,6 +17,7 @@ import numpy as np
 
 from kineverse.formats import load
 from kineverse.formats.locate import locate_model
+from kineverse.formats.srdf import read_srdf
 from kineverse.geometry import RULES, Rule, rules_as_data
 from kineverse.lie import Array, to_rpy
 from kineverse.model.body import Body, Box, Cylinder, Geometry, Shape, Sphere
@@ -112,8 +113,7 @@ def load_problem_sets(robot: str, most: int | None = None) -> Iterator[ProblemSe
 
 def _add_obstacles(model: Model, objects: Sequence[Sequence[Any]], srdf: Path) -> None:
     """Add obstacles with free poses, and rules: those of the SRDF, and none among obstacles."""
-    frames = {*model.frames}
-    rules = [rule for rule in _disabled_pairs(srdf) if rule.a in frames and rule.b in frames]
+    rules = [*read_srdf(srdf, model).rules]
     with model.edit() as edit:
         for name, kind, _, size in objects:
             *where, roll, pitch, yaw = _pose_symbols(name)
@@ -154,11 +154,6 @@ def _frame(obstacle: str) -> str:
 
 def _pose_symbols(obstacle: str) -> list[Symbol]:
     return [position(f"{_frame(obstacle)}/{k}") for k in ("x", "y", "z", "roll", "pitch", "yaw")]
-
-
-def _disabled_pairs(srdf: Path) -> Iterator[Rule]:
-    for pair in ElementTree.parse(srdf).iter("disable_collisions"):
-        yield Rule(pair.get("link1", ""), pair.get("link2", ""), why=pair.get("reason", ""))
 
 
 def _make_geometry(kind: str, size: Sequence[float]) -> Geometry:
