@@ -261,3 +261,22 @@ def test_frames_without_finite_poses_are_hidden_and_named():
         assert page.settled()
         assert (page.unplaced, hook.visible) == (["hook"], False)
         np.testing.assert_allclose(page.pose("hook")[:3, 3], [2, 0, 0])
+
+
+def test_overlaid_parts_move_with_their_frames_and_survive_edits():
+    from kineverse.geometry.shapes import solid_from_geometry
+    from kineverse.planning.spheres import cover_solid
+    from kineverse.view.sphere_drawables import draw_cover
+
+    model = cabinet()
+    frame = next(iter(model.bodies))
+    cover = cover_solid(solid_from_geometry(Box((0.1, 0.1, 0.1))), 0.03)
+    with view(model, port=0) as page:
+        page.show_overlay([draw_cover(frame, cover, np.eye(4)), draw_cover("gone", cover, np.eye(4))])
+        (node,) = page._scene._overlay_nodes
+        assert node.name.startswith(page._scene._nodes[frame].name)
+        page.refresh()
+        assert page.settled()
+        assert len(page._scene._overlay_nodes) == 1
+        page.show_overlay([])
+        assert not page._scene._overlay_nodes

@@ -29,8 +29,8 @@ if TYPE_CHECKING:
 
 HELP = """cover collision shapes by spheres, and show how far these stick out
 
-Every point of a shape lies in a sphere. Meshes are covered as the convex hulls that distances are computed to.
-The spheres are stored in the user's cache by the content of the shape and the settings.
+Every point of a shape lies in a sphere. Meshes are covered as the convex hulls that distances are computed
+to. The spheres are stored in the user's cache by the content of the shape and the settings.
 
 "protrusion" is the largest distance of a sphere's points from the shape, "excess" the volume of the spheres
 over that of the shapes, minus 1. By default spheres stick out by a tenth of the size of a shape, from 5 mm to

@@ -1,6 +1,7 @@
 """Motion planning for any model (layer 5); needs a C compiler."""
 
 from .manifold import FrameHold
+from .modes import Mode
 from .path import Path
 from .planner import Planner
 from .trajectories import (
@@ -16,6 +17,7 @@ from .trajectories import (
 __all__ = [
     "BlendedPath",
     "FrameHold",
+    "Mode",
     "MotionLimits",
     "Path",
     "Planner",

@@ -66,7 +66,7 @@ class CheckerStruct(ctypes.Structure):
     _fields_ = _fields(
         "iiiippppiippppppppiippd",
         "coordinates poses conditions stored compute kept lower upper links bodies link coarse fine planes "
-        "allowed world moving unused pairs moving_pairs pair moving_pair margin",
+        "allowed world moving fineness pairs moving_pairs pair moving_pair margin",
     )
 
 

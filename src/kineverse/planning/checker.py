@@ -5,10 +5,11 @@ from __future__ import annotations
 import ctypes
 import math
 from collections.abc import Iterator, Sequence
-from collections.abc import Set as AbstractSet
 from contextlib import contextmanager
 from itertools import combinations, permutations
+from typing import TypeAlias
 
+import casadi as ca
 import numpy as np
 import numpy.typing as npt
 
@@ -27,9 +28,15 @@ from .bindings import CheckerStruct, ObstacleSetStruct, planning_functions
 from .links import LinkTable, is_thin
 from .obstacles import Floats32, ObstacleSet
 
+BodyPairs: TypeAlias = frozenset[frozenset[str]]
+"""Pairs of bodies, {a, b} each."""
+
 RESOLUTION = 32.0
 """Samples of an edge for each unit of its length, [1/rad] and [1/m]."""
+FINENESS = 2000.0
+"""Samples of a unit of a coordinate by which a condition switches, such as that of a lock [1/rad], [1/m]."""
 _SAME = 1e-4
+_SWITCHES = {ca.OP_LT, ca.OP_LE, ca.OP_EQ, ca.OP_NE, ca.OP_NOT, ca.OP_AND, ca.OP_OR, ca.OP_IF_ELSE_ZERO}
 LEAST_INFLATION = 2e-4
 """Growth of spheres below which a collision between two samples counts as one [m]."""
 
@@ -102,6 +109,7 @@ class CollisionChecker:
         self._build_struct(margin)
 
     def _make_program(self, poses: list[Expression], conditions: Sequence[Expression]) -> VectorProgram:
+        self._conditions = tuple(conditions)
         outputs = [*poses, *conditions]
         # Loops that do not close have no pose: the sum of all entries is NaN then, and so is no condition.
         if any(e.nodes for e in outputs):
@@ -185,6 +193,8 @@ class CollisionChecker:
     def _build_struct(self, margin: float) -> None:
         n = len(self.coordinates)
         self.lower, self.upper = np.zeros(n, dtype=np.float32), np.zeros(n, dtype=np.float32)
+        switching = {s for e in self._conditions if is_switching(e) for s in e.symbols}
+        self._fineness = np.array([FINENESS * (s in switching) for s in self.coordinates], dtype=np.float32)
         self._plane_table = np.concatenate(self._planes or [np.zeros((1, 4))]).astype(np.float32)
         self._set_structs = (ObstacleSetStruct * max(len(self._sets), 1))(*(s.struct for s in self._sets))
         program, links = self.program, self.links
@@ -207,7 +217,7 @@ class CollisionChecker:
             self._allowed.ctypes.data,
             ctypes.addressof(self._world.struct),
             ctypes.addressof(self._set_structs),
-            None,
+            self._fineness.ctypes.data,
             len(self.pairs),
             len(self.moving_pairs),
             self.pairs.ctypes.data,
@@ -228,7 +238,7 @@ class CollisionChecker:
         self.struct.kept = self._kept.ctypes.data
 
     @contextmanager
-    def excepting(self, pairs: AbstractSet[frozenset[str]]) -> Iterator[None]:
+    def excepting(self, pairs: BodyPairs) -> Iterator[None]:
         """Leave out pairs of bodies, {a, b} each, while the context lasts."""
         if not pairs:
             yield
@@ -333,3 +343,9 @@ class CollisionChecker:
                 pairs = zip(self.outputs(q), self.outputs(turned), strict=True)
                 found[i] &= all(np.allclose(a, b, atol=_SAME, equal_nan=True) for a, b in pairs)
         return found
+
+
+def is_switching(expression: Expression) -> bool:
+    """Return True for an expression with comparisons, which may jump."""
+    function = ca.Function("expression", ca.symvar(expression.casadi), [expression.casadi])
+    return any(function.instruction_id(k) in _SWITCHES for k in range(function.n_instructions()))

@@ -16,6 +16,7 @@ from kineverse.lie import Array
 from kineverse.model.constraint import Constraint
 from kineverse.model.model_view import ModelView
 from kineverse.model.projection import is_equality
+from kineverse.state import State
 from kineverse.symbols import Symbol
 
 _WILDCARDS = "*?["
@@ -39,9 +40,10 @@ class PlanningSpace:
     ----------
     symbols
         The n coordinates, in the order in which they are given, patterns in the order of the model.
+    lower, upper
+        (n,) limits at the present place, ±inf for none; those that depend on moving coordinates are conditions.
     conditions
-        Expressions that are at most 0 where the inequalities of the model hold; limits of single coordinates that
-        are numbers are not among them.
+        Expressions that are at most 0 where the inequalities of the model hold; limits are not among them.
     equalities
         Expressions that are 0 where the equalities of the model hold.
     """
@@ -53,12 +55,15 @@ class PlanningSpace:
             raise InvalidValueError(
                 "There is nothing to move: the model has no coordinates, or move= is empty."
             )
+        self._limits: list[tuple[int, Expression, Expression]] = []
         ranges = self._read_constraints()
-        self._space = ConfigurationSpace(model, self.symbols, ranges)
-        self.turning = self._space.find_turning_candidates(ranges)
+        self.lower, self.upper = np.zeros((2, len(self.symbols)))
+        self.place(model.default_state())
+        self.turning = ConfigurationSpace(model, self.symbols, ranges).find_turning_candidates(ranges)
 
     def _read_constraints(self) -> dict[str, Constraint]:
         moved, rates = {*self.symbols}, self.model.rates
+        place: dict[Expression, int] = {s: k for k, s in enumerate(self.symbols)}
         self.conditions: list[Expression] = []
         self.condition_names: list[str] = []
         self.equalities: list[Expression] = []
@@ -74,7 +79,9 @@ class PlanningSpace:
             ranges[name] = whole
             if is_equality(whole):
                 self.equalities.append(middle - low)
-            elif not (isinstance(middle, Symbol) and not low.symbols and not high.symbols):
+            elif middle in moved and moved.isdisjoint({*low.symbols, *high.symbols}):
+                self._limits.append((place[middle], low, high))
+            else:
                 excess = [e for e in (low - middle, middle - high) if _is_bounded(e)]
                 if excess:
                     worst = excess[0] if len(excess) == 1 else as_expression(maximum(*excess))
@@ -88,15 +95,14 @@ class PlanningSpace:
                 self.equalities.append(as_expression(sum((s * s for s in quaternion), as_expression(-1.0))))
         return ranges
 
-    @property
-    def lower(self) -> Array:
-        """Lower limits (n,), -inf for none."""
-        return self._space.lower
-
-    @property
-    def upper(self) -> Array:
-        """Upper limits (n,), inf for none."""
-        return self._space.upper
+    def place(self, state: State) -> None:
+        """Set the limits to those at a state, on which they may depend."""
+        self.lower[:], self.upper[:] = -math.inf, math.inf
+        for k, low, high in self._limits:
+            self.lower[k] = max(self.lower[k], float(low(state)) if low.symbols else float(low))
+            self.upper[k] = min(self.upper[k], float(high(state)) if high.symbols else float(high))
+        # An empty range makes every configuration invalid, and messages name it.
+        self.upper[:] = np.maximum(self.lower, self.upper)
 
     def bounds(self, start: Array, points: Array) -> tuple[Array, Array]:
         """Return finite bounds (n,) of a search from a start (n,) to or about configurations (N, n).

@@ -20,7 +20,7 @@ from kineverse.lie import Array
 from kineverse.model.model_view import ModelView
 from kineverse.spatial import as_transform, inverse, log_so3
 from kineverse.state import State
-from kineverse.symbols import Symbol
+from kineverse.symbols import Symbol, parameter
 
 from .bindings import ProjectionStruct, planning_functions
 from .checker import CollisionChecker
@@ -121,32 +121,60 @@ class Manifold:
     ) -> None:
         self._checker, self._code = checker, planning_functions()
         symbols = checker.coordinates
-        errors = [model.rates.resolve(e) for hold in holds for e in hold.error.ravel()]
+        # Targets that are numbers are parameters, so that another target is the same program.
+        self._targets: list[Symbol] = []
+        errors = [e for hold in holds for e in self._rows_of(model, hold)]
         self.rows = as_expression(array([*errors, *equalities]))
         jacobian = _jacobian(self.rows, symbols)
         for hold in holds:
             moved = {s.position for s in model.rates.resolve(hold.error).gradient(heuristic=False)}
             if moved.isdisjoint(symbols):
                 raise InvalidValueError(f"{hold!r} depends on nothing that the planner moves.")
-        outputs = [newton_step(self.rows, jacobian), largest(self.rows)]
-        found = {s for e in outputs for s in e.symbols} - {*symbols}
-        self.parameters = tuple(sorted(found, key=lambda s: s.sort_key))
-        self._program = VectorProgram(outputs, symbols, self.parameters, scalar="float")
-        self._exact = VectorProgram(outputs, symbols, self.parameters, scalar="double")
+        # A coordinate that stands still, or stays at its limit, has no column.
+        free = [parameter(f"planning/free/{i}", 1.0) for i in range(len(symbols))]
+        outputs = [newton_step(self.rows, jacobian * array(free)), largest(self.rows)]
+        found = {s for e in outputs for s in e.symbols} - {*symbols, *free, *self._targets}
+        self._others = tuple(sorted(found, key=lambda s: s.sort_key))
+        self.parameters = (*self._others, *self._targets)
+        self._program = VectorProgram(outputs, (*symbols, *free), self.parameters, scalar="float")
+        self._exact = VectorProgram(outputs, (*symbols, *free), self.parameters, scalar="double")
         self._kept = self._program.prepare(np.zeros(len(self.parameters)))
         self._values = np.zeros(len(self.parameters))
         self.struct = ProjectionStruct(
             self._program.compute_address, self._kept.ctypes.data, self._program.stored, TOLERANCE, _STEPS
         )
 
+    def _rows_of(self, model: ModelView, hold: Hold) -> list[Expression]:
+        if as_expression(hold.target).symbols:
+            return [model.rates.resolve(e) for e in hold.error.ravel()]
+        targets = [
+            parameter(f"planning/target/{len(self._targets) + k}", 0.0) for k in range(hold.expression.size)
+        ]
+        self._targets += targets
+        entries = hold.expression.ravel()
+        return [model.rates.resolve(e) - t for e, t in zip(entries, targets, strict=True)]
+
     @property
     def address(self) -> int:
         """Address of :attr:`struct`, valid as long as this object."""
         return ctypes.addressof(self.struct)
 
-    def place(self, state: State) -> None:
-        """Set the values of everything that the holds depend on beside the coordinates."""
-        self._values = state.vector(self.parameters)
+    def place(self, state: State, holds: Sequence[Hold]) -> None:
+        """Set the values of everything that the holds depend on beside the coordinates.
+
+        Parameters
+        ----------
+        state
+            The state.
+        holds
+            The holds, or others that differ by their targets.
+        """
+        targets = [
+            np.broadcast_to(as_expression(hold.target)({}), hold.expression.shape).ravel()
+            for hold in holds
+            if not as_expression(hold.target).symbols
+        ]
+        self._values = np.concatenate([state.vector(self._others), *targets])
         self._kept = self._program.prepare(self._values)
         self.struct.kept = self._kept.ctypes.data
 
@@ -160,18 +188,30 @@ class Manifold:
 
     def polish(self, Q: Array) -> tuple[Array, Array]:
         """Return configurations (N, n) on the manifold and within limits in double precision, and residuals (N,)."""
-        x = np.array(Q, dtype=float)
         lower, upper = self._checker.lower.astype(float), self._checker.upper.astype(float)
+        x = np.array(Q, dtype=float)
+        factors = np.tile(np.where(lower < upper, 1.0, 0.0), (len(x), 1))
         for _ in range(_POLISHING):
-            steps, residuals = self._exact.evaluate(x, self._values)
+            steps, residuals = self._exact.evaluate(np.hstack([x, factors]), self._values)
             if (residuals <= EXACT).all():
-                break
-            x = np.clip(x + np.where((residuals > EXACT)[:, None], steps, 0.0), lower, upper)
-        return x, np.asarray(self._exact.evaluate(x, self._values)[1])
+                return x, np.asarray(residuals)
+            to = x + np.where((residuals > EXACT)[:, None], steps, 0.0)
+            x = np.clip(to, lower, upper)
+            factors[x != to] = 0.0
+        return x, self.residuals(x)
 
     def residuals(self, Q: Array) -> Array:
         """Return the largest residual (N,) of configurations (N, n) [m], [rad]."""
-        return np.asarray(self._exact.evaluate(np.asarray(Q, dtype=float), self._values)[1])
+        points = np.asarray(Q, dtype=float)
+        found = self._exact.evaluate(np.hstack([points, np.ones_like(points)]), self._values)[1]
+        return np.asarray(found)
+
+
+def manifold_key(holds: Sequence[Hold]) -> tuple[object, ...]:
+    """Return what the program of a manifold depends on: holds with other numbers as targets share it."""
+    return tuple(
+        (hold.expression, hold.target if as_expression(hold.target).symbols else None) for hold in holds
+    )
 
 
 def _jacobian(rows: Expression, symbols: Sequence[Symbol]) -> Expression:

@@ -36,6 +36,8 @@ class Path:
         Number of samples of the search.
     state
         State in which everything else stands.
+    modes
+        Of a path through modes, the name of each with the indices of its first and last point.
     """
 
     found: bool
@@ -47,6 +49,7 @@ class Path:
     iterations: int
     state: State
     measure: Callable[[Array], float] = field(repr=False)
+    modes: tuple[tuple[str, int, int], ...] = ()
 
     @property
     def length(self) -> float:

@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
+from dataclasses import replace
 from time import perf_counter
-from typing import Any
+from typing import Any, TypeAlias
 
 import numpy as np
 import numpy.typing as npt
@@ -22,14 +23,17 @@ from kineverse.model.model_view import ModelView
 from kineverse.state import State, StateLike, as_state
 from kineverse.symbols import Symbol
 
-from .checker import RESOLUTION, CollisionChecker
+from .checker import RESOLUTION, BodyPairs, CollisionChecker
 from .configuration import PlanningSpace
 from .connection import connect, connect_on_manifold
 from .endpoints import Endpoint, Endpoints
 from .judge import SceneJudge, describe_contacts
-from .manifold import FrameHold, Manifold, hold_frames
+from .manifold import FrameHold, Manifold, hold_frames, manifold_key
+from .modes import Mode, ModeSearch
 from .path import Path
 from .solutions import find_solutions
+
+Flags: TypeAlias = npt.NDArray[np.bool_]
 
 _JUDGED = 1.0
 """Longest step between judged configurations of a path that is certified [rad], [m]."""
@@ -110,8 +114,8 @@ class Planner:
         self.scene = scene
         self.checker = CollisionChecker(scene, space.symbols, space.conditions, self.margin, self._protrusion)
         space.turning &= self.checker.find_periodic(space.turning)
-        self._manifolds: dict[tuple[Hold, ...], Manifold] = {}
-        self._judges: dict[frozenset[frozenset[str]], SceneJudge] = {}
+        self._manifolds: dict[tuple[object, ...], Manifold] = {}
+        self._judges: dict[BodyPairs, SceneJudge] = {}
         self._version = model.version
         self._place(model.default_state() if self._state is None else model.default_state() | self._state)
 
@@ -159,6 +163,7 @@ class Planner:
 
     def _place(self, state: State) -> None:
         self._state = state
+        self.space.place(state)
         self.checker.place(state)
         self._set_bounds(self._here, self._here[None])
 
@@ -167,8 +172,12 @@ class Planner:
         assert self._state is not None
         return self._state.vector(self.space.symbols)
 
-    def _set_bounds(self, start: Array, points: Array) -> None:
-        self.checker.lower[:], self.checker.upper[:] = self.space.bounds(start, points)
+    def _set_bounds(self, start: Array, points: Array, still: Flags | None = None) -> None:
+        """Set the bounds of a search from a start (n,) to points (N, n); coordinates that stand still have none."""
+        lower, upper = self.space.bounds(start, points)
+        if still is not None:
+            lower, upper = np.where(still, start, lower), np.where(still, start, upper)
+        self.checker.lower[:], self.checker.upper[:] = lower, upper
 
     # -- configurations ------------------------------------------------------------------------------------
 
@@ -246,36 +255,44 @@ class Planner:
             Seed of the random starts.
         """
         self._synchronize()
+        count, seed = as_count("count", count, 1), as_count("seed", seed, 0)
         given = as_holds(tasks)
-        self._set_bounds(self._here, self._here[None])
-        manifold = self._manifold(given)
-        if manifold is None:
+        if not given and not self.space.equalities:
             raise InvalidValueError("There is no hold and no goal, so every configuration is a solution.")
-        with self.checker.excepting(self._touching(given)):
-            return find_solutions(
-                self.checker,
-                manifold,
-                self._here,
-                as_count("count", count, 1),
-                seconds,
-                as_count("seed", seed, 0),
-            )
+        return self._solutions(given, self._here, count, seconds, seed, self._touching(given))
+
+    def _solutions(
+        self,
+        holds: Sequence[Hold],
+        near: Array,
+        count: int,
+        seconds: float,
+        seed: int,
+        touching: BodyPairs,
+        still: Flags | None = None,
+    ) -> Array:
+        """Return solutions (K, n), those near to a configuration first; some coordinates have its values."""
+        self._set_bounds(near, near[None], still)
+        manifold = self._manifold(holds)
+        assert manifold is not None
+        with self.checker.excepting(touching):
+            return find_solutions(self.checker, manifold, near, count, seconds, seed)
 
     def _manifold(self, holds: Sequence[Hold]) -> Manifold | None:
         """Return the manifold of holds and equalities of the model, at the present place."""
         if not holds and not self.space.equalities:
             return None
-        key = tuple(holds)
+        key = manifold_key(holds)
         if key not in self._manifolds:
             if len(self._manifolds) >= _MOST_MANIFOLDS:
                 self._manifolds.clear()
-            self._manifolds[key] = Manifold(self.checker, self.model, key, self.space.equalities)
+            self._manifolds[key] = Manifold(self.checker, self.model, holds, self.space.equalities)
         manifold = self._manifolds[key]
         assert self._state is not None
-        manifold.place(self._state)
+        manifold.place(self._state, holds)
         return manifold
 
-    def _touching(self, holds: Iterable[Hold]) -> frozenset[frozenset[str]]:
+    def _touching(self, holds: Iterable[Hold]) -> BodyPairs:
         """Return the pairs of bodies that may touch while holds last."""
         bodies = self.scene.bodies
         return frozenset(
@@ -295,6 +312,7 @@ class Planner:
         goals: StateLike | npt.ArrayLike | Sequence[StateLike] | Sequence[Hold | Goal],
         *,
         along: Hold | Iterable[Hold] = (),
+        modes: Iterable[Mode] | None = None,
         seconds: float = 1.0,
         seed: int = 0,
     ) -> Path:
@@ -308,6 +326,10 @@ class Planner:
             A configuration (n,), several (K, n), states, or holds and goals that are met together at the end.
         along
             Holds that are met all along the path. Start and goals have to meet them up to 1 cm or .01 rad.
+        modes
+            Ways in which the coordinates may move, see :class:`.Mode`; the path changes from one to another where
+            the holds of both are met, such as from moving freely to moving a door by its handle. None for all
+            coordinates moving at once.
         seconds
             Largest time of the search [s]; checks of its result come on top.
         seed
@@ -319,15 +341,55 @@ class Planner:
         holds = as_holds(along)
         q = self._here if start is None else self._configurations(start, "start")[0]
         tasks = () if not _are_tasks(goals) else as_holds(goals)
+        touching = self._touching([*holds, *tasks])
+        if modes is not None:
+            if holds:
+                raise InvalidValueError(
+                    "along= is for a path of one mode; with modes= each mode has its own holds."
+                )
+            ends = None if tasks else self._configurations(goals, "goals")
+            return self._plan_modes(ModeSearch(self, modes, tasks, ends, seconds, seed), q, begin)
         if tasks:
-            ends = self.solutions([*holds, *tasks], _TASK_GOALS, seconds=seconds, seed=seed)
+            ends = self._solutions([*holds, *tasks], q, _TASK_GOALS, seconds, seed, touching)
             if not len(ends):
                 return self._no_path(q, self._no_solution([*holds, *tasks]), begin)
         else:
             ends = self._configurations(goals, "goals")
-        self._set_bounds(q, ends)
+        return self._between(q, ends, holds, touching, seconds, seed)
+
+    def _plan_modes(self, search: ModeSearch, q: Array, begin: float) -> Path:
+        """Return the path through modes that a search finds."""
+        found = search.run(q)
+        parts, modes, first = [q[None]], [], 0
+        for mode, points in found.segments:
+            parts.append(points[1:])
+            modes.append((mode.name, first, first + len(points) - 1))
+            first += len(points) - 1
+        touching = frozenset(pair for mode, _ in found.segments for pair in self._touching(mode.along))
+        whole = np.vstack(parts)
+        why = found.problem or f"Found through {len(modes)} modes, after {found.iterations} searches."
+        path = self._path(
+            not found.problem, whole, why, begin, perf_counter() - begin, found.iterations, touching
+        )
+        return replace(path, modes=tuple(modes))
+
+    def _between(
+        self,
+        q: Array,
+        ends: Array,
+        holds: Sequence[Hold],
+        touching: BodyPairs,
+        seconds: float,
+        seed: int,
+        still: Flags | None = None,
+    ) -> Path:
+        """Return a path from a configuration (n,) to any of some ends (K, n), along holds; see :meth:`plan`.
+
+        Bodies of the pairs ``touching`` may touch, and some coordinates may stand still.
+        """
+        begin = perf_counter()
+        self._set_bounds(q, ends, still)
         manifold = self._manifold(holds)
-        touching = self._touching([*holds, *tasks])
         with self.checker.excepting(touching):
             endpoints = Endpoints(self.space, self.checker, self._judge(touching), manifold)
             first = endpoints.check("The start", q)
@@ -345,7 +407,7 @@ class Planner:
         first: Endpoint,
         goals: Sequence[Endpoint],
         manifold: Manifold | None,
-        touching: frozenset[frozenset[str]],
+        touching: BodyPairs,
         seconds: float,
         seed: int,
         begin: float,
@@ -374,7 +436,7 @@ class Planner:
         why = f"Found after {found.iterations} samples."
         return self._path(True, whole, why, begin, spent, found.iterations, touching)
 
-    def _judge(self, touching: frozenset[frozenset[str]] = frozenset()) -> SceneJudge:
+    def _judge(self, touching: BodyPairs = frozenset()) -> SceneJudge:
         """Return the judge of the scene in which some pairs may touch, at the present place."""
         if touching not in self._judges:
             if len(self._judges) >= _MOST_MANIFOLDS:
@@ -406,7 +468,7 @@ class Planner:
         begin: float,
         spent: float,
         iterations: int,
-        touching: frozenset[frozenset[str]] = frozenset(),
+        touching: BodyPairs = frozenset(),
     ) -> Path:
         state, judge = self._state, self._judge(touching)
         assert state is not None

@@ -54,7 +54,7 @@ typedef struct {
   const unsigned char *allowed; /* (links, bodies of the world's set) */
   const ObstacleSet *world;
   const ObstacleSet *moving;
-  const void *unused;
+  const float *fineness; /* samples for each unit of a coordinate that conditions switch by; 0 for others */
   long long pairs, moving_pairs;
   const Pair *pair;        /* two links, spheres against spheres */
   const Pair *moving_pair; /* a link, spheres, against a moving set */
@@ -69,12 +69,12 @@ typedef struct {
 
 static int work_begin(Work *w, const Checker *c) {
   const size_t outputs = 12 * c->poses + c->conditions;
-  const size_t vectors = c->coordinates + c->stored + outputs + 12 * c->poses + 3 * c->links + 12 + 8;
+  const size_t vectors = 2 * c->coordinates + c->stored + outputs + 12 * c->poses + 3 * c->links + 12 + 8;
   w->memory = malloc(vectors * sizeof(V) + (c->links + 1) * sizeof(float) + 64);
   if (!w->memory) return 1;
   memset(w->memory, 0, vectors * sizeof(V) + (c->links + 1) * sizeof(float) + 64);
   w->x = (V *)(((size_t)w->memory + 63) & ~(size_t)63);
-  w->store = w->x + c->coordinates + 1;
+  w->store = w->x + 2 * c->coordinates + 1;
   w->o = w->store + c->stored + 1;
   w->centre = w->o + outputs + 1;
   w->relative = w->centre + 3 * c->links + 1;

@@ -21,8 +21,26 @@ INLINE void interpolate(const Checker *c, Work *w, const float *a, const float *
   for (int i = 0; i < c->coordinates; i++) w->x[i] = fused(t, splat(b[i] - a[i]), splat(a[i]));
 }
 
+/* Return 1 if all conditions hold on the way from a to b. Those that switch, such as locks, forbid thin ranges of their
+   coordinates, so that these are sampled more often than collisions are. */
+static int conditions_hold(const Checker *c, Work *w, const float *a, const float *b) {
+  float samples = 0.0f;
+  for (int i = 0; i < c->coordinates; i++) samples += c->fineness[i] * fabsf(b[i] - a[i]);
+  const int blocks = (int)ceilf(samples / W);
+  const float step = 1.0f / fmaxf(samples, 1.0f);
+  for (int k = 0; k < blocks; k++) {
+    interpolate(c, w, a, b, smaller((ramp() + splat(k * W + 1.0f)) * splat(step), splat(1.0f)));
+    evaluate(c, w);
+    const V *conditions = w->o + 12 * c->poses;
+    for (int i = 0; i < c->conditions; i++)
+      if (any(~(conditions[i] <= splat(0.0f)))) return 0;
+  }
+  return 1;
+}
+
 /* Return 1 if no sample on the way from a, exclusive, to b, inclusive, collides. Every block sees the whole edge. */
 static int edge_is_free(const Checker *c, Work *w, const float *a, const float *b, float resolution) {
+  if (!conditions_hold(c, w, a, b)) return 0;
   const int blocks = (int)ceilf(fmaxf(distance(a, b, c->coordinates) * resolution, 1.0f) / W);
   const float step = 1.0f / (blocks * W);
   for (int k = 0; k < blocks; k++) {
@@ -67,6 +85,8 @@ static float inflate(const Checker *c, Work *w, const V *before) {
 static int edge_is_certain(const Checker *c, Work *w, const float *a, const float *b, float resolution, float least,
                            float *where) {
   float middle[MOST_INTERVALS];
+  *where = 0.0f;
+  if (!conditions_hold(c, w, a, b)) return 0;
   int count = (int)ceilf(fmaxf(distance(a, b, (int)c->coordinates) * resolution, 1.0f));
   count = (count + W - 1) / W * W;
   if (count > MOST_INTERVALS / 4) count = MOST_INTERVALS / 4;
@@ -103,7 +123,8 @@ static int edge_is_certain(const Checker *c, Work *w, const float *a, const floa
   return 1;
 }
 
-/* Newton's step onto a manifold: outputs are the changes of the coordinates, then the largest residual. */
+/* Newton's step onto a manifold: inputs are the coordinates and a factor of each, 0 where it may not move; outputs are
+   the changes of the coordinates, then the largest residual. */
 typedef struct {
   Compute *step;
   const V *kept;
@@ -112,21 +133,29 @@ typedef struct {
   long long steps;
 } Projection;
 
+/* Residual below which a coordinate that meets its limit stays there. */
+#define CLOSE 0.05f
+
 /* Project all lanes of w->x; return the lanes that arrive within limits. `o` and `store` are work space. */
 static I project(const Checker *c, const Projection *p, Work *w, V *store, V *o) {
   const int n = (int)c->coordinates;
+  V *x = w->x, *factor = w->x + n;
+  for (int i = 0; i < n; i++) factor[i] = splat(c->lower[i] < c->upper[i] ? 1.0f : 0.0f);
   for (int k = 0;; k++) {
-    p->step(w->x, p->kept, store, o);
+    p->step(x, p->kept, store, o);
     const I done = o[n] <= splat((float)p->tolerance);
     if (k == p->steps || !any(~done)) {
       I good = done;
-      for (int i = 0; i < n; i++)
-        good &= (w->x[i] >= splat(c->lower[i])) & (w->x[i] <= splat(c->upper[i]));
+      for (int i = 0; i < n; i++) good &= (x[i] >= splat(c->lower[i])) & (x[i] <= splat(c->upper[i]));
       return good;
     }
+    const I close = o[n] <= splat(CLOSE);
     for (int i = 0; i < n; i++) {
-      const V x = w->x[i] + select_(done, splat(0.0f), o[i]);
-      w->x[i] = smaller(larger(x, splat(c->lower[i])), splat(c->upper[i]));
+      const V lower = splat(c->lower[i]), upper = splat(c->upper[i]);
+      const V to = x[i] + select_(done, splat(0.0f), o[i]);
+      /* Steps that end at a limit again and again converge slowly. */
+      factor[i] = select_(close & ((to < lower) | (to > upper)), splat(0.0f), factor[i]);
+      x[i] = smaller(larger(to, lower), upper);
     }
   }
 }
@@ -156,11 +185,15 @@ static int edge_on_manifold(const Checker *c, const Projection *p, Work *w, V *s
     if (!good[0]) return count;
     evaluate(c, w);
     good &= ~collisions(c, w);
-    for (int j = 0; j < W; j++) {
-      if (!good[j]) return count;
-      for (int i = 0; i < n; i++) points[count * n + i] = w->x[i][j];
-      last = points + count++ * n;
+    const int before = count;
+    int reached = 0;
+    for (; reached < W && good[reached]; reached++, count++)
+      for (int i = 0; i < n; i++) points[count * n + i] = w->x[i][reached];
+    for (int j = before; j < count; j++) {
+      if (!conditions_hold(c, w, last, points + j * n)) return j;
+      last = points + j * n;
     }
+    if (reached < W) return count;
   }
   *full = 1;
   return count;

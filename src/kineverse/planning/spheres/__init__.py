@@ -1,7 +1,7 @@
 """Covers of collision shapes by few spheres, with a hierarchy.
 
-:func:`cover_object` covers a collision object of a scene, :func:`cover_solid` any convex solid. Covers contain
-what they cover, provably, and say how far they stick out of it.
+:func:`cover_object` covers a collision object of a scene, :func:`cover_solid` any convex solid. Covers
+contain what they cover, provably, and say how far they stick out of it.
 """
 
 from .object_covers import cover_object

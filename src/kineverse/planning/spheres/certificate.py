@@ -1,9 +1,9 @@
 """Proof that spheres cover a polytope: subdivision until each tetrahedron lies in one sphere.
 
-A sphere is convex, so it contains a tetrahedron if it contains the four corners. The polytope is the union of
-the tetrahedra between an inner point and its triangles. Those that no sphere contains are cut at the middle of
-their longest edge, until the sphere that lacks least of them would have to grow by a small length only, or by as
-much as for one of their corners alone. By that much it does grow.
+A sphere is convex, so it contains a tetrahedron if it contains the four corners. The polytope is the union
+of the tetrahedra between an inner point and its triangles. One that no sphere contains is cut at the middle
+of its longest edge. It is final once the sphere that lacks least of it would have to grow by a small length
+only, or hardly more than for one corner alone. By that much the sphere does grow.
 """
 
 from __future__ import annotations
@@ -17,9 +17,9 @@ from kineverse.geometry.mesh_files import Floats, Integers
 from .polytope import CoverPolytope
 
 _EDGES = np.array([[0, 1], [0, 2], [0, 3], [1, 2], [1, 3], [2, 3]])
-_MOST_CELLS = 200_000
-_CHUNK = 400_000
-"""Distances that are computed at once."""
+_MOST_CELLS = 60_000
+_NEAR, _SMALL = 10, 0.7
+"""Spheres that a cell is tried with, and the edge of a small cell, as a fraction of the median radius."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -55,46 +55,64 @@ def find_uncovered(polytope: CoverPolytope, centres: Floats, radii: Floats, tole
     middle = polytope.corners.mean(axis=0)
     corners = polytope.corners[polytope.faces]
     cells = np.concatenate([np.broadcast_to(middle, (len(corners), 1, 3)), corners], axis=1)
+    # A small cell is tried with the spheres around it only. A large one may lie in others, and is cut.
+    near = _nearest_spheres(cells, centres, radii)
+    least = _SMALL * float(np.median(radii)) if len(radii) > _NEAR else np.inf
+    large = np.full(len(cells), len(radii) > _NEAR)
     while len(cells):
-        gaps, nearest, needs, outside = _measure_gaps(cells, centres, radii)
-        final = (gaps > 0.0) & (gaps <= np.maximum(needs, 0.0) + tolerance)
+        gaps, nearest, needs, outside = _measure_gaps(cells, near, centres, radii + growth)
+        final = (gaps > 0.0) & (gaps <= np.maximum(needs, 0.0) + tolerance) & ~large
         if len(cells) > _MOST_CELLS:
             final = gaps > 0.0
-        np.maximum.at(growth, nearest[final], gaps[final])
+        grown = growth.copy()
+        np.maximum.at(grown, nearest[final], growth[nearest[final]] + gaps[final])
+        growth = grown
         points.append(outside[final & (needs > 0.0)])
-        cells = cells[(gaps > 0.0) & ~final]
+        left_over = (gaps > 0.0) & ~final
+        cells, near = cells[left_over], near[left_over]
         a, b = cells[:, _EDGES[:, 0]], cells[:, _EDGES[:, 1]]
-        longest = ((a - b) ** 2).sum(axis=2).argmax(axis=1)
+        lengths = ((a - b) ** 2).sum(axis=2)
+        longest = lengths.argmax(axis=1)
         rows = np.arange(len(cells))
+        large = lengths[rows, longest] > least**2
         first, second = _EDGES[longest].T
         middles = (cells[rows, first] + cells[rows, second]) / 2
         left, right = cells.copy(), cells
         left[rows, second] = middles
         right[rows, first] = middles
         cells = np.concatenate([left, right])
+        near, large = np.concatenate([near, near]), np.concatenate([large, large])
+        near[large] = _nearest_spheres(cells[large], centres, radii + growth)
     return Uncovered(growth, np.concatenate(points))
 
 
-def _measure_gaps(cells: Floats, centres: Floats, radii: Floats) -> tuple[Floats, Integers, Floats, Floats]:
-    """Return how far each cell is from lying in one sphere, and in which one.
+def _nearest_spheres(cells: Floats, centres: Floats, radii: Floats) -> Integers:
+    """Return for each cell the indices (n, k) of the spheres that reach furthest beyond its middle."""
+    count = len(radii)
+    if count <= _NEAR:
+        return np.broadcast_to(np.arange(count), (len(cells), count)).copy()
+    depths = distances(cells.mean(axis=1), centres) - radii
+    return np.argpartition(depths, _NEAR, axis=1)[:, :_NEAR]
 
-    Further, how far its worst corner is from all spheres, negative inside; and that corner.
+
+def _measure_gaps(
+    cells: Floats, near: Integers, centres: Floats, radii: Floats
+) -> tuple[Floats, Integers, Floats, Floats]:
+    """Return how far each cell is from lying in one of some spheres, and in which one.
+
+    Further, how far its worst corner is from all of them, negative inside; and that corner.
     """
-    count = len(cells)
-    gaps, needs, worst = np.empty(count), np.empty(count), np.empty((count, 3))
-    nearest = np.empty(count, dtype=np.int64)
-    step = max(_CHUNK // (4 * len(radii)), 1)
-    for start in range(0, count, step):
-        part = slice(start, start + step)
-        beyond = (distances(cells[part].reshape(-1, 3), centres) - radii).reshape(-1, 4, len(radii))
-        of_cells = beyond.max(axis=1)
-        nearest[part] = of_cells.argmin(axis=1)
-        gaps[part] = of_cells.min(axis=1)
-        of_corners = beyond.min(axis=2)
-        which = of_corners.argmax(axis=1)
-        rows = np.arange(len(which))
-        needs[part], worst[part] = of_corners[rows, which], cells[part][rows, which]
-    return gaps, nearest, needs, worst
+    beyond = np.empty((len(cells), 4, near.shape[1]))
+    around, sizes = centres[near], radii[near]
+    for k in range(4):
+        apart = around - cells[:, k, None]
+        beyond[:, k] = np.sqrt(np.einsum("nij,nij->ni", apart, apart)) - sizes
+    of_cells = beyond.max(axis=1)
+    rows = np.arange(len(cells))
+    best = of_cells.argmin(axis=1)
+    of_corners = beyond.min(axis=2)
+    which = of_corners.argmax(axis=1)
+    return of_cells[rows, best], near[rows, best], of_corners[rows, which], cells[rows, which]
 
 
 def distances(points: Floats, centres: Floats) -> Floats:

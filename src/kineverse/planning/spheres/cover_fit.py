@@ -1,14 +1,14 @@
 """Few spheres that cover a polytope within a protrusion.
 
-A ball about a point c inside of a convex solid sticks out of it by its radius less the depth d(c), exactly. A
-point p therefore needs the protrusion min_i |p - c_i| - d(c_i), and a cover with N spheres is the location
-problem that minimises the largest need over the centres. The needs are largest at corners of the power cells of
-the spheres. So rounds alternate, as in Lloyd's iteration: the power diagram gives corners, and with it a cover
-that is proved; the needs of the corners, smoothed, are descended over the centres.
+A ball about a point c inside of a convex solid sticks out of it by its radius less the depth d(c), exactly.
+A point p therefore needs the protrusion min_i |p - c_i| - d(c_i), and a cover with N spheres is the location
+problem that minimises the largest need over the centres. The needs are largest at corners of the power cells
+of the spheres. So rounds alternate, as in Lloyd's iteration: the power diagram gives points that are hard to
+cover, and the needs of these, smoothed, are descended over the centres.
 
-The first centres come from a greedy set cover, or from a lattice. As covers with N spheres lie in many local
-minima, and the protrusion of either start is known only after the descent, the number of spheres is found by
-trying.
+The first centres come from a greedy set cover, or from a lattice. Covers with N spheres lie in many local
+minima, and the protrusion of either start is known only after the descent, so that the number of spheres is
+found by trying.
 """
 
 from __future__ import annotations
@@ -25,14 +25,14 @@ from .cover_mesh import CoverMesh
 from .cover_starts import CoverStarts
 from .polytope import CoverPolytope
 
-_ROUNDS, _FEW_ROUNDS, _STEPS = 24, 12, 6
+_ROUNDS, _FEW_ROUNDS, _STEPS = 20, 10, 6
 """Power diagrams of a descent and of a short one, and steps between two of them."""
 
 _WARM, _COLD = 0.2, 0.015
 """First and last temperature of the smoothed maximum, as a fraction of the protrusion."""
 
 _MOMENTUM = 0.6
-_SAMPLES, _HARD = 600, 0.6
+_SAMPLES, _HARD = 300, 0.6
 _TRIALS = 4
 _REMOVALS, _FEW_SPHERES = 3, 12
 _PROOF, _ALLOWANCE, _ATTEMPTS = 0.01, 1.04, 4
@@ -60,11 +60,12 @@ class FittedSpheres:
 class _Problem:
     """Polytope, with the points of it that a cover is fitted to."""
 
-    def __init__(self, polytope: CoverPolytope, protrusion: float) -> None:
+    def __init__(self, polytope: CoverPolytope, protrusion: float, most: int) -> None:
         self.polytope = polytope.simplify()
         a, b, c = np.moveaxis(polytope.corners[polytope.faces], 1, 0)
+        samples = max(_SAMPLES, 10 * most)
         area = float(np.linalg.norm(np.cross(b - a, c - a), axis=1).sum()) / 2
-        self.mesh = CoverMesh(self.polytope, max(protrusion, math.sqrt(area / _SAMPLES)))
+        self.mesh = CoverMesh(self.polytope, max(protrusion, math.sqrt(area / samples)))
         self.gaps: Floats = np.zeros((0, 3))
 
     def find_critical(self, centres: Floats, radii: Floats) -> tuple[Floats, Integers]:
@@ -88,7 +89,7 @@ def fit_spheres(polytope: CoverPolytope, protrusion: float, most: int) -> Fitted
     most
         Largest number of spheres.
     """
-    problem = _Problem(polytope, protrusion)
+    problem = _Problem(polytope, protrusion, most)
     aim = protrusion / _ALLOWANCE
     for _ in range(_ATTEMPTS):
         fitted = _fit_to_points(problem, aim, most)
@@ -111,6 +112,9 @@ def _fit_to_points(problem: _Problem, aim: float, most: int) -> FittedSpheres:
     if best.protrusion <= aim or most == 1:
         return best
     best = _search_start(problem, CoverStarts(problem.polytope, aim), aim, most, best)
+    if best.protrusion > aim and len(best.radii) < most:
+        added = descend(problem, _split_worst(problem, best, most), aim)
+        best = added if added.is_better(best, aim) else best
     polished = descend(problem, best.centres, aim)
     return _remove(problem, polished if polished.is_better(best, aim) else best, aim)
 
@@ -124,7 +128,7 @@ def _search_start(
     tried: set[int] = set()
     for _ in range(_TRIALS):
         centres = start.greedy(wanted)
-        if len(centres) in tried:
+        if len(centres) in tried or len(centres) > most:
             break
         tried.add(len(centres))
         found = descend(problem, centres, aim, _FEW_ROUNDS)
@@ -140,6 +144,17 @@ def _search_start(
         found = descend(problem, centres, aim, _FEW_ROUNDS)
         best = found if found.is_better(best, aim) else best
     return best
+
+
+def _split_worst(problem: _Problem, cover: FittedSpheres, most: int) -> Floats:
+    """Return the centres with one more beside each of those that protrude most, at most so many."""
+    depths = problem.polytope.depths(cover.centres)
+    points, owners = problem.find_critical(cover.centres, depths + cover.protrusion)
+    needs = np.linalg.norm(points - cover.centres[owners], axis=1) - depths[owners]
+    order = np.argsort(-needs, kind="stable")
+    first = order[np.sort(np.unique(owners[order], return_index=True)[1])][: most - len(cover.radii)]
+    added = 0.4 * cover.centres[owners[first]] + 0.6 * points[first]
+    return np.concatenate([cover.centres, added])
 
 
 def descend(problem: _Problem, centres: Floats, aim: float, rounds: int = _ROUNDS) -> FittedSpheres:
@@ -257,7 +272,7 @@ def prove(polytope: CoverPolytope, cover: FittedSpheres) -> tuple[FittedSpheres,
     """
     tolerance = _PROOF * cover.protrusion
     radii = cover.radii + tolerance
-    uncovered = find_uncovered(polytope, cover.centres, radii, 0.5 * tolerance)
+    uncovered = find_uncovered(polytope, cover.centres, radii, tolerance)
     radii = (radii + uncovered.growth) * (1.0 + _ROUNDING)
     protrusion = float((radii - polytope.depths(cover.centres)).max())
     return FittedSpheres(cover.centres, radii, protrusion), uncovered.points

@@ -1,8 +1,8 @@
 """Points of a polytope that are hardest to cover by given spheres.
 
 The power of a point x for a sphere is |x - c|² - r². Spheres cover a solid if and only if each one covers the
-part where its own power is least. These parts are convex, so that what is hardest to cover are their corners: on
-the surface, points of equal power for three spheres; on an edge, for two. A triangle whose corners belong to
+part where its own power is least. These parts are convex, so that their corners are hardest to cover: on the
+surface, points of equal power for three spheres; on an edge, for two. A triangle whose corners belong to
 different spheres is likely to have one.
 
 Source: F. Aurenhammer, Power diagrams: properties, algorithms and applications, SIAM J. Comput. 16 (1987).
@@ -18,7 +18,7 @@ from kineverse.geometry.mesh_files import Floats, Integers
 
 from .polytope import CoverPolytope
 
-_LAYERS, _INNER_TRIANGLES = (0.75, 0.5, 0.25), 150
+_LAYERS, _INNER_TRIANGLES = (0.75, 0.5, 0.25), 60
 """Sizes of the inner surfaces beside the outer one, and the number of their triangles."""
 
 

@@ -12,8 +12,7 @@ from .certificate import distances
 from .cover_mesh import split_triangles
 from .polytope import CoverPolytope
 
-_SAMPLES, _CANDIDATES = 300, 1500
-_MOST_IN_A_ROW = 24
+_SAMPLES, _CANDIDATES = 150, 1500
 
 
 class CoverStarts:
@@ -52,14 +51,17 @@ class CoverStarts:
         self._protrusion = protrusion
 
     def least_greedy(self, most: int) -> float:
-        """Return the least protrusion for which :meth:`greedy` chooses at most so many spheres."""
-        low = high = self._protrusion
+        """Return a protrusion, close to the least one, for which :meth:`greedy` chooses at most so many.
+
+        The search begins at half the protrusion of the starts.
+        """
+        low = high = 0.5 * self._protrusion
         while len(self.greedy(high)) > most:
             low, high = high, 2.0 * high
-        while high > 1.05 * low:
+        while high > 1.1 * low:
             middle = math.sqrt(low * high)
             low, high = (middle, high) if len(self.greedy(middle)) > most else (low, middle)
-        return high if high > self._protrusion else 0.5 * high
+        return high
 
     def greedy(self, protrusion: float) -> Floats:
         """Return centres whose balls cover the points, each chosen because it covers most new ones."""
@@ -84,13 +86,14 @@ class CoverStarts:
         corners = self._polytope.corners
         axes = _principal_axes(corners)
         low, high = (corners @ axes.T).min(axis=0), (corners @ axes.T).max(axis=0)
-        counts = np.stack(np.meshgrid(*3 * [np.arange(1, _MOST_IN_A_ROW + 1)], indexing="ij"), axis=-1)
-        counts = counts.reshape(-1, 3)
-        counts = counts[counts.prod(axis=1) <= most]
+        numbers = range(1, most + 1)
+        counts = np.array(
+            [(i, j, k) for i in numbers for j in numbers[: most // i] for k in numbers[: most // (i * j)]]
+        )
         half = (high - low) / 2 / counts
         protrusions = np.linalg.norm(half, axis=1) - half.min(axis=1)
-        numbers = np.where(protrusions <= protrusion, counts.prod(axis=1), np.inf)
-        best = counts[numbers.argmin() if np.isfinite(numbers).any() else protrusions.argmin()]
+        totals = np.where(protrusions <= protrusion, counts.prod(axis=1), np.inf)
+        best = counts[totals.argmin() if np.isfinite(totals).any() else protrusions.argmin()]
         ticks = [low[k] + (high[k] - low[k]) * (np.arange(best[k]) + 0.5) / best[k] for k in range(3)]
         centres = np.stack(np.meshgrid(*ticks, indexing="ij"), axis=-1).reshape(-1, 3) @ axes
         inside: Floats = centres[self._polytope.depths(centres) > -protrusion]

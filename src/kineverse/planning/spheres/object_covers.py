@@ -45,8 +45,8 @@ def _request(item: CollisionObject, protrusion: float | None, most: int) -> tupl
     solid = item.make_solid()
     if not solid.is_convex:
         raise InvalidValueError(
-            f"Shape {item.number} of body '{item.body}' is a triangle mesh, which has no inside to be covered "
-            "by spheres: leave the body out of triangles=, so that its hulls are covered."
+            f"Shape {item.number} of body '{item.body}' is a triangle mesh, which has no inside for spheres "
+            "to cover: leave the body out of triangles=, so that its hulls are covered."
         )
     wanted = default_protrusion(solid) if protrusion is None else protrusion
     return solid, wanted, cover_key(solid, wanted, most)

@@ -1,8 +1,8 @@
 """Polytopes around and inside of convex solids, for sphere covers.
 
 A cover of the outer polytope covers the solid. The depth of a point in the inner polytope is a lower bound of
-its depth in the solid. Boxes and hulls are both polytopes themselves; round primitives lie between the hull of
-points on their surface and that of points around them.
+its depth in the solid. Boxes and hulls are both polytopes themselves; round primitives lie between the hull
+of points on their surface and that of points around them.
 """
 
 from __future__ import annotations
@@ -56,7 +56,10 @@ class CoverPolytope:
         return depths
 
     def simplify(self) -> CoverPolytope:
-        """Return the hull of the corners that are extreme along some directions, for a hull with many corners."""
+        """Return the hull of the corners that are extreme along some directions, if there are many corners.
+
+        It lies inside of the solid, and is returned for hulls only.
+        """
         if self.is_round or len(self.corners) <= _MANY_CORNERS:
             return self
         extreme = np.unique((self.corners @ _sphere_lattice(_DIRECTIONS).T).argmax(axis=0))

@@ -15,7 +15,7 @@ from .certificate import distances, find_uncovered
 from .polytope import bound_solid
 from .union_volume import union_volume
 
-_ACCURACY = 2e-3
+_ACCURACY, _FINENESS = 2e-3, 0.01
 
 
 class CoverQuality(NamedTuple):
@@ -61,7 +61,7 @@ def measure_cover(solid: Solid, centres: npt.ArrayLike, radii: npt.ArrayLike) ->
         raise ShapeError(f"Spheres have centres (N, 3) and radii (N,), not {where.shape} and {sizes.shape}.")
     if not (np.isfinite(where).all() and np.isfinite(sizes).all() and (sizes > 0.0).all()):
         raise InvalidValueError("Spheres have finite centres and positive radii.")
-    polytope = bound_solid(solid, 0.05 * solid.radius)
+    polytope = bound_solid(solid, _FINENESS * solid.radius)
     missed = find_uncovered(polytope, where, sizes, _ACCURACY * solid.radius).points
     gaps = (distances(missed, where) - sizes).min(axis=1) if len(missed) else np.zeros(1)
     depths = polytope.depths(where)

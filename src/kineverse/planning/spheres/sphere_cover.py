@@ -68,8 +68,8 @@ def cover_solid(solid: Solid, protrusion: float | None = None, most: int = MOST)
     Raises
     ------
     InvalidValueError
-        For a triangle mesh, which has no inside; or if the protrusion is not a positive length, or ``most`` not
-        between 1 and 1024.
+        For a triangle mesh, which has no inside; or if the protrusion is not a positive length, or ``most``
+        not between 1 and 1024.
     """
     if isinstance(solid.surface, Faces):
         raise InvalidValueError(
@@ -124,8 +124,8 @@ def _make_cover(centres: Floats, radii: Floats, protrusion: float, volume: float
 def _capsule_chain(capsule: Capsule, protrusion: float, most: int) -> tuple[Floats, Floats, float]:
     """Return equal spheres along the axis of a capsule, and their protrusion [m].
 
-    With radius r + e they reach beyond both ends by e if the outermost are e inside of the ends of the axis, and
-    cover the side as long as neighbours are no further than 2 √((r + e)² - r²) apart.
+    With radius r + e they reach beyond both ends by e if the outermost are e inside of the ends of the axis,
+    and cover the side as long as neighbours are no further than 2 √((r + e)² - r²) apart.
     """
     radius, length = float(capsule.radius), float(capsule.length)
 

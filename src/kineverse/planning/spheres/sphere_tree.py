@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
+from itertools import pairwise
 
 import numpy as np
 import numpy.typing as npt
@@ -12,8 +13,8 @@ from kineverse.errors import InvalidValueError, ShapeError
 from kineverse.geometry.mesh_files import Floats, Integers
 
 _ALWAYS_FLAT = 4
-_LLOYD_ROUNDS = 20
-_BALL_STEPS = 400
+_LLOYD_ROUNDS = 10
+_BALL_STEPS = 100
 _ROUNDING = 1e-9
 
 
@@ -73,13 +74,13 @@ def make_sphere_tree(centres: npt.ArrayLike, radii: npt.ArrayLike) -> SphereTree
     order = np.argsort(clusters, kind="stable")
     where, sizes, clusters = where[order], sizes[order], clusters[order]
     first = np.append(np.flatnonzero(np.diff(clusters, prepend=-1)), len(sizes))
-    balls = [enclosing_ball(where[i:j], sizes[i:j]) for i, j in zip(first[:-1], first[1:], strict=True)]
+    balls = [enclosing_ball(where[i:j], sizes[i:j]) for i, j in pairwise(first.tolist())]
     coarse_centres = np.array([centre for centre, _ in balls])
     coarse_radii = np.array([radius for _, radius in balls])
     return SphereTree(where, sizes, order, coarse_centres, coarse_radii, first, ball_centre, ball_radius)
 
 
-def enclosing_ball(centres: Floats, radii: Floats) -> tuple[Floats, float]:
+def enclosing_ball(centres: Floats, radii: Floats, steps: int = _BALL_STEPS) -> tuple[Floats, float]:
     """Return centre (3,) and radius [m] of a ball that contains spheres, close to the smallest one.
 
     The centre approaches the sphere that reaches furthest by ever smaller steps (Bădoiu and Clarkson, Smaller
@@ -87,9 +88,9 @@ def enclosing_ball(centres: Floats, radii: Floats) -> tuple[Floats, float]:
     """
     if len(radii) == 1:
         return centres[0].copy(), float(radii[0])
-    centre = (centres - 0.0).mean(axis=0)
+    centre = centres.mean(axis=0)
     best, least = centre, math.inf
-    for k in range(1, _BALL_STEPS + 1):
+    for k in range(1, steps + 1):
         reach = np.linalg.norm(centres - centre, axis=1) + radii
         furthest = int(reach.argmax())
         if reach[furthest] < least:
@@ -116,7 +117,7 @@ def _cluster(centres: Floats, radii: Floats, count: int) -> Integers:
         reach = np.linalg.norm(centres[:, None] - means, axis=2) + radii[:, None]
         clusters = reach.argmin(axis=1)
         used = np.unique(clusters)
-        means = np.array(
-            [enclosing_ball(centres[clusters == k], radii[clusters == k])[0] for k in used.tolist()]
-        )
+        before, means = means, np.array([centres[clusters == k].mean(axis=0) for k in used.tolist()])
+        if means.shape == before.shape and np.allclose(means, before):
+            break
     return np.asarray(np.unique(clusters, return_inverse=True)[1].reshape(-1), dtype=np.int64)

@@ -1,0 +1,269 @@
+"""Planning through modes: moving freely, holding a handle, pressing a button (Hauser and Latombe 2010)."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass
+from time import perf_counter
+from typing import TYPE_CHECKING
+
+import numpy as np
+import numpy.typing as npt
+
+from kineverse.control.configuration_space import find_coordinates
+from kineverse.control.tasks import Hold
+from kineverse.errors import DuplicateNameError, InvalidValueError
+from kineverse.lie import Array
+from kineverse.symbols import Symbol
+
+from .manifold import FrameHold
+
+if TYPE_CHECKING:
+    from .planner import Planner
+
+_CANDIDATES = 12
+_SOLVING = 0.1
+"""Time for the configurations of one change of modes [s]."""
+_CONNECTING = 0.5
+"""Time for one path within a mode [s]."""
+_SAME = 1e-4
+
+
+@dataclass(frozen=True, eq=False)
+class Mode:
+    """Way in which some coordinates may move: a manifold of configurations.
+
+    Parameters
+    ----------
+    name
+        Name in results and messages.
+    along
+        Holds that are met in this mode, such as the grasp of a handle; none for moving freely.
+    moves
+        Coordinates of objects that move in this mode, as symbols or names. An object that is named by some mode stands
+        still in all others. Coordinates that no mode names, such as those of the robot, always move.
+    """
+
+    name: str
+    along: tuple[Hold, ...] = ()
+    moves: tuple[Symbol | str, ...] = ()
+
+    def __post_init__(self) -> None:
+        along, moves = self.along, self.moves
+        object.__setattr__(self, "along", (along,) if isinstance(along, Hold) else tuple(along))
+        object.__setattr__(self, "moves", (moves,) if isinstance(moves, str | Symbol) else tuple(moves))
+
+
+@dataclass(frozen=True, slots=True)
+class ModePath:
+    """Path through modes: segments with their points (N, n), the number of searches, and what is wrong with it."""
+
+    segments: list[tuple[Mode, Array]]
+    iterations: int
+    problem: str = ""
+
+
+@dataclass(frozen=True, slots=True)
+class _Node:
+    """Configuration in a mode, and the segment by which it was reached."""
+
+    mode: int
+    q: Array
+    parent: _Node | None
+    points: Array
+
+    def segments(self, modes: Sequence[Mode]) -> list[tuple[Mode, Array]]:
+        if self.parent is None:
+            return []
+        return [*self.parent.segments(modes), (modes[self.parent.mode], self.points)]
+
+
+class ModeSearch:
+    """Search of a path through modes: a tree of changes from one mode to another.
+
+    Parameters
+    ----------
+    planner
+        Planner of the segments.
+    modes
+        The modes; the first that the start meets is where the path begins.
+    tasks, ends
+        What is to be met at the end: holds, or configurations (K, n).
+    seconds
+        Largest time [s].
+    seed
+        Seed.
+
+    Raises
+    ------
+    InvalidValueError
+        Without modes, or for an object that the planner does not move.
+    DuplicateNameError
+        For two modes of one name.
+    """
+
+    def __init__(
+        self,
+        planner: Planner,
+        modes: Iterable[Mode],
+        tasks: Sequence[Hold],
+        ends: Array | None,
+        seconds: float,
+        seed: int,
+    ) -> None:
+        self._planner, self._modes = planner, tuple(modes)
+        self._tasks, self._ends, self._seconds, self._seed = tasks, ends, seconds, seed
+        if not self._modes or not all(isinstance(mode, Mode) for mode in self._modes):
+            raise InvalidValueError("modes= takes one or several kv.planning.Mode.")
+        names = [mode.name for mode in self._modes]
+        if len(set(names)) < len(names):
+            raise DuplicateNameError(f"Two modes have one name: {', '.join(map(repr, names))}.")
+        moved = [find_coordinates(planner.model, mode.moves, "moves") for mode in self._modes]
+        objects = frozenset[Symbol]().union(*moved)
+        foreign = objects - {*planner.symbols}
+        if foreign:
+            raise InvalidValueError(
+                f"A mode moves {', '.join(map(repr, map(str, foreign)))}, which the planner does not: add it to move=."
+            )
+        self._objects = np.array([s in objects for s in planner.symbols], dtype=bool)
+        self._still = [np.array([s in objects - own for s in planner.symbols], dtype=bool) for own in moved]
+        self._touching = [planner._touching(mode.along) for mode in self._modes]
+        self._searches = 0
+        self._generator = np.random.default_rng(seed)
+
+    def run(self, q: Array) -> ModePath:
+        """Return a path from a configuration (n,)."""
+        self._end = perf_counter() + self._seconds
+        first = self._find_mode(q)
+        if first is None:
+            return ModePath(
+                [], 0, f"The start is in none of the modes {', '.join(m.name for m in self._modes)}."
+            )
+        nodes = [_Node(first, q, None, q[None])]
+        seen = {self._signature(nodes[0])}
+        depth, k, tried = 0, 0, 0
+        while self._left() > 0.0:
+            if k == len(nodes):
+                # All are tried: again, with other values of the objects.
+                k, depth = 0, depth + 1
+                if tried == self._searches:
+                    break
+                tried = self._searches
+            node = nodes[k]
+            k += 1
+            points = self._reach_goal(node)
+            if points is not None:
+                segments = [*node.segments(self._modes), (self._modes[node.mode], points)]
+                return ModePath(segments, self._searches)
+            for other in range(len(self._modes)):
+                if other == node.mode or self._left() <= 0.0 or self._exclude(node.mode, other):
+                    continue
+                for values in self._object_values(node, depth):
+                    change = self._change(node, other, values)
+                    if change is not None and self._signature(change) not in seen:
+                        seen.add(self._signature(change))
+                        nodes.append(change)
+        best = max(nodes, key=lambda node: len(node.segments(self._modes)))
+        reached = ", ".join(sorted({self._modes[node.mode].name for node in nodes}))
+        problem = (
+            f"No path through the modes was found in {self._seconds:g} s: {len(nodes)} changes of modes were reached, "
+            f"in {reached}. More seconds=, another place of the base, or other holds may help."
+        )
+        return ModePath(best.segments(self._modes), self._searches, problem)
+
+    def _left(self) -> float:
+        return self._end - perf_counter()
+
+    def _find_mode(self, q: Array) -> int | None:
+        for k, mode in enumerate(self._modes):
+            manifold = self._planner._manifold(mode.along)
+            if manifold is None or float(manifold.residuals(q[None])[0]) < 1e-2:
+                return k
+        return None
+
+    def _signature(self, node: _Node) -> tuple[object, ...]:
+        """Return what makes a node differ from others: its mode and where the objects are."""
+        return node.mode, tuple(np.round(node.q[self._objects] / _SAME).astype(int).tolist())
+
+    def _exclude(self, one: int, other: int) -> bool:
+        """Return True if one frame would have to be at two others."""
+        a, b = (
+            {hold.frames[0]: hold.frames[1] for hold in self._modes[k].along if isinstance(hold, FrameHold)}
+            for k in (one, other)
+        )
+        return any(a[frame] != b[frame] for frame in a.keys() & b.keys())
+
+    def _object_values(self, node: _Node, depth: int) -> list[Array]:
+        """Return values of the coordinates at the next change: objects of the mode at their limits, or anywhere."""
+        moving = self._objects & ~self._still[node.mode]
+        if not moving.any():
+            return [node.q]
+        lower, upper = self._planner.space.bounds(node.q, node.q[None])
+        if depth:
+            shares = [self._generator.random(len(node.q))]
+        else:
+            shares = [np.ones(len(node.q)), np.zeros(len(node.q))]
+        return [np.where(moving, lower + share * (upper - lower), node.q) for share in shares]
+
+    def _change(self, node: _Node, other: int, values: Array) -> _Node | None:
+        """Return a node in another mode, with the objects at given values; None if there is no way."""
+        mode = self._modes[node.mode]
+        holds = tuple(dict.fromkeys((*mode.along, *self._modes[other].along)))
+        touching = self._touching_around(node) | self._touching[other]
+        ends = self._solve(holds, values, touching, self._objects) if holds else values[None]
+        points = self._connect(node, ends, touching)
+        return None if points is None else _Node(other, np.asarray(points[-1]), node, points)
+
+    def _touching_around(self, node: _Node) -> frozenset[frozenset[str]]:
+        """Return the pairs that may touch in a node's mode and where it was entered."""
+        before = frozenset[frozenset[str]]() if node.parent is None else self._touching[node.parent.mode]
+        return before | self._touching[node.mode]
+
+    def _reach_goal(self, node: _Node) -> Array | None:
+        """Return the points (N, n) of a way to the goal within the mode of a node; None if there is none."""
+        still, mode = self._still[node.mode], self._modes[node.mode]
+        touching = self._touching_around(node) | self._planner._touching(self._tasks)
+        if self._ends is not None:
+            same = np.abs(self._ends - node.q)[:, still].max(axis=1, initial=0.0) < _SAME
+            ends = self._ends[same].copy()
+            ends[:, still] = node.q[still]
+        elif self._concerns_still(node):
+            return None
+        else:
+            ends = self._solve((*mode.along, *self._tasks), node.q, touching, still)
+        return self._connect(node, ends, touching)
+
+    def _concerns_still(self, node: _Node) -> bool:
+        """Return True if a task is about objects that stand still in the mode, and is not met."""
+        moving = {
+            s for s, still in zip(self._planner.symbols, self._still[node.mode], strict=True) if not still
+        }
+        for task in self._tasks:
+            resolved = self._planner.model.rates.resolve(task.expression)
+            if moving.isdisjoint(resolved.symbols):
+                manifold = self._planner._manifold([task])
+                if manifold is not None and float(manifold.residuals(node.q[None])[0]) > _SAME:
+                    return True
+        return False
+
+    def _solve(
+        self,
+        holds: Sequence[Hold],
+        near: Array,
+        touching: frozenset[frozenset[str]],
+        still: npt.NDArray[np.bool_],
+    ) -> Array:
+        self._searches += 1
+        seconds = min(_SOLVING, max(self._left(), 0.0))
+        seed = self._seed + self._searches
+        return self._planner._solutions(holds, near, _CANDIDATES, seconds, seed, touching, still)
+
+    def _connect(self, node: _Node, ends: Array, touching: frozenset[frozenset[str]]) -> Array | None:
+        if not len(ends):
+            return None
+        self._searches += 1
+        seconds = min(_CONNECTING, max(self._left(), 0.0))
+        path = self._planner._between(
+            node.q, ends, self._modes[node.mode].along, touching, seconds, self._seed, self._still[node.mode]
+        )
+        return path.points if path.found else None

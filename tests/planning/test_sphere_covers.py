@@ -1,0 +1,210 @@
+"""Covers of convex solids by spheres: what they contain, how far they stick out, how many they are."""
+
+from __future__ import annotations
+
+import coal
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from kineverse.errors import InvalidValueError, ShapeError
+from kineverse.geometry.shapes import Solid, scale_solid, solid_from_geometry, solid_from_points
+from kineverse.model.body import Box, Capsule, Cone, Cylinder, Ellipsoid, Sphere
+from kineverse.planning.spheres import cover_solid, default_protrusion, measure_cover
+from kineverse.planning.spheres.certificate import find_uncovered
+from kineverse.planning.spheres.polytope import bound_solid
+from kineverse.planning.spheres.union_volume import union_volume
+
+KINDS = ("box", "hull", "cylinder", "cone", "ellipsoid", "capsule", "sphere")
+sizes = st.floats(0.02, 0.3)
+
+
+@st.composite
+def solids(draw: st.DrawFn) -> Solid:
+    """Draw a solid of any kind, whose sizes differ by a factor of up to 15 [m]."""
+    kind, a, b, c = draw(st.sampled_from(KINDS)), draw(sizes), draw(sizes), draw(sizes)
+    if kind == "hull":
+        points = np.random.default_rng(draw(st.integers(0, 1000))).normal(size=(draw(st.integers(4, 40)), 3))
+        return solid_from_points(points * (a, b, c) / 3 + (1.0, -2.0, 0.5))
+    return solid_from_geometry(
+        {
+            "box": Box((a, b, c)),
+            "cylinder": Cylinder(a / 2, b),
+            "cone": Cone(a / 2, b),
+            "ellipsoid": Ellipsoid((a / 2, b / 2, c / 2)),
+            "capsule": Capsule(a / 2, b),
+            "sphere": Sphere(a),
+        }[kind]
+    )
+
+
+def sample(solid: Solid, count: int) -> np.ndarray:
+    """Return random points of a solid: extreme ones, and between them."""
+    random = np.random.default_rng(1)
+    directions = random.normal(size=(count, 3))
+    directions /= np.linalg.norm(directions, axis=1, keepdims=True)
+    core = solid.core
+    if core.corners.shape[1]:
+        extreme = core.corners.T[(directions @ core.corners).argmax(axis=1)]
+    elif core.tip:
+        tip = (0.0, 0.0, core.tip)
+        rim = core.radii * directions / np.linalg.norm(directions[:, :2], axis=1, keepdims=True) - tip
+        extreme = np.where((directions[:, :1] > 0.3), tip, rim)
+    else:
+        round_ = core.radii**2 * directions
+        lengths = np.linalg.norm(core.radii * directions, axis=1, keepdims=True)
+        extreme = np.sign(directions) * core.half + core.radius * directions
+        extreme = extreme + round_ / np.where(lengths > 0.0, lengths, 1.0)
+    weights = random.dirichlet(np.full(4, 0.3), size=count)
+    between = np.einsum("nk,nkj->nj", weights, extreme[random.integers(count, size=(count, 4))])
+    return np.concatenate([extreme, between])
+
+
+def distances_outside(centres: np.ndarray, radii: np.ndarray, points: np.ndarray) -> np.ndarray:
+    """Return how far each point is outside of all spheres, negative inside."""
+    return (np.linalg.norm(points[:, None] - centres, axis=2) - radii).min(axis=1)
+
+
+def protrusions_by_coal(solid: Solid, centres: np.ndarray, radii: np.ndarray, points: np.ndarray) -> float:
+    """Return the largest distance from the solid of points on spheres, by coal."""
+    largest = 0.0
+    for centre, radius in zip(centres, radii, strict=True):
+        for point in centre + radius * points:
+            result = coal.DistanceResult()
+            coal.distance(
+                solid.engine,
+                coal.Transform3s.Identity(),
+                coal.Sphere(1e-9),
+                coal.Transform3s(np.eye(3), point),
+                coal.DistanceRequest(),
+                result,
+            )
+            largest = max(largest, result.min_distance)
+    return largest
+
+
+@settings(max_examples=12, deadline=None)
+@given(solids(), st.sampled_from([None, 0.01, 0.03]), st.sampled_from([1, 6, 32]))
+def test_cover_solid_contains_the_solid_and_keeps_to_its_protrusion(solid, protrusion, most):
+    cover = cover_solid(solid, protrusion, most)
+    points = sample(solid, 400)
+    assert distances_outside(cover.centres, cover.radii, points).max() <= 1e-9
+    directions = np.random.default_rng(2).normal(size=(6, 3))
+    directions /= np.linalg.norm(directions, axis=1, keepdims=True)
+    reached = protrusions_by_coal(solid, cover.centres, cover.radii, directions)
+    assert reached <= cover.protrusion + 1e-6
+    assert len(cover) <= most
+    wanted = default_protrusion(solid) if protrusion is None else protrusion
+    assert cover.protrusion <= wanted + 1e-9 or len(cover) >= 0.6 * most
+    assert cover.excess >= 0.0
+
+
+@settings(max_examples=2, deadline=None)
+@given(st.integers(0, 100), st.sampled_from([0.25, 8.0]))
+def test_cover_solid_scales_with_the_solid(seed, factor):
+    points = np.random.default_rng(seed).normal(size=(20, 3)) * (0.1, 0.05, 0.08)
+    solid = solid_from_points(points)
+    large = scale_solid(solid, factor)
+    one, other = cover_solid(solid, 0.05), cover_solid(large, 0.05 * factor)
+    assert other.protrusion <= 0.05 * factor * (1 + 1e-9)
+    assert abs(len(one) - len(other)) <= 0.25 * len(one) + 1
+
+
+def test_cover_solid_is_deterministic():
+    solid = solid_from_geometry(Cylinder(0.05, 0.1))
+    one, other = cover_solid(solid, 0.02), cover_solid(solid, 0.02)
+    assert np.array_equal(one.centres, other.centres)
+    assert np.array_equal(one.radii, other.radii)
+
+
+def test_cover_solid_takes_one_sphere_for_a_sphere():
+    cover = cover_solid(solid_from_geometry(Sphere(0.1)))
+    assert len(cover) == 1
+    assert cover.radii[0] == 0.1
+    assert cover.protrusion == 0.0
+    assert cover.excess == pytest.approx(0.0, abs=5e-3)
+
+
+@pytest.mark.parametrize(("length", "most"), [(0.001, 32), (0.05, 32), (0.4, 32), (0.4, 3), (0.4, 1)])
+def test_cover_solid_takes_a_chain_for_a_capsule(length, most):
+    solid = solid_from_geometry(Capsule(0.04, length))
+    cover = cover_solid(solid, 0.005, most)
+    assert np.ptp(cover.centres[:, :2]) == 0.0
+    assert len(cover) <= most
+    assert distances_outside(cover.centres, cover.radii, sample(solid, 2000)).max() <= 1e-12
+    assert cover.protrusion <= 0.0051 or len(cover) == most
+
+
+def test_cover_solid_covers_a_cube_by_few_spheres():
+    """Eight spheres in a lattice reach 18.3 mm."""
+    cover = cover_solid(solid_from_geometry(Box((0.1, 0.1, 0.1))), 0.02)
+    assert len(cover) == 8
+
+
+@pytest.mark.parametrize(
+    "points",
+    [
+        np.array([[0, 0, 0], [0.5, 0, 0], [0, 0.3, 0], [0.5, 0.3, 0]]),
+        np.array([[0, 0, 0], [1, 0, 0], [0, 1e-3, 0], [0, 0, 1e-3]]),
+        np.array([[0, 0, 0], [1e-4, 0, 0], [0, 1e-4, 0], [0, 0, 1e-4]]),
+    ],
+    ids=["flat", "needle", "tiny"],
+)
+def test_cover_solid_covers_degenerate_hulls(points):
+    solid = solid_from_points(points.astype(float))
+    cover = cover_solid(solid)
+    assert distances_outside(cover.centres, cover.radii, sample(solid, 500)).max() <= 1e-9
+    assert len(cover) <= 32
+
+
+@pytest.mark.parametrize(
+    ("settings_", "part"),
+    [({"protrusion": 0.0}, "positive"), ({"protrusion": np.nan}, "positive"), ({"most": 0}, "1 to 1024")],
+)
+def test_cover_solid_refuses_impossible_settings(settings_, part):
+    with pytest.raises(InvalidValueError, match=part):
+        cover_solid(solid_from_geometry(Box((1.0, 1.0, 1.0))), **settings_)
+
+
+def test_find_uncovered_finds_a_gap_between_spheres():
+    """Two balls about a bar leave its middle; the least growth that closes the gap is known."""
+    polytope = bound_solid(solid_from_geometry(Box((0.4, 0.02, 0.02))), 0.01)
+    centres, radii = np.array([[-0.1, 0, 0], [0.1, 0, 0]]), np.full(2, 0.09)
+    uncovered = find_uncovered(polytope, centres, radii, 1e-4)
+    needed = np.linalg.norm([0.1, 0.01, 0.01]) - 0.09
+    assert uncovered.growth.max() >= needed
+    assert uncovered.growth.max() <= needed + 2e-4
+    assert distances_outside(centres, radii, uncovered.points).min() > 0.0
+    grown = find_uncovered(polytope, centres, radii + uncovered.growth, 1e-4)
+    assert not len(grown.points)
+
+
+def test_measure_cover_measures_known_covers():
+    solid = solid_from_geometry(Box((0.2, 0.2, 0.2)))
+    around = measure_cover(solid, [[0, 0, 0]], [np.sqrt(3) * 0.1 + 1e-9])
+    assert around.protrusion == pytest.approx((np.sqrt(3) - 1) * 0.1)
+    assert around.uncovered == 0.0
+    assert around.excess == pytest.approx(np.pi * np.sqrt(3) / 2 - 1, abs=0.01)
+    inside = measure_cover(solid, [[0, 0, 0]], [0.1])
+    assert inside.protrusion == pytest.approx(0.0, abs=1e-12)
+    assert inside.uncovered == pytest.approx((np.sqrt(3) - 1) * 0.1, rel=1e-2)
+    beside = measure_cover(solid, [[0, 0, 0.3]], [0.05])
+    assert beside.protrusion == pytest.approx(0.25, abs=1e-6)
+
+
+def test_measure_cover_refuses_what_is_no_cover():
+    solid = solid_from_geometry(Box((0.2, 0.2, 0.2)))
+    with pytest.raises(ShapeError):
+        measure_cover(solid, [[0, 0, 0]], [0.1, 0.2])
+    with pytest.raises(InvalidValueError):
+        measure_cover(solid, [[0, 0, 0]], [-0.1])
+
+
+@settings(max_examples=20, deadline=None)
+@given(st.floats(1e-3, 2.5))
+def test_union_volume_of_two_spheres_is_that_of_the_lens_formula(apart):
+    lens = np.pi * (2 - apart) ** 2 * (apart**2 + 4 * apart) / (12 * apart) if apart < 2 else 0.0
+    expected = 8 / 3 * np.pi - lens
+    found = union_volume(np.array([[0, 0, 0], [0.6 * apart, 0, 0.8 * apart]]), np.ones(2))
+    assert found == pytest.approx(expected, rel=4e-3)
