@@ -121,6 +121,8 @@ class PlanningSpace:
 
         The nearest to the start come first. Without any there is q itself.
         """
+        if not self.turning.any():
+            return q[None]
         low, high = self.bounds(start, q[None])
         found = [q]
         for i in np.flatnonzero(self.turning).tolist():

@@ -15,6 +15,8 @@ from .search import RrtConnect
 DEVIATION = 5e-6
 """Largest residual half way between two points of a polished path [m], [rad]."""
 _LEVELS = 6
+_PATIENCE = 12
+"""Number of tries in a row that may bring nothing."""
 _MOST_POINTS = 4000
 
 
@@ -38,8 +40,9 @@ def shorten_on_manifold(
     """
     generator = np.random.default_rng(seed)
     begin = perf_counter()
+    failures = 0
     for k in range(rounds):
-        if len(points) < 4 or perf_counter() - begin > seconds:
+        if len(points) < 4 or failures > _PATIENCE or perf_counter() - begin > seconds:
             break
         # The whole way first: a path that a straight way replaces needs no other tries.
         i, j = (0, len(points) - 1) if k == 0 else sorted(generator.integers(0, len(points), 2).tolist())
@@ -49,11 +52,13 @@ def shorten_on_manifold(
         if np.linalg.norm(points[j] - points[i]) > 0.98 * length:
             continue
         way = search.walk(points[i], points[j])
+        failures += 1
         if way is None:
             continue
         shortcut = np.vstack([points[i : i + 1], way])
         if np.linalg.norm(np.diff(shortcut, axis=0), axis=1).sum() < 0.98 * length:
             points = np.ascontiguousarray(np.vstack([points[: i + 1], way, points[j + 1 :]]))
+            failures = 0
     return points
 
 

@@ -80,6 +80,9 @@ class Endpoints:
             np.clip(way, self._checker.lower, self._checker.upper), dtype=np.float32
         )
         if self._checker.valid(narrow)[0]:
+            touching = self._judge.uncovered_contacts(q)
+            if touching is not None:
+                return Endpoint(way, f"{what} is in collision: {describe_contacts(touching)}.")
             return Endpoint(way)
         _, conditions = self._checker.outputs(narrow[0])
         broken = [
@@ -98,6 +101,22 @@ class Endpoints:
                 "allow, and no way out was found. A smaller protrusion= or margin= helps.",
             )
         return Endpoint(np.array([q, found]))
+
+    def check_goals(self, ends: Array) -> list[Endpoint] | str:
+        """Return the goals among configurations (K, n) that can be used, or why there are none.
+
+        Of several, those that need no closer look are enough.
+        """
+        if len(ends) > 1:
+            inside = ((ends >= self._checker.lower) & (ends <= self._checker.upper)).all(axis=1)
+            if self._manifold is not None:
+                inside &= self._manifold.residuals(ends) <= EXACT
+            inside &= self._checker.valid(np.ascontiguousarray(ends, dtype=np.float32))
+            if inside.any():
+                return [Endpoint(end[None]) for end in ends[inside]]
+        names = ["The goal"] if len(ends) == 1 else [f"Goal {k}" for k in range(len(ends))]
+        found = [self.check(name, end) for name, end in zip(names, ends, strict=True)]
+        return [end for end in found if not end.reason] or " ".join(end.reason for end in found[:3])
 
     def _beyond_limits(self, q: Array) -> str:
         lower, upper = self._space.lower, self._space.upper

@@ -14,7 +14,7 @@ from kineverse.state import State
 from kineverse.symbols import Symbol
 
 from .checker import RESOLUTION
-from .path import densify
+from .path import densify, sample_along, sample_path
 
 FINE = 1 / 640
 """Step of samples where no certificate vouches for what lies between them [rad], [m]."""
@@ -82,18 +82,40 @@ class SceneJudge:
 
         Pairs that nobody else checks are looked at 32 times a unit at least.
         """
-        for q in densify(points, step):
+        for q in sample_path(points, step):
             found = self.contacts(q)
             if len(found):
                 return q, found[0]
-        if not np.ptp(points[:, self._concerned], axis=0).any():
+        moved = np.abs(np.diff(points[:, self._concerned], axis=0)).sum(axis=1)
+        if not moved.any():
             return None
-        for q in densify(points, min(step, 1 / RESOLUTION)):
+        for q in sample_along(points, moved, min(step, 1 / RESOLUTION)):
             self._update(q)
             found = self._uncovered()
             if len(found):
                 return q, found[0]
         return None
+
+    def uncovered_contacts(self, q: Array) -> DistanceResults | None:
+        """Return the touching pairs that nobody else checks, at a configuration (n,); None if there are none."""
+        if not self._concerned.any():
+            return None
+        self._update(q)
+        found = self._uncovered()
+        return found if len(found) else None
+
+    def free_interval(self, q: Array, column: int, lower: float, upper: float) -> tuple[float, float]:
+        """Return bounds of one coordinate about a configuration (n,) between which these pairs do not touch."""
+        ends = []
+        for bound in (lower, upper):
+            point, free = q.copy(), float(q[column])
+            for value in np.linspace(q[column], bound, max(int(abs(bound - q[column]) * RESOLUTION * 2), 2)):
+                point[column] = value
+                if self.uncovered_contacts(point) is not None:
+                    break
+                free = float(value)
+            ends.append(free)
+        return min(ends), max(ends)
 
     def clearance(self, points: Array, step: float, radius: float = 0.5) -> float:
         """Return the least distance of a pair at samples of a polyline [m]; infinite beyond a radius."""

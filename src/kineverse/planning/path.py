@@ -102,3 +102,19 @@ def densify(points: Array, step: float) -> Array:
         [k + np.arange(c) / c for k, c in enumerate(counts)] + [np.array([len(points) - 1.0])]
     )
     return np.column_stack([np.interp(at, np.arange(len(points)), column) for column in points.T])
+
+
+def sample_path(points: Array, step: float) -> Array:
+    """Return samples of a polyline (N, n), at most a step apart: its points and others, or of many points a part."""
+    lengths = np.linalg.norm(np.diff(points, axis=0), axis=1)
+    count = int(np.ceil(lengths.sum() / step)) + 1
+    if len(points) <= 4 * count:
+        return densify(points, step)
+    return sample_along(points, lengths, step)
+
+
+def sample_along(points: Array, lengths: Array, step: float) -> Array:
+    """Return samples of a polyline (N, n) whose edges have given lengths (N - 1,), at most a step apart."""
+    along = np.concatenate([[0.0], np.cumsum(lengths)])
+    at = np.linspace(0.0, along[-1], int(np.ceil(along[-1] / step)) + 1)
+    return np.column_stack([np.interp(at, along, column) for column in points.T])

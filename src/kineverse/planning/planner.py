@@ -18,6 +18,7 @@ from kineverse.geometry import Rule, Scene
 from kineverse.geometry.collision_filter import rigid_group
 from kineverse.geometry.objects import Exclusion
 from kineverse.geometry.prepared_query import flag_subtree
+from kineverse.geometry.results import DistanceResult
 from kineverse.lie import Array
 from kineverse.model.model_view import ModelView
 from kineverse.state import State, StateLike, as_state
@@ -35,12 +36,13 @@ from .solutions import find_solutions
 
 Flags: TypeAlias = npt.NDArray[np.bool_]
 
-_JUDGED = 1.0
+_JUDGED = 0.5
 """Longest step between judged configurations of a path that is certified [rad], [m]."""
 _SAMPLES = 64
 _TASK_GOALS = 32
 """Number of configurations that are looked for where tasks are the goal."""
 _MOST_MANIFOLDS = 16
+_NARROWINGS = 4
 
 
 class Planner:
@@ -116,6 +118,7 @@ class Planner:
         space.turning &= self.checker.find_periodic(space.turning)
         self._manifolds: dict[tuple[object, ...], Manifold] = {}
         self._judges: dict[BodyPairs, SceneJudge] = {}
+        self._carried_bodies: dict[str, tuple[str, ...]] = {}
         self._version = model.version
         self._place(model.default_state() if self._state is None else model.default_state() | self._state)
 
@@ -294,15 +297,19 @@ class Planner:
 
     def _touching(self, holds: Iterable[Hold]) -> BodyPairs:
         """Return the pairs of bodies that may touch while holds last."""
-        bodies = self.scene.bodies
         return frozenset(
             frozenset((a, b))
             for hold in holds
             if isinstance(hold, FrameHold)
-            for a in find_carried_bodies(self.model, bodies, hold.frames[0])
-            for b in find_carried_bodies(self.model, bodies, hold.frames[1])
+            for a in self._carried(hold.frames[0])
+            for b in self._carried(hold.frames[1])
             if a != b
         )
+
+    def _carried(self, frame: str) -> tuple[str, ...]:
+        if frame not in self._carried_bodies:
+            self._carried_bodies[frame] = find_carried_bodies(self.model, self.scene.bodies, frame)
+        return self._carried_bodies[frame]
 
     # -- paths ---------------------------------------------------------------------------------------------
 
@@ -395,12 +402,36 @@ class Planner:
             first = endpoints.check("The start", q)
             if first.reason:
                 return self._no_path(q, first.reason, begin)
-            names = ["The goal"] if len(ends) == 1 else [f"Goal {k}" for k in range(len(ends))]
-            last = [endpoints.check(name, end) for name, end in zip(names, ends, strict=True)]
-            usable = [goal for goal in last if not goal.reason]
-            if not usable:
-                return self._no_path(q, " ".join(goal.reason for goal in last[:3]), begin)
-            return self._connect(first, usable, manifold, touching, seconds, seed, begin)
+            usable = endpoints.check_goals(ends)
+            if isinstance(usable, str):
+                return self._no_path(q, usable, begin)
+            for _ in range(_NARROWINGS):
+                path, contact = self._connect(first, usable, manifold, touching, seconds, seed, begin)
+                if contact is None or not self._narrow(contact, q, touching):
+                    break
+            return path
+
+    def _narrow(self, contact: DistanceResult, q: Array, touching: BodyPairs) -> bool:
+        """Narrow the bounds of a coordinate to where it keeps a pair apart that only the scene checks.
+
+        Returns False for a pair that several coordinates move, and if the bounds are as narrow already.
+        """
+        pair = {contact.a, contact.b}
+        if not any(pair == set(other) for other in self.checker.uncovered):
+            return False
+        columns = {
+            k
+            for k, s in enumerate(self.space.symbols)
+            for body in pair & {*self.checker.moving}
+            if s in self.model.fk(body).symbols
+        }
+        if len(columns) != 1:
+            return False
+        (i,) = columns
+        before = float(self.checker.lower[i]), float(self.checker.upper[i])
+        lower, upper = self._judge(touching).free_interval(q, i, *before)
+        self.checker.lower[i], self.checker.upper[i] = lower, upper
+        return (lower, upper) != before
 
     def _connect(
         self,
@@ -411,7 +442,8 @@ class Planner:
         seconds: float,
         seed: int,
         begin: float,
-    ) -> Path:
+    ) -> tuple[Path, DistanceResult | None]:
+        """Return a path between checked ends, and the contact that the scene finds on it."""
         q = first.inner
         variants = [(goal, v) for goal in goals for v in self.space.equivalents(goal.inner, q)]
         targets = np.ascontiguousarray([v for _, v in variants], dtype=np.float32)
@@ -423,18 +455,18 @@ class Planner:
             found = connect_on_manifold(self.checker, manifold, starts, targets, seconds, seed)
         spent = perf_counter() - searched
         if found.problem:
-            return self._no_path(found.points, found.problem, begin, spent, found.iterations)
+            return self._no_path(found.points, found.problem, begin, spent, found.iterations), None
         points = found.points
         goal, variant = variants[int(np.argmin(np.abs(targets - points[-1]).max(axis=1)))]
         points[0], points[-1] = q, variant
         contact = self._judge(touching).first_contact(points, _JUDGED)
         if contact is not None:
             problem = f"The scene finds a contact on the path: {describe_contacts([contact[1]])}."
-            return self._no_path(points, problem, begin, spent, found.iterations)
+            return self._no_path(points, problem, begin, spent, found.iterations), contact[1]
         shift = variant - goal.inner
         whole = np.vstack([first.way[:-1], points, (goal.way[::-1] + shift)[1:]])
         why = f"Found after {found.iterations} samples."
-        return self._path(True, whole, why, begin, spent, found.iterations, touching)
+        return self._path(True, whole, why, begin, spent, found.iterations, touching), None
 
     def _judge(self, touching: BodyPairs = frozenset()) -> SceneJudge:
         """Return the judge of the scene in which some pairs may touch, at the present place."""

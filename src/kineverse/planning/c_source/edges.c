@@ -242,17 +242,48 @@ EXPORT int kineverse_edges(const Checker *c, const float *from, const float *to,
   return 0;
 }
 
+/* Mark those of up to W edges, which are no longer than the distance of two samples, that are certainly free: the
+   middles of all of them are one block. */
+static void certify_short_edges(const Checker *c, Work *w, const float *points, long long count, unsigned char *free_) {
+  const int n = (int)c->coordinates;
+  for (int half = 1; half >= 0; half--) {
+    for (int j = 0; j < W; j++) {
+      const float *a = points + (j < count ? j : count - 1) * n, *b = a + n;
+      for (int i = 0; i < n; i++) w->x[i][j] = 0.5f * (a[i] + b[i]) + 0.5f * half * (b[i] - a[i]);
+    }
+    evaluate(c, w);
+    if (half) memcpy(w->before, w->o, 12 * c->poses * sizeof(V));
+  }
+  inflate(c, w, w->before);
+  const unsigned hits = lane_bits(collisions(c, w));
+  memset(w->inflation, 0, c->links * sizeof(float));
+  for (int j = 0; j < count; j++) free_[j] = !(hits >> j & 1) && conditions_hold(c, w, points + j * n, points + (j + 1) * n);
+}
+
 /* Find the first collision on a polyline (count, n): return the number of its edge and write the fraction of the
    way along it, or return -1. */
 EXPORT long long kineverse_certify(const Checker *c, const float *points, long long count, double resolution,
                                    double least, double *where) {
   Work w;
   if (work_begin(&w, c)) return -2;
+  const int n = (int)c->coordinates;
   long long found = -1;
   float fraction = 0.0f;
-  for (long long k = 0; k + 1 < count && found < 0; k++) {
-    const float *a = points + k * c->coordinates;
-    if (!edge_is_certain(c, &w, a, a + c->coordinates, resolution, least, &fraction)) found = k;
+  for (long long k = 0; k + 1 < count && found < 0;) {
+    unsigned char certain[W] = {0};
+    int edges = 0;
+    while (edges < W && k + edges + 1 < count &&
+           distance(points + (k + edges) * n, points + (k + edges + 1) * n, n) * resolution <= 1.0)
+      edges++;
+    if (edges > 1)
+      certify_short_edges(c, &w, points + k * n, edges, certain);
+    else
+      edges = 1;
+    for (int j = 0; j < edges && found < 0; j++) {
+      const float *a = points + (k + j) * n;
+      if (!certain[j] && !edge_is_certain(c, &w, a, a + n, resolution, least, &fraction)) found = k + j;
+    }
+    k += edges;
   }
   *where = fraction;
   work_end(&w);
