@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
+from itertools import pairwise
 
 import numpy as np
 
@@ -12,7 +13,7 @@ from kineverse.state import StateLike
 from kineverse.symbols import Symbol
 
 CHECKS_PER_RADIAN = 32.0
-"""Number of configurations that planners check over a motion of length 1 in all coordinates [1/rad], [1/m]."""
+"""Configurations that planners check over a motion of length 1 of all coordinates [1/rad], [1/m]."""
 
 FINER = 20.0
 """Factor by which a returned path is sampled finer than that."""
@@ -67,7 +68,7 @@ class ConfigurationCheck:
 def sample_path(points: Array, density: float) -> Iterator[Array]:
     """Yield configurations along a path of straight edges, its points included."""
     yield points[0]
-    for a, b in zip(points[:-1], points[1:], strict=True):
+    for a, b in pairwise(points):
         steps = max(1, int(np.ceil(density * np.linalg.norm(b - a))))
         for k in range(1, steps + 1):
             yield a + (b - a) * (k / steps)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
 from types import MappingProxyType
@@ -27,7 +27,7 @@ SECONDS, SOON = 10.0, 0.1
 """Largest time of a search, and the time in which nearly all are to be solved [s]."""
 
 MEDIAN, LEAST_SOON, RESIDUAL = 1e-3, 95.0, 1e-5
-"""Targets: median time [s], share solved in :data:`SOON` of what is solved [%], residual of holds [m], [rad]."""
+"""Targets: median time [s], share solved soon of what is solved [%], residual of holds [m], [rad]."""
 
 _GOALS, _TRIES, _PATIENCE = 64, 300, 0.2
 """Number of goals, largest number of places of the base, and time of the search for grasps at each [s]."""
@@ -87,8 +87,14 @@ MOTIONS: Mapping[str, HeldMotion] = MappingProxyType(
             1.2,
             {"fetch/gripper_link": (0.04, 0.0, 0.0, np.pi / 2, 0.0, np.pi)},
             "kitchen/fridge_door_handle",
-            ("fetch/torso_lift_joint", "fetch/s*_joint", "fetch/u*_joint", "fetch/e*_joint", "fetch/fo*_joint")
-            + ("fetch/w*_joint",),
+            (
+                "fetch/torso*",
+                "fetch/shoulder*",
+                "fetch/upper*",
+                "fetch/elbow*",
+                "fetch/forearm*",
+                "fetch/wrist*",
+            ),
             ((0.1, -1.9, -0.6), (0.7, -1.0, 0.6)),
         ),
         "drawer held by two arms": HeldMotion(
@@ -101,8 +107,14 @@ MOTIONS: Mapping[str, HeldMotion] = MappingProxyType(
                 "pr2/r_gripper_palm_link": (0.22, 0.12, 0.0, np.pi / 2, 0.0, np.pi),
             },
             "kitchen/island_middle_upper_drawer_handle",
-            ("pr2/torso_lift_joint", "pr2/?_shoulder*", "pr2/?_upper*", "pr2/?_elbow*", "pr2/?_forearm*")
-            + ("pr2/?_wrist*",),
+            (
+                "pr2/torso*",
+                "pr2/*_shoulder*",
+                "pr2/*_upper*",
+                "pr2/*_elbow*",
+                "pr2/*_forearm*",
+                "pr2/*_wrist*",
+            ),
             ((-0.3, -0.2, np.pi - 0.3), (0.1, 0.2, np.pi + 0.3)),
         ),
     }
@@ -161,9 +173,7 @@ def run_held_motion(name: str, starts: int, progress: Progress, seed: int = 0) -
     motion, results = MOTIONS[name], HeldResults(name)
     model, joint = motion.model, motion.model.symbol(motion.joint)
     planner = Planner(model, move=(*motion.moving, joint))
-    holds = [
-        planner.hold(hand, f"grasp{k}", mask="xyz rx ry") for k, hand in enumerate(motion.hands)
-    ]
+    holds = [planner.hold(hand, f"grasp{k}", mask="xyz rx ry") for k, hand in enumerate(motion.hands)]
     base = [model.symbol(f"{motion.robot}/base/{c}") for c in ("x", "y", "angle")]
     residuals = [compile(hold.expression, (*base, *planner.symbols)) for hold in holds]
     random = np.random.default_rng(seed)
@@ -177,9 +187,7 @@ def run_held_motion(name: str, starts: int, progress: Progress, seed: int = 0) -
         if found is None:
             break
         path = planner.plan(found[0][0], found[1], along=holds, seconds=SECONDS, seed=number)
-        results.attempts.append(
-            Attempt(path.found, path.search_seconds, path.seconds, path.points, path.why)
-        )
+        results.attempts.append(Attempt(path.found, path.search_seconds, path.seconds, path.points, path.why))
         if path.found:
             rows = np.hstack([np.tile(place, (len(path.points), 1)), path.points])
             worst = max(float(np.abs(f.batch(rows)).max()) for f in residuals)
@@ -188,7 +196,7 @@ def run_held_motion(name: str, starts: int, progress: Progress, seed: int = 0) -
 
 
 def _find_ends(
-    planner: Planner, holds: list[Hold], closed: Hold, opened: Hold, seed: int
+    planner: Planner, holds: Sequence[Hold], closed: Hold, opened: Hold, seed: int
 ) -> tuple[Array, Array] | None:
     """Return grasps at the start and the goal, (K, n) each; None if there are none of one of them."""
     starts = planner.solutions([*holds, closed], count=1, seconds=_PATIENCE, seed=seed)

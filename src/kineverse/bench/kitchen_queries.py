@@ -13,7 +13,7 @@ import numpy as np
 from kineverse.articulations import OmniBase
 from kineverse.compile import compile  # noqa: A004
 from kineverse.control import Goal, InverseKinematics, Keep, Target
-from kineverse.formats import load
+from kineverse.errors import UnknownNameError
 from kineverse.formats.locate import locate_model
 from kineverse.geometry import RULES, Rule, Scene, rules_as_data
 from kineverse.lie import Array
@@ -80,7 +80,7 @@ KITCHENS: Mapping[str, str] = MappingProxyType(
 FRIDGE_OPEN: Mapping[str, float] = MappingProxyType({f"{KITCHEN}/fridge_door": 1.4})
 """Position of the door of the shipped fridge for the queries there [rad]."""
 
-FRIDGE_BASE = np.array([0.45, -1.65, 0.0])
+FRIDGE_BASE = np.array([0.45, -1.5, 0.0])
 """Place of the base there: x, y [m] and angle [rad]."""
 
 BESIDE_FRIDGE = np.array([[0.9, -1.2, 0.5], [1.1, -0.9, 1.3]])
@@ -89,6 +89,9 @@ INSIDE_FRIDGE = np.array([[1.3, -1.8, 0.8], [1.5, -1.4, 1.5]])
 
 OFFSET = 0.06, 0.12
 """Range of the distance of the fingertips from the handle [m]."""
+
+CLEARANCE = 0.005
+"""Least distance of the robot from the kitchen at starts and goals [m]."""
 
 _CONE = 0.5
 """Least cosine of the angle between the direction of approach and that to the handle."""
@@ -188,8 +191,8 @@ class KitchenArm:
         search = _QuerySearch(self, FRIDGE_OPEN)
         random = np.random.default_rng(seed)
         while count > 0:
-            start = search.reach(random.uniform(*BESIDE_FRIDGE, (4, 3)), FRIDGE_BASE, random)
-            goal = search.reach(random.uniform(*INSIDE_FRIDGE, (4, 3)), FRIDGE_BASE, random)
+            start = search.reach(_points_in(BESIDE_FRIDGE, random), FRIDGE_BASE, random)
+            goal = search.reach(_points_in(INSIDE_FRIDGE, random), FRIDGE_BASE, random)
             if start is not None and goal is not None:
                 yield search.query(start, goal, FRIDGE_BASE)
                 count -= 1
@@ -248,7 +251,9 @@ class _QuerySearch:
         )
         self._solver = InverseKinematics(model, tasks, still=arm.base)
         self._home = home = model.default_state().updated(state)
-        self._check = ConfigurationCheck(Scene(model), (*arm.base, *arm.symbols), home)
+        scene = Scene(model)
+        self._free = ConfigurationCheck(scene, (*arm.base, *arm.symbols), home)
+        self._near = scene.watch(f"{ROBOT}/*", f"{KITCHEN}/*", radius=CLEARANCE)
         self._handles = np.array([model.fk(frame)(home)[:3, 3] for frame in arm.handles])
         self._samples = np.random.default_rng(0).uniform(*arm.limits, (_SAMPLES, len(arm.symbols)))
         pose = compile(model.fk(arm.tool, BASE), arm.symbols).batch(self._samples)
@@ -269,6 +274,10 @@ class _QuerySearch:
             if goal is not None:
                 return self.query(start, goal, base)
 
+    def _check(self, base: Array, q: Array) -> bool:
+        """Return True for a configuration without contacts and with clearance of the kitchen."""
+        return self._free(np.concatenate([base, q])) and len(self._near()) == 0
+
     def query(self, start: Array, goal: Array, base: Array) -> PlanningQuery:
         """Return a query with the base at a place x, y [m] and angle [rad], shape (3,)."""
         coordinates = (*self._arm.base, *self._arm.symbols)
@@ -276,7 +285,7 @@ class _QuerySearch:
         return PlanningQuery(start, goal, self._home | State(here))
 
     def _place(self, handle: Array, random: np.random.Generator) -> tuple[Array, Array] | None:
-        """Return a configuration, and a base from which the hand is then beside a handle; None if not free."""
+        """Return a configuration, and a base from which the hand is beside a handle; None if not free."""
         offset = self._arm.arm.length + random.uniform(*OFFSET)
         touched = self._points + offset * self._axes
         at_height = np.flatnonzero(np.abs(touched[:, 2] - handle[2]) < _HEIGHT)
@@ -287,7 +296,7 @@ class _QuerySearch:
         c, s = np.cos(angle), np.sin(angle)
         base = np.array([*handle[:2] - np.array([[c, -s], [s, c]]) @ touched[chosen, :2], angle])
         start = self._samples[chosen]
-        return (start, base) if self._check(np.concatenate([base, start])) else None
+        return (start, base) if self._check(base, start) else None
 
     def reach(self, points: Iterable[Array], base: Array, random: np.random.Generator) -> Array | None:
         """Return a configuration with the hand beside the first point that can be reached; None for none."""
@@ -302,7 +311,7 @@ class _QuerySearch:
                 direction = turn @ self._axes[chosen]
                 point = handle - offset * direction
                 q = self._solve(self._samples[chosen], point, direction, base)
-                if q is not None and self._check(np.concatenate([base, q])):
+                if q is not None and self._check(base, q):
                     return q
         return None
 
@@ -313,10 +322,13 @@ class _QuerySearch:
         return np.clip(result.best.vector(arm.symbols), *arm.limits) if result.solved else None
 
 
+def _points_in(box: Array, random: np.random.Generator) -> Array:
+    """Return random points in a box, (4, 3) [m]."""
+    return np.asarray(random.uniform(box[0], box[1], (4, 3)))
+
+
 def find_missing(robot: str, kitchen: str) -> str | None:
     """Return a line on a robot or kitchen that is not among the models; None if both are."""
-    from kineverse.errors import UnknownNameError
-
     for name, file in ((robot, ARMS[robot].file), (kitchen, KITCHENS[kitchen])):
         try:
             locate_model(file)

@@ -45,14 +45,16 @@ def measure(settings: BenchmarkSettings, parts: Sequence[str] = PARTS) -> Benchm
             try:
                 summaries = run_published_problems(robot, settings.problems, SEEDS, settings.progress)
             except UnknownNameError:
-                missing.append(f"the problems of {robot} are not on the model path: planning_problems/{robot}")
+                missing.append(
+                    f"the problems of {robot} are not on the model path: planning_problems/{robot}"
+                )
                 continue
             for summary in summaries.values():
                 measured += summary.measurements()
             compared += compare_with_vamp(robot, summaries)
     if "fridge" in parts:
         times, ratios = time_fridge_problems(settings.processes, settings.progress)
-        measured += times.values()
+        measured += times
         compared += ratios
     if "kitchens" in parts and settings.queries:
         kitchens = run_kitchen_queries(settings.queries, settings.progress)
@@ -72,8 +74,8 @@ def measure(settings: BenchmarkSettings, parts: Sequence[str] = PARTS) -> Benchm
         name="planning",
         work=(
             f"paths without collisions: published problems of Panda and Fetch, {SEEDS} attempts each with at "
-            f"most {SECONDS:g} s; three problems at an open fridge; {settings.queries} queries between handles "
-            "of kitchens, whose paths the scene checks 20 times finer; a fridge and a drawer that are held; "
+            f"most {SECONDS:g} s; three problems at an open fridge; {settings.queries} queries between "
+            "handles of kitchens, whose paths the scene checks 20 times finer; a fridge and a drawer that are held; "
             "times of the search, with the judgement by the scene where that is said"
         ),
         measurements=tuple(measured),

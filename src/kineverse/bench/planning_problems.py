@@ -113,7 +113,7 @@ def load_problem_sets(robot: str, most: int | None = None) -> Iterator[ProblemSe
 
 def _add_obstacles(model: Model, objects: Sequence[Sequence[Any]], srdf: Path) -> None:
     """Add obstacles with free poses, and rules: those of the SRDF, and none among obstacles."""
-    rules = [*read_srdf(srdf, model).rules]
+    rules = [Rule(*rule) for rule in read_srdf(srdf, model).rules]
     with model.edit() as edit:
         for name, kind, _, size in objects:
             *where, roll, pitch, yaw = _pose_symbols(name)
@@ -127,8 +127,8 @@ def _add_obstacles(model: Model, objects: Sequence[Sequence[Any]], srdf: Path) -
 def _load_robot(file: Path, ends: Sequence[Mapping[str, float]]) -> Model:
     """Return the robot with the limits of its joints, widened to hold given starts and goals.
 
-    Some are beyond the limits by digits of π. VAMP checks no start or goal against limits, and knows no soft ones.
-    Meshes that are only drawn are not among the files.
+    Some are beyond the limits by digits of π. VAMP checks no start or goal against limits, and knows no soft
+    ones. Meshes that are only drawn are not among the files.
     """
     tree = ElementTree.parse(file)
     for link in tree.iterfind("link"):
@@ -176,4 +176,3 @@ def _read_problem(
         values |= dict(zip(_pose_symbols(obstacle), numbers.tolist(), strict=True))
     start, goal = np.array(entry["start"]), np.array(entry["goal"])
     return PublishedProblem(name, start, goal, model.default_state() | State(values), entry["objects"])
-

@@ -13,8 +13,8 @@ from kineverse.lie import to_rpy
 class VampRrtConnect:
     """RRT-Connect of VAMP with its default settings, measured by its own clock.
 
-    As in its own evaluation, cylinders are capsules, and boxes in the problems of the set ``box``, where the hand
-    has to come close to one from above.
+    As in its own evaluation, cylinders are capsules, and boxes in the problems of the set ``box``, where the
+    hand has to come close to one from above.
 
     Parameters
     ----------
