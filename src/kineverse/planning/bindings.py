@@ -42,6 +42,9 @@ LINK = np.dtype(
 )
 COARSE = np.dtype([("sphere", np.float32, 4), ("first", np.int32), ("count", np.int32)])
 
+MOST_COORDINATES = 64
+"""Largest number of coordinates, as in ``edges.c``."""
+
 BOX, CYLINDER, CAPSULE, SPHERE, HULL = range(5)
 """Kinds of obstacles."""
 

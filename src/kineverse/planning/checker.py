@@ -323,6 +323,8 @@ class CollisionChecker:
             LEAST_INFLATION,
             ctypes.addressof(where),
         )
+        if found < -1:
+            raise MemoryError("There is no memory for the check of a path.")
         return None if found < 0 else (int(found), where.value)
 
     def outputs(self, q: Floats32) -> tuple[Floats32, Floats32]:

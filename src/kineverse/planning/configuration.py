@@ -19,6 +19,8 @@ from kineverse.model.projection import is_equality
 from kineverse.state import State
 from kineverse.symbols import Symbol
 
+from .bindings import MOST_COORDINATES
+
 _WILDCARDS = "*?["
 _HALF_TURN, _BEYOND = math.pi + 0.3, 2.0
 CONDITION_TOLERANCE = 1e-5
@@ -54,6 +56,11 @@ class PlanningSpace:
         if not self.symbols:
             raise InvalidValueError(
                 "There is nothing to move: the model has no coordinates, or move= is empty."
+            )
+        if len(self.symbols) > MOST_COORDINATES:
+            raise InvalidValueError(
+                f"{len(self.symbols)} coordinates would move, and a planner moves {MOST_COORDINATES} at most. Choose "
+                "some of them with move=, as move='robot/*'."
             )
         self._limits: list[tuple[int, Expression, Expression]] = []
         ranges = self._read_constraints()

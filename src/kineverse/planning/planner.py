@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
 from dataclasses import replace
+from functools import partial
 from time import perf_counter
 from typing import Any, TypeAlias
 
@@ -12,7 +13,7 @@ import numpy.typing as npt
 
 from kineverse._checks import as_count, as_tolerance, real_number
 from kineverse.control.tasks import Goal, Hold
-from kineverse.errors import InvalidValueError, ShapeError
+from kineverse.errors import InvalidValueError, NoSolutionError, ShapeError
 from kineverse.expressions.expression import ExpressionLike
 from kineverse.geometry import Rule, Scene
 from kineverse.geometry.collision_filter import rigid_group
@@ -20,7 +21,10 @@ from kineverse.geometry.objects import Exclusion
 from kineverse.geometry.prepared_query import flag_subtree
 from kineverse.geometry.results import DistanceResult
 from kineverse.lie import Array
+from kineverse.model.frame import WORLD
+from kineverse.model.kinematics import ancestors
 from kineverse.model.model_view import ModelView
+from kineverse.model.sampling import StateSamples
 from kineverse.state import State, StateLike, as_state
 from kineverse.symbols import Symbol
 
@@ -43,6 +47,8 @@ _TASK_GOALS = 32
 """Number of configurations that are looked for where tasks are the goal."""
 _MOST_MANIFOLDS = 16
 _NARROWINGS = 4
+_LARGEST = 1e6
+"""Largest coordinate of a configuration [rad], [m]; edges are computed in single precision."""
 
 
 class Planner:
@@ -115,7 +121,7 @@ class Planner:
             scene = Scene(model, rules=(*self._rules, *self.excluded), **self._options)
         self.scene = scene
         self.checker = CollisionChecker(scene, space.symbols, space.conditions, self.margin, self._protrusion)
-        space.turning &= self.checker.find_periodic(space.turning)
+        self._candidates = space.turning.copy()
         self._manifolds: dict[tuple[object, ...], Manifold] = {}
         self._judges: dict[BodyPairs, SceneJudge] = {}
         self._carried_bodies: dict[str, tuple[str, ...]] = {}
@@ -123,17 +129,16 @@ class Planner:
         self._place(model.default_state() if self._state is None else model.default_state() | self._state)
 
     def _find_overlapping(self, scene: Scene) -> tuple[Rule, ...]:
-        """Return rules for pairs of bodies that touch wherever the coordinates are."""
-        generator = np.random.default_rng(0)
+        """Return rules for pairs of bodies that touch wherever the coordinates are, those of the others as well.
+
+        So a robot that stands in a wall by default, and is placed elsewhere, does not lose the pairs with the wall.
+        """
         home = self.model.default_state()
-        start = home.vector(self.space.symbols)
-        low, high = self.space.bounds(start, start[None])
-        states = [
-            home.updated(dict(zip(self.space.symbols, generator.uniform(low, high).tolist(), strict=True)))
-            for _ in range(_SAMPLES)
-        ]
+        samples = StateSamples(self.model, count=_SAMPLES)
+        columns = {s: samples.values_of(s).tolist() for s in home if s.has_derivative and not s.order}
+        states = [home.updated({s: values[k] for s, values in columns.items()}) for k in range(samples.size)]
         pairs = {frozenset(pair) for pair in scene.pairs_affected_by(self.space.symbols)}
-        found = scene.find_always_colliding([home, *states])
+        found = scene.find_always_colliding(filter(partial(_has_poses, scene), states))
         return tuple(rule for rule in found if frozenset((rule.a, rule.b)) in pairs)
 
     @property
@@ -168,6 +173,7 @@ class Planner:
         self._state = state
         self.space.place(state)
         self.checker.place(state)
+        self.space.turning[:] = self.checker.find_periodic(self._candidates)
         self._set_bounds(self._here, self._here[None])
 
     @property
@@ -191,6 +197,8 @@ class Planner:
         """
         self._synchronize()
         points = self._configurations(Q, "Q")
+        if not len(points):
+            return np.zeros(0, dtype=bool)
         # Any turn of a joint without limits is allowed.
         lower, upper = self.space.bounds(self._here, points)
         self.checker.lower[:] = np.where(self.space.turning, np.minimum(lower, points.min(axis=0)), lower)
@@ -215,7 +223,10 @@ class Planner:
             return self._whole(Q).vector(self.space.symbols)[None]
         if isinstance(Q, Sequence) and len(Q) and isinstance(Q[0], dict | State):
             return np.array([self._whole(q).vector(self.space.symbols) for q in Q])
-        points = np.atleast_2d(np.asarray(Q, dtype=float))
+        try:
+            points = np.atleast_2d(np.asarray(Q, dtype=float))
+        except (TypeError, ValueError):
+            raise InvalidValueError(f"{name} is a configuration, several, or states, not {Q!r}.") from None
         if points.ndim != 2 or points.shape[1] != n:
             raise ShapeError(
                 f"{name} has shape {np.shape(Q)}; wanted are configurations of {n} coordinates, in the order of "
@@ -223,6 +234,11 @@ class Planner:
             )
         if not np.isfinite(points).all():
             raise InvalidValueError(f"{name} has values that are not finite.")
+        if len(points) and np.abs(points).max() > _LARGEST:
+            raise InvalidValueError(
+                f"{name} has values beyond {_LARGEST:g}, which have no room in single precision. Choose an origin that "
+                "is nearer."
+            )
         return np.ascontiguousarray(points)
 
     # -- holds and solutions -------------------------------------------------------------------------------
@@ -232,7 +248,8 @@ class Planner:
     ) -> FrameHold:
         """Return the hold of a frame by another one, such as a grasp: see :func:`.hold_frames`.
 
-        While it lasts, the bodies at and below both frames may touch each other.
+        While it lasts, the bodies at and below both frames may touch each other. They may not if one frame carries
+        the other, as the world carries a hand that is kept upright.
         """
         return hold_frames(self.model, a, b, mask, offset)
 
@@ -300,7 +317,7 @@ class Planner:
         return frozenset(
             frozenset((a, b))
             for hold in holds
-            if isinstance(hold, FrameHold)
+            if isinstance(hold, FrameHold) and _are_apart(self.model, *hold.frames)
             for a in self._carried(hold.frames[0])
             for b in self._carried(hold.frames[1])
             if a != b
@@ -362,6 +379,8 @@ class Planner:
                 return self._no_path(q, self._no_solution([*holds, *tasks]), begin)
         else:
             ends = self._configurations(goals, "goals")
+            if not len(ends):
+                raise ShapeError("There is no goal: goals has no rows.")
         return self._between(q, ends, holds, touching, seconds, seed)
 
     def _plan_modes(self, search: ModeSearch, q: Array, begin: float) -> Path:
@@ -395,6 +414,8 @@ class Planner:
         Bodies of the pairs ``touching`` may touch, and some coordinates may stand still.
         """
         begin = perf_counter()
+        # A goal that is full turns away is the nearest one that is the same.
+        ends = np.array([self.space.equivalents(end, q, most=1)[0] for end in ends])
         self._set_bounds(q, ends, still)
         manifold = self._manifold(holds)
         with self.checker.excepting(touching):
@@ -516,6 +537,15 @@ class Planner:
         return f"<Planner: {len(self.symbols)} coordinates, {len(self.checker.moving)} bodies that move>"
 
 
+def _has_poses(scene: Scene, state: State) -> bool:
+    """Return True if all loops close at a state."""
+    try:
+        scene.update(state)
+    except NoSolutionError:
+        return False
+    return True
+
+
 def as_holds(tasks: Any) -> tuple[Hold, ...]:
     """Return holds from holds and goals, one or several."""
     given = (tasks,) if isinstance(tasks, Hold | Goal) else tuple(tasks)
@@ -531,11 +561,22 @@ def _are_tasks(goals: Any) -> bool:
     return isinstance(goals, list | tuple) and len(goals) > 0 and isinstance(goals[0], Hold | Goal)
 
 
+def _are_apart(model: ModelView, a: str, b: str) -> bool:
+    """Return True if no one of two frames carries the other."""
+    lookup = model.frames.__getitem__
+    return WORLD not in (a, b) and a != b and a not in ancestors(b, lookup) and b not in ancestors(a, lookup)
+
+
 def find_carried_bodies(model: ModelView, bodies: Sequence[str], frame: str) -> tuple[str, ...]:
-    """Return the bodies at and below a frame; if there are none, those that are rigidly connected with it."""
+    """Return the bodies at and below a frame; if there are none, those that are rigidly connected with it.
+
+    Of a frame that stands still it is the nearest body above it alone.
+    """
     below = [body for body, flag in zip(bodies, flag_subtree(model, bodies, frame), strict=True) if flag]
     if below:
         return tuple(below)
     frames = dict(model.frames)
     group = rigid_group(frame, frames)
+    if group == WORLD:
+        return tuple([name for name in ancestors(frame, frames.__getitem__) if name in bodies][:1])
     return tuple(body for body in bodies if rigid_group(body, frames) == group)

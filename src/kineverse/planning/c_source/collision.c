@@ -196,10 +196,11 @@ typedef struct {
   unsigned waiting; /* chunks before it that were not opened */
 } BoxSearch;
 
+/* Lanes without a pose, whose loops do not close, are NaN and must not hide the others. */
 INLINE void box_search_begin(BoxSearch *b, const V *centre, float reach) {
   for (int i = 0; i < 3; i++) {
-    b->low[i] = splat(least_lane(centre[i]) - reach);
-    b->high[i] = splat(largest_lane(centre[i]) + reach);
+    b->low[i] = splat(least_lane(smaller(centre[i], splat(INFINITY))) - reach);
+    b->high[i] = splat(largest_lane(larger(centre[i], splat(-INFINITY))) + reach);
   }
   b->next = 0;
   b->waiting = 0;

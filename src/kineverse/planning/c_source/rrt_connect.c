@@ -236,7 +236,7 @@ EXPORT long long kineverse_rrt_connect(Search *s, const float *starts, long long
       break;
     }
     /* The smaller tree grows. */
-    if (s->iterations) grown = trees[0].count > trees[1].count;
+    if (s->iterations >= start_count) grown = trees[0].count > trees[1].count;
     Tree *own = &trees[grown], *other = &trees[1 - grown];
     float away;
     if (s->iterations < start_count) {
