@@ -149,13 +149,18 @@ class HeldResults:
         return AttemptSummary(f"kineverse, {self.name}", self.attempts)
 
     def measurements(self) -> Iterator[Measurement]:
-        """Yield times, shares and residuals."""
+        """Yield times, shares and residuals; nothing if no place of the base is found."""
+        if not self.attempts:
+            return
         yield from self.summary.measurements()
         yield Measurement(f"kineverse, {self.name}: residual of the hold", "m, rad", (self.residual,))
 
     def comparisons(self) -> Iterator[Comparison]:
-        """Yield the figures with targets."""
+        """Yield the figures with targets; without values if no place of the base is found."""
         summary = self.summary
+        if not self.attempts:
+            yield Comparison(f"{summary.name}: median", None, "s", Bar(MEDIAN, at_least=False))
+            return
         if any(a.found for a in self.attempts):
             soon = 100.0 * float(np.mean(summary.times() <= SOON))
             yield bound_median(Measurement(f"{summary.name}: median", "s", (summary.median,)), MEDIAN)

@@ -119,7 +119,7 @@ def run_kitchen_queries(
     results.missing += dict.fromkeys(line for line in absent.values() if line is not None)
     present = [pair for pair in wanted if absent[pair] is None]
     counts = [len(part) for part in np.array_split(np.arange(queries), max(len(present), 1))]
-    for (robot, kitchen), count in zip(progress(present, "planning", "kitchen"), counts, strict=True):
+    for (robot, kitchen), count in zip(progress(present, "planning", "kitchen"), counts, strict=False):
         if count:
             _run_pair(make_kitchen_arm(robot, kitchen), count, seed, results)
     return results

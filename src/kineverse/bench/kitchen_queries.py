@@ -250,6 +250,7 @@ class _QuerySearch:
             Keep(_CONE, approach @ self._direction.expression, np.inf, name="approach"),
         )
         self._solver = InverseKinematics(model, tasks, still=arm.base)
+        self._known = {*self._solver.inputs, *arm.base, *arm.symbols}
         self._home = home = model.default_state().updated(state)
         scene = Scene(model)
         self._free = ConfigurationCheck(scene, (*arm.base, *arm.symbols), home)
@@ -318,7 +319,9 @@ class _QuerySearch:
     def _solve(self, first: Array, point: Array, direction: Array, base: Array) -> Array | None:
         arm, values = self._arm, self._point.values(point) | self._direction.values(direction)
         values |= dict(zip((*arm.base, *arm.symbols), (*base.tolist(), *first.tolist()), strict=True))
-        result = self._solver.solve(values, starts=1)
+        # An arm in a plane knows no component of the direction across it.
+        known = {symbol: value for symbol, value in values.items() if symbol in self._known}
+        result = self._solver.solve(known, starts=1)
         return np.clip(result.best.vector(arm.symbols), *arm.limits) if result.solved else None
 
 

@@ -65,6 +65,8 @@ def measure(settings: BenchmarkSettings, parts: Sequence[str] = PARTS) -> Benchm
         for name in MOTIONS:
             held = run_held_motion(name, settings.rounds, settings.progress)
             measured += held.measurements()
+            if not held.attempts:
+                missing.append(f"{name}: no grasps without collisions at {held.tried} places of the base")
             compared += held.comparisons()
     if "build" in parts:
         built = time_contenders("planning, build", _fresh_builds(), 1, settings.progress)
@@ -75,8 +77,8 @@ def measure(settings: BenchmarkSettings, parts: Sequence[str] = PARTS) -> Benchm
         work=(
             f"paths without collisions: published problems of Panda and Fetch, {SEEDS} attempts each with at "
             f"most {SECONDS:g} s; three problems at an open fridge; {settings.queries} queries between "
-            "handles of kitchens, whose paths the scene checks 20 times finer; a fridge and a drawer that are held; "
-            "times of the search, with the judgement by the scene where that is said"
+            "handles of kitchens, whose paths the scene checks 20 times finer; a fridge and a drawer that "
+            "are held; times of the search, with the judgement by the scene where that is said"
         ),
         measurements=tuple(measured),
         comparisons=tuple(compared),

@@ -89,7 +89,7 @@ class AttemptSummary:
         return float(np.percentile(self.times(), share))
 
     def measurements(self, percentile: float = 95.0) -> Iterator[Measurement]:
-        """Yield median, mean and a percentile of times, the median with the judgement, and the share solved."""
+        """Yield median, mean and percentile of times, the median with the judgement, and the share solved."""
         if any(attempt.found for attempt in self.attempts):
             times, judged = self.times(), self.times(judged=True)
             yield Measurement(f"{self.name}: median", "s", (self.median,))
