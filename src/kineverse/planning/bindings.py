@@ -83,8 +83,8 @@ class SearchStruct(ctypes.Structure):
     """Search and its results as C reads and writes them."""
 
     _fields_ = _fields(
-        "ppdddiiiiiiidd",
-        "checker projection range resolution seconds nodes seed "
+        "ppdddiiiiiiiidd",
+        "checker projection range resolution seconds nodes most_edges seed "
         "iterations edges count_start count_goal status elapsed gap",
     )
 

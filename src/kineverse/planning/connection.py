@@ -15,7 +15,7 @@ from .checker import RESOLUTION, CollisionChecker
 from .constrained_path import polish, shorten_on_manifold
 from .manifold import Manifold
 from .obstacles import Floats32
-from .search import RrtConnect, SearchResult
+from .search import MOST_EDGES, RrtConnect, SearchResult
 
 _SHORTCUTS = 60
 _REPAIRS = 12
@@ -47,14 +47,19 @@ class Connected:
 
 
 def connect(
-    checker: CollisionChecker, starts: Floats32, goals: Floats32, seconds: float, seed: int
+    checker: CollisionChecker,
+    starts: Floats32,
+    goals: Floats32,
+    seconds: float,
+    seed: int,
+    edges: int = MOST_EDGES,
 ) -> Connected:
     """Return a path from any of some starts (S, n) to any of some goals (G, n), certified between its samples.
 
     Edges of the search that collide between samples are planned anew, with more samples.
     """
     begin = perf_counter()
-    search = RrtConnect(checker)
+    search = RrtConnect(checker, edges=edges)
     with checker.widened(_WIDER, np.vstack([starts, goals])):
         found = search.solve(starts, goals, seconds, seed)
     if not found.found:
@@ -86,6 +91,7 @@ def connect_on_manifold(
     goals: Floats32,
     seconds: float,
     seed: int,
+    edges: int = MOST_EDGES,
 ) -> Connected:
     """Return a path on a manifold from any of some starts (S, n) to any of some goals (G, n).
 
@@ -93,7 +99,7 @@ def connect_on_manifold(
     path that collides between samples is searched again, with another seed and more samples.
     """
     begin = perf_counter()
-    search = RrtConnect(checker, manifold)
+    search = RrtConnect(checker, manifold, edges)
     iterations, resolution, problem = 0, RESOLUTION, ""
     points = starts
     for attempt in range(_ATTEMPTS):

@@ -22,10 +22,11 @@ if TYPE_CHECKING:
     from .planner import Planner
 
 _CANDIDATES = 12
-_SOLVING = 0.1
-"""Time for the configurations of one change of modes [s]."""
-_CONNECTING = 0.5
-"""Time for one path within a mode [s]."""
+_BATCHES, _EDGES = 2, 2000
+"""Effort for the configurations of one change of modes and for one path: numbers, not times, so that the same seed
+leads to the same path. Each round of the search has four times as much."""
+_DEPTH = 4
+"""Largest number of changes of modes in the first round; each round allows as many more."""
 _SAME = 1e-4
 
 
@@ -71,6 +72,7 @@ class _Node:
     q: Array
     parent: _Node | None
     points: Array
+    depth: int = 0
 
     def segments(self, modes: Sequence[Mode]) -> list[tuple[Mode, Array]]:
         if self.parent is None:
@@ -141,16 +143,18 @@ class ModeSearch:
             )
         nodes = [_Node(first, q, None, q[None])]
         seen = {self._signature(nodes[0])}
-        depth, k, tried = 0, 0, 0
+        self._round, k, tried = 0, 0, 0
         while self._left() > 0.0:
             if k == len(nodes):
-                # All are tried: again, with other values of the objects.
-                k, depth = 0, depth + 1
+                # All are tried: again, with more effort and other values of the objects.
+                k, self._round = 0, self._round + 1
                 if tried == self._searches:
                     break
                 tried = self._searches
             node = nodes[k]
             k += 1
+            if node.depth > _DEPTH * (self._round + 1):
+                continue
             points = self._reach_goal(node)
             if points is not None:
                 segments = [*node.segments(self._modes), (self._modes[node.mode], points)]
@@ -158,7 +162,7 @@ class ModeSearch:
             for other in range(len(self._modes)):
                 if other == node.mode or self._left() <= 0.0 or self._exclude(node.mode, other):
                     continue
-                for values in self._object_values(node, depth):
+                for values in self._object_values(node):
                     change = self._change(node, other, values)
                     if change is not None and self._signature(change) not in seen:
                         seen.add(self._signature(change))
@@ -193,13 +197,13 @@ class ModeSearch:
         )
         return any(a[frame] != b[frame] for frame in a.keys() & b.keys())
 
-    def _object_values(self, node: _Node, depth: int) -> list[Array]:
+    def _object_values(self, node: _Node) -> list[Array]:
         """Return values of the coordinates at the next change: objects of the mode at their limits, or anywhere."""
         moving = self._objects & ~self._still[node.mode]
         if not moving.any():
             return [node.q]
         lower, upper = self._planner.space.bounds(node.q, node.q[None])
-        if depth:
+        if self._round:
             shares = [self._generator.random(len(node.q))]
         else:
             shares = [np.ones(len(node.q)), np.zeros(len(node.q))]
@@ -212,7 +216,7 @@ class ModeSearch:
         touching = self._touching_around(node) | self._touching[other]
         ends = self._solve(holds, values, touching, self._objects) if holds else values[None]
         points = self._connect(node, ends, touching)
-        return None if points is None else _Node(other, np.asarray(points[-1]), node, points)
+        return None if points is None else _Node(other, np.asarray(points[-1]), node, points, node.depth + 1)
 
     def _touching_around(self, node: _Node) -> frozenset[frozenset[str]]:
         """Return the pairs that may touch in a node's mode and where it was entered."""
@@ -254,16 +258,16 @@ class ModeSearch:
         still: npt.NDArray[np.bool_],
     ) -> Array:
         self._searches += 1
-        seconds = min(_SOLVING, max(self._left(), 0.0))
-        seed = self._seed + self._searches
-        return self._planner._solutions(holds, near, _CANDIDATES, seconds, seed, touching, still)
+        seed, batches = self._seed + self._searches, _BATCHES * 4**self._round
+        return self._planner._solutions(
+            holds, near, _CANDIDATES, max(self._left(), 0.0), seed, touching, still, batches
+        )
 
     def _connect(self, node: _Node, ends: Array, touching: frozenset[frozenset[str]]) -> Array | None:
         if not len(ends):
             return None
         self._searches += 1
-        seconds = min(_CONNECTING, max(self._left(), 0.0))
-        path = self._planner._between(
-            node.q, ends, self._modes[node.mode].along, touching, seconds, self._seed, self._still[node.mode]
-        )
+        mode, still, edges = self._modes[node.mode], self._still[node.mode], _EDGES * 4**self._round
+        left = max(self._left(), 0.0)
+        path = self._planner._between(node.q, ends, mode.along, touching, left, self._seed, still, edges)
         return path.points if path.found else None

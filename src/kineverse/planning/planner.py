@@ -36,7 +36,8 @@ from .judge import SceneJudge, describe_contacts
 from .manifold import FrameHold, Manifold, hold_frames, manifold_key
 from .modes import Mode, ModeSearch
 from .path import Path
-from .solutions import find_solutions
+from .search import MOST_EDGES
+from .solutions import MOST_BATCHES, find_solutions
 
 Flags: TypeAlias = npt.NDArray[np.bool_]
 
@@ -290,13 +291,14 @@ class Planner:
         seed: int,
         touching: BodyPairs,
         still: Flags | None = None,
+        batches: int = MOST_BATCHES,
     ) -> Array:
         """Return solutions (K, n), those near to a configuration first; some coordinates have its values."""
         self._set_bounds(near, near[None], still)
         manifold = self._manifold(holds)
         assert manifold is not None
         with self.checker.excepting(touching):
-            return find_solutions(self.checker, manifold, near, count, seconds, seed)
+            return find_solutions(self.checker, manifold, near, count, seconds, seed, batches)
 
     def _manifold(self, holds: Sequence[Hold]) -> Manifold | None:
         """Return the manifold of holds and equalities of the model, at the present place."""
@@ -408,6 +410,7 @@ class Planner:
         seconds: float,
         seed: int,
         still: Flags | None = None,
+        edges: int = MOST_EDGES,
     ) -> Path:
         """Return a path from a configuration (n,) to any of some ends (K, n), along holds; see :meth:`plan`.
 
@@ -427,7 +430,7 @@ class Planner:
             if isinstance(usable, str):
                 return self._no_path(q, usable, begin)
             for _ in range(_NARROWINGS):
-                path, contact = self._connect(first, usable, manifold, touching, seconds, seed, begin)
+                path, contact = self._connect(first, usable, manifold, touching, seconds, seed, begin, edges)
                 if contact is None or not self._narrow(contact, q, touching):
                     break
             return path
@@ -463,6 +466,7 @@ class Planner:
         seconds: float,
         seed: int,
         begin: float,
+        edges: int,
     ) -> tuple[Path, DistanceResult | None]:
         """Return a path between checked ends, and the contact that the scene finds on it."""
         q = first.inner
@@ -471,9 +475,9 @@ class Planner:
         starts = np.ascontiguousarray(q[None], dtype=np.float32)
         searched = perf_counter()
         if manifold is None:
-            found = connect(self.checker, starts, targets, seconds, seed)
+            found = connect(self.checker, starts, targets, seconds, seed, edges)
         else:
-            found = connect_on_manifold(self.checker, manifold, starts, targets, seconds, seed)
+            found = connect_on_manifold(self.checker, manifold, starts, targets, seconds, seed, edges)
         spent = perf_counter() - searched
         if found.problem:
             return self._no_path(found.points, found.problem, begin, spent, found.iterations), None

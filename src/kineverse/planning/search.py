@@ -15,6 +15,8 @@ from .obstacles import Floats32
 RANGE = 1.0
 """Largest length of an edge of a tree [rad], [m]."""
 _MOST_NODES = 200_000
+MOST_EDGES = 1 << 40
+"""Number of edges of a search that only its time ends."""
 _ROOM = 16_384
 """Largest number of points of a path."""
 
@@ -43,9 +45,14 @@ class RrtConnect:
         Collision checker.
     manifold
         The manifold; None for the whole space.
+    edges
+        Largest number of edges that a search tries.
     """
 
-    def __init__(self, checker: CollisionChecker, manifold: Manifold | None = None) -> None:
+    def __init__(
+        self, checker: CollisionChecker, manifold: Manifold | None = None, edges: int = MOST_EDGES
+    ) -> None:
+        self._edges = edges
         self._checker, self._manifold, self._code = checker, manifold, planning_functions()
         self._path = np.zeros((_ROOM, len(checker.coordinates)), dtype=np.float32)
         self._struct = SearchStruct()
@@ -119,4 +126,5 @@ class RrtConnect:
         s.checker = self._checker.address
         s.projection = None if self._manifold is None else self._manifold.address
         s.range, s.resolution, s.seconds, s.nodes, s.seed = RANGE, resolution, seconds, nodes, seed
+        s.most_edges = self._edges
         return s

@@ -13,12 +13,20 @@ from .connection import unique_rows
 from .manifold import EXACT, Manifold
 
 _BATCH = 2048
+MOST_BATCHES = 1_000_000
+"""Number of batches of a search that only its time ends."""
 _APART = 0.05
 """Least distance of two solutions that count as different [rad], [m]."""
 
 
 def find_solutions(
-    checker: CollisionChecker, manifold: Manifold, near: Array, count: int, seconds: float, seed: int
+    checker: CollisionChecker,
+    manifold: Manifold,
+    near: Array,
+    count: int,
+    seconds: float,
+    seed: int,
+    batches: int = MOST_BATCHES,
 ) -> Array:
     """Return different configurations (K, n) on a manifold, free of collisions, at most some number of them.
 
@@ -34,12 +42,14 @@ def find_solutions(
         Largest time [s].
     seed
         Seed of the random configurations.
+    batches
+        Largest number of batches of them.
     """
     generator = np.random.default_rng(seed)
     begin = perf_counter()
     lower, upper = checker.lower.astype(float), checker.upper.astype(float)
     found = np.zeros((0, len(near)))
-    for k in range(1_000_000):
+    for k in range(batches):
         if k == 0:
             tries = near + generator.standard_normal((_BATCH, len(near))) * (upper - lower) / 8
             tries[0] = near

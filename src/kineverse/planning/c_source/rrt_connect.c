@@ -100,7 +100,7 @@ typedef struct {
   const Checker *checker;
   const Projection *projection; /* null: the whole space */
   double range, resolution, seconds;
-  long long nodes, seed;
+  long long nodes, most_edges, seed;
   /* results */
   long long iterations, edges, count_start, count_goal, status;
   double elapsed, gap;
@@ -231,7 +231,7 @@ EXPORT long long kineverse_rrt_connect(Search *s, const float *starts, long long
   s->status = TIME_IS_UP;
   for (;; s->iterations++) {
     if ((s->iterations & 15) == 0 && now() - begin > s->seconds) break;
-    if (trees[0].count + trees[1].count > s->nodes) {
+    if (trees[0].count + trees[1].count > s->nodes || s->edges > s->most_edges) {
       s->status = TOO_MANY_NODES;
       break;
     }
