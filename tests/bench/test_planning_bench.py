@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from kineverse.bench import kitchen_queries, measure_planning
-from kineverse.bench.configuration_check import ConfigurationCheck, sample_path
+from kineverse.bench.configuration_check import ConfigurationCheck, interpolate_path
 from kineverse.bench.held_planning import HeldResults
 from kineverse.bench.kitchen_planning import KitchenResults, run_kitchen_queries
 from kineverse.bench.kitchen_queries import CLEARANCE, make_kitchen_arm
@@ -129,7 +129,7 @@ def test_published_problems_are_compared_with_published_figures(problems, withou
 
 def test_sampled_paths_have_steps_below_the_density_and_contain_the_points():
     points = np.array([[0.0, 0.0], [0.3, 0.4], [0.3, 0.4], [1.0, 0.4]])
-    samples = np.array(list(sample_path(points, 20.0)))
+    samples = np.array(list(interpolate_path(points, 20.0)))
     assert np.linalg.norm(np.diff(samples, axis=0), axis=1).max() <= 0.05 + 1e-12
     assert all((np.abs(samples - point).max(axis=1) < 1e-12).any() for point in points)
 
@@ -175,7 +175,7 @@ def test_ompl_finds_a_way_around_an_obstacle():
     assert found.found
     np.testing.assert_array_equal(found.points, again.points)
     np.testing.assert_array_equal(found.points[[0, -1]], [start, goal])
-    assert all(free(q) for q in sample_path(found.points, 32.0))
+    assert all(free(q) for q in interpolate_path(found.points, 32.0))
     assert not planner.plan(start, np.array([0.0, -0.5]), 0.05, seed=0).found
 
 

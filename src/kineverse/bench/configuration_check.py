@@ -62,10 +62,10 @@ class ConfigurationCheck:
         density
             Number of samples over a motion of length 1 in all coordinates [1/rad], [1/m].
         """
-        return sum(not self(q) for q in sample_path(points, density))
+        return sum(not self(q) for q in interpolate_path(points, density))
 
 
-def sample_path(points: Array, density: float) -> Iterator[Array]:
+def interpolate_path(points: Array, density: float) -> Iterator[Array]:
     """Yield configurations along a path of straight edges, its points included."""
     yield points[0]
     for a, b in pairwise(points):
