@@ -80,7 +80,6 @@ __all__ = [
     "planning",
     "position",
     "quaternion",
-    "planning",
     "reasoning",
     "rotation_x",
     "rotation_y",
