@@ -75,7 +75,7 @@ def test_a_button_out_of_reach_leaves_the_drawer_locked(model, planner, modes):
     goal = kv.control.Hold(model.symbol("drawer"), 0.25)
     path = planner.plan(None, goal, modes=[modes[0], far, modes[2]], seconds=0.3)
     assert not path.found
-    assert "free, pull" in path.why
+    assert "free" in path.why
 
 
 def test_the_same_seed_leads_to_the_same_path(model, planner, modes):

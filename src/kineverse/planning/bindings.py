@@ -129,6 +129,7 @@ def _declare_signatures(code: Any) -> None:
         "kineverse_edges": (ctypes.c_int, [pointer, pointer, pointer, count, number, number, pointer]),
         "kineverse_certify": (count, [pointer, pointer, count, number, number, pointer]),
         "kineverse_poses": (ctypes.c_int, [pointer, pointer, pointer]),
+        "kineverse_count_touching": (ctypes.c_int, [pointer, pointer, count, pointer, pointer, pointer]),
         "kineverse_rrt_connect": (count, [pointer, pointer, count, pointer, count, pointer, count]),
         "kineverse_project": (ctypes.c_int, [pointer, pointer, pointer, count, pointer]),
         "kineverse_walk": (count, [pointer, pointer, pointer, pointer, count]),

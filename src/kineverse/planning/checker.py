@@ -36,6 +36,8 @@ RESOLUTION = 32.0
 FINENESS = 2000.0
 """Samples of a unit of a coordinate by which a condition switches, such as that of a lock [1/rad], [1/m]."""
 _SAME = 1e-4
+_ROUNDING = 2.5e-7
+"""Error of a pose in single precision, as a fraction of its distance from the origin."""
 _SWITCHES = {ca.OP_LT, ca.OP_LE, ca.OP_EQ, ca.OP_NE, ca.OP_NOT, ca.OP_AND, ca.OP_OR, ca.OP_IF_ELSE_ZERO}
 LEAST_INFLATION = 2e-4
 """Growth of spheres below which a collision between two samples counts as one [m]."""
@@ -106,6 +108,7 @@ class CollisionChecker:
         self._place_static(dependence)
         self._place_moving(members, poses)
         self._choose_pairs(dependence)
+        self._margin = margin
         self._build_struct(margin)
 
     def _make_program(self, poses: list[Expression], conditions: Sequence[Expression]) -> VectorProgram:
@@ -153,6 +156,9 @@ class CollisionChecker:
         lanes = self.program.lanes
         self._sets: list[ObstacleSet] = []
         self._costs = []
+        table = self.scene.collision_world.table
+        numbers = [self.scene.collision_world.body_index(body) for body in self.moving]
+        self._carried = np.flatnonzero(np.isin(table.body, numbers))
         for k, items in enumerate(members):
             solids = [solid for _, solid, _ in items]
             found = ObstacleSet(
@@ -236,6 +242,8 @@ class CollisionChecker:
         self._world.place(self.scene.collision_world.table.poses[self._static])
         self._kept = self.program.prepare(state.vector(self.parameters))
         self.struct.kept = self._kept.ctypes.data
+        places = self.scene.collision_world.table.poses[self._carried, :, 3]
+        self.struct.margin = self._margin + _ROUNDING * float(np.abs(places).max(initial=0.0))
 
     @contextmanager
     def excepting(self, pairs: BodyPairs) -> Iterator[None]:
@@ -243,6 +251,17 @@ class CollisionChecker:
         if not pairs:
             yield
             return
+        allowed, spheres, shapes = self._without(pairs)
+        self._use(allowed, spheres, shapes)
+        try:
+            yield
+        finally:
+            self._use(self._allowed, self.pairs, self.moving_pairs)
+
+    def _without(
+        self, pairs: BodyPairs
+    ) -> tuple[npt.NDArray[np.uint8], npt.NDArray[np.int32], npt.NDArray[np.int32]]:
+        """Return the tables of checked pairs without some of them."""
         standing = {body: k for k, body in enumerate(self.standing)}
         numbers = {body: k for k, body in enumerate(self.moving)}
         allowed = self._allowed.copy()
@@ -253,14 +272,10 @@ class CollisionChecker:
 
         def keep(rows: npt.NDArray[np.int32]) -> npt.NDArray[np.int32]:
             names = [frozenset((self.moving[i], self.moving[j])) for i, j in rows.tolist()]
-            return np.ascontiguousarray(rows[[name not in pairs for name in names]].reshape(-1, 2))
+            kept = np.array([name not in pairs for name in names], dtype=bool)
+            return np.ascontiguousarray(rows[kept].reshape(-1, 2))
 
-        spheres, shapes = keep(self.pairs), keep(self.moving_pairs)
-        self._use(allowed, spheres, shapes)
-        try:
-            yield
-        finally:
-            self._use(self._allowed, self.pairs, self.moving_pairs)
+        return allowed, keep(self.pairs), keep(self.moving_pairs)
 
     @contextmanager
     def widened(self, by: float, ends: Floats32) -> Iterator[None]:
@@ -326,6 +341,33 @@ class CollisionChecker:
         if found < -1:
             raise MemoryError("There is no memory for the check of a path.")
         return None if found < 0 else (int(found), where.value)
+
+    def count_touching(self, Q: Floats32) -> dict[tuple[str, str], int]:
+        """Return of each checked pair of bodies at how many configurations (N, n) their spheres touch."""
+        world = np.zeros((len(self.moving), max(len(self.standing), 1)), dtype=np.int32)
+        pairs, moving_pairs = (np.zeros(len(p) + 1, dtype=np.int32) for p in (self.pairs, self.moving_pairs))
+        self._code.kineverse_count_touching(
+            self.address,
+            Q.ctypes.data,
+            len(Q),
+            world.ctypes.data,
+            pairs.ctypes.data,
+            moving_pairs.ctypes.data,
+        )
+        found = {
+            (self.moving[i], self.standing[j]): int(world[i, j])
+            for i, j in np.argwhere(self._allowed).tolist()
+        }
+        for rows, counts in ((self.pairs, pairs), (self.moving_pairs, moving_pairs)):
+            for (i, j), number in zip(rows.tolist(), counts.tolist(), strict=False):
+                found[self.moving[i], self.moving[j]] = number
+        return found
+
+    def leave_to_scene(self, pairs: Sequence[tuple[str, str]]) -> None:
+        """Check pairs of bodies no more, from now on: they are among :attr:`uncovered`."""
+        self.uncovered += pairs
+        self._allowed, self.pairs, self.moving_pairs = self._without(frozenset(map(frozenset, pairs)))
+        self._use(self._allowed, self.pairs, self.moving_pairs)
 
     def outputs(self, q: Floats32) -> tuple[Floats32, Floats32]:
         """Return the poses (K, 3, 4) of the rigid groups and the conditions at a configuration (n,)."""

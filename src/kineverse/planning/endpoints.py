@@ -10,6 +10,7 @@ from kineverse.lie import Array
 
 from .checker import CollisionChecker
 from .configuration import PlanningSpace
+from .constrained_path import polish
 from .judge import FINE, SceneJudge, describe_contacts
 from .manifold import EXACT, Manifold
 
@@ -100,7 +101,7 @@ class Endpoints:
                 f"{what} is free by the scene, but nearer to a contact than the spheres of the planner or its margin "
                 "allow, and no way out was found. A smaller protrusion= or margin= helps.",
             )
-        return Endpoint(np.array([q, found]))
+        return Endpoint(found)
 
     def check_goals(self, ends: Array) -> list[Endpoint] | str:
         """Return the goals among configurations (K, n) that can be used, or why there are none.
@@ -128,7 +129,7 @@ class Endpoints:
         return "; ".join(wrong[:4])
 
     def _leave_spheres(self, q: Array) -> Array | None:
-        """Return a near configuration in which no sphere touches, to which the scene finds the way free."""
+        """Return the way (K, n) to a near configuration in which no sphere touches, which the scene finds free."""
         generator = np.random.default_rng(0)
         low, high = self._checker.lower, self._checker.upper
         for distance in _DISTANCES:
@@ -141,6 +142,9 @@ class Endpoints:
             if self._manifold is not None and len(free):
                 free = self._manifold.polish(free)[0]
             for other in free:
-                if self._judge.first_contact(np.array([q, other]), FINE * 4) is None:
-                    return np.asarray(other)
+                way: Array | None = np.array([q, other])
+                if self._manifold is not None and way is not None:
+                    way = polish(self._manifold, way)
+                if way is not None and self._judge.first_contact(way, FINE * 4) is None:
+                    return way
         return None

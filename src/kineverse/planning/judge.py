@@ -13,11 +13,12 @@ from kineverse.lie import Array
 from kineverse.state import State
 from kineverse.symbols import Symbol
 
-from .checker import RESOLUTION
 from .path import densify, sample_along, sample_path
 
 FINE = 1 / 640
 """Step of samples where no certificate vouches for what lies between them [rad], [m]."""
+_UNCOVERED = 4 * FINE
+"""Largest step of samples for pairs without spheres [rad], [m]: 6 mm at the edge of a door."""
 
 
 class SceneJudge:
@@ -80,7 +81,7 @@ class SceneJudge:
     def first_contact(self, points: Array, step: float) -> tuple[Array, DistanceResult] | None:
         """Return the first sample of a polyline (N, n) with a contact, and the contact.
 
-        Pairs that nobody else checks are looked at 32 times a unit at least.
+        Pairs that nobody else checks are looked at 160 times a unit at least.
         """
         for q in sample_path(points, step):
             found = self.contacts(q)
@@ -89,7 +90,7 @@ class SceneJudge:
         moved = np.abs(np.diff(points[:, self._concerned], axis=0)).sum(axis=1)
         if not moved.any():
             return None
-        for q in sample_along(points, moved, min(step, 1 / RESOLUTION)):
+        for q in sample_along(points, moved, min(step, _UNCOVERED)):
             self._update(q)
             found = self._uncovered()
             if len(found):
@@ -109,7 +110,7 @@ class SceneJudge:
         ends = []
         for bound in (lower, upper):
             point, free = q.copy(), float(q[column])
-            for value in np.linspace(q[column], bound, max(int(abs(bound - q[column]) * RESOLUTION * 2), 2)):
+            for value in np.linspace(q[column], bound, max(int(abs(bound - q[column]) / _UNCOVERED), 2)):
                 point[column] = value
                 if self.uncovered_contacts(point) is not None:
                     break

@@ -16,7 +16,6 @@ from kineverse.control.tasks import Goal, Hold
 from kineverse.errors import InvalidValueError, NoSolutionError, ShapeError
 from kineverse.expressions.expression import ExpressionLike
 from kineverse.geometry import Rule, Scene
-from kineverse.geometry.collision_filter import rigid_group
 from kineverse.geometry.objects import Exclusion
 from kineverse.geometry.prepared_query import flag_subtree
 from kineverse.geometry.results import DistanceResult
@@ -44,6 +43,8 @@ Flags: TypeAlias = npt.NDArray[np.bool_]
 _JUDGED = 0.5
 """Longest step between judged configurations of a path that is certified [rad], [m]."""
 _SAMPLES = 64
+_NEARLY_ALWAYS = 0.9
+"""Share of configurations from which on pairs of spheres count as always touching."""
 _TASK_GOALS = 32
 """Number of configurations that are looked for where tasks are the goal."""
 _MOST_MANIFOLDS = 16
@@ -72,7 +73,8 @@ class Planner:
     rules
         Rules of the collision filter, see :class:`.Scene`, such as those of an SRDF.
     margin
-        Least distance of bodies that move from everything [m].
+        Least distance of bodies that move from everything [m]; for rounding, 0.25 mm a kilometre from the origin come
+        on top.
     decomposed
         Bodies, or patterns, whose meshes are unions of convex hulls, see :class:`.Scene`.
     leave_out
@@ -126,6 +128,7 @@ class Planner:
         self._manifolds: dict[tuple[object, ...], Manifold] = {}
         self._judges: dict[BodyPairs, SceneJudge] = {}
         self._carried_bodies: dict[str, tuple[str, ...]] = {}
+        self._leave_near_pairs()
         self._version = model.version
         self._place(model.default_state() if self._state is None else model.default_state() | self._state)
 
@@ -141,6 +144,41 @@ class Planner:
         pairs = {frozenset(pair) for pair in scene.pairs_affected_by(self.space.symbols)}
         found = scene.find_always_colliding(filter(partial(_has_poses, scene), states))
         return tuple(rule for rule in found if frozenset((rule.a, rule.b)) in pairs)
+
+    def _leave_near_pairs(self) -> None:
+        """Leave to the scene the pairs whose spheres nearly always touch where the bodies themselves do not.
+
+        Such are the links around a wrist, a few millimetres apart. Of a pair that one coordinate moves, and whose
+        bodies touch nowhere on its range, nothing is left to check.
+        """
+        generator = np.random.default_rng(1)
+        home = self.model.default_state()
+        start = home.vector(self.space.symbols)
+        self.checker.place(home)
+        Q = generator.uniform(*self.space.bounds(start, start[None]), (_SAMPLES, len(start)))
+        counts = self.checker.count_touching(np.ascontiguousarray(Q, dtype=np.float32))
+        near = [pair for pair, count in counts.items() if count >= _NEARLY_ALWAYS * _SAMPLES]
+        judged = SceneJudge(self.scene, self.space.symbols, (), near)
+        judged.place(home)
+        touching = (
+            [{frozenset((c.a, c.b)) for c in judged.uncovered_contacts(q) or ()} for q in Q] if near else []
+        )
+        apart = [p for p in near if sum(frozenset(p) in t for t in touching) < 0.5 * _SAMPLES]
+        self.checker.leave_to_scene(apart)
+        for pair in apart:
+            columns = self._columns_between(*pair)
+            if len(columns) == 1:
+                own = SceneJudge(self.scene, self.space.symbols, (), [pair])
+                own.place(home)
+                low, high = self.space.bounds(start, start[None])
+                ends = own.free_interval(start, columns[0], low[columns[0]], high[columns[0]])
+                if ends == (low[columns[0]], high[columns[0]]):
+                    self.checker.uncovered.remove(pair)
+
+    def _columns_between(self, a: str, b: str) -> list[int]:
+        """Return the columns of the coordinates that move two bodies with respect to each other."""
+        moving = {*self.model.fk(a, b).symbols}
+        return [k for k, s in enumerate(self.space.symbols) if s in moving]
 
     @property
     def symbols(self) -> tuple[Symbol, ...]:
@@ -277,6 +315,7 @@ class Planner:
         """
         self._synchronize()
         count, seed = as_count("count", count, 1), as_count("seed", seed, 0)
+        seconds = as_tolerance(seconds, "seconds=")
         given = as_holds(tasks)
         if not given and not self.space.equalities:
             raise InvalidValueError("There is no hold and no goal, so every configuration is a solution.")
@@ -443,12 +482,7 @@ class Planner:
         pair = {contact.a, contact.b}
         if not any(pair == set(other) for other in self.checker.uncovered):
             return False
-        columns = {
-            k
-            for k, s in enumerate(self.space.symbols)
-            for body in pair & {*self.checker.moving}
-            if s in self.model.fk(body).symbols
-        }
+        columns = self._columns_between(contact.a, contact.b)
         if len(columns) != 1:
             return False
         (i,) = columns
@@ -572,15 +606,14 @@ def _are_apart(model: ModelView, a: str, b: str) -> bool:
 
 
 def find_carried_bodies(model: ModelView, bodies: Sequence[str], frame: str) -> tuple[str, ...]:
-    """Return the bodies at and below a frame; if there are none, those that are rigidly connected with it.
+    """Return the bodies at and below a frame; without any, those below the next frame above that has some.
 
-    Of a frame that stands still it is the nearest body above it alone.
+    So a tool frame between the fingers stands for the palm and the fingers.
     """
-    below = [body for body, flag in zip(bodies, flag_subtree(model, bodies, frame), strict=True) if flag]
-    if below:
-        return tuple(below)
-    frames = dict(model.frames)
-    group = rigid_group(frame, frames)
-    if group == WORLD:
-        return tuple([name for name in ancestors(frame, frames.__getitem__) if name in bodies][:1])
-    return tuple(body for body in bodies if rigid_group(body, frames) == group)
+    frames = model.frames
+    while frame != WORLD:
+        flags = flag_subtree(model, bodies, frame)
+        if flags.any():
+            return tuple(body for body, flag in zip(bodies, flags, strict=True) if flag)
+        frame = frames[frame].parent
+    return ()

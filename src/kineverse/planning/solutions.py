@@ -61,7 +61,10 @@ def find_solutions(
         if len(rows):
             exact, residuals = manifold.polish(rows[: 4 * count].astype(float))
             inside = (exact >= lower - 1e-9).all(axis=1) & (exact <= upper + 1e-9).all(axis=1)
-            found = np.vstack([found, exact[inside & (residuals <= EXACT)]])
+            exact = exact[inside & (residuals <= EXACT)]
+            # Polishing moves them a little.
+            free = checker.valid(np.ascontiguousarray(np.clip(exact, lower, upper), dtype=np.float32))
+            found = np.vstack([found, exact[free]])
             found = found[unique_rows(found, _APART)]
         if len(found) >= count or perf_counter() - begin > seconds:
             break

@@ -331,47 +331,58 @@ INLINE I link_against_link(const Checker *c, const Link *a, const Link *b, const
   return hit;
 }
 
+/* The lanes in which two links touch, spheres against spheres, and those that were hit before. */
+INLINE I touching_links(const Checker *c, Work *w, const Pair *pair, int early, I hit) {
+  const int i = pair->one, j = pair->other;
+  const Link *a = c->link + i, *b = c->link + j;
+  const V *p = w->centre + 3 * i, *q = w->centre + 3 * j;
+  const float grown = w->inflation[i] + w->inflation[j] + (float)c->margin;
+  if (!any(spheres_touch(p, q, a->ball[3] + b->ball[3] + grown) & ~hit)) return hit;
+  return link_against_link(c, a, b, w->o + 12 * a->pose, w->o + 12 * b->pose, p, q, grown, early, hit);
+}
+
+/* The lanes in which a link touches the shapes of a body that moves, and those that were hit before. */
+INLINE I touching_set(const Checker *c, Work *w, const Pair *pair, int early, I hit) {
+  const int i = pair->one;
+  const ObstacleSet *s = c->moving + pair->other;
+  const Link *a = c->link + i, *b = c->link + s->link;
+  /* A body that moves has its inflation among those of the links. */
+  const float grown = w->inflation[i] + w->inflation[s->link];
+  const float reach = a->ball[3] + b->ball[3] + grown + (float)c->margin;
+  if (!any(spheres_touch(w->centre + 3 * i, w->centre + 3 * s->link, reach) & ~hit)) return hit;
+  V centre[3];
+  relative_pose(w->o + 12 * s->pose, w->o + 12 * a->pose, w->relative);
+  transform_point(w->relative, a->ball, centre);
+  return link_against_set(c, a, w->relative, centre, s, 0, grown, early, hit);
+}
+
 /* The lanes of w->x that are not free. With `early` all that matters is whether there is any. The outputs of
    `compute` are there already. */
 INLINE I find_collisions(const Checker *c, Work *w, int early) {
   I hit = splat(0.0f) < splat(0.0f);
+#define RETURN_IF_KNOWN \
+  if (early ? any(hit) : !any(~hit)) return hit
   const V *conditions = w->o + 12 * c->poses;
   for (int k = 0; k < c->conditions; k++) hit |= ~(conditions[k] <= splat(0.0f));
-  if (early ? any(hit) : !any(~hit)) return hit;
+  RETURN_IF_KNOWN;
   for (int k = 0; k < c->links; k++) {
     const Link *l = c->link + k;
     const V *T = w->o + 12 * l->pose;
     transform_point(T, l->ball, w->centre + 3 * k);
     if (!l->coarse) continue;
-    hit = link_against_set(c, l, T, w->centre + 3 * k, c->world, c->allowed + k * c->bodies,
-                           w->inflation[k], early, hit);
-    if (early ? any(hit) : !any(~hit)) return hit;
+    hit = link_against_set(c, l, T, w->centre + 3 * k, c->world, c->allowed + k * c->bodies, w->inflation[k], early,
+                           hit);
+    RETURN_IF_KNOWN;
   }
   for (int k = 0; k < c->pairs; k++) {
-    const int i = c->pair[k].one, j = c->pair[k].other;
-    const Link *a = c->link + i, *b = c->link + j;
-    const float grown = w->inflation[i] + w->inflation[j] + (float)c->margin;
-    const I near = spheres_touch(w->centre + 3 * i, w->centre + 3 * j, a->ball[3] + b->ball[3] + grown);
-    if (!any(near & ~hit)) continue;
-    hit = link_against_link(c, a, b, w->o + 12 * a->pose, w->o + 12 * b->pose, w->centre + 3 * i, w->centre + 3 * j,
-                            grown, early, hit);
-    if (early ? any(hit) : !any(~hit)) return hit;
+    hit = touching_links(c, w, c->pair + k, early, hit);
+    RETURN_IF_KNOWN;
   }
   for (int k = 0; k < c->moving_pairs; k++) {
-    const int i = c->moving_pair[k].one;
-    const Link *a = c->link + i;
-    const ObstacleSet *s = c->moving + c->moving_pair[k].other;
-    const Link *b = c->link + s->link;
-    /* A body that moves has its inflation among those of the links. */
-    const float grown = w->inflation[i] + w->inflation[s->link];
-    const float reach = a->ball[3] + b->ball[3] + grown + (float)c->margin;
-    if (!any(spheres_touch(w->centre + 3 * i, w->centre + 3 * s->link, reach) & ~hit)) continue;
-    V centre[3];
-    relative_pose(w->o + 12 * s->pose, w->o + 12 * a->pose, w->relative);
-    transform_point(w->relative, a->ball, centre);
-    hit = link_against_set(c, a, w->relative, centre, s, 0, grown, early, hit);
-    if (early ? any(hit) : !any(~hit)) return hit;
+    hit = touching_set(c, w, c->moving_pair + k, early, hit);
+    RETURN_IF_KNOWN;
   }
+#undef RETURN_IF_KNOWN
   return hit;
 }
 

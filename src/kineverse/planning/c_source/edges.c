@@ -300,3 +300,38 @@ EXPORT int kineverse_poses(const Checker *c, const float *row, float *outputs) {
   work_end(&w);
   return 0;
 }
+
+/* Add to the counts of all pairs the configurations (count, n) in which they touch: of each link with each body of the
+   world (links, bodies), of the pairs of links, and of links with moving sets. */
+EXPORT int kineverse_count_touching(const Checker *c, const float *rows, long long count, int *world, int *pairs,
+                                    int *moving_pairs) {
+  Work w;
+  unsigned char *one = calloc((size_t)c->bodies + 1, 1);
+  if (work_begin(&w, c) || !one) return -1;
+  for (long long first = 0; first < count; first += W) {
+    const long long left = count - first;
+    const unsigned lanes = left < W ? (1u << left) - 1 : (unsigned)((1ull << W) - 1);
+    const I none = splat(0.0f) < splat(0.0f);
+    read_lanes(c, &w, rows + first * c->coordinates, left);
+    evaluate(c, &w);
+    for (int k = 0; k < c->links; k++) {
+      const Link *l = c->link + k;
+      const V *T = w.o + 12 * l->pose;
+      transform_point(T, l->ball, w.centre + 3 * k);
+      for (int b = 0; l->coarse && b < c->bodies; b++) {
+        if (!c->allowed[k * c->bodies + b]) continue;
+        one[b] = 1;
+        const I hit = link_against_set(c, l, T, w.centre + 3 * k, c->world, one, 0.0f, 0, none);
+        one[b] = 0;
+        world[k * c->bodies + b] += __builtin_popcount(lane_bits(hit) & lanes);
+      }
+    }
+    for (int k = 0; k < c->pairs; k++)
+      pairs[k] += __builtin_popcount(lane_bits(touching_links(c, &w, c->pair + k, 0, none)) & lanes);
+    for (int k = 0; k < c->moving_pairs; k++)
+      moving_pairs[k] += __builtin_popcount(lane_bits(touching_set(c, &w, c->moving_pair + k, 0, none)) & lanes);
+  }
+  free(one);
+  work_end(&w);
+  return 0;
+}
