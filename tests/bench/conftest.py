@@ -30,6 +30,8 @@ def tiny(robot_file):
         rows=40,
         operations=60,
         boxes=90,
+        problems=1,
+        queries=2,
         robots=("pr2",),
         examples=("arm_ur5_wrist_cam_lookat",),
     )

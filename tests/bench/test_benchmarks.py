@@ -17,9 +17,12 @@ HAS_PEERS = all(importlib.util.find_spec(name) for name in ("pinocchio", "mujoco
 BATCH = pytest.param("batch", marks=pytest.mark.compiler)
 
 
-# test_control_bench.py runs "control" without its long parts.
+# test_control_bench.py and test_planning_bench.py run these without their long parts.
+LONG = ("control", "planning")
+
+
 @pytest.mark.parametrize(
-    "name", [BATCH if name == "batch" else name for name in BENCHMARKS if name != "control"]
+    "name", [BATCH if name == "batch" else name for name in BENCHMARKS if name not in LONG]
 )
 def test_a_benchmark_measures_all_installed_peers(name, tiny):
     (result,) = run_benchmarks([name], tiny)

@@ -105,6 +105,21 @@ def build_controller(robot: str) -> dict[str, Any]:
     return {"build": built - start, "ready": perf_counter() - built}
 
 
+def build_planner(robot: str) -> dict[str, Any]:
+    """Return the time from a robot's file to its planner in the shipped kitchen [s].
+
+    ``build_planner ROBOT``; a robot of :data:`kineverse.bench.kitchen_queries.ARMS`.
+    """
+    from kineverse.bench.kitchen_queries import make_kitchen_arm
+    from kineverse.planning import Planner
+
+    arm = make_kitchen_arm(robot, "kitchen (shipped)")
+    start = perf_counter()
+    planner = Planner(arm.model, move=arm.symbols)
+    planner.valid([[0.0] * len(planner.symbols)])
+    return {"seconds": perf_counter() - start}
+
+
 def memory_of_robot(library: str, file: str, frame: str) -> dict[str, Any]:
     """Return the memory of a robot beyond that of the imports [MB], loaded and evaluated.
 
@@ -152,6 +167,7 @@ _PROGRAMS = (
     load_with_mujoco,
     load_with_pinocchio,
     build_controller,
+    build_planner,
     memory_of_robot,
 )
 

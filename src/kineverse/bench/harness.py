@@ -60,6 +60,10 @@ class BenchmarkSettings:
         Largest number of boxes around the arm.
     robots
         Robots that open a fridge.
+    problems
+        Largest number of problems of each published set of planning problems; None for all.
+    queries
+        Number of planning queries in kitchens.
     examples
         Examples of other libraries; all if empty.
     progress
@@ -76,11 +80,13 @@ class BenchmarkSettings:
     operations: int = 10_000
     boxes: int = 3000
     robots: Sequence[str] = ("pr2", "fetch", "hsr")
+    problems: int | None = None
+    queries: int = 1000
     examples: Sequence[str] = ()
     progress: Progress = _no_progress
 
 
-QUICK = BenchmarkSettings(rounds=5, processes=3, steps=20, operations=1_000)
+QUICK = BenchmarkSettings(rounds=5, processes=3, steps=20, operations=1_000, problems=4, queries=60)
 """Settings for an order of magnitude."""
 
 
@@ -214,11 +220,11 @@ def time_contenders(
 
 
 DISTRIBUTIONS: Mapping[str, str] = MappingProxyType(
-    {"pinocchio": "pin", "pink": "pin-pink", "ripl_articulation": "ripl-articulation"}
+    {"pinocchio": "pin", "pink": "pin-pink", "ripl_articulation": "ripl-articulation", "vamp": "vamp-planner"}
 )
 """Distributions of modules with another name."""
 
-BENCH_EXTRA = ("pinocchio", "mujoco", "pybullet", "pink", "mink")
+BENCH_EXTRA = ("pinocchio", "mujoco", "pybullet", "pink", "mink", "ompl")
 """Modules that the extra ``bench`` installs."""
 
 

@@ -12,7 +12,19 @@ from kineverse._version import __version__
 from kineverse.compile import CompilerInformation, compile, compiler_information  # noqa: A004
 from kineverse.compile.call_extension import call_extension
 
-VERSIONS = ("casadi", "numpy", "pin", "mujoco", "coal", "pybullet", "daqp", "pin-pink", "mink", "qpsolvers")
+VERSIONS = (
+    "casadi",
+    "numpy",
+    "pin",
+    "mujoco",
+    "coal",
+    "pybullet",
+    "daqp",
+    "pin-pink",
+    "mink",
+    "qpsolvers",
+    "ompl",
+)
 
 
 @dataclass(frozen=True, slots=True)

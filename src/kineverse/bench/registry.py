@@ -24,6 +24,7 @@ BENCHMARKS: Mapping[str, str] = MappingProxyType(
         "tracking": "a kitchen's coordinates from noisy poses of its doors and drawers",
         "identification": "the joint between two parts, from twenty poses of both and from one more",
         "control": "a controller's step, a robot that opens a fridge; beside pink and mink",
+        "planning": "paths without collisions: published problems, robots in kitchens, held doors",
         "examples": "published examples of pink and mink, beside the same ones of this library",
         "import": "importing the library, and how many packages that takes",
         "memory": "the memory of a loaded robot",

@@ -10,6 +10,7 @@ from collections.abc import Iterable
 from dataclasses import asdict, replace
 from typing import TYPE_CHECKING, Any
 
+from kineverse._checks import as_count
 from kineverse.cli.output import format_table, show_progress
 from kineverse.expressions.printing import format_number
 
@@ -40,6 +41,9 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     )
     parser.add_argument("--robot", metavar="MODEL", help="path of a URDF file, or name of a model (a PR2)")
     parser.add_argument("--frame", metavar="FRAME", help="frame of the pose and Jacobian (a gripper)")
+    parser.add_argument(
+        "--queries", metavar="N", type=int, help="number of queries of 'planning' in kitchens (1000)"
+    )
     parser.add_argument("--json", action="store_true", help="one JSON object on standard output")
 
 
@@ -57,6 +61,8 @@ def run(arguments: argparse.Namespace) -> int:
         frame=arguments.frame,
         progress=show_progress,
     )
+    if arguments.queries is not None:
+        settings = replace(settings, queries=as_count("--queries", arguments.queries, 0))
     here = bench.describe_machine()
     if arguments.json:
         results = list(bench.run_benchmarks(names, settings))

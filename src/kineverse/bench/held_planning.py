@@ -1,0 +1,211 @@
+"""Planning with holds: an arm opens a fridge that it holds, and two arms a drawer."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, field
+from functools import cached_property
+from types import MappingProxyType
+
+import numpy as np
+
+from kineverse.compile import compile  # noqa: A004
+from kineverse.control import Hold
+from kineverse.formats import load
+from kineverse.geometry import RULES, Rule, rules_as_data
+from kineverse.lie import Array
+from kineverse.model.model import Model
+from kineverse.planning import Planner
+from kineverse.spatial import rpy, translation
+from kineverse.state import State
+
+from .harness import Progress
+from .planning_attempts import Attempt, AttemptSummary
+from .result import Bar, Comparison, Measurement, bound_median
+
+SECONDS, SOON = 10.0, 0.1
+"""Largest time of a search, and the time in which nearly all are to be solved [s]."""
+
+MEDIAN, LEAST_SOON, RESIDUAL = 1e-3, 95.0, 1e-5
+"""Targets: median time [s], share solved soon of what is solved [%], residual of holds [m], [rad]."""
+
+_GOALS, _TRIES, _PATIENCE = 64, 300, 0.2
+"""Number of goals, largest number of places of the base, and time of the search for grasps at each [s]."""
+
+
+@dataclass(frozen=True)
+class HeldMotion:
+    """Motion of a door or drawer that hands hold.
+
+    Attributes
+    ----------
+    robot
+        Name of the shipped robot.
+    joint
+        Joint of the door or drawer in the shipped kitchen.
+    closed, opened
+        Its positions at the start and the goal [m], [rad].
+    hands
+        Frames of the hands, each with the pose of its grasp in the frame of the handle: x, y, z [m] and roll,
+        pitch, yaw [rad].
+    handle
+        Frame of the handle.
+    moving
+        Patterns of the coordinates that move, the joint besides.
+    base
+        Ranges of the base's x, y [m] and angle [rad], shape (2, 3).
+    """
+
+    robot: str
+    joint: str
+    closed: float
+    opened: float
+    hands: Mapping[str, tuple[float, ...]]
+    handle: str
+    moving: tuple[str, ...]
+    base: tuple[tuple[float, float, float], tuple[float, float, float]]
+
+    @cached_property
+    def model(self) -> Model:
+        """The robot in the kitchen, with the frames of the grasps."""
+        model = load(self.robot)
+        with model.edit() as edit:
+            edit.include("kitchen", "kitchen")
+            for k, (*where, roll, pitch, yaw) in enumerate(self.hands.values()):
+                edit.add_frame(f"grasp{k}", self.handle, translation(*where) @ rpy(roll, pitch, yaw))
+            kitchen = Rule("kitchen/*", "kitchen/*", why="it is closed when the robot comes")
+            edit.write(RULES, rules_as_data([kitchen]))
+        return model
+
+
+MOTIONS: Mapping[str, HeldMotion] = MappingProxyType(
+    {
+        "fridge held by an arm": HeldMotion(
+            "fetch",
+            "kitchen/fridge_door",
+            0.03,
+            1.2,
+            {"fetch/gripper_link": (0.04, 0.0, 0.0, np.pi / 2, 0.0, np.pi)},
+            "kitchen/fridge_door_handle",
+            (
+                "fetch/torso*",
+                "fetch/shoulder*",
+                "fetch/upper*",
+                "fetch/elbow*",
+                "fetch/forearm*",
+                "fetch/wrist*",
+            ),
+            ((0.1, -1.9, -0.6), (0.7, -1.0, 0.6)),
+        ),
+        "drawer held by two arms": HeldMotion(
+            "pr2",
+            "kitchen/island_middle_upper_drawer",
+            0.02,
+            0.3,
+            {
+                "pr2/l_gripper_palm_link": (0.22, -0.12, 0.0, np.pi / 2, 0.0, np.pi),
+                "pr2/r_gripper_palm_link": (0.22, 0.12, 0.0, np.pi / 2, 0.0, np.pi),
+            },
+            "kitchen/island_middle_upper_drawer_handle",
+            (
+                "pr2/torso*",
+                "pr2/*_shoulder*",
+                "pr2/*_upper*",
+                "pr2/*_elbow*",
+                "pr2/*_forearm*",
+                "pr2/*_wrist*",
+            ),
+            ((-0.3, -0.2, np.pi - 0.3), (0.1, 0.2, np.pi + 0.3)),
+        ),
+    }
+)
+"""Motions by name."""
+
+
+@dataclass
+class HeldResults:
+    """Attempts at a motion with holds.
+
+    Attributes
+    ----------
+    name
+        Name of the motion.
+    attempts
+        Attempts, each from another place of the base.
+    residual
+        Largest residual of the holds on the paths [m], [rad].
+    tried
+        Number of places of the base that were tried to find these.
+    """
+
+    name: str
+    attempts: list[Attempt] = field(default_factory=list)
+    residual: float = 0.0
+    tried: int = 0
+
+    @property
+    def summary(self) -> AttemptSummary:
+        """Summary of the attempts."""
+        return AttemptSummary(f"kineverse, {self.name}", self.attempts)
+
+    def measurements(self) -> Iterator[Measurement]:
+        """Yield times, shares and residuals; nothing if no place of the base is found."""
+        if not self.attempts:
+            return
+        yield from self.summary.measurements()
+        yield Measurement(f"kineverse, {self.name}: residual of the hold", "m, rad", (self.residual,))
+
+    def comparisons(self) -> Iterator[Comparison]:
+        """Yield the figures with targets; without values if no place of the base is found."""
+        summary = self.summary
+        if not self.attempts:
+            yield Comparison(f"{summary.name}: median", None, "s", Bar(MEDIAN, at_least=False))
+            return
+        if any(a.found for a in self.attempts):
+            soon = 100.0 * float(np.mean(summary.times() <= SOON))
+            yield bound_median(Measurement(f"{summary.name}: median", "s", (summary.median,)), MEDIAN)
+            name = f"{summary.name}: solved in {1e3 * SOON:g} ms of those solved in {SECONDS:g} s"
+            yield Comparison(name, soon, "%", Bar(LEAST_SOON, at_least=True))
+        residual = Measurement(f"{summary.name}: residual of the hold", "m, rad", (self.residual,))
+        yield bound_median(residual, RESIDUAL)
+
+
+def run_held_motion(name: str, starts: int, progress: Progress, seed: int = 0) -> HeldResults:
+    """Return attempts at a motion of :data:`MOTIONS` from random places of the base.
+
+    Places count where grasps without collisions exist at the start and the goal.
+    """
+    motion, results = MOTIONS[name], HeldResults(name)
+    model, joint = motion.model, motion.model.symbol(motion.joint)
+    planner = Planner(model, move=(*motion.moving, joint))
+    holds = [planner.hold(hand, f"grasp{k}", mask="xyz rx ry") for k, hand in enumerate(motion.hands)]
+    base = [model.symbol(f"{motion.robot}/base/{c}") for c in ("x", "y", "angle")]
+    residuals = [compile(hold.expression, (*base, *planner.symbols)) for hold in holds]
+    random = np.random.default_rng(seed)
+    for number in progress(range(starts), f"planning, {name}", "start"):
+        found = None
+        while found is None and results.tried < _TRIES:
+            results.tried += 1
+            place = random.uniform(*motion.base)
+            planner.place(model.default_state() | State(dict(zip(base, place.tolist(), strict=True))))
+            found = _find_ends(planner, holds, Hold(joint, motion.closed), Hold(joint, motion.opened), number)
+        if found is None:
+            break
+        path = planner.plan(found[0][0], found[1], along=holds, seconds=SECONDS, seed=number)
+        results.attempts.append(Attempt(path.found, path.search_seconds, path.seconds, path.points, path.why))
+        if path.found:
+            rows = np.hstack([np.tile(place, (len(path.points), 1)), path.points])
+            worst = max(float(np.abs(f.batch(rows)).max()) for f in residuals)
+            results.residual = max(results.residual, worst)
+    return results
+
+
+def _find_ends(
+    planner: Planner, holds: Sequence[Hold], closed: Hold, opened: Hold, seed: int
+) -> tuple[Array, Array] | None:
+    """Return grasps at the start and the goal, (K, n) each; None if there are none of one of them."""
+    starts = planner.solutions([*holds, closed], count=1, seconds=_PATIENCE, seed=seed)
+    if not len(starts):
+        return None
+    goals = planner.solutions([*holds, opened], count=_GOALS, seconds=_PATIENCE, seed=seed)
+    return (starts, goals) if len(goals) else None

@@ -1,0 +1,100 @@
+"""Attempts of planners: what one found, and summaries over many problems."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, field
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from kineverse.lie import Array
+
+from .result import Measurement
+
+if TYPE_CHECKING:
+    from kineverse.planning import Planner
+
+
+@dataclass(frozen=True, slots=True)
+class Attempt:
+    """Result of a planner for one problem.
+
+    Attributes
+    ----------
+    found
+        True if a path was found.
+    seconds
+        Time of the search, without anything that is done once for a robot [s].
+    judged
+        Time with the judgement of the path by a scene [s]; the same for planners that do not judge.
+    points
+        Configurations of the path, shape (N, n) [m], [rad]; empty without one.
+    why
+        How the path was found, or why there is none.
+    """
+
+    found: bool
+    seconds: float
+    judged: float
+    points: Array = field(default_factory=lambda: np.empty((0, 0)))
+    why: str = ""
+
+
+def attempt_with_kineverse(
+    planner: Planner, start: Array, goals: Array, seconds: float, seed: int
+) -> Attempt:
+    """Return the attempt of our planner, whose obstacles are placed."""
+    path = planner.plan(start, goals, seconds=seconds, seed=seed)
+    return Attempt(path.found, path.search_seconds, path.seconds, path.points, path.why)
+
+
+@dataclass(frozen=True)
+class AttemptSummary:
+    """Times and success of a planner over problems.
+
+    Attributes
+    ----------
+    name
+        Planner and problems.
+    attempts
+        Its attempts.
+    """
+
+    name: str
+    attempts: Sequence[Attempt]
+
+    @property
+    def solved(self) -> float:
+        """Share of attempts that found a path [%]."""
+        return 100.0 * float(np.mean([attempt.found for attempt in self.attempts]))
+
+    def times(self, judged: bool = False) -> Array:
+        """Return the times of attempts that found a path [s]; one of ∞ if there are none."""
+        times = [a.judged if judged else a.seconds for a in self.attempts if a.found]
+        return np.array(times or [np.inf])
+
+    @property
+    def median(self) -> float:
+        """Median time of what was solved [s]."""
+        return float(np.median(self.times()))
+
+    @property
+    def mean(self) -> float:
+        """Mean time of what was solved [s]."""
+        return float(np.mean(self.times()))
+
+    def percentile(self, share: float) -> float:
+        """Return a percentile of the time of what was solved [s]."""
+        return float(np.percentile(self.times(), share))
+
+    def measurements(self, percentile: float = 95.0) -> Iterator[Measurement]:
+        """Yield median, mean and percentile of times, the median with the judgement, and the share solved."""
+        if any(attempt.found for attempt in self.attempts):
+            times, judged = self.times(), self.times(judged=True)
+            yield Measurement(f"{self.name}: median", "s", (self.median,))
+            yield Measurement(f"{self.name}: mean", "s", (self.mean,))
+            yield Measurement(f"{self.name}: p{percentile:g}", "s", (self.percentile(percentile),))
+            if not np.array_equal(times, judged):
+                yield Measurement(f"{self.name}: median, path judged", "s", (float(np.median(judged)),))
+        yield Measurement(f"{self.name}: solved", "%", (self.solved,))
