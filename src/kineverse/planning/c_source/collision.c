@@ -365,7 +365,8 @@ INLINE I find_collisions(const Checker *c, Work *w, int early) {
   const V *conditions = w->o + 12 * c->poses;
   for (int k = 0; k < c->conditions; k++) hit |= ~(conditions[k] <= splat(0.0f));
   RETURN_IF_KNOWN;
-  for (int k = 0; k < c->links; k++) {
+  /* The last links of an arm meet most. */
+  for (int k = (int)c->links - 1; k >= 0; k--) {
     const Link *l = c->link + k;
     const V *T = w->o + 12 * l->pose;
     transform_point(T, l->ball, w->centre + 3 * k);
