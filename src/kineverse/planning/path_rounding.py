@@ -166,9 +166,12 @@ def _round_valid(points: Array, deviation: npt.ArrayLike, checks: PathChecks) ->
     if len(path.points) < 3:
         return path
     allowed = _deviations(path)
-    # Where the way itself is free by the scene only, nothing vouches for a shortcut.
-    for k in {0, len(path.lengths) - 1}:
-        if checks.find_collision(path.points[k : k + 2]) is not None:
+    # At the ends the way may be free by the scene only: nothing vouches for a shortcut there.
+    edges = range(len(path.lengths))
+    for order in (edges, reversed(edges)):
+        for k in order:
+            if checks.find_collision(path.points[k : k + 2]) is None:
+                break
             allowed[[k, k + 1]] = 0.0
     return round_corners(path.points, allowed)
 
