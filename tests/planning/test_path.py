@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import importlib.util
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -12,6 +13,7 @@ from arm_and_box import ARM, INSIDE, LEFT, MOVING, RIGHT
 from kineverse.compile.toolchain import toolchain
 from kineverse.errors import FormatError, InvalidValueError, ShapeError
 from kineverse.planning import Planner, Trajectory, motion_limits
+from kineverse.planning.path_rounding import PathSection
 
 pytestmark = [
     pytest.mark.skipif(toolchain() is None, reason="planning needs a C compiler"),
@@ -123,6 +125,16 @@ def test_motion_along_a_hold_keeps_it_and_does_not_stop(opening):
     inner = np.linalg.norm(trajectory.velocities[1:-1], axis=1)
     assert inner.min() > 1e-3
     assert (np.diff(path.times) >= 0).all()
+
+
+def test_motion_rests_between_sections(path):
+    k = len(path) // 2
+    ends = ((0, k), (k, len(path) - 1))
+    parts = replace(path, sections=tuple(PathSection(i, j, path.checks) for i, j in ends))
+    trajectory = parts.trajectory()
+    assert parts.times[-1] == pytest.approx(trajectory.duration)
+    assert np.allclose(trajectory.positions_at(parts.times[k]), path.points[k])
+    assert np.allclose(trajectory.velocities_at(parts.times[k]), 0.0)
 
 
 def test_path_that_was_not_found_has_no_trajectory(planner, tmp_path):

@@ -16,11 +16,13 @@ from kineverse.errors import DuplicateNameError, InvalidValueError
 from kineverse.lie import Array
 from kineverse.symbols import Symbol
 
+from .checker import BodyPairs
 from .manifold import FrameHold
 
 if TYPE_CHECKING:
     from .planner import Planner
 
+_NO_PAIRS: BodyPairs = frozenset()
 _CANDIDATES = 12
 _BATCHES, _EDGES = 2, 2000
 """Effort for the configurations of one change of modes and for one path: numbers, not times, so that the same seed
@@ -56,10 +58,19 @@ class Mode:
 
 
 @dataclass(frozen=True, slots=True)
-class ModePath:
-    """Path through modes: segments with their points (N, n), the number of searches, and what is wrong with it."""
+class ModeSegment:
+    """Part of a path in one mode: its points (N, n), and the pairs of bodies that may touch on it."""
 
-    segments: list[tuple[Mode, Array]]
+    mode: Mode
+    points: Array
+    touching: BodyPairs
+
+
+@dataclass(frozen=True, slots=True)
+class ModePath:
+    """Path through modes: its segments, the number of searches, and what is wrong with it."""
+
+    segments: list[ModeSegment]
     iterations: int
     problem: str = ""
 
@@ -72,12 +83,14 @@ class _Node:
     q: Array
     parent: _Node | None
     points: Array
+    touching: BodyPairs = frozenset()
     depth: int = 0
 
-    def segments(self, modes: Sequence[Mode]) -> list[tuple[Mode, Array]]:
+    def segments(self, modes: Sequence[Mode]) -> list[ModeSegment]:
         if self.parent is None:
             return []
-        return [*self.parent.segments(modes), (modes[self.parent.mode], self.points)]
+        own = ModeSegment(modes[self.parent.mode], self.points, self.touching)
+        return [*self.parent.segments(modes), own]
 
 
 class ModeSearch:
@@ -155,10 +168,9 @@ class ModeSearch:
             k += 1
             if node.depth > _DEPTH * (self._round + 1):
                 continue
-            points = self._reach_goal(node)
-            if points is not None:
-                segments = [*node.segments(self._modes), (self._modes[node.mode], points)]
-                return ModePath(segments, self._searches)
+            last = self._reach_goal(node)
+            if last is not None:
+                return ModePath([*node.segments(self._modes), last], self._searches)
             for other in range(len(self._modes)):
                 if other == node.mode or self._left() <= 0.0 or self._exclude(node.mode, other):
                     continue
@@ -216,15 +228,19 @@ class ModeSearch:
         touching = self._touching_around(node) | self._touching[other]
         ends = self._solve(holds, values, touching, self._objects) if holds else values[None]
         points = self._connect(node, ends, touching)
-        return None if points is None else _Node(other, np.asarray(points[-1]), node, points, node.depth + 1)
+        return (
+            None
+            if points is None
+            else _Node(other, np.asarray(points[-1]), node, points, touching, node.depth + 1)
+        )
 
-    def _touching_around(self, node: _Node) -> frozenset[frozenset[str]]:
+    def _touching_around(self, node: _Node) -> BodyPairs:
         """Return the pairs that may touch in a node's mode and where it was entered."""
-        before = frozenset[frozenset[str]]() if node.parent is None else self._touching[node.parent.mode]
+        before = _NO_PAIRS if node.parent is None else self._touching[node.parent.mode]
         return before | self._touching[node.mode]
 
-    def _reach_goal(self, node: _Node) -> Array | None:
-        """Return the points (N, n) of a way to the goal within the mode of a node; None if there is none."""
+    def _reach_goal(self, node: _Node) -> ModeSegment | None:
+        """Return a way to the goal within the mode of a node; None if there is none."""
         still, mode = self._still[node.mode], self._modes[node.mode]
         touching = self._touching_around(node) | self._planner._touching(self._tasks)
         if self._ends is not None:
@@ -235,7 +251,8 @@ class ModeSearch:
             return None
         else:
             ends = self._solve((*mode.along, *self._tasks), node.q, touching, still)
-        return self._connect(node, ends, touching)
+        points = self._connect(node, ends, touching)
+        return None if points is None else ModeSegment(mode, points, touching)
 
     def _concerns_still(self, node: _Node) -> bool:
         """Return True if a task is about objects that stand still in the mode, and is not met."""
@@ -254,7 +271,7 @@ class ModeSearch:
         self,
         holds: Sequence[Hold],
         near: Array,
-        touching: frozenset[frozenset[str]],
+        touching: BodyPairs,
         still: npt.NDArray[np.bool_],
     ) -> Array:
         self._searches += 1
@@ -263,7 +280,7 @@ class ModeSearch:
             holds, near, _CANDIDATES, max(self._left(), 0.0), seed, touching, still, batches
         )
 
-    def _connect(self, node: _Node, ends: Array, touching: frozenset[frozenset[str]]) -> Array | None:
+    def _connect(self, node: _Node, ends: Array, touching: BodyPairs) -> Array | None:
         if not len(ends):
             return None
         self._searches += 1

@@ -16,8 +16,14 @@ from kineverse.state import State
 from kineverse.symbols import Symbol
 
 from .path_checks import PathChecks
-from .path_rounding import parameterize_path, passing_times
-from .trajectories import BlendedPath, MotionLimits, Trajectory, motion_limits
+from .path_rounding import (
+    PathSection,
+    TimedSection,
+    join_sections,
+    parameterize_sections,
+    section_times,
+)
+from .trajectories import MotionLimits, Trajectory, motion_limits
 from .trajectories.motion_limits import RAMP
 
 DEVIATION = 0.1
@@ -47,8 +53,12 @@ class Path:
         Number of samples of the search.
     state
         State in which everything else stands.
+    checks
+        Checks of configurations.
     modes
         Of a path through modes, the name of each with the indices of its first and last point.
+    sections
+        Parts with checks of their own, at whose ends the trajectory rests; empty for a path that is one part.
     """
 
     found: bool
@@ -61,6 +71,7 @@ class Path:
     state: State
     checks: PathChecks = field(repr=False)
     modes: tuple[tuple[str, int, int], ...] = ()
+    sections: tuple[PathSection, ...] = field(default=(), repr=False)
 
     @property
     def length(self) -> float:
@@ -110,7 +121,7 @@ class Path:
         ShapeError
             For limits or deviations of another shape.
         """
-        return self._parameterize(deviation, ramp, velocity, acceleration)[1]
+        return join_sections(self._parameterize(deviation, ramp, velocity, acceleration))
 
     @property
     def times(self) -> Array:
@@ -125,7 +136,7 @@ class Path:
 
     @cached_property
     def _times(self) -> Array:
-        found = passing_times(self.points, *self._parameterize(DEVIATION, RAMP, None, None))
+        found = section_times(self.points, self._parameterize(DEVIATION, RAMP, None, None))
         found.flags.writeable = False
         return found
 
@@ -135,7 +146,7 @@ class Path:
         ramp: float,
         velocity: npt.ArrayLike | None,
         acceleration: npt.ArrayLike | None,
-    ) -> tuple[BlendedPath, Trajectory]:
+    ) -> list[TimedSection]:
         if not self.found:
             raise InvalidValueError(f"There is no path to move along. {self.why}")
         self.checks.ensure_current()
@@ -147,7 +158,8 @@ class Path:
                 for own, other in zip(stated, given, strict=True)
             )
         )
-        return parameterize_path(self.points, self.symbols, limits, deviation, self.checks)
+        sections = self.sections or (PathSection(0, len(self.points) - 1, self.checks),)
+        return parameterize_sections(self.points, self.symbols, limits, deviation, sections)
 
     def save(self, path: str | os.PathLike[str]) -> None:
         """Write the :meth:`trajectory` to a JSON file, see :meth:`.Trajectory.save`.

@@ -20,6 +20,8 @@ if TYPE_CHECKING:
     from .judge import SceneJudge
     from .manifold import Manifold
 
+_ROUNDING = 1e-6
+
 
 class PathChecks:
     """Checks of configurations in the surroundings of a path, wherever the planner has placed things since.
@@ -82,7 +84,7 @@ class PathChecks:
         if self._manifold is not None and self._targets is not None:
             self._manifold.place(self.state, self._targets)
         narrow = points.astype(np.float32)
-        checker.lower[:], checker.upper[:] = narrow.min(axis=0), narrow.max(axis=0)
+        checker.lower[:], checker.upper[:] = narrow.min(axis=0) - _ROUNDING, narrow.max(axis=0) + _ROUNDING
         try:
             with checker.excepting(self._touching):
                 yield

@@ -4,10 +4,13 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
+from functools import reduce
+from typing import NamedTuple
 
 import numpy as np
 import numpy.typing as npt
 
+from kineverse.errors import ShapeError
 from kineverse.lie import Array
 from kineverse.symbols import Symbol
 
@@ -24,6 +27,68 @@ _SAME = 1e-5
 _ROUNDS, _LAST_ROUNDS = 8, 4
 _STEP = 0.02
 """Largest distance of samples of a trajectory [rad], [m]."""
+
+
+class PathSection(NamedTuple):
+    """Part of a path with holds of its own, from one of its points to another; the motion rests at both.
+
+    Attributes
+    ----------
+    first, last
+        Indices of the points.
+    checks
+        Checks of configurations between them.
+    """
+
+    first: int
+    last: int
+    checks: PathChecks
+
+
+class TimedSection(NamedTuple):
+    """Section of a path with its rounded polyline and the motion along it."""
+
+    section: PathSection
+    path: BlendedPath
+    trajectory: Trajectory
+
+
+def parameterize_sections(
+    points: Array,
+    symbols: Sequence[Symbol],
+    limits: MotionLimits,
+    deviation: npt.ArrayLike,
+    sections: Sequence[PathSection],
+) -> list[TimedSection]:
+    """Return the motions along the sections of a path (N, n), see :func:`parameterize_path`."""
+    given = np.asarray(deviation, dtype=float)
+    if given.shape not in ((), (len(points),)):
+        raise ShapeError(
+            f"deviation= is a number or an array of one for each of the {len(points)} points, not of shape "
+            f"{given.shape}."
+        )
+    found = []
+    for section in sections:
+        part = slice(section.first, section.last + 1)
+        allowed = given if given.ndim == 0 else given[part]
+        found.append(
+            TimedSection(section, *parameterize_path(points[part], symbols, limits, allowed, section.checks))
+        )
+    return found
+
+
+def join_sections(sections: Sequence[TimedSection]) -> Trajectory:
+    """Return the motion along sections one after the other."""
+    return reduce(Trajectory.then, [timed.trajectory for timed in sections])
+
+
+def section_times(points: Array, sections: Sequence[TimedSection]) -> Array:
+    """Return the times (N,) at which a motion along sections is nearest to points of a path (N, n)."""
+    times, begin = np.zeros(len(points)), 0.0
+    for (first, last, _), path, trajectory in sections:
+        times[first : last + 1] = begin + passing_times(points[first : last + 1], path, trajectory)
+        begin += trajectory.duration
+    return times
 
 
 def parameterize_path(
@@ -101,9 +166,12 @@ def _round_valid(points: Array, deviation: npt.ArrayLike, checks: PathChecks) ->
     if len(path.points) < 3:
         return path
     allowed = _deviations(path)
-    # Where the way itself is free by the scene only, nothing vouches for a shortcut.
-    for k in {0, len(path.lengths) - 1}:
-        if checks.find_collision(path.points[k : k + 2]) is not None:
+    # At the ends the way may be free by the scene only: nothing vouches for a shortcut there.
+    edges = range(len(path.lengths))
+    for order in (edges, reversed(edges)):
+        for k in order:
+            if checks.find_collision(path.points[k : k + 2]) is None:
+                break
             allowed[[k, k + 1]] = 0.0
     return round_corners(path.points, allowed)
 

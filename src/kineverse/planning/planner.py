@@ -38,6 +38,7 @@ from .manifold import FrameHold, Manifold, hold_frames, hold_targets, manifold_k
 from .modes import Mode, ModeSearch
 from .path import Path
 from .path_checks import PathChecks
+from .path_rounding import PathSection
 from .roadmap import Roadmap
 from .search import MOST_EDGES
 from .solutions import MOST_BATCHES, find_solutions
@@ -461,18 +462,21 @@ class Planner:
     def _plan_modes(self, search: ModeSearch, q: Array, begin: float) -> Path:
         """Return the path through modes that a search finds."""
         found = search.run(q)
-        parts, modes, first = [q[None]], [], 0
-        for mode, points in found.segments:
-            parts.append(points[1:])
-            modes.append((mode.name, first, first + len(points) - 1))
-            first += len(points) - 1
-        touching = frozenset(pair for mode, _ in found.segments for pair in self._touching(mode.along))
+        parts, modes, sections, first = [q[None]], [], [], 0
+        for segment in found.segments:
+            parts.append(segment.points[1:])
+            last = first + len(segment.points) - 1
+            modes.append((segment.mode.name, first, last))
+            checks = self._checks(segment.touching, self._manifold(segment.mode.along))
+            sections.append(PathSection(first, last, checks))
+            first = last
+        touching = frozenset(pair for segment in found.segments for pair in segment.touching)
         whole = np.vstack(parts)
         why = found.problem or f"Found through {len(modes)} modes, after {found.iterations} searches."
         path = self._path(
             not found.problem, whole, why, begin, perf_counter() - begin, found.iterations, touching
         )
-        return replace(path, modes=tuple(modes))
+        return replace(path, modes=tuple(modes), sections=tuple(sections))
 
     def _between(
         self,
@@ -621,11 +625,14 @@ class Planner:
         touching: BodyPairs = frozenset(),
         manifold: Manifold | None = None,
     ) -> Path:
+        checks, seconds = self._checks(touching, manifold), perf_counter() - begin
+        return Path(found, self.space.symbols, points, why, seconds, spent, iterations, checks.state, checks)
+
+    def _checks(self, touching: BodyPairs, manifold: Manifold | None) -> PathChecks:
+        """Return the checks of a path at the present place."""
         state, judge = self._state, self._judge(touching)
         assert state is not None
-        checks = PathChecks(self.model, state, self.checker, judge, manifold, touching, self._replace)
-        seconds = perf_counter() - begin
-        return Path(found, self.space.symbols, points, why, seconds, spent, iterations, state, checks)
+        return PathChecks(self.model, state, self.checker, judge, manifold, touching, self._replace)
 
     def __repr__(self) -> str:
         return f"<Planner: {len(self.symbols)} coordinates, {len(self.checker.moving)} bodies that move>"
