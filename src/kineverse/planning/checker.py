@@ -227,7 +227,10 @@ class CollisionChecker:
     def place(self, state: State) -> None:
         """Place everything as at a state: obstacles, and what the poses depend on beside the coordinates."""
         self.scene.update(state)
-        poses, parameters = self.scene.collision_world.table.poses[self._static], state.vector(self.parameters)
+        poses, parameters = (
+            self.scene.collision_world.table.poses[self._static],
+            state.vector(self.parameters),
+        )
         self._world.place(poses)
         self._kept = self.program.prepare(parameters)
         self.struct.kept = self._kept.ctypes.data
@@ -237,9 +240,9 @@ class CollisionChecker:
 
     @property
     def version(self) -> tuple[int, frozenset[frozenset[str]]]:
-        """The place of everything and the pairs that are left out: a validity holds, at one margin, until it changes.
+        """Number of the placement, and the pairs that are left out.
 
-        Numbers of places differ between checkers too. Limits are apart.
+        While it stays, and the margin and the limits, so do the answers. Other checkers have other numbers.
         """
         return self._placed, self._excepted
 

@@ -70,6 +70,11 @@ class Planner:
     protrusion
         Largest distance by which spheres stick out of the shape that they cover [m]; None for what suits the shape.
 
+    Attributes
+    ----------
+    roadmap
+        Roadmap of the calls of :meth:`plan` with ``method="prm"``; None before the first one.
+
     Raises
     ------
     CompileError
@@ -105,7 +110,7 @@ class Planner:
         """Build everything for the present version of the model."""
         if self._version == self.model.version:
             return
-        model, symbols = self.model, None if self._version is None else self.space.symbols
+        model = self.model
         self.space = space = PlanningSpace(model, self._move)
         scene = Scene(model, rules=self._rules, **self._options)
         self.excluded = self._find_overlapping(scene)
@@ -116,7 +121,7 @@ class Planner:
         space.turning &= self.checker.find_periodic(space.turning)
         self._manifolds: dict[tuple[Hold, ...], Manifold] = {}
         self._judges: dict[frozenset[frozenset[str]], SceneJudge] = {}
-        if symbols != space.symbols or (self.roadmap and (self.roadmap.turning != space.turning).any()):
+        if self.roadmap is not None and not self.roadmap.suits(space.symbols, space.turning):
             self.roadmap = None
         self._version = model.version
         self._place(model.default_state() if self._state is None else model.default_state() | self._state)
@@ -320,8 +325,8 @@ class Planner:
         seed
             Seed of the search: the same one leads to the same path on one machine, unless the time is up.
         method
-            ``"rrt-connect"`` grows new trees for each call; ``"prm"`` keeps a :class:`.Roadmap`, the attribute
-            ``roadmap``, so that its paths also depend on the calls before. It does not do holds along the path.
+            ``"rrt-connect"`` grows new trees for each call. ``"prm"`` keeps a :class:`.Roadmap` between
+            calls, so that its paths depend on the calls before as well; it has no holds along the path.
 
         Raises
         ------
@@ -406,7 +411,7 @@ class Planner:
 
     def _require_roadmap(self) -> Roadmap:
         if self.roadmap is None:
-            self.roadmap = Roadmap(self.space.turning)
+            self.roadmap = Roadmap(self.space.symbols, self.space.turning)
         return self.roadmap
 
     def _judge(self, touching: frozenset[frozenset[str]] = frozenset()) -> SceneJudge:
