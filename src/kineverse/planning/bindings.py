@@ -94,9 +94,10 @@ class RoadmapStruct(ctypes.Structure):
 
     _fields_ = _fields(
         "pddddiiiipppppppppppppiiiiiiiiiiidd",
-        "checker resolution least greed seconds seed degree room first_batch period columns lengths targets incoming next "
-        "node edge passing visits_start visits_goal order_start order_goal count ends drawn round query "
-        "samples nodes_checked edges_checked reached_start reached_goal status elapsed gap",
+        "checker resolution least greed seconds seed degree room least_batch period columns lengths "
+        "targets incoming next node edge passing visits_start visits_goal order_start order_goal count "
+        "ends drawn round query samples nodes_checked edges_checked reached_start reached_goal status "
+        "elapsed gap",
     )
 
 

@@ -258,9 +258,9 @@ class CollisionChecker:
 
     @property
     def version(self) -> tuple[int, frozenset[frozenset[str]]]:
-        """The place of everything and the pairs that are left out: a validity holds, at one margin, until it changes.
+        """Number of the placement, and the pairs that are left out.
 
-        Numbers of places differ between checkers too. Limits are apart.
+        While it stays, and the margin and the limits, so do the answers. Other checkers have other numbers.
         """
         return self._placed, self._excepted
 

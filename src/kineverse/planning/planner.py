@@ -88,6 +88,11 @@ class Planner:
     protrusion
         Largest distance by which spheres stick out of the shape that they cover [m]; None for what suits the shape.
 
+    Attributes
+    ----------
+    roadmap
+        Roadmap of the calls of :meth:`plan` with ``method="prm"``; None before the first one.
+
     Raises
     ------
     CompileError
@@ -118,7 +123,6 @@ class Planner:
         self._version: int | None = None
         self._state: State | None = None
         self.roadmap: Roadmap | None = None
-        self._roadmap_symbols: tuple[Symbol, ...] = ()
         self._synchronize()
 
     def _synchronize(self) -> None:
@@ -426,8 +430,8 @@ class Planner:
         seed
             Seed of the search: the same one leads to the same path on one machine, unless the time is up.
         method
-            ``"rrt-connect"`` grows new trees for each call; ``"prm"`` keeps a :class:`.Roadmap`, the attribute
-            ``roadmap``, so that its paths also depend on the calls before. It does not do holds along the path.
+            ``"rrt-connect"`` grows new trees for each call. ``"prm"`` keeps a :class:`.Roadmap` between
+            calls, so that its paths depend on the calls before as well; it has no holds along the path.
 
         Raises
         ------
@@ -543,10 +547,9 @@ class Planner:
             raise InvalidValueError(
                 f"method='prm' plans in the whole space and cannot keep {reason}; use method='rrt-connect'."
             )
-        turning = self.space.turning
-        same = self._roadmap_symbols == self.space.symbols
-        if self.roadmap is None or not same or (self.roadmap.turning != turning).any():
-            self.roadmap, self._roadmap_symbols = Roadmap(turning.copy()), self.space.symbols
+        symbols, turning = self.space.symbols, self.space.turning
+        if self.roadmap is None or not self.roadmap.suits(symbols, turning):
+            self.roadmap = Roadmap(symbols, turning)
         return self.roadmap
 
     def _connect(

@@ -23,7 +23,7 @@ typedef struct {
 typedef struct {
   const Checker *checker;
   double resolution, least, greed, seconds; /* least: growth of spheres, see edge_is_certain */
-  long long seed, degree, room, first_batch;
+  long long seed, degree, room, least_batch;
   const float *period; /* infinite for a coordinate on a line */
   float *columns, *lengths; /* lengths of edges, (room, degree) */
   int *targets;             /* of edges, (room, degree) */
@@ -239,8 +239,9 @@ static int check_way(Query *s, const float *a, const float *b, int certain) {
   float to[MOST_COORDINATES], where;
   for (int i = 0; i < r->checker->coordinates; i++) to[i] = unwind(b[i], a[i], r->period[i]);
   r->edges_checked++;
-  if (certain && edge_is_certain(r->checker, &s->w, a, to, (float)r->resolution, (float)r->least, &where)) return CERTAIN;
-  return !certain && edge_is_free(r->checker, &s->w, a, to, (float)r->resolution) ? FREE : BLOCKED;
+  const float resolution = (float)r->resolution;
+  if (certain) return edge_is_certain(r->checker, &s->w, a, to, resolution, (float)r->least, &where) ? CERTAIN : BLOCKED;
+  return edge_is_free(r->checker, &s->w, a, to, resolution) ? FREE : BLOCKED;
 }
 
 static int edge_is_usable(Query *s, long long e, int certain) {
@@ -443,7 +444,7 @@ static long long straight_way(Query *s, const float *starts, long long start_cou
     for (long long j = 1; j < goal_count; j++)
       if (distance_around(s->r, starts + i * n, goals + j * n) < distance_around(s->r, starts + i * n, goal))
         goal = goals + j * n;
-    if (check_way(s, starts + i * n, goal, 0) == BLOCKED || check_way(s, starts + i * n, goal, 1) == BLOCKED) continue;
+    if (check_way(s, starts + i * n, goal, 0) == BLOCKED) continue;
     memcpy(path, starts + i * n, n * sizeof(float));
     memcpy(path + n, goal, n * sizeof(float));
     return 2;
@@ -473,7 +474,9 @@ static long long search_roadmap(Query *s, float *path, long long room) {
     r->status = TIME_IS_UP;
     if (now() - s->begin > until) break;
     if (outcome) continue;
-    const long long batch = r->count / 4 > r->first_batch ? r->count / 4 : r->first_batch;
+    /* A round costs as much as the smaller side is large, and so may nodes. */
+    const long long smaller_side = s->reached[0] < s->reached[1] ? s->reached[0] : s->reached[1];
+    const long long batch = smaller_side / 2 > r->least_batch ? smaller_side / 2 : r->least_batch;
     if (grow(s, batch, until)) continue;
     /* Blocked nodes and ends of other queries give way to new nodes, once. */
     const long long before = r->count;
