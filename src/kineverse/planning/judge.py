@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+import math
+from collections.abc import Iterator, Sequence
 
 import numpy as np
 
@@ -87,14 +88,21 @@ class SceneJudge:
             found = self.contacts(q)
             if len(found):
                 return q, found[0]
-        if not np.ptp(points[:, self._concerned], axis=0).any():
-            return None
-        for q in densify(points, min(step, _UNCOVERED)):
+        for q in self._concerning(points, min(step, _UNCOVERED)):
             self._update(q)
             found = self._uncovered()
             if len(found):
                 return q, found[0]
         return None
+
+    def _concerning(self, points: Array, step: float) -> Iterator[Array]:
+        """Yield samples of a polyline (N, n) at a step of the coordinates that pairs without spheres depend on."""
+        if len(points) > 1:
+            lengths = np.linalg.norm(np.diff(points[:, self._concerned], axis=0), axis=1)
+            for a, b, length in zip(points[:-1], points[1:], lengths.tolist(), strict=True):
+                count = math.ceil(length / step)
+                for k in range(1, count + 1):
+                    yield a + (k / count) * (b - a)
 
     def clearance(self, points: Array, step: float, radius: float = 0.5) -> float:
         """Return the least distance of a pair at samples of a polyline [m]; infinite beyond a radius."""
