@@ -193,3 +193,16 @@ def test_full_turn_of_a_screw_is_not_the_same():
     assert planner.plan([0.0], [7.0]).points[-1, 0] == pytest.approx(7.0 - 2 * np.pi)
     planner.place({"pitch": 0.01})
     assert planner.plan([0.0], [7.0]).points[-1, 0] == 7.0
+
+
+def test_way_to_a_grasp_goes_around_what_is_grasped():
+    x, y = kv.position("x"), kv.position("y")
+    model = kv.Model()
+    with model.edit() as edit:
+        edit.add_frame("hand", "world", kv.translation(x, y, 0), body(Sphere(0.05)))
+        edit.add_frame("block", "world", kv.translation(1, 0, 0), body(Box((0.5, 2.0, 1.0))))
+    planner = Planner(model)
+    # Behind the block, 1 cm from it.
+    path = planner.plan([0, 0], [planner.hold("hand", "block", "xyz", kv.translation(0.31, 0, 0))])
+    assert path, path.why
+    assert is_free(planner, path.points)

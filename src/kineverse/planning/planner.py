@@ -353,7 +353,24 @@ class Planner:
         ends = np.array([self.space.equivalents(end, q, most=1)[0] for end in ends])
         self._set_bounds(q, ends)
         manifold = self._manifold(holds)
-        touching = self._touching([*holds, *tasks])
+        # What a goal lets touch may not touch on the way, unless there is no other one.
+        for touching in dict.fromkeys((self._touching(holds), self._touching([*holds, *tasks]))):
+            path = self._plan_between(q, ends, manifold, touching, seconds, seed, begin)
+            if path.found:
+                break
+        return path
+
+    def _plan_between(
+        self,
+        q: Array,
+        ends: Array,
+        manifold: Manifold | None,
+        touching: frozenset[frozenset[str]],
+        seconds: float,
+        seed: int,
+        begin: float,
+    ) -> Path:
+        """Return a path from a configuration (n,) to one of some (K, n) on which some pairs may touch."""
         with self.checker.excepting(touching):
             endpoints = Endpoints(self.space, self.checker, self._judge(touching), manifold)
             first = endpoints.check("The start", q)
