@@ -122,9 +122,9 @@ class SceneJudge:
         """Return the least distance of a pair at samples of a polyline [m]; infinite beyond a radius."""
         least = np.inf
         for q in densify(points, step):
-            found = self.contacts(q, min(radius, least))
+            found = self.contacts(q, min(radius, max(least, 0.0)))
             if len(found):
-                least = float(found.distances[0])
+                least = min(least, float(found.distances[0]))
         return float(least)
 
 

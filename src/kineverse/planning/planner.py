@@ -461,7 +461,12 @@ class Planner:
             ends = self._configurations(goals, "goals")
             if not len(ends):
                 raise ShapeError("There is no goal: goals has no rows.")
-        return self._between(q, ends, holds, touching, seconds, seed, roadmap=roadmap)
+        # What a goal lets touch does not touch on the way, unless there is no other one.
+        for allowed in dict.fromkeys((self._touching(holds), touching)):
+            path = self._between(q, ends, holds, allowed, seconds, seed, roadmap=roadmap)
+            if path.found:
+                break
+        return path
 
     def _plan_modes(self, search: ModeSearch, q: Array, begin: float) -> Path:
         """Return the path through modes that a search finds."""

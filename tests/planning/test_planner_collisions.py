@@ -1,0 +1,166 @@
+"""Collision checks of a planner against the collision scene, which computes in double precision."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+import trimesh
+from planning_models import arm_among_shapes, ball_and_plate, body, contacts, is_free
+
+import kineverse as kv
+from kineverse.geometry import Scene
+from kineverse.model.body import Box, Mesh, Sphere
+from kineverse.planning import Planner
+
+pytestmark = pytest.mark.compiler
+
+
+@pytest.fixture(scope="module")
+def arm(tmp_path_factory):
+    folder = tmp_path_factory.mktemp("meshes")
+    points = np.random.default_rng(0).normal(size=(30, 3)) * 0.08
+    trimesh.Trimesh(points).convex_hull.export(folder / "hull.stl")
+    model = arm_among_shapes(Mesh("hull.stl", folder=str(folder)))
+    return Planner(model, "j*")
+
+
+@pytest.fixture(scope="module")
+def plate():
+    return Planner(ball_and_plate())
+
+
+def configurations(planner, count, seed=0):
+    return np.random.default_rng(seed).uniform(-2.5, 2.5, (count, len(planner.symbols)))
+
+
+@pytest.mark.parametrize(("base", "tolerance"), [(0.0, 2e-6), (1000.0, 1e-3)])
+def test_valid_is_true_only_without_contact_and_false_only_near_one(arm, base, tolerance):
+    arm.place({"base": base, "cart": 0.6})
+    Q = configurations(arm, 500, seed=int(base))
+    found, distances = arm.valid(Q), contacts(arm, Q)
+    assert 0.2 < found.mean() < 0.95
+    assert distances[found].min() > -1e-6
+    # Spheres stick out of both bodies; of polytopes around round shapes by a part of their size.
+    assert distances[~found].max() <= 0.06 + tolerance
+    np.testing.assert_array_equal(found, [arm.valid(q)[0] for q in Q])
+
+
+def test_margin_keeps_bodies_apart(plate):
+    wide = Planner(plate.model, margin=0.05)
+    Q = np.random.default_rng(0).uniform(-0.2, 0.2, (300, 3))
+    found, distances = wide.valid(Q), contacts(wide, Q)
+    assert distances[found].min() > 0.05 - 1e-5
+    assert distances[~found].max() < 0.07
+
+
+def test_place_moves_obstacles_without_compiling(arm, monkeypatch):
+    monkeypatch.setattr("subprocess.Popen", None)
+    monkeypatch.setattr("subprocess.run", None)
+    arm.place({"base": 0.0, "cart": 0.6})
+    Q = configurations(arm, 200)
+    q = Q[arm.valid(Q)][0]
+    assert arm.valid(q)[0] and (contacts(arm, q[None]) > 0).all()
+    arm.place({"cart": 0.0})
+    assert not arm.valid(q)[0] and (contacts(arm, q[None]) <= 0).all()
+    arm.place({"cart": 0.6})
+    assert arm.valid(q)[0]
+
+
+def test_poses_are_those_of_the_model(arm):
+    arm.place({"base": 0.3, "cart": 0.6})
+    for q in configurations(arm, 20).astype(np.float32):
+        poses, _ = arm.checker.outputs(q)
+        state = arm._state.updated(dict(zip(arm.symbols, q.astype(float).tolist(), strict=True)))
+        for name, pose in zip(arm.checker.groups, poses, strict=True):
+            np.testing.assert_allclose(pose, arm.model.fk(name)(state)[:3], atol=1e-6)
+
+
+def test_path_of_an_arm_is_free_by_the_scene_and_the_same_for_one_seed(arm):
+    arm.place({"base": 0.0, "cart": 0.6})
+    Q = configurations(arm, 400, seed=5) / 2.5
+    free = Q[arm.valid(Q)]
+    paths = [arm.plan(free[2 * k], free[2 * k + 1], seed=k, seconds=0.2) for k in range(8)]
+    found = [k for k, path in enumerate(paths) if path]
+    # Some goals are enclosed.
+    assert len(found) >= 4
+    for k in found:
+        assert is_free(arm, paths[k].points)
+        np.testing.assert_array_equal(paths[k].points[[0, -1]], free[2 * k : 2 * k + 2])
+        again = arm.plan(free[2 * k], free[2 * k + 1], seed=k, seconds=5.0)
+        np.testing.assert_array_equal(paths[k].points, again.points)
+
+
+def test_pair_that_touches_at_the_default_place_only_is_checked_elsewhere():
+    x, turn = kv.position("x"), kv.position("turn")
+    model = kv.Model()
+    with model.edit() as edit:
+        edit.add_frame("base", "world", kv.translation(x, 0, 0), body(Box((0.3, 0.3, 0.1))))
+        edit.add_frame("arm", "base", kv.rotation_z(turn), body(Box((0.2, 0.2, 0.1))))
+        edit.add_frame("cupboard", "world", np.eye(4), body(Box((1, 1, 1))))
+    planner = Planner(model, "turn")
+    assert not planner.excluded
+    planner.place({"x": 0.55})
+    assert not planner.valid([[0.0]])[0]
+    planner.place({"x": 0.8})
+    assert planner.valid([[0.0]])[0]
+
+
+def test_certificate_finds_a_plate_between_two_samples(plate):
+    rng = np.random.default_rng(0)
+    A, B = rng.uniform(0.02, 0.5, (2, 100, 3)).astype(np.float32)
+    B[:, 0] *= -1
+    A[:, 2], B[:, 2] = 0.0, 0.0
+    column = [str(s) for s in plate.symbols].index("x")
+    order = [column, *(k for k in range(3) if k != column)]
+    A, B = (np.ascontiguousarray(m[:, np.argsort(order)]) for m in (A, B))
+    turn = [str(s) for s in plate.symbols].index("turn")
+    A[:, turn] = B[:, turn] = 0.0
+    assert not plate.checker.edges(A, B, least=2e-4).any()
+    for a, b in zip(A, B, strict=True):
+        collision = plate.checker.find_collision(np.array([a, b]))
+        assert collision is not None and collision[0] == 0
+        at = a + collision[1] * (b - a)
+        assert abs(at[column]) < 0.05
+
+
+def test_no_path_crosses_a_plate(plate):
+    for k in range(3):
+        start, goal = {"x": 0.1, "y": 0.3 * k, "turn": 0.0}, {"x": -0.1, "y": 0.2, "turn": 0.0}
+        path = plate.plan(start, goal, seed=k, seconds=3.0)
+        assert path, path.why
+        assert is_free(plate, path.points, 1000.0)
+
+
+@pytest.mark.parametrize("goal", [10.0, 3.0, -2.0, 315.0, 2 * np.pi + 1, 1000.0])
+def test_turning_joint_goes_the_short_way(plate, goal):
+    q = plate.model.default_state().updated({"x": 0.5})
+    path = plate.plan(q, q.updated({"turn": goal}), seconds=3.0)
+    assert path, path.why
+    column = [str(s) for s in plate.symbols].index("turn")
+    turned = path.points[-1, column]
+    assert np.cos(turned - goal) == pytest.approx(1.0)
+    assert is_free(plate, path.points)
+    # The post is at -π + 0.2, and the way around it is the other one.
+    assert abs(turned) <= np.pi + 0.3
+
+
+def test_goal_behind_full_turns_is_checked_where_it_is(plate):
+    q = plate.model.default_state().updated({"x": 0.5})
+    for turns in (0, 2, -3):
+        path = plate.plan(q, q.updated({"turn": 0.2 - np.pi + 2 * np.pi * turns}))
+        assert not path and "'arm' and 'post'" in path.why
+
+
+def test_edits_of_the_model_are_followed():
+    x = kv.position("x")
+    model = kv.Model()
+    with model.edit() as edit:
+        edit.add_frame("hand", "world", kv.translation(x, 0, 0), body(Sphere(0.05)))
+        edit.add_frame("post", "world", kv.translation(0.5, 0.3, 0), body(Sphere(0.05)))
+    planner = Planner(model)
+    assert planner.valid([[0.5], [1.0]]).tolist() == [True, True]
+    with model.edit() as edit:
+        edit.add_frame("cup", "hand", kv.translation(0, 0.2, 0), body(Sphere(0.06)))
+        edit.add_frame("box", "world", kv.translation(1.0, 0, 0), body(Box((0.1, 0.1, 0.1))))
+    assert planner.valid([[0.5], [1.0], [-1.0]]).tolist() == [False, False, True]
+    assert Scene(model).bodies == planner.scene.bodies

@@ -1,0 +1,171 @@
+"""Wrong input of planners, sizes at their bounds, threads."""
+
+from __future__ import annotations
+
+from concurrent.futures import ThreadPoolExecutor
+
+import numpy as np
+import pytest
+from planning_models import body
+
+import kineverse as kv
+from kineverse.errors import CompileError, InvalidValueError, KineverseError, ShapeError, UnknownNameError
+from kineverse.model.body import Box, Sphere
+from kineverse.planning import Planner, bindings
+from kineverse.planning.checker import CollisionChecker
+from kineverse.planning.search import RrtConnect
+import itertools
+
+pytestmark = pytest.mark.compiler
+
+
+def points(count: int, obstacles: int = 0) -> kv.Model:
+    """Return a ball that many coordinates move in turn along the three axes, among boxes."""
+    q = [kv.position(f"q{k:02}") for k in range(count)]
+    model = kv.Model()
+    with model.edit() as edit:
+        place = kv.translation(*(sum(q[axis::3], kv.expressions.as_expression(0.0)) for axis in range(3)))
+        edit.add_frame("ball", "world", place, body(Sphere(0.05)))
+        for k in range(obstacles):
+            at = (k % 20 - 10.0, k // 20 - 10.3, 0.0)
+            edit.add_frame(f"box{k}", "world", kv.translation(*at), body(Box((0.2, 0.2, 0.2))))
+    return model
+
+
+@pytest.fixture(scope="module")
+def ball():
+    return Planner(points(2))
+
+
+def test_nothing_around_is_no_obstacle(ball):
+    assert ball.valid([[0, 0], [1, 1]]).all() and ball.edges([[0, 0]], [[1, 1]]).all()
+    assert ball.valid(np.zeros((0, 2))).shape == ball.edges(np.zeros((0, 2)), np.zeros((0, 2))).shape == (0,)
+    assert ball.plan([0, 0], [0, 0]).length == 0.0
+    assert ball.plan([0, 0], np.random.default_rng(0).uniform(-5, 5, (500, 2)))
+    assert np.isinf(ball.plan([0, 0], [1, 1]).clearance())
+
+
+@pytest.mark.parametrize(
+    ("given", "error"),
+    [
+        ([[np.nan, 0]], InvalidValueError),
+        ([[np.inf, 0]], InvalidValueError),
+        ([[1e30, 0]], InvalidValueError),
+        ("abc", InvalidValueError),
+        ([[1, 2, 3]], ShapeError),
+        (np.zeros((2, 2, 2)), ShapeError),
+        ({"nothing": 1.0}, UnknownNameError),
+    ],
+)
+def test_wrong_configurations_are_refused(ball, given, error):
+    for call in (
+        ball.valid,
+        lambda Q: ball.edges(Q, Q),
+        lambda Q: ball.plan(Q, [0, 0]),
+        lambda Q: ball.plan([0, 0], Q),
+    ):
+        with pytest.raises(error):
+            call(given)
+
+
+def test_wrong_arguments_are_refused(ball):
+    for wrong in (
+        {"margin": -1},
+        {"margin": np.nan},
+        {"protrusion": 0.0},
+        {"move": []},
+        {"move": "nothing*"},
+    ):
+        with pytest.raises(KineverseError):
+            Planner(ball.model, **wrong)
+    for goals in ([], np.zeros((0, 2))):
+        with pytest.raises(ShapeError):
+            ball.plan([0, 0], goals)
+    for mask in ("", "xx", "xq", "rx rx"):
+        with pytest.raises(InvalidValueError, match="mask="):
+            ball.hold("ball", "world", mask)
+    with pytest.raises(UnknownNameError):
+        ball.hold("ball", "nothing")
+    with pytest.raises(InvalidValueError, match="no goal"):
+        ball.solutions([])
+    with pytest.raises(InvalidValueError, match="seconds="):
+        ball.solutions(kv.control.Hold(ball.symbols[0], 0.5), seconds=float("nan"))
+    with pytest.raises(UnknownNameError):
+        ball.place({"nothing": 1.0})
+    with pytest.raises(ShapeError, match="differ"):
+        ball.edges(np.zeros((2, 2)), np.zeros((3, 2)))
+
+
+def test_rolling_base_is_not_moved():
+    model = kv.Model()
+    with model.edit() as edit:
+        edit.apply(
+            kv.articulations.DifferentialDrive(
+                name="base", parent="world", child="base", radius=0.1, track=0.4
+            )
+        )
+        edit.add_frame("box", "base", np.eye(4), body(Box((0.2, 0.2, 0.2))))
+        edit.add_frame("head", "base", kv.rotation_z(kv.position("neck")), body(Sphere(0.1)))
+    assert [str(s) for s in Planner(model).symbols] == ["neck"]
+    with pytest.raises(InvalidValueError, match="cannot move independently"):
+        Planner(model, "base")
+
+
+def test_64_coordinates_are_planned_and_65_refused():
+    planner = Planner(points(64))
+    path = planner.plan(np.zeros(64), np.full(64, 0.2))
+    assert path, path.why
+    with pytest.raises(InvalidValueError, match="65 coordinates"):
+        Planner(points(65))
+
+
+def test_many_obstacles_are_all_seen():
+    planner = Planner(points(2, 400))
+    rng = np.random.default_rng(0)
+    Q = rng.uniform(-12, 12, (3000, 2))
+    column = [str(s) for s in planner.symbols].index("q00")
+    x, y = Q[:, column], Q[:, 1 - column]
+    nearest = np.clip(np.round(x), -10, 9), np.clip(np.round(y + 0.3), -10, 9) - 0.3
+    gap = np.hypot(np.maximum(abs(x - nearest[0]) - 0.1, 0), np.maximum(abs(y - nearest[1]) - 0.1, 0))
+    np.testing.assert_array_equal(planner.valid(Q), gap > 0.05)
+
+
+def test_path_longer_than_its_room_is_an_answer(ball, monkeypatch):
+    monkeypatch.setattr("kineverse.planning.search._ROOM", 3)
+    ball.place({"q00": 0.0, "q01": 0.0})
+    path = ball.plan([0, 0], [40, 0])
+    assert not path and path.why
+
+
+def test_search_from_several_starts_is_the_same_each_time(ball):
+    checker: CollisionChecker = ball.checker
+    starts = np.array([[0, 0], [5, 5], [9, 9]], dtype=np.float32)
+    goals = np.array([[5.5, 5.5]], dtype=np.float32)
+    found = [RrtConnect(checker).solve(starts, goals, 1.0, 3) for _ in range(3)]
+    assert all(f.found for f in found)
+    for f in found[1:]:
+        np.testing.assert_array_equal(f.points, found[0].points)
+
+
+def test_planners_in_two_threads_do_not_meet(ball):
+    def work(seed: int) -> list[float]:
+        planner = Planner(points(2, 100))
+        planner.place({"q00": 0.0})
+        rng = np.random.default_rng(seed)
+        Q = rng.uniform(-12, -6, (20, 2))
+        Q = Q[planner.valid(Q)]
+        return [planner.plan(a, b, seed=seed, seconds=5.0).length for a, b in itertools.pairwise(Q)]
+
+    alone = [work(k) for k in range(2)]
+    with ThreadPoolExecutor(2) as pool:
+        assert list(pool.map(work, range(2))) == alone
+
+
+def test_missing_compiler_is_said_with_what_works_without(ball, monkeypatch):
+    class Missing:
+        def prepare(self, wait: bool) -> bool:
+            return False
+
+    monkeypatch.setattr(bindings, "_library", Missing)
+    with pytest.raises(CompileError, match="inverse_kinematics"):
+        Planner(ball.model)
