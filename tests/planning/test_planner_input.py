@@ -131,7 +131,7 @@ def test_many_obstacles_are_all_seen():
 
 
 def test_path_longer_than_its_room_is_an_answer(ball, monkeypatch):
-    monkeypatch.setattr("kineverse.planning.search._ROOM", 3)
+    monkeypatch.setattr("kineverse.planning.search.PATH_ROOM", 3)
     ball.place({"q00": 0.0, "q01": 0.0})
     path = ball.plan([0, 0], [40, 0])
     assert not path and path.why
