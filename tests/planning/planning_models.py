@@ -90,7 +90,7 @@ def ball_and_plate() -> kv.Model:
 def contacts(planner: Planner, points: np.ndarray, scene: Scene | None = None) -> np.ndarray:
     """Return the deepest distance of a pair at each configuration, by a scene of its own; infinite beyond 1 m."""
     scene = scene or Scene(planner.model, rules=planner.excluded)
-    state, found, query = planner._state, [], None
+    state, found, query = planner.planning_scene.state, [], None
     for q in points:
         scene.update(state.updated(dict(zip(planner.symbols, q.tolist(), strict=True))))
         query = query or scene.watch(moving=planner.symbols, radius=1.0)

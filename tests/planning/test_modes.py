@@ -65,7 +65,7 @@ def test_a_locked_drawer_is_opened_after_its_button(model, planner, modes):
     opened = path.points[:, column["drawer"]] > 1e-4
     assert (path.points[opened, column["button"]] > PRESSED).all()
     assert path.points[-1, column["drawer"]] == pytest.approx(0.25, abs=1e-8)
-    held = planner._manifold(modes[2].along)
+    held = planner.planning_scene.manifold(modes[2].along)
     _, first, last = path.modes[-1]
     assert held.residuals(path.points[first : last + 1]).max() < 1e-5
 

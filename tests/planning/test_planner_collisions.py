@@ -59,9 +59,11 @@ def test_place_moves_obstacles_without_compiling(arm, monkeypatch):
     arm.place({"base": 0.0, "cart": 0.6})
     Q = configurations(arm, 200)
     q = Q[arm.valid(Q)][0]
-    assert arm.valid(q)[0] and (contacts(arm, q[None]) > 0).all()
+    assert arm.valid(q)[0]
+    assert (contacts(arm, q[None]) > 0).all()
     arm.place({"cart": 0.0})
-    assert not arm.valid(q)[0] and (contacts(arm, q[None]) <= 0).all()
+    assert not arm.valid(q)[0]
+    assert (contacts(arm, q[None]) <= 0).all()
     arm.place({"cart": 0.6})
     assert arm.valid(q)[0]
 
@@ -118,7 +120,8 @@ def test_certificate_finds_a_plate_between_two_samples(plate):
     assert not plate.checker.edges(A, B, least=2e-4).any()
     for a, b in zip(A, B, strict=True):
         collision = plate.checker.find_collision(np.array([a, b]))
-        assert collision is not None and collision[0] == 0
+        assert collision is not None
+        assert collision[0] == 0
         at = a + collision[1] * (b - a)
         assert abs(at[column]) < 0.05
 
@@ -148,7 +151,8 @@ def test_goal_behind_full_turns_is_checked_where_it_is(plate):
     q = plate.model.default_state().updated({"x": 0.5})
     for turns in (0, 2, -3):
         path = plate.plan(q, q.updated({"turn": 0.2 - np.pi + 2 * np.pi * turns}))
-        assert not path and "'arm' and 'post'" in path.why
+        assert not path
+        assert "'arm' and 'post'" in path.why
 
 
 def test_edits_of_the_model_are_followed():

@@ -46,7 +46,8 @@ def test_solutions_of_holds_are_free_and_hold_what_the_mask_says(flying, mask):
     Q = flying.solutions(flying.hold("hand", "mark", mask, offset), 8, seconds=0.1)
     # Without anything left to turn there are few.
     assert len(Q) == 8 or (mask == "xyz rx ry rz" and len(Q) > 0)
-    assert flying.valid(Q).all() and (contacts(flying, Q) > 0).all()
+    assert flying.valid(Q).all()
+    assert (contacts(flying, Q) > 0).all()
     held = flying.model.fk("mark")({}) @ np.array(offset())
     for q in Q:
         T = np.linalg.inv(held) @ flying.model.fk("hand")(dict(zip(flying.symbols, q.tolist(), strict=True)))
@@ -130,7 +131,8 @@ def test_door_is_judged_by_the_scene():
     assert planner.checker.uncovered == [("leaf", "pin")]
     for k in range(20):
         assert not planner.plan([0.002 * k], [1.5 + 0.01 * k])
-    assert planner.plan([0.0], [0.9]) and planner.plan([1.1], [2.0])
+    assert planner.plan([0.0], [0.9])
+    assert planner.plan([1.1], [2.0])
     assert "'leaf' and 'pin'" in planner.plan([0.0], [1.0]).why
 
 
@@ -165,7 +167,8 @@ def test_closed_loop_has_the_poses_of_the_model_and_no_collision_is_hidden(four_
     Q = rng.uniform(-3, 3, (400, 2))
     found = four_bar.valid(Q)
     crank = [str(s) for s in four_bar.symbols].index("crank")
-    assert not found[np.abs(Q[:, crank]) > 1.2].any() and 0.1 < found.mean() < 0.9
+    assert not found[np.abs(Q[:, crank]) > 1.2].any()
+    assert 0.1 < found.mean() < 0.9
     # Beyond its limits the loop does not close: lanes without poses.
     np.testing.assert_array_equal(found, [four_bar.valid(q)[0] for q in Q])
     assert (contacts(four_bar, Q[found], Scene(four_bar.model, rules=four_bar.excluded)) > -1e-6).all()

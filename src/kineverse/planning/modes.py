@@ -20,7 +20,7 @@ from .checker import BodyPairs
 from .manifold import FrameHold
 
 if TYPE_CHECKING:
-    from .planner import Planner
+    from .planning_scene import PlanningScene
 
 _NO_PAIRS: BodyPairs = frozenset()
 _CANDIDATES = 12
@@ -98,8 +98,8 @@ class ModeSearch:
 
     Parameters
     ----------
-    planner
-        Planner of the segments.
+    scene
+        What the segments are planned in.
     modes
         The modes; the first that the start meets is where the path begins.
     tasks, ends
@@ -119,30 +119,32 @@ class ModeSearch:
 
     def __init__(
         self,
-        planner: Planner,
+        scene: PlanningScene,
         modes: Iterable[Mode],
         tasks: Sequence[Hold],
         ends: Array | None,
         seconds: float,
         seed: int,
     ) -> None:
-        self._planner, self._modes = planner, tuple(modes)
+        self._scene, self._modes = scene, tuple(modes)
         self._tasks, self._ends, self._seconds, self._seed = tasks, ends, seconds, seed
         if not self._modes or not all(isinstance(mode, Mode) for mode in self._modes):
             raise InvalidValueError("modes= takes one or several kv.planning.Mode.")
         names = [mode.name for mode in self._modes]
         if len(set(names)) < len(names):
             raise DuplicateNameError(f"Two modes have one name: {', '.join(map(repr, names))}.")
-        moved = [find_coordinates(planner.model, mode.moves, "moves") for mode in self._modes]
+        moved = [find_coordinates(scene.model, mode.moves, "moves") for mode in self._modes]
         objects = frozenset[Symbol]().union(*moved)
-        foreign = objects - {*planner.symbols}
+        foreign = objects - {*scene.space.symbols}
         if foreign:
             raise InvalidValueError(
                 f"A mode moves {', '.join(map(repr, map(str, foreign)))}, which the planner does not: add it to move=."
             )
-        self._objects = np.array([s in objects for s in planner.symbols], dtype=bool)
-        self._still = [np.array([s in objects - own for s in planner.symbols], dtype=bool) for own in moved]
-        self._touching = [planner._touching(mode.along) for mode in self._modes]
+        self._objects = np.array([s in objects for s in scene.space.symbols], dtype=bool)
+        self._still = [
+            np.array([s in objects - own for s in scene.space.symbols], dtype=bool) for own in moved
+        ]
+        self._touching = [scene.touching_pairs(mode.along) for mode in self._modes]
         self._searches = 0
         self._generator = np.random.default_rng(seed)
 
@@ -192,7 +194,7 @@ class ModeSearch:
 
     def _find_mode(self, q: Array) -> int | None:
         for k, mode in enumerate(self._modes):
-            manifold = self._planner._manifold(mode.along)
+            manifold = self._scene.manifold(mode.along)
             if manifold is None or float(manifold.residuals(q[None])[0]) < 1e-2:
                 return k
         return None
@@ -214,7 +216,7 @@ class ModeSearch:
         moving = self._objects & ~self._still[node.mode]
         if not moving.any():
             return [node.q]
-        lower, upper = self._planner.space.bounds(node.q, node.q[None])
+        lower, upper = self._scene.space.bounds(node.q, node.q[None])
         if self._round:
             shares = [self._generator.random(len(node.q))]
         else:
@@ -242,7 +244,7 @@ class ModeSearch:
     def _reach_goal(self, node: _Node) -> ModeSegment | None:
         """Return a way to the goal within the mode of a node; None if there is none."""
         still, mode = self._still[node.mode], self._modes[node.mode]
-        touching = self._touching_around(node) | self._planner._touching(self._tasks)
+        touching = self._touching_around(node) | self._scene.touching_pairs(self._tasks)
         if self._ends is not None:
             same = np.abs(self._ends - node.q)[:, still].max(axis=1, initial=0.0) < _SAME
             ends = self._ends[same].copy()
@@ -257,12 +259,12 @@ class ModeSearch:
     def _concerns_still(self, node: _Node) -> bool:
         """Return True if a task is about objects that stand still in the mode, and is not met."""
         moving = {
-            s for s, still in zip(self._planner.symbols, self._still[node.mode], strict=True) if not still
+            s for s, still in zip(self._scene.space.symbols, self._still[node.mode], strict=True) if not still
         }
         for task in self._tasks:
-            resolved = self._planner.model.rates.resolve(task.expression)
+            resolved = self._scene.model.rates.resolve(task.expression)
             if moving.isdisjoint(resolved.symbols):
-                manifold = self._planner._manifold([task])
+                manifold = self._scene.manifold([task])
                 if manifold is not None and float(manifold.residuals(node.q[None])[0]) > _SAME:
                     return True
         return False
@@ -276,7 +278,7 @@ class ModeSearch:
     ) -> Array:
         self._searches += 1
         seed, batches = self._seed + self._searches, _BATCHES * 4**self._round
-        return self._planner._solutions(
+        return self._scene.solutions(
             holds, near, _CANDIDATES, max(self._left(), 0.0), seed, touching, still, batches
         )
 
@@ -286,5 +288,5 @@ class ModeSearch:
         self._searches += 1
         mode, still, edges = self._modes[node.mode], self._still[node.mode], _EDGES * 4**self._round
         left = max(self._left(), 0.0)
-        path = self._planner._between(node.q, ends, mode.along, touching, left, self._seed, still, edges)
+        path = self._scene.between(node.q, ends, mode.along, touching, left, self._seed, still, edges)
         return path.points if path.found else None

@@ -1,0 +1,325 @@
+"""One version of a model, placed at one state, in which paths are searched."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterable, Mapping, Sequence
+from time import perf_counter
+from typing import Any, TypeAlias
+
+import numpy as np
+import numpy.typing as npt
+
+from kineverse.control.tasks import Hold
+from kineverse.errors import InvalidValueError
+from kineverse.geometry import Rule, Scene
+from kineverse.geometry.prepared_query import flag_subtree
+from kineverse.geometry.results import DistanceResult
+from kineverse.lie import Array
+from kineverse.model.frame import WORLD
+from kineverse.model.kinematics import ancestors
+from kineverse.model.model_view import ModelView
+from kineverse.state import State
+from kineverse.symbols import Symbol
+
+from .checker import BodyPairs, CollisionChecker
+from .configuration import PlanningSpace
+from .connection import connect, connect_on_manifold
+from .endpoints import Endpoint, Endpoints
+from .judge import SceneJudge, describe_contacts
+from .manifold import FrameHold, Manifold, hold_targets, manifold_key
+from .near_pairs import columns_between, find_overlapping_pairs, leave_near_pairs
+from .path import Path
+from .path_checks import PathChecks
+from .roadmap import Roadmap
+from .search import MOST_EDGES
+from .solutions import MOST_BATCHES, find_solutions
+
+Flags: TypeAlias = npt.NDArray[np.bool_]
+
+_JUDGED = 0.5
+"""Longest step between judged configurations of a path that is certified [rad], [m]."""
+_MOST_MANIFOLDS = 16
+_NARROWINGS = 4
+
+
+class PlanningScene:
+    """Present version of a model, with everything placed at a state: what searches of paths are about.
+
+    Parameters
+    ----------
+    model
+        The model.
+    move, rules, margin, protrusion
+        As for :class:`.Planner`.
+    options
+        Further arguments of the collision scene.
+    state
+        Where everything stands.
+
+    Attributes
+    ----------
+    space
+        Coordinates that move, with their limits.
+    scene
+        Collision scene.
+    checker
+        Compiled collision check.
+    excluded
+        Rules for pairs of bodies that always touch, which are not checked.
+    version
+        Version of the model.
+
+    Raises
+    ------
+    InvalidValueError
+        If no body has a shape.
+    """
+
+    def __init__(
+        self,
+        model: ModelView,
+        move: Iterable[Symbol | str] | Symbol | str | None,
+        rules: Sequence[Rule],
+        margin: float,
+        protrusion: float | None,
+        options: Mapping[str, Any],
+        state: State,
+    ) -> None:
+        self.model, self.version = model, model.version
+        self.space = space = PlanningSpace(model, move)
+        scene = Scene(model, rules=rules, **options)
+        if not scene.bodies:
+            raise InvalidValueError(
+                "No body of the model has a shape, so nothing can collide: add collision or visual shapes."
+            )
+        self.excluded = find_overlapping_pairs(scene, space)
+        if self.excluded:
+            scene = Scene(model, rules=(*rules, *self.excluded), **options)
+        self.scene = scene
+        self.checker = CollisionChecker(scene, space.symbols, space.conditions, margin, protrusion)
+        self._candidates = space.turning.copy()
+        self._manifolds: dict[tuple[object, ...], Manifold] = {}
+        self._judges: dict[BodyPairs, SceneJudge] = {}
+        self._carried_bodies: dict[str, tuple[str, ...]] = {}
+        leave_near_pairs(self.checker, space)
+        self.place(state)
+
+    def place(self, state: State) -> None:
+        """Place everything that does not move, and the obstacles with it."""
+        self.state = state
+        self.space.place(state)
+        self.checker.place(state)
+        self.space.turning[:] = self.checker.find_periodic(self._candidates)
+        self.set_bounds(self.here, self.here[None])
+
+    @property
+    def here(self) -> Array:
+        """Where the coordinates that move are placed, (n,)."""
+        return self.state.vector(self.space.symbols)
+
+    def _replace(self) -> None:
+        """Place the checker again where everything stands."""
+        self.checker.place(self.state)
+
+    def set_bounds(self, start: Array, points: Array, still: Flags | None = None) -> None:
+        """Set the bounds of a search from a start (n,) to points (N, n); coordinates that stand still have none."""
+        lower, upper = self.space.bounds(start, points)
+        if still is not None:
+            lower, upper = np.where(still, start, lower), np.where(still, start, upper)
+        self.checker.lower[:], self.checker.upper[:] = lower, upper
+
+    def solutions(
+        self,
+        holds: Sequence[Hold],
+        near: Array,
+        count: int,
+        seconds: float,
+        seed: int,
+        touching: BodyPairs,
+        still: Flags | None = None,
+        batches: int = MOST_BATCHES,
+    ) -> Array:
+        """Return solutions (K, n), those near to a configuration first; some coordinates have its values."""
+        self.set_bounds(near, near[None], still)
+        manifold = self.manifold(holds)
+        assert manifold is not None
+        with self.checker.excepting(touching):
+            return find_solutions(self.checker, manifold, near, count, seconds, seed, batches)
+
+    def manifold(self, holds: Sequence[Hold]) -> Manifold | None:
+        """Return the manifold of holds and equalities of the model, at the present place."""
+        if not holds and not self.space.equalities:
+            return None
+        key = manifold_key(holds)
+        if key not in self._manifolds:
+            if len(self._manifolds) >= _MOST_MANIFOLDS:
+                self._manifolds.clear()
+            self._manifolds[key] = Manifold(self.checker, self.model, holds, self.space.equalities)
+        manifold = self._manifolds[key]
+        manifold.place(self.state, hold_targets(holds))
+        return manifold
+
+    def touching_pairs(self, holds: Iterable[Hold]) -> BodyPairs:
+        """Return the pairs of bodies that may touch while holds last."""
+        return frozenset(
+            frozenset((a, b))
+            for hold in holds
+            if isinstance(hold, FrameHold) and _are_apart(self.model, *hold.frames)
+            for a in self._carried(hold.frames[0])
+            for b in self._carried(hold.frames[1])
+            if a != b
+        )
+
+    def _carried(self, frame: str) -> tuple[str, ...]:
+        if frame not in self._carried_bodies:
+            self._carried_bodies[frame] = find_carried_bodies(self.model, self.scene.bodies, frame)
+        return self._carried_bodies[frame]
+
+    def between(
+        self,
+        q: Array,
+        ends: Array,
+        holds: Sequence[Hold],
+        touching: BodyPairs,
+        seconds: float,
+        seed: int,
+        still: Flags | None = None,
+        edges: int = MOST_EDGES,
+        roadmap: Roadmap | None = None,
+    ) -> Path:
+        """Return a path from a configuration (n,) to any of some ends (K, n), along holds; see :meth:`plan`.
+
+        Bodies of the pairs ``touching`` may touch, and some coordinates may stand still.
+        """
+        begin = perf_counter()
+        # A goal that is full turns away is the nearest one that is the same.
+        ends = np.array([self.space.equivalents(end, q, most=1)[0] for end in ends])
+        self.set_bounds(q, ends, still)
+        manifold = self.manifold(holds)
+        with self.checker.excepting(touching):
+            endpoints = Endpoints(self.space, self.checker, self.judge(touching), manifold)
+            first = endpoints.check("The start", q)
+            if first.reason:
+                return self.no_path(q, first.reason, begin)
+            usable = endpoints.check_goals(ends)
+            if isinstance(usable, str):
+                return self.no_path(q, usable, begin)
+            for _ in range(_NARROWINGS):
+                path, contact = self._connect(
+                    first, usable, manifold, touching, seconds, seed, begin, edges, roadmap
+                )
+                if contact is None or not self._narrow(contact, q, touching):
+                    break
+            return path
+
+    def _narrow(self, contact: DistanceResult, q: Array, touching: BodyPairs) -> bool:
+        """Narrow the bounds of a coordinate to where it keeps a pair apart that only the scene checks.
+
+        Returns False for a pair that several coordinates move, and if the bounds are as narrow already.
+        """
+        pair = {contact.a, contact.b}
+        if not any(pair == set(other) for other in self.checker.uncovered):
+            return False
+        columns = columns_between(self.space, contact.a, contact.b)
+        if len(columns) != 1:
+            return False
+        (i,) = columns
+        before = float(self.checker.lower[i]), float(self.checker.upper[i])
+        lower, upper = self.judge(touching).free_interval(q, i, *before)
+        self.checker.lower[i], self.checker.upper[i] = lower, upper
+        return (lower, upper) != before
+
+    def _connect(
+        self,
+        first: Endpoint,
+        goals: Sequence[Endpoint],
+        manifold: Manifold | None,
+        touching: BodyPairs,
+        seconds: float,
+        seed: int,
+        begin: float,
+        edges: int,
+        roadmap: Roadmap | None,
+    ) -> tuple[Path, DistanceResult | None]:
+        """Return a path between checked ends, and the contact that the scene finds on it."""
+        q = first.inner
+        variants = [(goal, v) for goal in goals for v in self.space.equivalents(goal.inner, q)]
+        targets = np.ascontiguousarray([v for _, v in variants], dtype=np.float32)
+        starts = np.ascontiguousarray(q[None], dtype=np.float32)
+        searched = perf_counter()
+        if manifold is None:
+            found = connect(self.checker, starts, targets, seconds, seed, edges, roadmap)
+        else:
+            found = connect_on_manifold(self.checker, manifold, starts, targets, seconds, seed, edges)
+        spent = perf_counter() - searched
+        if found.problem:
+            return self.no_path(found.points, found.problem, begin, spent, found.iterations), None
+        points = found.points
+        # A roadmap may wind further than the variants do.
+        turns = np.where(self.space.turning, np.round((points[-1] - targets) / math.tau), 0.0) * math.tau
+        k = int(np.argmin(np.abs(targets + turns - points[-1]).max(axis=1)))
+        goal, variant = variants[k][0], variants[k][1] + turns[k]
+        points[0], points[-1] = q, variant
+        contact = self.judge(touching).first_contact(points, _JUDGED)
+        if contact is not None:
+            problem = f"The scene finds a contact on the path: {describe_contacts([contact[1]])}."
+            return self.no_path(points, problem, begin, spent, found.iterations), contact[1]
+        shift = variant - goal.inner
+        whole = np.vstack([first.way[:-1], points, (goal.way[::-1] + shift)[1:]])
+        why = f"Found after {found.iterations} samples{'' if roadmap is None else roadmap.describe()}."
+        path = self.path(True, whole, why, begin, spent, found.iterations, touching, manifold)
+        return path, None
+
+    def judge(self, touching: BodyPairs = frozenset()) -> SceneJudge:
+        """Return the judge of the scene in which some pairs may touch, at the present place."""
+        if touching not in self._judges:
+            if len(self._judges) >= _MOST_MANIFOLDS:
+                self._judges.clear()
+            rules = [Rule(a, b, False, "held") for a, b in map(sorted, touching)]
+            self._judges[touching] = SceneJudge(self.scene, self.space.symbols, rules, self.checker.uncovered)
+        judge = self._judges[touching]
+        judge.place(self.state)
+        return judge
+
+    def no_path(self, points: Array, why: str, begin: float, spent: float = 0.0, iterations: int = 0) -> Path:
+        return self.path(False, np.atleast_2d(points), why, begin, spent, iterations)
+
+    def path(
+        self,
+        found: bool,
+        points: Array,
+        why: str,
+        begin: float,
+        spent: float,
+        iterations: int,
+        touching: BodyPairs = frozenset(),
+        manifold: Manifold | None = None,
+    ) -> Path:
+        checks, seconds = self.checks(touching, manifold), perf_counter() - begin
+        return Path(found, self.space.symbols, points, why, seconds, spent, iterations, checks.state, checks)
+
+    def checks(self, touching: BodyPairs, manifold: Manifold | None) -> PathChecks:
+        """Return the checks of a path at the present place."""
+        state, judge = self.state, self.judge(touching)
+        return PathChecks(self.model, state, self.checker, judge, manifold, touching, self._replace)
+
+
+def find_carried_bodies(model: ModelView, bodies: Sequence[str], frame: str) -> tuple[str, ...]:
+    """Return the bodies at and below a frame; without any, those below the next frame above that has some.
+
+    So a tool frame between the fingers stands for the palm and the fingers.
+    """
+    frames = model.frames
+    while frame != WORLD:
+        flags = flag_subtree(model, bodies, frame)
+        if flags.any():
+            return tuple(body for body, flag in zip(bodies, flags, strict=True) if flag)
+        frame = frames[frame].parent
+    return ()
+
+
+def _are_apart(model: ModelView, a: str, b: str) -> bool:
+    """Return True if no one of two frames carries the other."""
+    lookup = model.frames.__getitem__
+    return WORLD not in (a, b) and a != b and a not in ancestors(b, lookup) and b not in ancestors(a, lookup)
