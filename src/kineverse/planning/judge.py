@@ -46,9 +46,7 @@ class SceneJudge:
         self._scene = scene
         excepted = {frozenset(rule[:2]) for rule in rules}
         left = [pair for pair in uncovered if frozenset(pair) not in excepted]
-        moving = {
-            s for body in {name for pair in left for name in pair} for s in scene.model.fk(body).symbols
-        }
+        moving = {s for a, b in left for s in scene.model.fk(a, b).symbols}
         self._concerned = np.array([s in moving for s in coordinates], dtype=bool)
         self._uncovered = PreparedQuery(scene.collision_world, lambda: self._flag(left), 0.0)
         self._query = scene.watch(moving=coordinates, rules=rules, radius=0.0)
