@@ -72,7 +72,9 @@ def test_poses_are_those_of_the_model(arm):
     arm.place({"base": 0.3, "cart": 0.6})
     for q in configurations(arm, 20).astype(np.float32):
         poses, _ = arm.checker.outputs(q)
-        state = arm._state.updated(dict(zip(arm.symbols, q.astype(float).tolist(), strict=True)))
+        state = arm.planning_scene.state.updated(
+            dict(zip(arm.symbols, q.astype(float).tolist(), strict=True))
+        )
         for name, pose in zip(arm.checker.groups, poses, strict=True):
             np.testing.assert_allclose(pose, arm.model.fk(name)(state)[:3], atol=1e-6)
 

@@ -12,7 +12,7 @@ from kineverse import gallery
 from kineverse.geometry import Scene
 from kineverse.model.body import Box, Capsule, Cylinder, Sphere
 from kineverse.planning import Planner
-from kineverse.planning.planner import find_carried_bodies
+from kineverse.planning.planning_scene import find_carried_bodies
 
 pytestmark = pytest.mark.compiler
 
@@ -70,7 +70,7 @@ def test_path_keeps_to_a_hold_between_its_points(flying):
     path = flying.plan(start, goals, along=hold, seconds=3.0)
     assert path, path.why
     error = [
-        flying._manifold((hold,)).residuals(m).max()
+        flying.planning_scene.manifold((hold,)).residuals(m).max()
         for m in (path.points, (path.points[1:] + path.points[:-1]) / 2)
     ]
     assert max(error) < 1e-5
@@ -79,7 +79,7 @@ def test_path_keeps_to_a_hold_between_its_points(flying):
 def test_only_what_both_frames_carry_may_touch(flying):
     hold = flying.hold("hand", "bar", "xyz")
     pairs = {frozenset((a, b)) for a in ("hand", "finger") for b in ("bar", "knob")}
-    assert flying._touching([hold]) == pairs
+    assert flying.planning_scene.touching_pairs([hold]) == pairs
     # A frame that is fixed stands for the body above it, and not for all that is fixed.
     assert find_carried_bodies(flying.model, flying.scene.bodies, "top") == ("wall",)
     assert find_carried_bodies(flying.model, flying.scene.bodies, "mark") == ()
@@ -89,7 +89,7 @@ def test_only_what_both_frames_carry_may_touch(flying):
 @pytest.mark.parametrize("other", ["world", "mark"])
 def test_hold_against_the_world_does_not_open_walls(flying, other):
     hold = flying.hold("hand", other, "z", kv.translation(0, 0, -0.1) if other == "mark" else None)
-    assert not flying._touching([hold])
+    assert not flying.planning_scene.touching_pairs([hold])
     start = dict.fromkeys(flying.symbols, 0.0)
     path = flying.plan(
         start, {**start, flying.symbols[3]: -1.0, flying.model.symbol("x"): -1.0}, along=hold, seconds=0.1

@@ -1,4 +1,4 @@
-"""Collision checker of a planner: the bodies that move against everything else, W configurations at a time."""
+"""Collision checker of a planner: bodies that move against all others, W configurations at a time."""
 
 from __future__ import annotations
 
@@ -300,7 +300,7 @@ class CollisionChecker:
 
     @contextmanager
     def widened(self, by: float, ends: Floats32) -> Iterator[None]:
-        """Widen the margin by a length [m] while the context lasts, if configurations (N, n) stay valid with it."""
+        """Widen the margin [m] while the context lasts, if configurations (N, n) stay valid with it."""
         margin = self.struct.margin
         self.struct.margin = margin + by
         if not self.valid(np.ascontiguousarray(ends)).all():
@@ -349,7 +349,7 @@ class CollisionChecker:
         return found.astype(bool)
 
     def find_collision(self, points: Floats32, resolution: float = RESOLUTION) -> tuple[int, float] | None:
-        """Return the first edge of a polyline (N, n) that is not certainly free, and the fraction along it."""
+        """Return the first edge of a polyline (N, n) that is not certainly free, and a fraction of it."""
         where = ctypes.c_double()
         found = self._code.kineverse_certify(
             self.address,
@@ -398,7 +398,7 @@ class CollisionChecker:
         return found[:count].reshape(-1, 3, 4), found[count:]
 
     def find_periodic(self, candidates: npt.NDArray[np.bool_]) -> npt.NDArray[np.bool_]:
-        """Return flags (n,) of the coordinates among some whose full turns change no pose and no condition."""
+        """Return flags (n,) of those coordinates whose full turns change no pose and no condition."""
         generator = np.random.default_rng(0)
         found = candidates.copy()
         for i in np.flatnonzero(candidates).tolist():

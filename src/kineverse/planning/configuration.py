@@ -35,15 +35,16 @@ class PlanningSpace:
     model
         The model.
     move
-        Coordinates as symbols, names or patterns; an articulation stands for its coordinates. None for all that may
-        move freely.
+        Coordinates as symbols, names or patterns; an articulation stands for its coordinates. None for all
+        that may move freely.
 
     Attributes
     ----------
     symbols
         The n coordinates, in the order in which they are given, patterns in the order of the model.
     lower, upper
-        (n,) limits at the present place, ±inf for none; those that depend on moving coordinates are conditions.
+        (n,) limits at the present place, ±inf for none; those that depend on moving coordinates are
+        conditions.
     conditions
         Expressions that are at most 0 where the inequalities of the model hold; limits are not among them.
     equalities
@@ -59,8 +60,8 @@ class PlanningSpace:
             )
         if len(self.symbols) > MOST_COORDINATES:
             raise InvalidValueError(
-                f"{len(self.symbols)} coordinates would move, and a planner moves {MOST_COORDINATES} at most. Choose "
-                "some of them with move=, as move='robot/*'."
+                f"{len(self.symbols)} coordinates would move, and a planner moves {MOST_COORDINATES} at "
+                "most. Choose some of them with move=, as move='robot/*'."
             )
         self._limits: list[tuple[int, Expression, Expression]] = []
         ranges = self._read_constraints()
@@ -114,8 +115,9 @@ class PlanningSpace:
     def bounds(self, start: Array, points: Array) -> tuple[Array, Array]:
         """Return finite bounds (n,) of a search from a start (n,) to or about configurations (N, n).
 
-        A joint that turns fully, without limits, may turn by a little more than half a turn to either side of the
-        start; another coordinate without limits may go beyond the start and the given ones by 2 m or rad.
+        A joint that turns fully, without limits, may turn by a little more than half a turn to either side
+        of the start; another coordinate without limits may go beyond the start and the given ones by 2 m or
+        rad.
         """
         given = np.vstack([start[None], points])
         low = np.where(self.turning, start - _HALF_TURN, given.min(axis=0) - _BEYOND)
@@ -124,7 +126,7 @@ class PlanningSpace:
         return np.where(finite[0], self.lower, low), np.where(finite[1], self.upper, high)
 
     def equivalents(self, q: Array, start: Array, most: int = 32) -> Array:
-        """Return configurations (K, n) within the bounds about a start that are q but for full turns of joints.
+        """Return configurations (K, n) within bounds about a start that are q but for full turns of joints.
 
         The nearest to the start come first. Without any there is q itself.
         """
@@ -152,13 +154,13 @@ def _is_bounded(excess: Expression) -> bool:
 
 
 def free_coordinates(model: ModelView) -> tuple[Symbol, ...]:
-    """Return the independent coordinates whose speeds are free: a wheeled base that rolls is not among them."""
+    """Return the independent coordinates whose speeds are free, without those of a base that rolls."""
     rolling = _rolling_coordinates(model)
     return tuple(s for s in model.degrees_of_freedom if s not in rolling)
 
 
 def _rolling_coordinates(model: ModelView) -> set[Symbol]:
-    """Return the coordinates that fewer speeds drive than there are coordinates: they do not move independently."""
+    """Return the coordinates that fewer speeds drive: they do not move independently."""
     driven: dict[Symbol, set[Symbol]] = {
         x: {*row} for x, row in model.rates.items() if x not in model.rates.dependent
     }
@@ -192,8 +194,8 @@ def _find_moving(model: ModelView, move: Iterable[Symbol | str] | Symbol | str) 
     rolling = [s for s in found if s in _rolling_coordinates(model)]
     if rolling:
         raise InvalidValueError(
-            f"move=: {', '.join(map(repr, map(str, rolling[:6])))} cannot move independently: wheels that roll drive "
-            "them, and a straight way between two configurations would slip. Leave them out and place the base with "
-            "place(), or give it a base that moves freely."
+            f"move=: {', '.join(map(repr, map(str, rolling[:6])))} cannot move independently: wheels that "
+            "roll drive them, and a straight way between two configurations would slip. Leave them out and place the "
+            "base with place(), or give it a base that moves freely."
         )
     return tuple(found)

@@ -27,7 +27,7 @@ _ATTEMPTS, _NEXT_SEED = 16, 7919
 _TELLING = 100
 """Number of samples after which a small tree says that its root cannot be left."""
 _WIDER = 1e-3
-"""Margin beyond the one asked for, with which edges of a search are free between their samples too, mostly [m]."""
+"""Margin beyond the one asked for: edges of a search are mostly free between their samples then [m]."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -58,7 +58,7 @@ def connect(
     edges: int = MOST_EDGES,
     roadmap: Roadmap | None = None,
 ) -> Connected:
-    """Return a path from any of some starts (S, n) to any of some goals (G, n), certified between its samples.
+    """Return a path from one of (S, n) starts to one of (G, n) goals, certified between its samples.
 
     Edges of the search that collide between samples are planned anew, with more samples.
 
@@ -89,8 +89,8 @@ def connect(
         if certain is not None:
             return Connected(certain.astype(float), "", iterations)
     problem = (
-        "A path was found whose samples are free, but something thin lies between two of them, and no way around "
-        "it was found in the time given. More seconds=, or another seed=, may find one."
+        "A path was found whose samples are free, but something thin lies between two of them, and no way "
+        "around it was found in the time given. More seconds=, or another seed=, may find one."
     )
     return Connected(points.astype(float), problem, iterations)
 
@@ -125,8 +125,9 @@ def connect_on_manifold(
 ) -> Connected:
     """Return a path on a manifold from any of some starts (S, n) to any of some goals (G, n).
 
-    Its points are in double precision on the manifold, and lines between them keep to it; see :func:`.polish`. A
-    path that collides between samples is searched again, with another seed and more samples.
+    Its points are in double precision on the manifold, and lines between them keep to it; see
+    :func:`.polish`. A path that collides between samples is searched again, with another seed and more
+    samples.
     """
     begin = perf_counter()
     search = RrtConnect(checker, manifold, edges)
@@ -165,8 +166,8 @@ def explain_failure(found: SearchResult, seconds: float) -> str:
     hint = f" It seems that {' and '.join(enclosed)} cannot be left." if enclosed else ""
     if found.status == TIME_IS_UP:
         return (
-            f"The time of {seconds:g} s is up: {reached}, and the nearest pair is {found.gap:.3g} apart.{hint} Give "
-            "more seconds=, or other goals."
+            f"The time of {seconds:g} s is up: {reached}, and the nearest pair is {found.gap:.3g} apart."
+            f"{hint} Give more seconds=, or other goals."
         )
     return f"The search ended: {reached}, and the nearest pair is {found.gap:.3g} apart.{hint}"
 

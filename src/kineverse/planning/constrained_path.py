@@ -65,8 +65,8 @@ def shorten_on_manifold(
 def polish(manifold: Manifold, points: Array) -> Array | None:
     """Return points in double precision on the manifold, so dense that lines between them keep to it.
 
-    Half way between two of them the residual is at most :data:`DEVIATION`. None if a point does not arrive within
-    limits.
+    Half way between two of them the residual is at most :data:`DEVIATION`. None if a point does not arrive
+    within limits.
     """
     exact, residuals = manifold.polish(points)
     for _ in range(_LEVELS):

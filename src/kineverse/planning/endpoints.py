@@ -1,4 +1,4 @@
-"""Starts and goals of a plan: whether they are free, and the way out of the spheres where only these touch."""
+"""Starts and goals of a plan: whether they are free, and ways out of spheres where only these touch."""
 
 from __future__ import annotations
 
@@ -28,7 +28,8 @@ class Endpoint:
     Attributes
     ----------
     way
-        Configurations (K, n) from the given one to one in which no sphere touches; the given one alone if none does.
+        Configurations (K, n) from the given one to one in which no sphere touches; the given one alone if
+        none does.
     reason
         Why it cannot be used; empty if it can.
     """
@@ -63,7 +64,7 @@ class Endpoints:
         self._space, self._checker, self._judge, self._manifold = space, checker, judge, manifold
 
     def check(self, what: str, q: Array) -> Endpoint:
-        """Return a start or goal (n,), with the reason why it cannot be used, or the way out of its spheres."""
+        """Return a start or goal (n,), with the reason why it cannot be used, or its way out of spheres."""
         way = q[None].astype(float)
         outside = self._beyond_limits(q)
         if outside:
@@ -74,7 +75,8 @@ class Endpoints:
             if not residuals[0] <= EXACT or self._beyond_limits(way[0]):
                 return Endpoint(
                     q[None],
-                    f"{what} does not meet the holds: it is off by {off:.3g}. planner.solutions(holds) finds some.",
+                    f"{what} does not meet the holds: it is off by {off:.3g}. planner.solutions(holds) "
+                    "finds some.",
                 )
             q = way[0]
         narrow = np.ascontiguousarray(
@@ -98,8 +100,8 @@ class Endpoints:
         if found is None:
             return Endpoint(
                 way,
-                f"{what} is free by the scene, but nearer to a contact than the spheres of the planner or its margin "
-                "allow, and no way out was found. A smaller protrusion= or margin= helps.",
+                f"{what} is free by the scene, but nearer to a contact than the spheres of the planner or "
+                "its margin allow, and no way out was found. A smaller protrusion= or margin= helps.",
             )
         return Endpoint(found)
 
@@ -129,7 +131,7 @@ class Endpoints:
         return "; ".join(wrong[:4])
 
     def _leave_spheres(self, q: Array) -> Array | None:
-        """Return the way (K, n) to a near configuration in which no sphere touches, which the scene finds free."""
+        """Return a way (K, n), free by the scene, to a near configuration in which no sphere touches."""
         generator = np.random.default_rng(0)
         low, high = self._checker.lower, self._checker.upper
         for distance in _DISTANCES:

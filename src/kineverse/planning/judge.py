@@ -96,7 +96,7 @@ class SceneJudge:
         return None
 
     def uncovered_contacts(self, q: Array) -> DistanceResults | None:
-        """Return the touching pairs that nobody else checks, at a configuration (n,); None if there are none."""
+        """Return the touching pairs that nobody else checks, at a configuration (n,); None without any."""
         if not self._concerned.any():
             return None
         self._update(q)
@@ -104,7 +104,7 @@ class SceneJudge:
         return found if len(found) else None
 
     def free_interval(self, q: Array, column: int, lower: float, upper: float) -> tuple[float, float]:
-        """Return bounds of one coordinate about a configuration (n,) between which these pairs do not touch."""
+        """Return bounds of a coordinate about a configuration (n,) between which these pairs are apart."""
         ends = []
         for bound in (lower, upper):
             point, free = q.copy(), float(q[column])

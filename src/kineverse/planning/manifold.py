@@ -61,8 +61,9 @@ def hold_frames(
     a, b
         The frames, such as a hand and a handle.
     mask
-        Directions that are held, of ``x``, ``y``, ``z`` (positions) and ``rx``, ``ry``, ``rz`` (rotations), in
-        any order and in the axes of the pose that is held: ``"xyz rx ry"`` lets the hand turn about its z axis.
+        Directions that are held, of ``x``, ``y``, ``z`` (positions) and ``rx``, ``ry``, ``rz`` (rotations),
+        in any order and in the axes of the pose that is held: ``"xyz rx ry"`` lets the hand turn about its z
+        axis.
     offset
         b_T_a, 4×4, the pose of a in b that is held; None for frames that coincide.
 
@@ -184,7 +185,7 @@ class Manifold:
         return arrived.astype(bool)
 
     def polish(self, Q: Array) -> tuple[Array, Array]:
-        """Return configurations (N, n) on the manifold and within limits in double precision, and residuals (N,)."""
+        """Return configurations (N, n) on the manifold, within limits, in double, and residuals (N,)."""
         lower, upper = self._checker.lower.astype(float), self._checker.upper.astype(float)
         x = np.array(Q, dtype=float)
         factors = np.tile(np.where(lower < upper, 1.0, 0.0), (len(x), 1))

@@ -25,7 +25,7 @@ if TYPE_CHECKING:
 _NO_PAIRS: BodyPairs = frozenset()
 _CANDIDATES = 12
 _BATCHES, _EDGES = 2, 2000
-"""Effort for the configurations of one change of modes and for one path: numbers, not times, so that the same seed
+"""Effort for the configurations of one change of modes and for one path: numbers, so that the same seed
 leads to the same path. Each round of the search has four times as much."""
 _DEPTH = 4
 """Largest number of changes of modes in the first round; each round allows as many more."""
@@ -43,8 +43,9 @@ class Mode:
     along
         Holds that are met in this mode, such as the grasp of a handle; none for moving freely.
     moves
-        Coordinates of objects that move in this mode, as symbols or names. An object that is named by some mode stands
-        still in all others. Coordinates that no mode names, such as those of the robot, always move.
+        Coordinates of objects that move in this mode, as symbols or names. An object that is named by some
+        mode stands still in all others. Coordinates that no mode names, such as those of the robot, always
+        move.
     """
 
     name: str
@@ -138,7 +139,8 @@ class ModeSearch:
         foreign = objects - {*scene.space.symbols}
         if foreign:
             raise InvalidValueError(
-                f"A mode moves {', '.join(map(repr, map(str, foreign)))}, which the planner does not: add it to move=."
+                f"A mode moves {', '.join(map(repr, map(str, foreign)))}, which the planner does not: add it "
+                "to move=."
             )
         self._objects = np.array([s in objects for s in scene.space.symbols], dtype=bool)
         self._still = [
@@ -184,8 +186,8 @@ class ModeSearch:
         best = max(nodes, key=lambda node: len(node.segments(self._modes)))
         reached = ", ".join(sorted({self._modes[node.mode].name for node in nodes}))
         problem = (
-            f"No path through the modes was found in {self._seconds:g} s: {len(nodes)} changes of modes were reached, "
-            f"in {reached}. More seconds=, another place of the base, or other holds may help."
+            f"No path through the modes was found in {self._seconds:g} s: {len(nodes)} changes of modes were "
+            f"reached, in {reached}. More seconds=, another place of the base, or other holds may help."
         )
         return ModePath(best.segments(self._modes), self._searches, problem)
 
@@ -212,7 +214,7 @@ class ModeSearch:
         return any(a[frame] != b[frame] for frame in a.keys() & b.keys())
 
     def _object_values(self, node: _Node) -> list[Array]:
-        """Return values of the coordinates at the next change: objects of the mode at their limits, or anywhere."""
+        """Return values of the coordinates at the next change: objects at their limits, or anywhere."""
         moving = self._objects & ~self._still[node.mode]
         if not moving.any():
             return [node.q]

@@ -23,7 +23,8 @@ _NEARLY_ALWAYS = 0.9
 def find_overlapping_pairs(scene: Scene, space: PlanningSpace) -> tuple[Rule, ...]:
     """Return rules for pairs of bodies that touch wherever the coordinates are, those of the others as well.
 
-    So a robot that stands in a wall by default, and is placed elsewhere, does not lose the pairs with the wall.
+    So a robot that stands in a wall by default, and is placed elsewhere, does not lose the pairs with the
+    wall.
     """
     home = scene.model.default_state()
     samples = StateSamples(scene.model, count=_SAMPLES)

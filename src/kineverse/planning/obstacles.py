@@ -148,8 +148,8 @@ def aligned_floats(shape: tuple[int, ...]) -> Floats32:
 def _hull_planes(solid: Solid) -> Array:
     """Return the planes of a hull, or of a polytope around another solid: rows of a normal and an offset [m].
 
-    Planes that are equal up to rounding are one, as those of triangles in one face. Large faces come first, since
-    they separate most.
+    Planes that are equal up to rounding are one, as those of triangles in one face. Large faces come first,
+    since they separate most.
     """
     surface = solid.surface
     if isinstance(surface, Hull):
@@ -183,7 +183,8 @@ def _support(core: Core, normals: Array) -> Array:
 def _spatial_order(points: Array, size: int) -> npt.NDArray[np.intp]:
     """Return an order of points in which those of a chunk are near to each other.
 
-    The points are halved along the axis of their largest spread, at multiples of the size, until they are chunks.
+    The points are halved along the axis of their largest spread, at multiples of the size, until they are
+    chunks.
     """
     done: list[npt.NDArray[np.intp]] = []
     waiting = [np.arange(len(points))]

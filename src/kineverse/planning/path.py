@@ -211,7 +211,7 @@ def densify(points: Array, step: float) -> Array:
 
 
 def sample_path(points: Array, step: float) -> Array:
-    """Return samples of a polyline (N, n), at most a step apart: its points and others, or of many points a part."""
+    """Return samples of a polyline (N, n), at most a step apart: its points and others, or some of many."""
     lengths = np.linalg.norm(np.diff(points, axis=0), axis=1)
     count = int(np.ceil(lengths.sum() / step)) + 1
     if len(points) <= 4 * count:

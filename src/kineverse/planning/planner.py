@@ -41,31 +41,32 @@ _METHODS = ("rrt-connect", "prm")
 class Planner:
     """Planner of paths without collisions, for any coordinates of a model.
 
-    Bodies that move are covered by spheres, everything else is obstacles. A generated function computes the poses of
-    many configurations at once, and compiled code checks edges of trees (RRT-Connect). A path is certified between its
-    samples too, and judged by the collision scene before it is returned.
+    Bodies that move are covered by spheres, everything else is obstacles. A generated function computes the
+    poses of many configurations at once, and compiled code checks edges of trees (RRT-Connect). A path is
+    certified between its samples too, and judged by the collision scene before it is returned.
 
-    Everything is computed from the model: an edit of the model is followed at the next call. A planner is for one
-    thread at a time.
+    Everything is computed from the model: an edit of the model is followed at the next call. A planner is
+    for one thread at a time.
 
     Parameters
     ----------
     model
         The model of everything: robot and surroundings.
     move
-        Coordinates that move, as symbols, names or patterns (``"fetch/*"``); a name of an articulation stands for its
-        coordinates. None for all that may move freely; a base on rolling wheels does not.
+        Coordinates that move, as symbols, names or patterns (``"fetch/*"``); a name of an articulation
+        stands for its coordinates. None for all that may move freely; a base on rolling wheels does not.
     rules
         Rules of the collision filter, see :class:`.Scene`, such as those of an SRDF.
     margin
-        Least distance of bodies that move from everything [m]; for rounding, 0.25 mm a kilometre from the origin come
-        on top.
+        Least distance of bodies that move from everything [m]; for rounding, 0.25 mm a kilometre from the
+        origin come on top.
     decomposed
         Bodies, or patterns, whose meshes are unions of convex hulls, see :class:`.Scene`.
     leave_out
         Excluded bodies, or patterns, or shapes, see :class:`.Scene`.
     protrusion
-        Largest distance by which spheres stick out of the shape that they cover [m]; None for what suits the shape.
+        Largest distance by which spheres stick out of the shape that they cover [m]; None for what suits the
+        shape.
 
     Attributes
     ----------
@@ -214,8 +215,8 @@ class Planner:
             raise InvalidValueError(f"{name} has values that are not finite.")
         if len(points) and np.abs(points).max() > _LARGEST:
             raise InvalidValueError(
-                f"{name} has values beyond {_LARGEST:g}, which have no room in single precision. Choose an origin that "
-                "is nearer."
+                f"{name} has values beyond {_LARGEST:g}, which have no room in single precision. Choose an "
+                "origin that is nearer."
             )
         return np.ascontiguousarray(points)
 
@@ -226,8 +227,8 @@ class Planner:
     ) -> FrameHold:
         """Return the hold of a frame by another one, such as a grasp: see :func:`.hold_frames`.
 
-        While it lasts, the bodies at and below both frames may touch each other. They may not if one frame carries
-        the other, as the world carries a hand that is kept upright.
+        While it lasts, the bodies at and below both frames may touch each other. They may not if one frame
+        carries the other, as the world carries a hand that is kept upright.
         """
         return hold_frames(self.model, a, b, mask, offset)
 
@@ -285,9 +286,9 @@ class Planner:
         along
             Holds that are met all along the path. Start and goals have to meet them up to 1 cm or .01 rad.
         modes
-            Ways in which the coordinates may move, see :class:`.Mode`; the path changes from one to another where
-            the holds of both are met, such as from moving freely to moving a door by its handle. None for all
-            coordinates moving at once.
+            Ways in which the coordinates may move, see :class:`.Mode`; the path changes from one to another
+            where the holds of both are met, such as from moving freely to moving a door by its handle. None
+            for all coordinates moving at once.
         seconds
             Largest time of the search [s]; checks of its result come on top.
         seed
@@ -369,8 +370,8 @@ class Planner:
     def _no_solution(self, tasks: Sequence[Hold]) -> str:
         names = ", ".join(repr(task) for task in tasks)
         return (
-            f"No configuration without collision was found at which {names} are met. Out of reach, or always in "
-            "contact? kv.control.inverse_kinematics says which; another place of the base may help."
+            f"No configuration without collision was found at which {names} are met. Out of reach, or always "
+            "in contact? kv.control.inverse_kinematics says which; another place of the base may help."
         )
 
     def __repr__(self) -> str:

@@ -123,7 +123,7 @@ class PlanningScene:
         self.checker.place(self.state)
 
     def set_bounds(self, start: Array, points: Array, still: Flags | None = None) -> None:
-        """Set the bounds of a search from a start (n,) to points (N, n); coordinates that stand still have none."""
+        """Set the bounds of a search from a start (n,) to points (N, n); some coordinates may stand still."""
         lower, upper = self.space.bounds(start, points)
         if still is not None:
             lower, upper = np.where(still, start, lower), np.where(still, start, upper)
@@ -283,6 +283,7 @@ class PlanningScene:
         return judge
 
     def no_path(self, points: Array, why: str, begin: float, spent: float = 0.0, iterations: int = 0) -> Path:
+        """Return the answer that there is no path, with the reason and the points (N, n) that were reached."""
         return self.path(False, np.atleast_2d(points), why, begin, spent, iterations)
 
     def path(
@@ -296,6 +297,10 @@ class PlanningScene:
         touching: BodyPairs = frozenset(),
         manifold: Manifold | None = None,
     ) -> Path:
+        """Return a path through points (N, n), with what is known about it.
+
+        Times are the one at which planning began and the one that the search took [s].
+        """
         checks, seconds = self.checks(touching, manifold), perf_counter() - begin
         return Path(found, self.space.symbols, points, why, seconds, spent, iterations, checks.state, checks)
 

@@ -106,7 +106,7 @@ class RrtConnect:
         return np.ascontiguousarray(found[keep])
 
     def walk(self, a: Floats32, b: Floats32, resolution: float = RESOLUTION) -> Floats32 | None:
-        """Return points (N, n) on the manifold from a to b, without a and with b; None if the way ends before.
+        """Return points (N, n) on the manifold from a, exclusive, to b; None if the way ends before.
 
         Parameters
         ----------
