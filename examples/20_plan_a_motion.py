@@ -15,7 +15,7 @@ from kineverse.view import save_picture
 model = kv.load("kitchen")
 model.include("fetch")
 arm = [s for s in model.symbols_of("fetch/gripper_link") if "base" not in str(s)]
-planner = Planner(model, arm)
+planner = Planner(model, arm, protrusion=0.04)  # coarse spheres, which are found sooner
 planner.place({"fetch/base/x": 0.3, "fetch/base/y": -1.3, "kitchen/fridge_door": 1.5})
 
 hand = model.fk("fetch/gripper_link")

@@ -104,7 +104,8 @@ def test_documented_commands_print_the_documented_output(page, at_the_root, page
         else:
             assert printed.out, command
         listed = words[1:] in ([], ["articulations"])
-        opened += words[0] == "view" and not listed and "--picture" not in words
+        shown = words[0] == "view" or "--view" in words
+        opened += shown and not listed and "--picture" not in words
     assert pages == [(200, True)] * opened
 
 

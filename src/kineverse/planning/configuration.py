@@ -195,7 +195,7 @@ def _find_moving(model: ModelView, move: Iterable[Symbol | str] | Symbol | str) 
     if rolling:
         raise InvalidValueError(
             f"move=: {', '.join(map(repr, map(str, rolling[:6])))} cannot move independently: wheels that "
-            "roll drive them, and a straight way between two configurations would slip. Leave them out and place the "
-            "base with place(), or give it a base that moves freely."
+            "roll drive them, and a straight way between two configurations would slip. Leave them out and "
+            "place the base with place(), or give it a base that moves freely."
         )
     return tuple(found)

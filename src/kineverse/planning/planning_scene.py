@@ -115,7 +115,7 @@ class PlanningScene:
 
     @property
     def here(self) -> Array:
-        """Where the coordinates that move are placed, (n,)."""
+        """Placed values of the coordinates that move, (n,)."""
         return self.state.vector(self.space.symbols)
 
     def _replace(self) -> None:
@@ -283,7 +283,7 @@ class PlanningScene:
         return judge
 
     def no_path(self, points: Array, why: str, begin: float, spent: float = 0.0, iterations: int = 0) -> Path:
-        """Return the answer that there is no path, with the reason and the points (N, n) that were reached."""
+        """Return the answer that there is no path, with the reason and points (N, n) on the way."""
         return self.path(False, np.atleast_2d(points), why, begin, spent, iterations)
 
     def path(
