@@ -401,12 +401,16 @@ class CollisionChecker:
         """Return flags (n,) of those coordinates whose full turns change no pose and no condition."""
         generator = np.random.default_rng(0)
         found = candidates.copy()
+        # At other places too: a screw whose pitch happens to be 0 is not periodic.
+        elsewhere = self.program.prepare(generator.uniform(-1.0, 1.0, len(self.parameters)))
+        self.struct.kept = elsewhere.ctypes.data
         for i in np.flatnonzero(candidates).tolist():
             for q in generator.uniform(-1.0, 1.0, (3, len(candidates))).astype(np.float32):
                 turned = q.copy()
                 turned[i] += math.tau
                 pairs = zip(self.outputs(q), self.outputs(turned), strict=True)
                 found[i] &= all(np.allclose(a, b, atol=_SAME, equal_nan=True) for a, b in pairs)
+        self.struct.kept = self._kept.ctypes.data
         return found
 
 

@@ -98,7 +98,7 @@ class PlanningScene:
             scene = Scene(model, rules=(*rules, *self.excluded), **options)
         self.scene = scene
         self.checker = CollisionChecker(scene, space.symbols, space.conditions, margin, protrusion)
-        self._candidates = space.turning.copy()
+        space.turning &= self.checker.find_periodic(space.turning)
         self._manifolds: dict[tuple[object, ...], Manifold] = {}
         self._judges: dict[BodyPairs, SceneJudge] = {}
         self._carried_bodies: dict[str, tuple[str, ...]] = {}
@@ -110,7 +110,6 @@ class PlanningScene:
         self.state = state
         self.space.place(state)
         self.checker.place(state)
-        self.space.turning[:] = self.checker.find_periodic(self._candidates)
         self.set_bounds(self.here, self.here[None])
 
     @property
