@@ -9,7 +9,6 @@ from typing import Any
 
 import numpy as np
 
-from kineverse._extras import install_command  # noqa: F401
 from kineverse.compile.c_library import NO_COMPILER, SourceLibrary
 from kineverse.compile.toolchain import NO_UNDEFINED_FLAGS
 from kineverse.compile.vector_program import vector_header

@@ -113,7 +113,8 @@ class CollisionChecker:
         self._margin = margin
         self._build_struct(margin)
         self._placement: tuple[bytes, bytes] | None = None
-        self._placed, self._excepted = next(_placements), frozenset[frozenset[str]]()
+        self._placed = next(_placements)
+        self._excepted: BodyPairs = frozenset()
 
     def _make_program(self, poses: list[Expression], conditions: Sequence[Expression]) -> VectorProgram:
         self._conditions = tuple(conditions)
@@ -243,21 +244,19 @@ class CollisionChecker:
     def place(self, state: State) -> None:
         """Place everything as at a state: obstacles, and what the poses depend on beside the coordinates."""
         self.scene.update(state)
-        poses, parameters = (
-            self.scene.collision_world.table.poses[self._static],
-            state.vector(self.parameters),
-        )
+        table, parameters = self.scene.collision_world.table, state.vector(self.parameters)
+        poses = table.poses[self._static]
         self._world.place(poses)
         self._kept = self.program.prepare(parameters)
         self.struct.kept = self._kept.ctypes.data
-        places = self.scene.collision_world.table.poses[self._carried, :, 3]
+        places = table.poses[self._carried, :, 3]
         self.struct.margin = self._margin + _ROUNDING * float(np.abs(places).max(initial=0.0))
         placement = poses.tobytes(), parameters.tobytes()
         if placement != self._placement:
             self._placement, self._placed = placement, next(_placements)
 
     @property
-    def version(self) -> tuple[int, frozenset[frozenset[str]]]:
+    def version(self) -> tuple[int, BodyPairs]:
         """Number of the placement, and the pairs that are left out.
 
         While it stays, and the margin and the limits, so do the answers. Other checkers have other numbers.

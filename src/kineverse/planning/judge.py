@@ -89,10 +89,9 @@ class SceneJudge:
         if not moved.any():
             return None
         for q in sample_along(points, moved, min(step, _UNCOVERED)):
-            self._update(q)
-            found = self._uncovered()
-            if len(found):
-                return q, found[0]
+            touching = self.uncovered_contacts(q)
+            if touching is not None:
+                return q, touching[0]
         return None
 
     def uncovered_contacts(self, q: Array) -> DistanceResults | None:

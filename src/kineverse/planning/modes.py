@@ -5,7 +5,6 @@ from __future__ import annotations
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from time import perf_counter
-from typing import TYPE_CHECKING
 
 import numpy as np
 import numpy.typing as npt
@@ -18,9 +17,7 @@ from kineverse.symbols import Symbol
 
 from .checker import BodyPairs
 from .manifold import FrameHold
-
-if TYPE_CHECKING:
-    from .planning_scene import PlanningScene
+from .planning_scene import PlanningScene
 
 _NO_PAIRS: BodyPairs = frozenset()
 _CANDIDATES = 12

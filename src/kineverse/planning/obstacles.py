@@ -8,6 +8,7 @@ from itertools import pairwise
 import numpy as np
 import numpy.typing as npt
 
+from kineverse.compile.batch import allocate_aligned
 from kineverse.geometry.shapes import Core, Hull, Solid
 from kineverse.lie import Array
 from kineverse.model.body import Box, Capsule, Cylinder, Sphere
@@ -71,8 +72,8 @@ class ObstacleSet:
         self._half = np.array([solid.half for solid in solids]).reshape(-1, 3)
         chunks = -(-max(count, 1) // lanes)
         padded_chunks = -(-chunks // lanes) * lanes
-        self._boxes = aligned_floats((6, chunks * lanes))
-        self._chunks = aligned_floats((6, padded_chunks))
+        self._boxes = _aligned_rows(6, chunks * lanes)
+        self._chunks = _aligned_rows(6, padded_chunks)
         self._sorted = np.zeros(chunks * lanes, dtype=OBSTACLE)
         self.struct = ObstacleSetStruct(
             self._sorted.ctypes.data,
@@ -137,12 +138,9 @@ class ObstacleSet:
         self._chunks[3:, : chunks.shape[1]] = chunks[3:].max(axis=2)
 
 
-def aligned_floats(shape: tuple[int, ...]) -> Floats32:
-    """Return zeros that begin at a cache line."""
-    size = int(np.prod(shape))
-    block = np.zeros(size + 16, dtype=np.float32)
-    start = -block.ctypes.data % 64 // 4
-    return block[start : start + size].reshape(shape)
+def _aligned_rows(rows: int, columns: int) -> Floats32:
+    """Return rows of floats, not initialised, that begin at cache lines for whole vectors of columns."""
+    return allocate_aligned(rows * columns // 2).view(np.float32).reshape(rows, columns)
 
 
 def _hull_planes(solid: Solid) -> Array:

@@ -14,7 +14,7 @@ from kineverse.lie import Array
 from kineverse.model.model_view import ModelView
 from kineverse.state import State
 
-from .checker import RESOLUTION, CollisionChecker
+from .checker import RESOLUTION, BodyPairs, CollisionChecker
 
 if TYPE_CHECKING:
     from .judge import SceneJudge
@@ -51,7 +51,7 @@ class PathChecks:
         checker: CollisionChecker,
         judge: SceneJudge,
         manifold: Manifold | None,
-        touching: frozenset[frozenset[str]],
+        touching: BodyPairs,
         restore: Callable[[], None],
     ) -> None:
         self.model, self.state, self._version = model, state, model.version

@@ -187,7 +187,7 @@ class PlanningScene:
         edges: int = MOST_EDGES,
         roadmap: Roadmap | None = None,
     ) -> Path:
-        """Return a path from a configuration (n,) to any of some ends (K, n), along holds; see :meth:`plan`.
+        """Return a path from a configuration (n,) to any of some ends (K, n), see :meth:`.Planner.plan`.
 
         Bodies of the pairs ``touching`` may touch, and some coordinates may stand still.
         """

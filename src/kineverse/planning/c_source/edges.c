@@ -199,8 +199,6 @@ static int edge_on_manifold(const Checker *c, const Projection *p, Work *w, V *s
   return count;
 }
 
-#define EXPORT __attribute__((visibility("default")))
-
 /* Read rows (count, n) into lanes; lanes behind the last row repeat it. */
 static void read_lanes(const Checker *c, Work *w, const float *rows, long long count) {
   const int n = (int)c->coordinates;
@@ -211,7 +209,7 @@ static void read_lanes(const Checker *c, Work *w, const float *rows, long long c
 }
 
 /* Write 1 for every configuration (count, n) that is within limits, holds all conditions and does not collide. */
-EXPORT int kineverse_valid(const Checker *c, const float *rows, long long count, unsigned char *valid) {
+EXPORTED int kineverse_valid(const Checker *c, const float *rows, long long count, unsigned char *valid) {
   Work w;
   if (work_begin(&w, c)) return -1;
   for (long long first = 0; first < count; first += W) {
@@ -228,7 +226,7 @@ EXPORT int kineverse_valid(const Checker *c, const float *rows, long long count,
 }
 
 /* Write 1 for every edge that is free: sampled if `least` is 0, else certain between the samples too. */
-EXPORT int kineverse_edges(const Checker *c, const float *from, const float *to, long long count, double resolution,
+EXPORTED int kineverse_edges(const Checker *c, const float *from, const float *to, long long count, double resolution,
                            double least, unsigned char *valid) {
   Work w;
   if (work_begin(&w, c)) return -1;
@@ -262,7 +260,7 @@ static void certify_short_edges(const Checker *c, Work *w, const float *points, 
 
 /* Find the first collision on a polyline (count, n): return the number of its edge and write the fraction of the
    way along it, or return -1. */
-EXPORT long long kineverse_certify(const Checker *c, const float *points, long long count, double resolution,
+EXPORTED long long kineverse_certify(const Checker *c, const float *points, long long count, double resolution,
                                    double least, double *where) {
   Work w;
   if (work_begin(&w, c)) return -2;
@@ -291,7 +289,7 @@ EXPORT long long kineverse_certify(const Checker *c, const float *points, long l
 }
 
 /* Write the poses of one configuration (12 each) and the conditions; for messages and tests. */
-EXPORT int kineverse_poses(const Checker *c, const float *row, float *outputs) {
+EXPORTED int kineverse_poses(const Checker *c, const float *row, float *outputs) {
   Work w;
   if (work_begin(&w, c)) return -1;
   read_lanes(c, &w, row, 1);
@@ -303,11 +301,15 @@ EXPORT int kineverse_poses(const Checker *c, const float *row, float *outputs) {
 
 /* Add to the counts of all pairs the configurations (count, n) in which they touch: of each link with each body of the
    world (links, bodies), of the pairs of links, and of links with moving sets. */
-EXPORT int kineverse_count_touching(const Checker *c, const float *rows, long long count, int *world, int *pairs,
+EXPORTED int kineverse_count_touching(const Checker *c, const float *rows, long long count, int *world, int *pairs,
                                     int *moving_pairs) {
   Work w;
+  if (work_begin(&w, c)) return -1;
   unsigned char *one = calloc((size_t)c->bodies + 1, 1);
-  if (work_begin(&w, c) || !one) return -1;
+  if (!one) {
+    work_end(&w);
+    return -1;
+  }
   for (long long first = 0; first < count; first += W) {
     const long long left = count - first;
     const unsigned lanes = left < W ? (1u << left) - 1 : (unsigned)((1ull << W) - 1);

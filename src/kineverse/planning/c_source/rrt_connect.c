@@ -202,7 +202,7 @@ static long long branch(Walk *k, const Tree *t, int j, int backwards, float *out
 
 /* Search a path from any start to any goal; write its configurations (room, n) and return their number. Without a
    path those from a start to the node nearest to a goal are written, and the status says why. */
-EXPORT long long kineverse_rrt_connect(Search *s, const float *starts, long long start_count, const float *goals,
+EXPORTED long long kineverse_rrt_connect(Search *s, const float *starts, long long start_count, const float *goals,
                                        long long goal_count, float *path, long long room) {
   const Checker *c = s->checker;
   const int n = (int)c->coordinates;
@@ -307,7 +307,7 @@ end:
 
 /* Shorten a polyline (count, n) in place: random points on it are connected where the way between them is certain,
    until `rounds` tries have failed or the time is up. Return the new number of points. */
-EXPORT long long kineverse_shortcut(Search *s, float *path, long long count, long long room, long long rounds,
+EXPORTED long long kineverse_shortcut(Search *s, float *path, long long count, long long room, long long rounds,
                                     double least) {
   const Checker *c = s->checker;
   const int n = (int)c->coordinates;
@@ -356,7 +356,7 @@ EXPORT long long kineverse_shortcut(Search *s, float *path, long long count, lon
 }
 
 /* Project configurations (count, n) in place; write 1 for those that arrive within limits. */
-EXPORT int kineverse_project(const Checker *c, const Projection *p, float *rows, long long count,
+EXPORTED int kineverse_project(const Checker *c, const Projection *p, float *rows, long long count,
                              unsigned char *arrived) {
   Search s = {.checker = c, .projection = p, .range = 1.0, .resolution = 1.0};
   Walk k;
@@ -379,7 +379,7 @@ EXPORT int kineverse_project(const Checker *c, const Projection *p, float *rows,
 
 /* Go from a to b on the manifold; write the points reached (room, n) and return their number, or -1 if the way ends
    before b. */
-EXPORT long long kineverse_walk(Search *s, const float *a, const float *b, float *points, long long room) {
+EXPORTED long long kineverse_walk(Search *s, const float *a, const float *b, float *points, long long room) {
   Walk k;
   const int n = (int)s->checker->coordinates;
   s->range = distance(a, b, n);
