@@ -14,7 +14,7 @@ from kineverse.compile.toolchain import NO_UNDEFINED_FLAGS
 from kineverse.compile.vector_program import vector_header
 from kineverse.errors import CompileError
 
-SOURCES = ("collision.c", "edges.c", "rrt_connect.c", "roadmap.c")
+SOURCES = ("collision.c", "edges.c", "rrt_connect.c", "manifold.c", "roadmap.c")
 
 OBSTACLE = np.dtype(
     [
@@ -75,7 +75,10 @@ class CheckerStruct(ctypes.Structure):
 class ProjectionStruct(ctypes.Structure):
     """Projection onto a manifold as C reads it."""
 
-    _fields_ = _fields("ppidi", "step kept stored tolerance steps")
+    _fields_ = _fields(
+        "ppidippid",
+        "step kept stored tolerance steps exact exact_kept exact_stored exact_tolerance",
+    )
 
 
 class SearchStruct(ctypes.Structure):
@@ -143,7 +146,9 @@ def _declare_signatures(code: Any) -> None:
         "kineverse_count_touching": (ctypes.c_int, [pointer, pointer, count, pointer, pointer, pointer]),
         "kineverse_rrt_connect": (count, [pointer, pointer, count, pointer, count, pointer, count]),
         "kineverse_project": (ctypes.c_int, [pointer, pointer, pointer, count, pointer]),
-        "kineverse_walk": (count, [pointer, pointer, pointer, pointer, count]),
+        "kineverse_shorten_on_manifold": (count, [pointer, pointer, count, count, count]),
+        "kineverse_polish": (ctypes.c_int, [pointer, pointer, pointer, count, count, pointer]),
+        "kineverse_refine": (count, [pointer, pointer, pointer, count, count, count, number]),
         "kineverse_roadmap": (count, [pointer, pointer, count, pointer, count, pointer, count]),
         "kineverse_shortcut": (count, [pointer, pointer, count, count, count, number]),
     }

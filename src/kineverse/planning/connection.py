@@ -12,7 +12,6 @@ from kineverse.lie import Array
 
 from .bindings import TIME_IS_UP
 from .checker import RESOLUTION, CollisionChecker
-from .constrained_path import polish, shorten_on_manifold
 from .manifold import Manifold
 from .obstacles import Floats32
 from .roadmap import Roadmap
@@ -126,7 +125,7 @@ def connect_on_manifold(
     """Return a path on a manifold from any of some starts (S, n) to any of some goals (G, n).
 
     Its points are in double precision on the manifold, and lines between them keep to it; see
-    :func:`.polish`. A path that collides between samples is searched again, with another seed and more
+    :meth:`.Manifold.refine`. A path that collides between samples is searched again, with another seed and more
     samples.
     """
     begin = perf_counter()
@@ -144,9 +143,8 @@ def connect_on_manifold(
             return Connected(
                 found.points.astype(float), problem or explain_failure(found, seconds), iterations
             )
-        points = found.points
-        whole = shorten_on_manifold(search, found.points, left, seed, _SHORTCUTS)
-        exact = polish(manifold, whole.astype(float))
+        points = search.shorten(found.points, left, seed, _SHORTCUTS)
+        exact = manifold.refine(points)
         if exact is None:
             problem = "A path was found, but it leaves the limits where the holds are met exactly."
             continue

@@ -10,7 +10,6 @@ from kineverse.lie import Array
 
 from .checker import CollisionChecker
 from .configuration import PlanningSpace
-from .constrained_path import polish
 from .judge import FINE, SceneJudge, describe_contacts
 from .manifold import EXACT, Manifold
 
@@ -146,7 +145,7 @@ class Endpoints:
             for other in free:
                 way: Array | None = np.array([q, other])
                 if self._manifold is not None and way is not None:
-                    way = polish(self._manifold, way)
+                    way = self._manifold.refine(way)
                 if way is not None and self._judge.first_contact(way, FINE * 4) is None:
                     return way
         return None

@@ -5,6 +5,7 @@ from __future__ import annotations
 import ctypes
 from collections.abc import Sequence
 from dataclasses import dataclass, field
+from typing import Any
 
 import numpy as np
 import numpy.typing as npt
@@ -30,6 +31,10 @@ TOLERANCE = 1e-4
 """Largest residual of a projection in float [m], [rad]."""
 EXACT = 1e-9
 """Largest residual of a polished configuration [m], [rad]."""
+DEVIATION = 5e-6
+"""Largest residual half way between two points of a polished path [m], [rad]."""
+_MOST_POINTS = 50_000
+"""Number of points that polishing may add to a path."""
 _STEPS, _POLISHING = 8, 12
 _DAMPING = 1e-5
 """Damping of Newton's step where rows depend on each other, beside squares of derivatives [m²], [rad²]."""
@@ -139,11 +144,22 @@ class Manifold:
         self.parameters = (*self._others, *self._targets)
         self._program = VectorProgram(outputs, (*symbols, *free), self.parameters, scalar="float")
         self._exact = VectorProgram(outputs, (*symbols, *free), self.parameters, scalar="double")
-        self._kept = self._program.prepare(np.zeros(len(self.parameters)))
-        self._values = np.zeros(len(self.parameters))
+        # Both are compiled at the same time.
+        self._exact.request()
+        nothing = np.zeros(len(self.parameters))
+        self._kept, self._exact_kept = self._program.prepare(nothing), self._exact.prepare(nothing)
         self.targets = hold_targets(holds)
+        self._state: State | None = None
         self.struct = ProjectionStruct(
-            self._program.compute_address, self._kept.ctypes.data, self._program.stored, TOLERANCE, _STEPS
+            self._program.compute_address,
+            self._kept.ctypes.data,
+            self._program.stored,
+            TOLERANCE,
+            _STEPS,
+            self._exact.compute_address,
+            self._exact_kept.ctypes.data,
+            self._exact.stored,
+            EXACT,
         )
 
     def _rows_of(self, model: ModelView, hold: Hold) -> list[Expression]:
@@ -171,10 +187,12 @@ class Manifold:
         targets
             Numbers that holds have as targets, see :func:`hold_targets`.
         """
-        self.targets = targets
-        self._values = np.concatenate([state.vector(self._others), targets])
-        self._kept = self._program.prepare(self._values)
-        self.struct.kept = self._kept.ctypes.data
+        if state is self._state and np.array_equal(targets, self.targets):
+            return
+        self._state, self.targets = state, targets
+        values = np.concatenate([state.vector(self._others), targets])
+        self._program.prepare(values, self._kept)
+        self._exact.prepare(values, self._exact_kept)
 
     def project(self, Q: Floats32) -> npt.NDArray[np.bool_]:
         """Project configurations (N, n) in place; return flags (N,) of those that arrive within limits."""
@@ -186,23 +204,32 @@ class Manifold:
 
     def polish(self, Q: Array) -> tuple[Array, Array]:
         """Return configurations (N, n) on the manifold, within limits, in double, and residuals (N,)."""
-        lower, upper = self._checker.lower.astype(float), self._checker.upper.astype(float)
-        x = np.array(Q, dtype=float)
-        factors = np.tile(np.where(lower < upper, 1.0, 0.0), (len(x), 1))
-        for _ in range(_POLISHING):
-            steps, residuals = self._exact.evaluate(np.hstack([x, factors]), self._values)
-            if (residuals <= EXACT).all():
-                return x, np.asarray(residuals)
-            to = x + np.where((residuals > EXACT)[:, None], steps, 0.0)
-            x = np.clip(to, lower, upper)
-            factors[x != to] = 0.0
-        return x, self.residuals(x)
+        return self._polish(Q, _POLISHING)
 
     def residuals(self, Q: Array) -> Array:
         """Return the largest residual (N,) of configurations (N, n) [m], [rad]."""
-        points = np.asarray(Q, dtype=float)
-        found = self._exact.evaluate(np.hstack([points, np.ones_like(points)]), self._values)[1]
-        return np.asarray(found)
+        return self._polish(Q, 0)[1]
+
+    def _polish(self, Q: Array, steps: int) -> tuple[Array, Array]:
+        x = np.array(Q, dtype=float, order="C")
+        residuals = np.zeros(len(x))
+        self._code.kineverse_polish(
+            self._checker.address, self.address, x.ctypes.data, len(x), steps, residuals.ctypes.data
+        )
+        return x, residuals
+
+    def refine(self, points: npt.NDArray[np.floating[Any]]) -> Array | None:
+        """Return a polyline (N, n) in double on the manifold, so dense that lines between points keep to it.
+
+        Half way between two points the residual is at most :data:`DEVIATION`. None if a point does not arrive
+        within limits.
+        """
+        work = np.empty((len(points) + _MOST_POINTS, points.shape[1]))
+        work[: len(points)] = points
+        count = self._code.kineverse_refine(
+            self._checker.address, self.address, work.ctypes.data, len(points), len(work), _POLISHING, DEVIATION
+        )
+        return None if count < 0 else work[:count].copy()
 
 
 def hold_targets(holds: Sequence[Hold]) -> Array:

@@ -19,6 +19,8 @@ MOST_EDGES = 1 << 40
 """Number of edges of a search that only its time ends."""
 PATH_ROOM = 16_384
 """Largest number of points of a path."""
+_MORE, _MORE_ON_MANIFOLD = 64, 1024
+"""Number of points that shortcuts may add."""
 
 
 class SearchResult(NamedTuple):
@@ -90,36 +92,24 @@ class RrtConnect:
         return SearchResult(points, s.status, s.iterations, (s.count_start, s.count_goal), s.gap)
 
     def shorten(self, points: Floats32, seconds: float, seed: int, rounds: int) -> Floats32:
-        """Return a shorter path: points on it are joined where the way between them is certainly free."""
+        """Return a shorter path: points on it are joined where the way between them is free.
+
+        In the whole space the way is straight, and certainly free. On a manifold its samples are free.
+        """
         s = self._setup(seconds, seed, RESOLUTION, 0)
-        room = len(points) + 64
+        on_manifold = self._manifold is not None
+        room = len(points) + (_MORE_ON_MANIFOLD if on_manifold else _MORE)
         work = np.zeros((room, points.shape[1]), dtype=np.float32)
         work[: len(points)] = points
-        count = self._code.kineverse_shortcut(
-            ctypes.addressof(s), work.ctypes.data, len(points), room, rounds, LEAST_INFLATION
-        )
-        found = work[:count]
+        given = ctypes.addressof(s), work.ctypes.data, len(points), room, rounds
+        if on_manifold:
+            return work[: self._code.kineverse_shorten_on_manifold(*given)]
+        found = work[: self._code.kineverse_shortcut(*given, LEAST_INFLATION)]
         apart = np.abs(np.diff(found, axis=0)).max(axis=1, initial=0.0) > 1e-6
         # The ends stay exact, whatever is dropped.
         keep = np.concatenate([[True], apart])
         keep[-1] = True
         return np.ascontiguousarray(found[keep])
-
-    def walk(self, a: Floats32, b: Floats32, resolution: float = RESOLUTION) -> Floats32 | None:
-        """Return points (N, n) on the manifold from a, exclusive, to b; None if the way ends before.
-
-        Parameters
-        ----------
-        a, b
-            (n,) configurations on the manifold, contiguous.
-        resolution
-            Points for each unit of length.
-        """
-        s = self._setup(0.0, 0, resolution, 0)
-        count = self._code.kineverse_walk(
-            ctypes.addressof(s), a.ctypes.data, b.ctypes.data, self._path.ctypes.data, PATH_ROOM
-        )
-        return None if count < 0 else self._path[:count].copy()
 
     def _setup(self, seconds: float, seed: int, resolution: float, nodes: int) -> SearchStruct:
         s = self._struct

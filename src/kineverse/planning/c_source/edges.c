@@ -123,14 +123,18 @@ static int edge_is_certain(const Checker *c, Work *w, const float *a, const floa
   return 1;
 }
 
-/* Newton's step onto a manifold: inputs are the coordinates and a factor of each, 0 where it may not move; outputs are
-   the changes of the coordinates, then the largest residual. */
+/* Newton's step onto a manifold, in float and in double: inputs are the coordinates and a factor of each, 0 where it may
+   not move; outputs are the changes of the coordinates, then the largest residual. */
 typedef struct {
   Compute *step;
   const V *kept;
   long long stored;
   double tolerance;
   long long steps;
+  void (*exact)(const void *x, const void *kept, void *store, void *o);
+  const void *exact_kept;
+  long long exact_stored;
+  double exact_tolerance;
 } Projection;
 
 /* Residual below which a coordinate that meets its limit stays there. */

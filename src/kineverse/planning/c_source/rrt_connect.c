@@ -354,39 +354,3 @@ EXPORTED long long kineverse_shortcut(Search *s, float *path, long long count, l
   s->elapsed = now() - begin;
   return count;
 }
-
-/* Project configurations (count, n) in place; write 1 for those that arrive within limits. */
-EXPORTED int kineverse_project(const Checker *c, const Projection *p, float *rows, long long count,
-                             unsigned char *arrived) {
-  Search s = {.checker = c, .projection = p, .range = 1.0, .resolution = 1.0};
-  Walk k;
-  const int n = (int)c->coordinates;
-  if (walk_begin(&k, &s)) {
-    walk_end(&k);
-    return -1;
-  }
-  for (long long first = 0; first < count; first += W) {
-    read_lanes(c, &k.w, rows + first * n, count - first);
-    const I good = project(c, p, &k.w, k.store, k.o);
-    for (int j = 0; j < W && first + j < count; j++) {
-      arrived[first + j] = good[j] != 0;
-      for (int i = 0; i < n; i++) rows[(first + j) * n + i] = k.w.x[i][j];
-    }
-  }
-  walk_end(&k);
-  return 0;
-}
-
-/* Go from a to b on the manifold; write the points reached (room, n) and return their number, or -1 if the way ends
-   before b. */
-EXPORTED long long kineverse_walk(Search *s, const float *a, const float *b, float *points, long long room) {
-  Walk k;
-  const int n = (int)s->checker->coordinates;
-  s->range = distance(a, b, n);
-  long long count = -1;
-  int full = 0;
-  if (!walk_begin(&k, s) && k.room <= room)
-    count = edge_on_manifold(s->checker, s->projection, &k.w, k.store, k.o, a, b, (float)s->resolution, points, &full);
-  walk_end(&k);
-  return full && distance(points + (count - 1) * n, b, n) < 1e-3f ? count : -1;
-}
