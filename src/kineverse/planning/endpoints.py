@@ -5,13 +5,16 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
+import numpy.typing as npt
 
 from kineverse.lie import Array
 
 from .checker import CollisionChecker
 from .configuration import PlanningSpace
+from .connection import WIDER
 from .judge import FINE, SceneJudge, describe_contacts
 from .manifold import EXACT, Manifold
+from .obstacles import Floats32
 
 _DISTANCES = (0.01, 0.02, 0.04, 0.08, 0.15, 0.3, 0.5)
 _TRIES, _WAYS = 256, 6
@@ -85,7 +88,10 @@ class Endpoints:
             touching = self._judge.uncovered_contacts(q)
             if touching is not None:
                 return Endpoint(way, f"{what} is in collision: {describe_contacts(touching)}.")
-            return Endpoint(way)
+            # No way on a manifold leads to an end that nearly touches without its spheres touching between samples.
+            tight = self._manifold is not None and not self._have_room(narrow)[0]
+            out = self._leave_spheres(q) if tight else None
+            return Endpoint(way if out is None else out)
         _, conditions = self._checker.outputs(narrow[0])
         broken = [
             name for name, c in zip(self._space.condition_names, conditions, strict=False) if not c <= 0
@@ -113,7 +119,11 @@ class Endpoints:
             inside = ((ends >= self._checker.lower) & (ends <= self._checker.upper)).all(axis=1)
             if self._manifold is not None:
                 inside &= self._manifold.residuals(ends) <= EXACT
-            inside &= self._checker.valid(np.ascontiguousarray(ends, dtype=np.float32))
+            narrow = np.ascontiguousarray(ends, dtype=np.float32)
+            inside &= self._checker.valid(narrow)
+            if self._manifold is not None:
+                roomy = inside & self._have_room(narrow)
+                inside = roomy if roomy.any() else inside
             if inside.any():
                 return [Endpoint(end[None]) for end in ends[inside]]
         names = ["The goal"] if len(ends) == 1 else [f"Goal {k}" for k in range(len(ends))]
@@ -129,6 +139,11 @@ class Endpoints:
         ]
         return "; ".join(wrong[:4])
 
+    def _have_room(self, Q: Floats32) -> npt.NDArray[np.bool_]:
+        """Return flags (N,) of configurations (N, n) that are free with the margin of a search."""
+        with self._checker.widened(WIDER, Q[:0]):
+            return self._checker.valid(Q)
+
     def _leave_spheres(self, q: Array) -> Array | None:
         """Return a way (K, n), free by the scene, to a near configuration in which no sphere touches."""
         generator = np.random.default_rng(0)
@@ -139,7 +154,7 @@ class Endpoints:
             tries = np.ascontiguousarray(np.clip(q + step, low, high), dtype=np.float32)
             if self._manifold is not None:
                 tries = np.ascontiguousarray(tries[self._manifold.project(tries)])
-            free = tries[self._checker.valid(tries)][:_WAYS].astype(float)
+            free = tries[self._have_room(tries)][:_WAYS].astype(float)
             if self._manifold is not None and len(free):
                 free = self._manifold.polish(free)[0]
             for other in free:

@@ -234,12 +234,16 @@ class Manifold:
 
 def hold_targets(holds: Sequence[Hold]) -> Array:
     """Return the numbers that holds have as targets, of all holds one after the other."""
-    found = [
-        np.broadcast_to(as_expression(hold.target)({}), hold.expression.shape).ravel()
-        for hold in holds
-        if not as_expression(hold.target).symbols
-    ]
-    return np.concatenate([np.zeros(0), *found])
+    found = [np.zeros(0)]
+    for hold in holds:
+        target = hold.target
+        if not isinstance(target, int | float):
+            target = as_expression(target)
+            if target.symbols:
+                continue
+            target = target({})
+        found.append(np.full(hold.expression.shape, target, dtype=float).ravel())
+    return np.concatenate(found)
 
 
 def manifold_key(holds: Sequence[Hold]) -> tuple[object, ...]:
