@@ -146,7 +146,7 @@ def _declare_signatures(code: Any) -> None:
         "kineverse_count_touching": (ctypes.c_int, [pointer, pointer, count, pointer, pointer, pointer]),
         "kineverse_rrt_connect": (count, [pointer, pointer, count, pointer, count, pointer, count]),
         "kineverse_project": (ctypes.c_int, [pointer, pointer, pointer, count, pointer]),
-        "kineverse_shorten_on_manifold": (count, [pointer, pointer, count, count, count]),
+        "kineverse_relax": (count, [pointer, pointer, count, count]),
         "kineverse_polish": (ctypes.c_int, [pointer, pointer, pointer, count, count, pointer]),
         "kineverse_refine": (count, [pointer, pointer, pointer, count, count, count, number]),
         "kineverse_roadmap": (count, [pointer, pointer, count, pointer, count, pointer, count]),

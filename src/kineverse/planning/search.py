@@ -19,8 +19,6 @@ MOST_EDGES = 1 << 40
 """Number of edges of a search that only its time ends."""
 PATH_ROOM = 16_384
 """Largest number of points of a path."""
-_MORE, _MORE_ON_MANIFOLD = 64, 1024
-"""Number of points that shortcuts may add."""
 
 
 class SearchResult(NamedTuple):
@@ -92,19 +90,18 @@ class RrtConnect:
         return SearchResult(points, s.status, s.iterations, (s.count_start, s.count_goal), s.gap)
 
     def shorten(self, points: Floats32, seconds: float, seed: int, rounds: int) -> Floats32:
-        """Return a shorter path: points on it are joined where the way between them is free.
+        """Return a shorter path.
 
-        In the whole space the way is straight, and certainly free. On a manifold its samples are free.
+        In the whole space points on it are joined, a number of times, where the straight way between them is
+        certainly free. On a manifold it contracts like a band, as long as its samples are free.
         """
         s = self._setup(seconds, seed, RESOLUTION, 0)
-        on_manifold = self._manifold is not None
-        room = len(points) + (_MORE_ON_MANIFOLD if on_manifold else _MORE)
-        work = np.zeros((room, points.shape[1]), dtype=np.float32)
+        work = np.zeros((3 * len(points) + 64, points.shape[1]), dtype=np.float32)
         work[: len(points)] = points
-        given = ctypes.addressof(s), work.ctypes.data, len(points), room, rounds
-        if on_manifold:
-            return work[: self._code.kineverse_shorten_on_manifold(*given)]
-        found = work[: self._code.kineverse_shortcut(*given, LEAST_INFLATION)]
+        given = ctypes.addressof(s), work.ctypes.data, len(points), len(work)
+        if self._manifold is not None:
+            return work[: self._code.kineverse_relax(*given)]
+        found = work[: self._code.kineverse_shortcut(*given, rounds, LEAST_INFLATION)]
         apart = np.abs(np.diff(found, axis=0)).max(axis=1, initial=0.0) > 1e-6
         # The ends stay exact, whatever is dropped.
         keep = np.concatenate([[True], apart])

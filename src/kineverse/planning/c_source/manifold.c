@@ -28,94 +28,124 @@ static float polyline_length(const float *points, long long count, int n) {
   return sum;
 }
 
-/* Return 1 if no configuration of a polyline (count, n) collides, the first one excepted, and if conditions hold
-   between them. Every block sees the whole polyline. */
-static int points_are_free(const Checker *c, Work *w, const float *points, long long count) {
+/* Number of times that the edges of a relaxed path are halved, which begin with this many samples. */
+#define HALVINGS 4
+/* Over-relaxation of a sweep, largest number of sweeps, and the gain of one below which it is the last one. */
+#define OVER 1.6f
+#define SWEEPS 40
+#define LEAST_GAIN 0.01f
+
+/* Move every other inner node of a polyline (count, n) from `first` on towards the middle of its neighbours, by a
+   factor of the distance, where it stays free and the squares of its edges become smaller. */
+static float relax_nodes(Walk *k, float *path, long long count, long long first, float factor) {
+  const Checker *c = k->s->checker;
   const int n = (int)c->coordinates;
-  const long long blocks = (count - 2 + W) / W;
-  for (long long k = 0; k < blocks; k++) {
+  float gain = 0.0f;
+  for (long long block = first; block < count - 1; block += 2 * W) {
     for (int j = 0; j < W; j++) {
-      const long long at = 1 + k + j * blocks;
-      const float *row = points + (at < count ? at : count - 1) * n;
-      for (int i = 0; i < n; i++) w->x[i][j] = row[i];
+      const float *row = path + (block + 2 * j < count - 1 ? block + 2 * j : block) * n;
+      for (int i = 0; i < n; i++) k->w.x[i][j] = row[i] + factor * (0.5f * (row[i - n] + row[i + n]) - row[i]);
     }
-    evaluate(c, w);
-    if (collides(c, w)) return 0;
+    I good = project(c, k->s->projection, &k->w, k->store, k->o);
+    if (!any(good)) continue;
+    evaluate(c, &k->w);
+    good &= ~collisions(c, &k->w);
+    for (int j = 0; j < W && block + 2 * j < count - 1; j++) {
+      float *row = path + (block + 2 * j) * n, before = 0.0f, after = 0.0f;
+      for (int i = 0; i < n; i++) {
+        const float a = row[i - n], b = row[i + n], q = k->w.x[i][j];
+        before += (row[i] - a) * (row[i] - a) + (b - row[i]) * (b - row[i]);
+        after += (q - a) * (q - a) + (b - q) * (b - q);
+      }
+      if (good[j] && after < before) {
+        gain += before - after;
+        for (int i = 0; i < n; i++) row[i] = k->w.x[i][j];
+      }
+    }
   }
-  for (long long k = 1; k < count; k++)
-    if (!conditions_hold(c, w, points + (k - 1) * n, points + k * n)) return 0;
+  return gain;
+}
+
+/* Insert a node half way along every edge of a polyline (count, n), which has room for them. Return 1 if all arrive, are
+   free, and are near to both neighbours. */
+static int insert_middles(Walk *k, float *path, long long count) {
+  const Checker *c = k->s->checker;
+  const int n = (int)c->coordinates;
+  for (long long e = count - 1; e > 0; e--) memcpy(path + 2 * e * n, path + e * n, n * sizeof(float));
+  for (long long block = 1; block < 2 * count - 1; block += 2 * W) {
+    for (int j = 0; j < W; j++) {
+      const float *row = path + (block + 2 * j < 2 * count - 1 ? block + 2 * j : block) * n;
+      for (int i = 0; i < n; i++) k->w.x[i][j] = 0.5f * (row[i - n] + row[i + n]);
+    }
+    if (any(~project(c, k->s->projection, &k->w, k->store, k->o))) return 0;
+    evaluate(c, &k->w);
+    if (collides(c, &k->w)) return 0;
+    for (int j = 0; j < W && block + 2 * j < 2 * count - 1; j++) {
+      float *row = path + (block + 2 * j) * n;
+      for (int i = 0; i < n; i++) row[i] = k->w.x[i][j];
+      const float most = 0.75f * distance(row - n, row + n, n) + 1e-4f;
+      if (distance(row - n, row, n) > most || distance(row, row + n, n) > most) return 0;
+    }
+  }
   return 1;
 }
 
-/* Project the straight way from a to b, at most as long as k->s->range: write a and the points after it, and return
-   their number; 0 if a point does not arrive, or is far from the one before. */
-static long long project_way(Walk *k, const float *a, const float *b, float *points) {
-  const Checker *c = k->s->checker;
-  const int n = (int)c->coordinates;
-  const float length = distance(a, b, n);
-  const int blocks = (int)ceilf(fmaxf(length * (float)k->s->resolution, 1.0f) / W);
-  const float step = 1.0f / (blocks * W), gap = 2.5f * length * step + 1e-4f;
-  memcpy(points, a, n * sizeof(float));
-  for (int e = 0; e < blocks; e++) {
-    interpolate(c, &k->w, a, b, (ramp() + splat(e * W + 1.0f)) * splat(step));
-    const I good = project(c, k->s->projection, &k->w, k->store, k->o);
-    if (any(~good)) return 0;
-    for (int j = 0; j < W; j++) {
-      float *row = points + (1 + e * W + j) * n;
-      for (int i = 0; i < n; i++) row[i] = k->w.x[i][j];
-      if (!(distance(row - n, row, n) <= gap)) return 0;
-    }
+/* Write nodes of a path (count, n), its ends and others about evenly spaced, and return their number. */
+static long long choose_nodes(const float *path, long long count, int n, long long edges, float *nodes) {
+  const float spacing = polyline_length(path, count, n) / edges;
+  float along = 0.0f;
+  long long found = 0;
+  for (long long k = 0; k < count; k++) {
+    if (k) along += distance(path + (k - 1) * n, path + k * n, n);
+    if (k == count - 1 && found > edges) found = edges;
+    if (k == count - 1 || along >= found * spacing) memcpy(nodes + found++ * n, path + k * n, n * sizeof(float));
   }
-  return distance(points + blocks * W * n, b, n) < 1e-3f ? 1 + blocks * W : 0;
+  return found;
 }
 
-/* A way that is shorter than this fraction of another one is worth it. */
-#define SHORTER 0.98f
-/* Number of tries in a row that may bring nothing. */
-#define PATIENCE 12
-
-/* Shorten a polyline (count, n) on a manifold in place, in which there is room for more points: points of it are joined
-   by projections of the straight way between them, until `rounds` tries are over or the time is up. Return the new
-   number of points. */
-EXPORTED long long kineverse_shorten_on_manifold(Search *s, float *path, long long count, long long room,
-                                               long long rounds) {
-  const Checker *c = s->checker;
+/* Shorten a path like a band: few nodes of it are relaxed, by sweeps over odd and even ones, and then the edges are
+   halved some times. Write the nodes and return their number, or 0 if the way between them is not free. */
+static long long relax(Walk *k, const float *path, long long count, int halvings, float *nodes) {
+  const Checker *c = k->s->checker;
   const int n = (int)c->coordinates;
+  const float samples = polyline_length(path, count, n) * (float)k->s->resolution;
+  const long long edges = (long long)ceilf(fmaxf(samples, 1.0f) / (1 << HALVINGS)) << (HALVINGS - halvings);
+  long long found = choose_nodes(path, count, n, edges, nodes);
+  float squares = 0.0f, gain = INFINITY;
+  for (long long e = 1; e < found; e++) {
+    const float d = distance(nodes + (e - 1) * n, nodes + e * n, n);
+    squares += d * d;
+  }
+  for (int sweep = 0; sweep < SWEEPS && gain > LEAST_GAIN * squares; sweep++) {
+    gain = relax_nodes(k, nodes, found, 1, OVER) + relax_nodes(k, nodes, found, 2, OVER);
+    squares -= gain;
+  }
+  for (int first = 1; first <= 2; first++) relax_nodes(k, nodes, found, first, 1.0f);
+  for (; halvings; halvings--) {
+    if (!insert_middles(k, nodes, found)) return 0;
+    found = 2 * found - 1;
+  }
+  for (long long e = 1; e < found; e++)
+    if (!conditions_hold(c, &k->w, nodes + (e - 1) * n, nodes + e * n)) return 0;
+  return found;
+}
+
+/* Shorten a path (count, n) on a manifold in place, which has room for more points, and return their number. Few nodes
+   are fast to relax; where something lies between them, more are tried. */
+EXPORTED long long kineverse_relax(Search *s, float *path, long long count, long long room) {
+  const int n = (int)s->checker->coordinates;
   const double begin = now();
-  Random random = (Random)s->seed * 0x2545f4914f6cdd1dULL + 0x9e3779b97f4a7c15ULL;
   Walk k;
   s->range = polyline_length(path, count, n);
-  if (walk_begin(&k, s)) {
-    walk_end(&k);
-    return count;
-  }
-  int failures = 0;
-  for (long long round = 0; round < rounds && count >= 4 && failures <= PATIENCE; round++) {
-    if (now() - begin > s->seconds) break;
-    /* The whole way first: a path that a straight way replaces needs no other tries. */
-    long long i = 0, j = count - 1;
-    if (round) {
-      i = (long long)(random_unit(&random) * count), j = (long long)(random_unit(&random) * count);
-      if (i > j) {
-        const long long swap = i;
-        i = j, j = swap;
-      }
-    }
-    if (j < i + 3) continue;
-    const float length = polyline_length(path + i * n, j - i + 1, n);
-    if (distance(path + i * n, path + j * n, n) > SHORTER * length) continue;
-    failures++;
-    const long long found = project_way(&k, path + i * n, path + j * n, k.points);
-    if (!found || count - (j - i + 1) + found > room || polyline_length(k.points, found, n) > SHORTER * length ||
-        !points_are_free(c, &k.w, k.points, found))
-      continue;
-    memmove(path + (i + found) * n, path + (j + 1) * n, (count - j - 1) * n * sizeof(float));
-    memcpy(path + i * n, k.points, found * n * sizeof(float));
-    count += found - (j - i + 1);
-    failures = 0;
+  long long found = 0;
+  if (!walk_begin(&k, s))
+    for (int halvings = HALVINGS; halvings >= 0 && !found && now() - begin < s->seconds; halvings--)
+      found = relax(&k, path, count, halvings, k.points);
+  if (found && found <= room) {
+    memcpy(path, k.points, found * n * sizeof(float));
+    count = found;
   }
   walk_end(&k);
-  s->elapsed = now() - begin;
   return count;
 }
 

@@ -124,7 +124,7 @@ static int walk_begin(Walk *k, Search *s) {
   if (work_begin(&k->w, s->checker)) return 1;
   if (s->projection) {
     const size_t vectors = s->projection->stored + n + 4;
-    k->room = (int)ceil(s->range * s->resolution) + 4 * W;
+    k->room = (int)ceil(s->range * s->resolution) + 4 * W + 2;
     k->memory = malloc(vectors * sizeof(V) + 64 + (size_t)k->room * n * sizeof(float));
     if (!k->memory) return 1;
     k->o = (V *)(((size_t)k->memory + 63) & ~(size_t)63);
