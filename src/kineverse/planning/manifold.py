@@ -31,7 +31,7 @@ TOLERANCE = 1e-4
 """Largest residual of a projection in float [m], [rad]."""
 EXACT = 1e-9
 """Largest residual of a polished configuration [m], [rad]."""
-DEVIATION = 5e-6
+DEVIATION = 8e-6
 """Largest residual half way between two points of a polished path [m], [rad]."""
 _MOST_POINTS = 50_000
 """Number of points that polishing may add to a path."""

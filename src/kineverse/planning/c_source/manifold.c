@@ -152,22 +152,30 @@ EXPORTED long long kineverse_relax(Search *s, float *path, long long count, long
 /* Vectors of D doubles, as the step in double has them. */
 enum { D = REGISTER / 8 };
 typedef double Doubles __attribute__((vector_size(REGISTER)));
+typedef long long Mask __attribute__((vector_size(REGISTER)));
 
+INLINE Doubles choose(Mask mask, Doubles a, Doubles b) { return (Doubles)((mask & (Mask)a) | (~mask & (Mask)b)); }
+
+/* Work space of steps in double, and in float. */
 typedef struct {
   const Checker *c;
   const Projection *p;
   Doubles *x, *o, *store;
+  V *narrow_x, *narrow_o, *narrow_store;
   void *memory;
 } Polish;
 
 static int polish_begin(Polish *w, const Checker *c, const Projection *p) {
   const size_t n = c->coordinates;
   w->c = c, w->p = p;
-  w->memory = malloc((3 * n + 2 + p->exact_stored) * sizeof(Doubles) + 64);
+  w->memory = malloc((6 * n + 4 + p->exact_stored + p->stored) * REGISTER + 64);
   if (!w->memory) return 1;
   w->x = (Doubles *)(((size_t)w->memory + 63) & ~(size_t)63);
   w->o = w->x + 2 * n;
   w->store = w->o + n + 1;
+  w->narrow_x = (V *)(w->store + p->exact_stored + 1);
+  w->narrow_o = w->narrow_x + 2 * n;
+  w->narrow_store = w->narrow_o + n + 1;
   return 0;
 }
 
@@ -175,24 +183,23 @@ static int polish_begin(Polish *w, const Checker *c, const Projection *p) {
 static void polish_block(Polish *w, double *rows, long long count, long long steps, double *residuals) {
   const int n = (int)w->c->coordinates, lanes = count < D ? (int)count : D;
   const float *lower = w->c->lower, *upper = w->c->upper;
+  const Doubles zero = {0.0};
   Doubles *x = w->x, *factor = x + n, *o = w->o;
-  for (int i = 0; i < n; i++)
-    for (int j = 0; j < D; j++) {
-      x[i][j] = rows[(j < lanes ? j : lanes - 1) * n + i];
-      factor[i][j] = lower[i] < upper[i];
-    }
+  for (int i = 0; i < n; i++) {
+    factor[i] = zero + (lower[i] < upper[i] ? 1.0 : 0.0);
+    for (int j = 0; j < D; j++) x[i][j] = rows[(j < lanes ? j : lanes - 1) * n + i];
+  }
   for (long long k = 0;; k++) {
     w->p->exact(x, w->p->exact_kept, w->store, o);
+    const Mask done = o[n] <= zero + w->p->exact_tolerance;
     int left = 0;
-    for (int j = 0; j < lanes; j++) left += !(o[n][j] <= w->p->exact_tolerance);
+    for (int j = 0; j < D; j++) left |= !done[j];
     if (k == steps || !left) break;
-    for (int i = 0; i < n; i++)
-      for (int j = 0; j < D; j++) {
-        const double to = x[i][j] + (o[n][j] > w->p->exact_tolerance ? o[i][j] : 0.0);
-        const double in = to < lower[i] ? lower[i] : to > upper[i] ? upper[i] : to;
-        if (in != to) factor[i][j] = 0.0;
-        x[i][j] = in;
-      }
+    for (int i = 0; i < n; i++) {
+      const Doubles low = zero + lower[i], high = zero + upper[i], to = x[i] + choose(done, zero, o[i]);
+      x[i] = choose(to < low, low, choose(to > high, high, to));
+      factor[i] = choose(x[i] == to, factor[i], zero);
+    }
   }
   for (int j = 0; j < lanes; j++) {
     residuals[j] = o[n][j];
@@ -226,20 +233,19 @@ static long long subdivide(Polish *w, double *points, long long count, long long
   if (!step) return -1;
   int *parts = (int *)(step + edges * n);
   long long total = 1;
-  for (long long first = 0; first + 1 < count; first += D) {
-    for (int j = 0; j < D; j++) {
+  V *x = w->narrow_x, *o = w->narrow_o;
+  for (int i = 0; i < n; i++) x[n + i] = splat(w->c->lower[i] < w->c->upper[i] ? 1.0f : 0.0f);
+  for (long long first = 0; first + 1 < count; first += W) {
+    for (int j = 0; j < W; j++) {
       const double *a = points + (first + j + 2 < count ? first + j : count - 2) * n;
-      for (int i = 0; i < n; i++) {
-        w->x[i][j] = 0.5 * (a[i] + a[n + i]);
-        w->x[n + i][j] = w->c->lower[i] < w->c->upper[i];
-      }
+      for (int i = 0; i < n; i++) x[i][j] = (float)(0.5 * (a[i] + a[n + i]));
     }
-    w->p->exact(w->x, w->p->exact_kept, w->store, w->o);
-    for (long long k = first; k < first + D && k + 1 < count; k++) {
-      const double residual = w->o[n][k - first];
+    w->p->step(x, w->p->kept, w->narrow_store, o);
+    for (long long k = first; k < first + W && k + 1 < count; k++) {
+      const double residual = o[n][k - first];
       const double wanted = residual > deviation ? ceil(sqrt(RESERVE * residual / deviation)) : 1.0;
       parts[k] = wanted < MOST_PARTS ? (int)wanted : MOST_PARTS;
-      for (int i = 0; i < n; i++) step[k * n + i] = w->o[i][k - first];
+      for (int i = 0; i < n; i++) step[k * n + i] = o[i][k - first];
       total += parts[k];
     }
   }
