@@ -133,11 +133,12 @@ class PlanningSpace:
         if not self.turning.any():
             return q[None]
         low, high = self.bounds(start, q[None])
+        first = np.ceil((low - q) / math.tau - 1e-9).astype(int)
+        last = np.floor((high - q) / math.tau + 1e-9).astype(int)
         found = [q]
-        for i in np.flatnonzero(self.turning).tolist():
-            first = math.ceil((low[i] - q[i]) / math.tau - 1e-9)
-            last = math.floor((high[i] - q[i]) / math.tau + 1e-9)
-            found = [_shifted(p, i, k * math.tau) for p in found for k in range(first, last + 1)] or found
+        for i in np.flatnonzero(self.turning & (first <= last) & ((first != 0) | (last != 0))).tolist():
+            turns = range(first[i], last[i] + 1)
+            found = [_shifted(p, i, k * math.tau) for p in found for k in turns]
             found.sort(key=lambda p: float(np.linalg.norm(p - start)))
             del found[most:]
         return np.array(found)

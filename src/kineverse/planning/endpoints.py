@@ -84,13 +84,13 @@ class Endpoints:
         narrow = np.ascontiguousarray(
             np.clip(way, self._checker.lower, self._checker.upper), dtype=np.float32
         )
-        if self._checker.valid(narrow)[0]:
+        roomy = self._manifold is not None and self._have_room(narrow)[0]
+        if roomy or self._checker.valid(narrow)[0]:
             touching = self._judge.uncovered_contacts(q)
             if touching is not None:
                 return Endpoint(way, f"{what} is in collision: {describe_contacts(touching)}.")
             # No way on a manifold leads to an end that nearly touches without its spheres touching between samples.
-            tight = self._manifold is not None and not self._have_room(narrow)[0]
-            out = self._leave_spheres(q) if tight else None
+            out = None if roomy or self._manifold is None else self._leave_spheres(q)
             return Endpoint(way if out is None else out)
         _, conditions = self._checker.outputs(narrow[0])
         broken = [

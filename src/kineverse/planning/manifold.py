@@ -163,7 +163,7 @@ class Manifold:
         )
 
     def _rows_of(self, model: ModelView, hold: Hold) -> list[Expression]:
-        if as_expression(hold.target).symbols:
+        if not _is_number(hold):
             return [model.rates.resolve(e) for e in hold.error.ravel()]
         targets = [
             parameter(f"planning/target/{len(self._targets) + k}", 0.0) for k in range(hold.expression.size)
@@ -236,21 +236,20 @@ def hold_targets(holds: Sequence[Hold]) -> Array:
     """Return the numbers that holds have as targets, of all holds one after the other."""
     found = [np.zeros(0)]
     for hold in holds:
-        target = hold.target
-        if not isinstance(target, int | float):
-            target = as_expression(target)
-            if target.symbols:
-                continue
-            target = target({})
-        found.append(np.full(hold.expression.shape, target, dtype=float).ravel())
+        if _is_number(hold):
+            value = hold.target if isinstance(hold.target, int | float) else as_expression(hold.target)({})
+            found.append(np.full(hold.expression.shape, value, dtype=float).ravel())
     return np.concatenate(found)
+
+
+def _is_number(hold: Hold) -> bool:
+    """Return True if the target of a hold is a number, or an array of some."""
+    return isinstance(hold.target, int | float) or not as_expression(hold.target).symbols
 
 
 def manifold_key(holds: Sequence[Hold]) -> tuple[object, ...]:
     """Return what the program of a manifold depends on: holds with other numbers as targets share it."""
-    return tuple(
-        (hold.expression, hold.target if as_expression(hold.target).symbols else None) for hold in holds
-    )
+    return tuple((hold.expression, None if _is_number(hold) else hold.target) for hold in holds)
 
 
 def _jacobian(rows: Expression, symbols: Sequence[Symbol]) -> Expression:

@@ -101,6 +101,7 @@ class PlanningScene:
         space.turning &= self.checker.find_periodic(space.turning)
         self._manifolds: dict[tuple[object, ...], Manifold] = {}
         self._judges: dict[BodyPairs, SceneJudge] = {}
+        self._touching: dict[frozenset[tuple[str, str]], BodyPairs] = {}
         self._carried_bodies: dict[str, tuple[str, ...]] = {}
         leave_near_pairs(self.checker, space)
         self.place(state)
@@ -161,14 +162,17 @@ class PlanningScene:
 
     def touching_pairs(self, holds: Iterable[Hold]) -> BodyPairs:
         """Return the pairs of bodies that may touch while holds last."""
-        return frozenset(
-            frozenset((a, b))
-            for hold in holds
-            if isinstance(hold, FrameHold) and _are_apart(self.model, *hold.frames)
-            for a in self._carried(hold.frames[0])
-            for b in self._carried(hold.frames[1])
-            if a != b
-        )
+        frames = frozenset(hold.frames for hold in holds if isinstance(hold, FrameHold))
+        if frames not in self._touching:
+            self._touching[frames] = frozenset(
+                frozenset((a, b))
+                for one, other in frames
+                if _are_apart(self.model, one, other)
+                for a in self._carried(one)
+                for b in self._carried(other)
+                if a != b
+            )
+        return self._touching[frames]
 
     def _carried(self, frame: str) -> tuple[str, ...]:
         if frame not in self._carried_bodies:
