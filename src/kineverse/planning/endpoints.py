@@ -17,7 +17,7 @@ from .manifold import EXACT, Manifold
 from .obstacles import Floats32
 
 _DISTANCES = (0.01, 0.02, 0.04, 0.08, 0.15, 0.3, 0.5)
-_TRIES, _WAYS = 256, 6
+_TRIES, _WAYS, _FEW = 256, 6, 8
 _LIMIT = 1e-6
 _NEAR = 0.01
 """Largest residual of an end that is brought onto a manifold [m], [rad]."""
@@ -116,16 +116,18 @@ class Endpoints:
         Of several, those that need no closer look are enough.
         """
         if len(ends) > 1:
-            inside = ((ends >= self._checker.lower) & (ends <= self._checker.upper)).all(axis=1)
-            if self._manifold is not None:
-                inside &= self._manifold.residuals(ends) <= EXACT
             narrow = np.ascontiguousarray(ends, dtype=np.float32)
-            inside &= self._checker.valid(narrow)
-            if self._manifold is not None:
-                roomy = inside & self._have_room(narrow)
-                inside = roomy if roomy.any() else inside
-            if inside.any():
-                return [Endpoint(end[None]) for end in ends[inside]]
+            inside = ((ends >= self._checker.lower) & (ends <= self._checker.upper)).all(axis=1)
+            if self._manifold is None:
+                easy = inside & self._checker.valid(narrow)
+            else:
+                inside &= self._manifold.residuals(ends) <= EXACT
+                easy = inside & self._have_room(narrow)
+            if easy.any():
+                return [Endpoint(end[None]) for end in ends[easy]]
+            tight = inside & self._checker.valid(narrow)
+            if tight.any():
+                ends = ends[tight][:_FEW]
         names = ["The goal"] if len(ends) == 1 else [f"Goal {k}" for k in range(len(ends))]
         found = [self.check(name, end) for name, end in zip(names, ends, strict=True)]
         return [end for end in found if not end.reason] or " ".join(end.reason for end in found[:3])
