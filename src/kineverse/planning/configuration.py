@@ -130,15 +130,16 @@ class PlanningSpace:
 
         The nearest to the start come first. Without any there is q itself.
         """
-        if not self.turning.any():
-            return q[None]
-        low, high = self.bounds(start, q[None])
-        first = np.ceil((low - q) / math.tau - 1e-9).astype(int)
-        last = np.floor((high - q) / math.tau + 1e-9).astype(int)
+        columns = np.flatnonzero(self.turning)
+        lower, upper, here = self.lower[columns], self.upper[columns], start[columns]
+        low = np.where(np.isfinite(lower), lower, here - _HALF_TURN) - q[columns]
+        high = np.where(np.isfinite(upper), upper, here + _HALF_TURN) - q[columns]
+        first = np.ceil(low / math.tau - 1e-9).astype(int)
+        last = np.floor(high / math.tau + 1e-9).astype(int)
         found = [q]
-        for i in np.flatnonzero(self.turning & (first <= last) & ((first != 0) | (last != 0))).tolist():
-            turns = range(first[i], last[i] + 1)
-            found = [_shifted(p, i, k * math.tau) for p in found for k in turns]
+        for k in np.flatnonzero((first <= last) & ((first != 0) | (last != 0))).tolist():
+            turns = range(first[k], last[k] + 1)
+            found = [_shifted(p, int(columns[k]), turn * math.tau) for p in found for turn in turns]
             found.sort(key=lambda p: float(np.linalg.norm(p - start)))
             del found[most:]
         return np.array(found)

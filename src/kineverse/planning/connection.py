@@ -138,12 +138,11 @@ def connect_on_manifold(
             break
         with checker.widened(WIDER, np.vstack([starts, goals])):
             found = search.solve(starts, goals, left, seed + _NEXT_SEED * attempt, resolution)
-        iterations += found.iterations
-        if not found.found:
-            return Connected(
-                found.points.astype(float), problem or explain_failure(found, seconds), iterations
-            )
-        with checker.widened(WIDER / 2, np.vstack([starts, goals])):
+            iterations += found.iterations
+            if not found.found:
+                return Connected(
+                    found.points.astype(float), problem or explain_failure(found, seconds), iterations
+                )
             points = search.shorten(found.points, left, seed, _SHORTCUTS)
         exact = manifold.refine(points)
         if exact is None:

@@ -17,7 +17,7 @@ from .manifold import EXACT, Manifold
 from .obstacles import Floats32
 
 _DISTANCES = (0.01, 0.02, 0.04, 0.08, 0.15, 0.3, 0.5)
-_TRIES, _WAYS, _FEW = 256, 6, 8
+_TRIES, _WAYS, _FEW = (32, 256), 12, 8
 _LIMIT = 1e-6
 _NEAR = 0.01
 """Largest residual of an end that is brought onto a manifold [m], [rad]."""
@@ -150,12 +150,13 @@ class Endpoints:
         """Return a way (K, n), free by the scene, to a near configuration in which no sphere touches."""
         generator = np.random.default_rng(0)
         low, high = self._checker.lower, self._checker.upper
-        for distance in _DISTANCES:
-            step = generator.standard_normal((_TRIES, len(q)))
-            step *= distance / np.linalg.norm(step, axis=1)[:, None]
-            tries = np.ascontiguousarray(np.clip(q + step, low, high), dtype=np.float32)
+        for number in _TRIES:
+            step = generator.standard_normal((len(_DISTANCES), number, len(q)))
+            step *= np.array(_DISTANCES)[:, None, None] / np.linalg.norm(step, axis=2, keepdims=True)
+            tries = np.ascontiguousarray(np.clip(q + step.reshape(-1, len(q)), low, high), dtype=np.float32)
             if self._manifold is not None:
                 tries = np.ascontiguousarray(tries[self._manifold.project(tries)])
+            # The nearest come first.
             free = tries[self._have_room(tries)][:_WAYS].astype(float)
             if self._manifold is not None and len(free):
                 free = self._manifold.polish(free)[0]
