@@ -76,6 +76,45 @@ def test_path_keeps_to_a_hold_between_its_points(flying):
     assert max(error) < 1e-5
 
 
+@pytest.fixture(scope="module")
+def globe():
+    """A ball on a unit sphere, and an obstacle half way between two of its places; planner and hold."""
+    x, y, z = (kv.position(n) for n in "xyz")
+    model = kv.Model()
+    with model.edit() as edit:
+        edit.add_frame("ball", "world", kv.translation(x, y, z), body(Sphere(0.05)))
+        edit.add_frame("hill", "world", kv.translation(1, 0, 0), body(Sphere(0.25)))
+        for name, symbol in zip("xyz", (x, y, z), strict=True):
+            edit.constrain(name, -1.5, symbol, 1.5)
+    return Planner(model), kv.control.Hold(np.sqrt(x * x + y * y + z * z), 1.0)
+
+
+def test_path_on_a_manifold_is_as_short_as_a_band(globe):
+    planner, hold = globe
+    away, radius = np.pi / 4, 2 * np.arcsin(0.3 / 2)
+    ends = np.array([[np.cos(a), np.sin(a), 0.0] for a in (-away, away)])
+    # Great circles to the circle around the hill, and the way along it.
+    straight = np.arccos(np.cos(away) / np.cos(radius))
+    around = (np.pi - 2 * np.arccos(np.tan(radius) / np.tan(away))) * np.sin(radius)
+    for seed in range(5):
+        path = planner.plan(*ends, along=hold, seed=seed)
+        assert path, path.why
+        assert is_free(planner, path.points)
+        assert path.length < 1.05 * (2 * straight + around)
+        np.testing.assert_array_equal(planner.plan(*ends, along=hold, seed=seed).points, path.points)
+        middle = (path.points[1:] + path.points[:-1]) / 2
+        assert 2e-6 < np.abs(np.linalg.norm(middle, axis=1) - 1.0).max() < 1e-5
+
+
+def test_ends_that_nearly_touch_are_left_first(globe):
+    planner, hold = globe
+    angle = 2 * np.arcsin((0.3 + 1e-4) / 2)
+    start = np.array([np.cos(angle), np.sin(angle), 0.0])
+    path = planner.plan(start, [np.cos(1.0), -np.sin(1.0), 0.0], along=hold, seconds=0.5)
+    assert path, path.why
+    np.testing.assert_allclose(path.points[0], start, atol=1e-9)
+
+
 def test_only_what_both_frames_carry_may_touch(flying):
     hold = flying.hold("hand", "bar", "xyz")
     pairs = {frozenset((a, b)) for a in ("hand", "finger") for b in ("bar", "knob")}

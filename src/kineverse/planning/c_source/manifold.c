@@ -35,33 +35,47 @@ static float polyline_length(const float *points, long long count, int n) {
 #define SWEEPS 40
 #define LEAST_GAIN 0.01f
 
-/* Move every other inner node of a polyline (count, n) from `first` on towards the middle of its neighbours, by a
-   factor of the distance, where it stays free and the squares of its edges become smaller. */
-static float relax_nodes(Walk *k, float *path, long long count, long long first, float factor) {
+/* Lanes of w->x that arrive on the manifold and are free. */
+static I project_free(Walk *k) {
   const Checker *c = k->s->checker;
-  const int n = (int)c->coordinates;
+  const I good = project(c, k->s->projection, &k->w, k->store, k->o);
+  if (!any(good)) return good;
+  evaluate(c, &k->w);
+  return good & ~collisions(c, &k->w);
+}
+
+/* Move every other inner node of a polyline (count, n) from `first` on towards the middle of its neighbours, by a
+   factor of the distance, where it stays free and the squares of its edges become smaller. With `careful`, the middles
+   of its edges stay free as well. Return by how much the squares of edges became smaller. */
+static float relax_nodes(Walk *k, float *path, long long count, long long first, float factor, int careful) {
+  const int n = (int)k->s->checker->coordinates;
+  V a[MOST_COORDINATES], b[MOST_COORDINATES], q[MOST_COORDINATES], *x = k->w.x;
   float gain = 0.0f;
   for (long long block = first; block < count - 1; block += 2 * W) {
-    for (int j = 0; j < W; j++) {
-      const float *row = path + (block + 2 * j < count - 1 ? block + 2 * j : block) * n;
-      for (int i = 0; i < n; i++) k->w.x[i][j] = row[i] + factor * (0.5f * (row[i - n] + row[i + n]) - row[i]);
-    }
-    I good = project(c, k->s->projection, &k->w, k->store, k->o);
-    if (!any(good)) continue;
-    evaluate(c, &k->w);
-    good &= ~collisions(c, &k->w);
-    for (int j = 0; j < W && block + 2 * j < count - 1; j++) {
-      float *row = path + (block + 2 * j) * n, before = 0.0f, after = 0.0f;
-      for (int i = 0; i < n; i++) {
-        const float a = row[i - n], b = row[i + n], q = k->w.x[i][j];
-        before += (row[i] - a) * (row[i] - a) + (b - row[i]) * (b - row[i]);
-        after += (q - a) * (q - a) + (b - q) * (b - q);
+    V before = splat(0.0f), after = splat(0.0f);
+    for (int i = 0; i < n; i++) {
+      for (int j = 0; j < W; j++) {
+        const float *row = path + (block + 2 * j < count - 1 ? block + 2 * j : block) * n + i;
+        a[i][j] = row[-n], q[i][j] = row[0], b[i][j] = row[n];
       }
-      if (good[j] && after < before) {
-        gain += before - after;
-        for (int i = 0; i < n; i++) row[i] = k->w.x[i][j];
-      }
+      before += (q[i] - a[i]) * (q[i] - a[i]) + (b[i] - q[i]) * (b[i] - q[i]);
+      x[i] = q[i] + splat(factor) * (splat(0.5f) * (a[i] + b[i]) - q[i]);
     }
+    I good = project_free(k);
+    for (int i = 0; i < n; i++) {
+      q[i] = x[i];
+      after += (q[i] - a[i]) * (q[i] - a[i]) + (b[i] - q[i]) * (b[i] - q[i]);
+    }
+    good &= after < before;
+    for (int side = 0; side < 2 * careful && any(good); side++) {
+      for (int i = 0; i < n; i++) x[i] = splat(0.5f) * (q[i] + (side ? b[i] : a[i]));
+      good &= project_free(k);
+    }
+    for (int j = 0; j < W && block + 2 * j < count - 1; j++)
+      if (good[j]) {
+        gain += before[j] - after[j];
+        for (int i = 0; i < n; i++) path[(block + 2 * j) * n + i] = q[i][j];
+      }
   }
   return gain;
 }
@@ -69,17 +83,14 @@ static float relax_nodes(Walk *k, float *path, long long count, long long first,
 /* Insert a node half way along every edge of a polyline (count, n), which has room for them. Return 1 if all arrive, are
    free, and are near to both neighbours. */
 static int insert_middles(Walk *k, float *path, long long count) {
-  const Checker *c = k->s->checker;
-  const int n = (int)c->coordinates;
+  const int n = (int)k->s->checker->coordinates;
   for (long long e = count - 1; e > 0; e--) memcpy(path + 2 * e * n, path + e * n, n * sizeof(float));
   for (long long block = 1; block < 2 * count - 1; block += 2 * W) {
     for (int j = 0; j < W; j++) {
       const float *row = path + (block + 2 * j < 2 * count - 1 ? block + 2 * j : block) * n;
       for (int i = 0; i < n; i++) k->w.x[i][j] = 0.5f * (row[i - n] + row[i + n]);
     }
-    if (any(~project(c, k->s->projection, &k->w, k->store, k->o))) return 0;
-    evaluate(c, &k->w);
-    if (collides(c, &k->w)) return 0;
+    if (any(~project_free(k))) return 0;
     for (int j = 0; j < W && block + 2 * j < 2 * count - 1; j++) {
       float *row = path + (block + 2 * j) * n;
       for (int i = 0; i < n; i++) row[i] = k->w.x[i][j];
@@ -105,7 +116,7 @@ static long long choose_nodes(const float *path, long long count, int n, long lo
 
 /* Shorten a path like a band: few nodes of it are relaxed, by sweeps over odd and even ones, and then the edges are
    halved some times. Write the nodes and return their number, or 0 if the way between them is not free. */
-static long long relax(Walk *k, const float *path, long long count, int halvings, float *nodes) {
+static long long relax(Walk *k, const float *path, long long count, int halvings, int careful, float *nodes) {
   const Checker *c = k->s->checker;
   const int n = (int)c->coordinates;
   const float samples = polyline_length(path, count, n) * (float)k->s->resolution;
@@ -117,10 +128,10 @@ static long long relax(Walk *k, const float *path, long long count, int halvings
     squares += d * d;
   }
   for (int sweep = 0; sweep < SWEEPS && gain > LEAST_GAIN * squares; sweep++) {
-    gain = relax_nodes(k, nodes, found, 1, OVER) + relax_nodes(k, nodes, found, 2, OVER);
+    gain = relax_nodes(k, nodes, found, 1, OVER, careful) + relax_nodes(k, nodes, found, 2, OVER, careful);
     squares -= gain;
   }
-  for (int first = 1; first <= 2; first++) relax_nodes(k, nodes, found, first, 1.0f);
+  for (int first = 1; first <= 2; first++) relax_nodes(k, nodes, found, first, 1.0f, careful);
   for (; halvings; halvings--) {
     if (!insert_middles(k, nodes, found)) return 0;
     found = 2 * found - 1;
@@ -139,8 +150,10 @@ EXPORTED long long kineverse_relax(Search *s, float *path, long long count, long
   s->range = polyline_length(path, count, n);
   long long found = 0;
   if (!walk_begin(&k, s))
-    for (int halvings = HALVINGS; halvings >= 0 && !found && now() - begin < s->seconds; halvings--)
-      found = relax(&k, path, count, halvings, k.points);
+    for (int halvings = HALVINGS, careful = 0; halvings >= 0 && !found && now() - begin < s->seconds; careful = 1) {
+      found = relax(&k, path, count, halvings, careful, k.points);
+      halvings -= careful;
+    }
   if (found && found <= room) {
     memcpy(path, k.points, found * n * sizeof(float));
     count = found;
