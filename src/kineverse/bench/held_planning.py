@@ -184,9 +184,9 @@ class HeldResults:
 
 
 def run_held_motion(name: str, places: int, progress: Progress, seed: int = 0) -> HeldResults:
-    """Return attempts at a motion of :data:`MOTIONS`, with start and goal given, from random places of the base.
+    """Return attempts at a motion of :data:`MOTIONS` from given starts to given goals.
 
-    Places count where grasps without collisions exist at the start and the goal.
+    The base stands at random places. They count where grasps without collisions exist at both ends.
     """
     motion, results = MOTIONS[name], HeldResults(name)
     model, joint = motion.model, motion.model.symbol(motion.joint)
@@ -230,7 +230,8 @@ def _find_ends(
 ) -> tuple[Array, Array] | None:
     """Return grasps at starts and goals, as many (K, n) of each; None if there are none."""
     ends = [
-        planner.solutions([*holds, end], count=STARTS, seconds=_PATIENCE, seed=seed) for end in (closed, opened)
+        planner.solutions([*holds, end], count=STARTS, seconds=_PATIENCE, seed=seed)
+        for end in (closed, opened)
     ]
     count = min(map(len, ends))
     return (ends[0][:count], ends[1][:count]) if count else None

@@ -125,8 +125,8 @@ def connect_on_manifold(
     """Return a path on a manifold from any of some starts (S, n) to any of some goals (G, n).
 
     Its points are in double precision on the manifold, and lines between them keep to it; see
-    :meth:`.Manifold.refine`. A path that collides between samples is searched again, with another seed and more
-    samples.
+    :meth:`.Manifold.refine`. A path that collides between samples is searched again, with another seed and
+    more samples.
     """
     begin = perf_counter()
     search = RrtConnect(checker, manifold, edges)
@@ -143,7 +143,7 @@ def connect_on_manifold(
                 return Connected(
                     found.points.astype(float), problem or explain_failure(found, seconds), iterations
                 )
-            points = search.shorten(found.points, left, seed, _SHORTCUTS)
+            points = search.contract(found.points, left)
         exact = manifold.refine(points)
         if exact is None:
             problem = "A path was found, but it leaves the limits where the holds are met exactly."

@@ -89,7 +89,7 @@ class Endpoints:
             touching = self._judge.uncovered_contacts(q)
             if touching is not None:
                 return Endpoint(way, f"{what} is in collision: {describe_contacts(touching)}.")
-            # No way on a manifold leads to an end that nearly touches without its spheres touching between samples.
+            # On a manifold the edge to an end that nearly touches is hardly ever certain.
             out = None if roomy or self._manifold is None else self._leave_spheres(q)
             return Endpoint(way if out is None else out)
         _, conditions = self._checker.outputs(narrow[0])

@@ -90,23 +90,28 @@ class RrtConnect:
         return SearchResult(points, s.status, s.iterations, (s.count_start, s.count_goal), s.gap)
 
     def shorten(self, points: Floats32, seconds: float, seed: int, rounds: int) -> Floats32:
-        """Return a shorter path.
-
-        In the whole space points on it are joined, a number of times, where the straight way between them is
-        certainly free. On a manifold it contracts like a band, as long as its samples are free.
-        """
+        """Return a shorter path: points on it are joined where the way between them is certainly free."""
         s = self._setup(seconds, seed, RESOLUTION, 0)
-        work = np.zeros((3 * len(points) + 64, points.shape[1]), dtype=np.float32)
+        room = len(points) + 64
+        work = np.zeros((room, points.shape[1]), dtype=np.float32)
         work[: len(points)] = points
-        given = ctypes.addressof(s), work.ctypes.data, len(points), len(work)
-        if self._manifold is not None:
-            return work[: self._code.kineverse_relax(*given)]
-        found = work[: self._code.kineverse_shortcut(*given, rounds, LEAST_INFLATION)]
+        count = self._code.kineverse_shortcut(
+            ctypes.addressof(s), work.ctypes.data, len(points), room, rounds, LEAST_INFLATION
+        )
+        found = work[:count]
         apart = np.abs(np.diff(found, axis=0)).max(axis=1, initial=0.0) > 1e-6
         # The ends stay exact, whatever is dropped.
         keep = np.concatenate([[True], apart])
         keep[-1] = True
         return np.ascontiguousarray(found[keep])
+
+    def contract(self, points: Floats32, seconds: float) -> Floats32:
+        """Return a shorter path on the manifold: it contracts like a band, as long as its samples are free."""
+        s = self._setup(seconds, 0, RESOLUTION, 0)
+        work = np.zeros((3 * len(points) + 64, points.shape[1]), dtype=np.float32)
+        work[: len(points)] = points
+        given = ctypes.addressof(s), work.ctypes.data, len(points), len(work)
+        return work[: self._code.kineverse_relax(*given)]
 
     def _setup(self, seconds: float, seed: int, resolution: float, nodes: int) -> SearchStruct:
         s = self._struct
