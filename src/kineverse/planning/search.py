@@ -106,7 +106,7 @@ class RrtConnect:
         return np.ascontiguousarray(found[keep])
 
     def contract(self, points: Floats32, seconds: float) -> Floats32:
-        """Return a shorter path on the manifold: it contracts like a band, as long as its samples are free."""
+        """Return a shorter path on the manifold: it contracts like a band, while its samples are free."""
         s = self._setup(seconds, 0, RESOLUTION, 0)
         work = np.zeros((3 * len(points) + 64, points.shape[1]), dtype=np.float32)
         work[: len(points)] = points

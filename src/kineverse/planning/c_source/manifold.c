@@ -28,7 +28,7 @@ static float polyline_length(const float *points, long long count, int n) {
   return sum;
 }
 
-/* Number of times that the edges of a relaxed path are halved, which begin with this many samples. */
+/* Largest number of times that the edges of a relaxed path are halved. */
 #define HALVINGS 4
 /* Over-relaxation of a sweep, largest number of sweeps, and the gain of one below which it is the last one. */
 #define OVER 1.6f
@@ -119,8 +119,8 @@ static long long choose_nodes(const float *path, long long count, int n, long lo
 static long long relax(Walk *k, const float *path, long long count, int halvings, int careful, float *nodes) {
   const Checker *c = k->s->checker;
   const int n = (int)c->coordinates;
-  const float samples = polyline_length(path, count, n) * (float)k->s->resolution;
-  const long long edges = (long long)ceilf(fmaxf(samples, 1.0f) / (1 << HALVINGS)) << (HALVINGS - halvings);
+  const float samples = fmaxf((float)(k->s->range * k->s->resolution), 1.0f);
+  const long long edges = (long long)ceilf(samples / (1 << halvings));
   long long found = choose_nodes(path, count, n, edges, nodes);
   float squares = 0.0f, gain = INFINITY;
   for (long long e = 1; e < found; e++) {
@@ -148,9 +148,11 @@ EXPORTED long long kineverse_relax(Search *s, float *path, long long count, long
   const double begin = now();
   Walk k;
   s->range = polyline_length(path, count, n);
+  int most = HALVINGS;
+  while (most && (1 << most) > s->range * s->resolution) most--;
   long long found = 0;
   if (!walk_begin(&k, s))
-    for (int halvings = HALVINGS, careful = 0; halvings >= 0 && !found && now() - begin < s->seconds; careful = 1) {
+    for (int halvings = most, careful = 0; halvings >= 0 && !found && now() - begin < s->seconds; careful = 1) {
       found = relax(&k, path, count, halvings, careful, k.points);
       halvings -= careful;
     }
