@@ -165,9 +165,9 @@ static I project(const Checker *c, const Projection *p, Work *w, V *store, V *o)
 }
 
 /* Go from a towards b on the manifold as far as possible; write the points reached, (count, n), and return their
-   number. `full` is set if nothing stops the way. */
+   number. `full` is set if nothing stops the way. A way that was gone before, to `known`, is not checked again. */
 static int edge_on_manifold(const Checker *c, const Projection *p, Work *w, V *store, V *o, const float *a,
-                            const float *b, float resolution, float *points, int *full) {
+                            const float *b, float resolution, float *points, int *full, const float *known) {
   const int n = (int)c->coordinates;
   const float length = distance(a, b, n);
   const int blocks = (int)ceilf(fmaxf(length * resolution, 1.0f) / W);
@@ -187,14 +187,16 @@ static int edge_on_manifold(const Checker *c, const Projection *p, Work *w, V *s
     }
     good &= gaps <= splat(gap * gap);
     if (!good[0]) return count;
-    evaluate(c, w);
-    good &= ~collisions(c, w);
+    if (!known) {
+      evaluate(c, w);
+      good &= ~collisions(c, w);
+    }
     const int before = count;
     int reached = 0;
     for (; reached < W && good[reached]; reached++, count++)
       for (int i = 0; i < n; i++) points[count * n + i] = w->x[i][reached];
     for (int j = before; j < count; j++) {
-      if (!conditions_hold(c, w, last, points + j * n)) return j;
+      if (known ? distance(last, known, n) < 1e-6f : !conditions_hold(c, w, last, points + j * n)) return j;
       last = points + j * n;
     }
     if (reached < W) return count;

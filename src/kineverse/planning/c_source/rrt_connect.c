@@ -152,7 +152,7 @@ static int extend(Walk *k, const float *a, const float *b, float *reached) {
   }
   int full;
   const int count = edge_on_manifold(c, k->s->projection, &k->w, k->store, k->o, a, b, (float)k->s->resolution,
-                                     k->points, &full);
+                                     k->points, &full, 0);
   if (!count || (!full && distance(a, k->points + (count - 1) * n, n) < 1e-3f)) return 0;
   memcpy(reached, k->points + (count - 1) * n, n * sizeof(float));
   return full ? 2 : 1;
@@ -175,11 +175,12 @@ static long long branch(Walk *k, const Tree *t, int j, int backwards, float *out
   for (long long i = depth - 1; i >= 0; i--, j = t->parent[j]) nodes[i] = j;
   for (long long i = 0; i < depth; i++) {
     int points = 1, full;
-    float from[MOST_COORDINATES];
+    float from[MOST_COORDINATES], to[MOST_COORDINATES];
     if (k->s->projection && i) {
       tree_read(t, n, nodes[i - 1], from);
+      tree_read(t, n, nodes[i], to);
       points = edge_on_manifold(c, k->s->projection, &k->w, k->store, k->o, from, t->aims + (long long)nodes[i] * n,
-                                (float)k->s->resolution, k->points, &full);
+                                (float)k->s->resolution, k->points, &full, to);
     }
     if (count + points > room) {
       count = -1;
