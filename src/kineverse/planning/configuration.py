@@ -130,16 +130,14 @@ class PlanningSpace:
 
         The nearest to the start come first. Without any there is q itself.
         """
-        columns = np.flatnonzero(self.turning)
-        lower, upper, here = self.lower[columns], self.upper[columns], start[columns]
-        low = np.where(np.isfinite(lower), lower, here - _HALF_TURN) - q[columns]
-        high = np.where(np.isfinite(upper), upper, here + _HALF_TURN) - q[columns]
-        first = np.ceil(low / math.tau - 1e-9).astype(int)
-        last = np.floor(high / math.tau + 1e-9).astype(int)
+        if not self.turning.any():
+            return q[None]
+        low, high = self.bounds(start, q[None])
         found = [q]
-        for k in np.flatnonzero((first <= last) & ((first != 0) | (last != 0))).tolist():
-            turns = range(first[k], last[k] + 1)
-            found = [_shifted(p, int(columns[k]), turn * math.tau) for p in found for turn in turns]
+        for i in np.flatnonzero(self.turning).tolist():
+            first = math.ceil((low[i] - q[i]) / math.tau - 1e-9)
+            last = math.floor((high[i] - q[i]) / math.tau + 1e-9)
+            found = [_shifted(p, i, k * math.tau) for p in found for k in range(first, last + 1)] or found
             found.sort(key=lambda p: float(np.linalg.norm(p - start)))
             del found[most:]
         return np.array(found)
