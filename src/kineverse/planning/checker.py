@@ -111,6 +111,7 @@ class CollisionChecker:
         self._choose_pairs(dependence)
         self._margin = margin
         self._objects = ObjectPlacement(world.table)
+        self._solids = [world.solid(k) for k in range(len(world.objects))]  # C has pointers to them
         self.links.shapes["object"] = [k for b in self.moving for k in world.members[world.body_index(b)]]
         self._build_struct(margin)
         self._placement: tuple[bytes, bytes] | None = None
