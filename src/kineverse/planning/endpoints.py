@@ -1,24 +1,20 @@
-"""Starts and goals of a plan: whether they are free, and ways out of spheres where only these touch."""
+"""Starts and goals of a plan: whether they are free."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass
 
 import numpy as np
-import numpy.typing as npt
 
 from kineverse.lie import Array
 
 from .checker import CollisionChecker
 from .configuration import PlanningSpace
-from .connection import WIDER
-from .judge import FINE, SceneJudge, describe_contacts
+from .judge import SceneJudge, describe_contacts
 from .manifold import EXACT, Manifold
-from .obstacles import Floats32
 
-_DISTANCES = (0.01, 0.02, 0.04, 0.08, 0.15, 0.3, 0.5)
-_TRIES, _WAYS, _FEW = (32, 256), 12, 8
 _LIMIT = 1e-6
+_ROUNDING = 1e-5
 _NEAR = 0.01
 """Largest residual of an end that is brought onto a manifold [m], [rad]."""
 
@@ -29,20 +25,14 @@ class Endpoint:
 
     Attributes
     ----------
-    way
-        Configurations (K, n) from the given one to one in which no sphere touches; the given one alone if
-        none does.
+    q
+        The configuration (n,), on the manifold if there is one.
     reason
         Why it cannot be used; empty if it can.
     """
 
-    way: Array
+    q: Array
     reason: str = ""
-
-    @property
-    def inner(self) -> Array:
-        """The configuration (n,) from which the search goes on."""
-        return np.asarray(self.way[-1])
 
 
 class Endpoints:
@@ -53,7 +43,7 @@ class Endpoints:
     space
         Coordinates and their limits.
     checker
-        Collision checker with spheres.
+        Compiled collision check.
     judge
         Collision scene.
     manifold
@@ -66,49 +56,40 @@ class Endpoints:
         self._space, self._checker, self._judge, self._manifold = space, checker, judge, manifold
 
     def check(self, what: str, q: Array) -> Endpoint:
-        """Return a start or goal (n,), with the reason why it cannot be used, or its way out of spheres."""
-        way = q[None].astype(float)
+        """Return a start or goal (n,), with the reason why it cannot be used."""
         outside = self._beyond_limits(q)
         if outside:
-            return Endpoint(way, f"{what} is out of limits: {outside}.")
+            return Endpoint(q, f"{what} is out of limits: {outside}.")
         if self._manifold is not None:
-            off = float(self._manifold.residuals(way)[0])
-            way, residuals = self._manifold.polish(way) if off <= _NEAR else (way, np.array([off]))
-            if not residuals[0] <= EXACT or self._beyond_limits(way[0]):
+            given = q
+            off = float(self._manifold.residuals(q[None])[0])
+            if off <= _NEAR:
+                points, residuals = self._manifold.polish(q[None])
+                q, off = points[0], float(residuals[0])
+            if not off <= EXACT or self._beyond_limits(q):
                 return Endpoint(
-                    q[None],
+                    given,
                     f"{what} does not meet the holds: it is off by {off:.3g}. planner.solutions(holds) "
                     "finds some.",
                 )
-            q = way[0]
-        narrow = np.ascontiguousarray(
-            np.clip(way, self._checker.lower, self._checker.upper), dtype=np.float32
-        )
-        roomy = self._manifold is not None and self._have_room(narrow)[0]
-        if roomy or self._checker.valid(narrow)[0]:
-            touching = self._judge.uncovered_contacts(q)
-            if touching is not None:
-                return Endpoint(way, f"{what} is in collision: {describe_contacts(touching)}.")
-            # On a manifold the edge to an end that nearly touches is hardly ever certain.
-            out = None if roomy or self._manifold is None else self._leave_spheres(q)
-            return Endpoint(way if out is None else out)
-        _, conditions = self._checker.outputs(narrow[0])
+        checker = self._checker
+        narrow = np.ascontiguousarray(np.clip(q, checker.lower, checker.upper)[None], dtype=np.float32)
+        if checker.valid(narrow)[0]:
+            return Endpoint(q)
+        _, conditions = checker.outputs(narrow[0])
         broken = [
             name for name, c in zip(self._space.condition_names, conditions, strict=False) if not c <= 0
         ]
         if broken:
-            return Endpoint(way, f"{what} violates {', '.join(map(repr, broken[:6]))}.")
+            return Endpoint(q, f"{what} violates {', '.join(map(repr, broken[:6]))}.")
         contacts = self._judge.contacts(q)
         if len(contacts):
-            return Endpoint(way, f"{what} is in collision: {describe_contacts(contacts)}.")
-        found = self._leave_spheres(q)
-        if found is None:
-            return Endpoint(
-                way,
-                f"{what} is free by the scene, but nearer to a contact than the spheres of the planner or "
-                "its margin allow, and no way out was found. A smaller protrusion= or margin= helps.",
-            )
-        return Endpoint(found)
+            return Endpoint(q, f"{what} is in collision: {describe_contacts(contacts)}.")
+        nearest = self._judge.contacts(q, checker.struct.margin + _ROUNDING)
+        found = [f"'{c.a}' and '{c.b}' are {1e3 * c.distance:.2g} mm apart" for c in [*nearest][:3]]
+        return Endpoint(
+            q, f"{what} is free, but nearer to a contact than margin= allows: {', '.join(found)}."
+        )
 
     def check_goals(self, ends: Array) -> list[Endpoint] | str:
         """Return the goals among configurations (K, n) that can be used, or why there are none.
@@ -116,18 +97,12 @@ class Endpoints:
         Of several, those that need no closer look are enough.
         """
         if len(ends) > 1:
-            narrow = np.ascontiguousarray(ends, dtype=np.float32)
             inside = ((ends >= self._checker.lower) & (ends <= self._checker.upper)).all(axis=1)
-            if self._manifold is None:
-                easy = inside & self._checker.valid(narrow)
-            else:
+            if self._manifold is not None:
                 inside &= self._manifold.residuals(ends) <= EXACT
-                easy = inside & self._have_room(narrow)
-            if easy.any():
-                return [Endpoint(end[None]) for end in ends[easy]]
-            tight = inside & self._checker.valid(narrow)
-            if tight.any():
-                ends = ends[tight][:_FEW]
+            inside &= self._checker.valid(np.ascontiguousarray(ends, dtype=np.float32))
+            if inside.any():
+                return [Endpoint(end) for end in ends[inside]]
         names = ["The goal"] if len(ends) == 1 else [f"Goal {k}" for k in range(len(ends))]
         found = [self.check(name, end) for name, end in zip(names, ends, strict=True)]
         return [end for end in found if not end.reason] or " ".join(end.reason for end in found[:3])
@@ -140,30 +115,3 @@ class Endpoints:
             if not low - _LIMIT <= value <= high + _LIMIT
         ]
         return "; ".join(wrong[:4])
-
-    def _have_room(self, Q: Floats32) -> npt.NDArray[np.bool_]:
-        """Return flags (N,) of configurations (N, n) that are free with the margin of a search."""
-        with self._checker.widened(WIDER, Q[:0]):
-            return self._checker.valid(Q)
-
-    def _leave_spheres(self, q: Array) -> Array | None:
-        """Return a way (K, n), free by the scene, to a near configuration in which no sphere touches."""
-        generator = np.random.default_rng(0)
-        low, high = self._checker.lower, self._checker.upper
-        for number in _TRIES:
-            step = generator.standard_normal((len(_DISTANCES), number, len(q)))
-            step *= np.array(_DISTANCES)[:, None, None] / np.linalg.norm(step, axis=2, keepdims=True)
-            tries = np.ascontiguousarray(np.clip(q + step.reshape(-1, len(q)), low, high), dtype=np.float32)
-            if self._manifold is not None:
-                tries = np.ascontiguousarray(tries[self._manifold.project(tries)])
-            # The nearest come first.
-            free = tries[self._have_room(tries)][:_WAYS].astype(float)
-            if self._manifold is not None and len(free):
-                free = self._manifold.polish(free)[0]
-            for other in free:
-                way: Array | None = np.array([q, other])
-                if self._manifold is not None and way is not None:
-                    way = self._manifold.refine(way)
-                if way is not None and self._judge.first_contact(way, FINE * 4) is None:
-                    return way
-        return None

@@ -38,6 +38,8 @@ class ObstacleSet:
         Table that the planes of hulls are added to; rows of a normal and an offset.
     lanes
         Number of obstacles in a chunk.
+    objects
+        (M,) number of the object of each solid in the scene; for the world only.
     pose, link
         Numbers of the pose and of the link that carries the set; 0 for the world.
 
@@ -57,10 +59,11 @@ class ObstacleSet:
         lanes: int,
         pose: int = 0,
         link: int = 0,
+        objects: npt.ArrayLike = 0,
     ) -> None:
         self._lanes, count = lanes, len(solids)
         self._items = np.zeros(count, dtype=OBSTACLE)
-        self._items["body"] = bodies
+        self._items["body"], self._items["object"] = bodies, objects
         self._sizes = np.zeros((count, 3))
         self._order: npt.NDArray[np.intp] | None = None
         for k, solid in enumerate(solids):
