@@ -106,7 +106,7 @@ def test_path_on_a_manifold_is_as_short_as_a_band(globe):
         assert 2e-6 < np.abs(np.linalg.norm(middle, axis=1) - 1.0).max() < 1e-5
 
 
-def test_ends_that_nearly_touch_are_left_first(globe):
+def test_path_on_a_manifold_from_a_start_that_nearly_touches(globe):
     planner, hold = globe
     angle = 2 * np.arcsin((0.3 + 1e-4) / 2)
     start = np.array([np.cos(angle), np.sin(angle), 0.0])
