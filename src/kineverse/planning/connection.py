@@ -25,7 +25,7 @@ _FINEST = 4000.0
 _ATTEMPTS, _NEXT_SEED = 16, 7919
 _TELLING = 100
 """Number of samples after which a small tree says that its root cannot be left."""
-WIDER = 1e-3
+_WIDER = 1e-3
 """Margin beyond the one asked for: edges of a search are mostly free between their samples then [m]."""
 
 
@@ -73,7 +73,7 @@ def connect(
         left = seconds - (perf_counter() - begin)
         if attempt and left <= 0.0:
             break
-        with checker.widened(WIDER, np.vstack([starts, goals])):
+        with checker.widened(_WIDER, np.vstack([starts, goals])):
             if roadmap is None:
                 found = search.solve(starts, goals, left, seed + _NEXT_SEED * attempt)
             else:
@@ -82,7 +82,7 @@ def connect(
         if not found.found:
             return Connected(found.points.astype(float), explain_failure(found, seconds), iterations)
         # Parts of a shortcut that just passes would not be certain by themselves.
-        with checker.widened(WIDER / 2, np.vstack([starts, goals])):
+        with checker.widened(_WIDER / 2, np.vstack([starts, goals])):
             points = search.shorten(found.points, seconds - (perf_counter() - begin), seed, _SHORTCUTS)
         certain = _repair(search, checker, points, begin + seconds, seed)
         if certain is not None:
@@ -136,7 +136,7 @@ def connect_on_manifold(
         left = seconds - (perf_counter() - begin)
         if attempt and left <= 0.0:
             break
-        with checker.widened(WIDER, np.vstack([starts, goals])):
+        with checker.widened(_WIDER, np.vstack([starts, goals])):
             found = search.solve(starts, goals, left, seed + _NEXT_SEED * attempt, resolution)
             iterations += found.iterations
             if not found.found:
