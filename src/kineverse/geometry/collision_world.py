@@ -80,6 +80,7 @@ class CollisionWorld:
         self._version: int | None = None
         self._placed_at: tuple[tuple[Symbol, ...], Floats] = (), np.zeros(0)  # symbols and values
         self._missing_state = ""
+        self._function: Any = None
         self._evaluator: Any = None
         self.inputs: tuple[Symbol, ...] = ()
         self.objects: list[CollisionObject] = []
@@ -155,7 +156,7 @@ class CollisionWorld:
         self._restore_poses()
 
     def _compile(self, poses: list[Any]) -> None:
-        function = compile_expressions(np.stack(poses)) if poses else None
+        self._function = function = compile_expressions(np.stack(poses)) if poses else None
         self.inputs = function.inputs if function else ()
         self._evaluator = function.bind() if function else None
 
@@ -173,6 +174,25 @@ class CollisionWorld:
         elif not isinstance(state, Mapping) and len(state):
             raise InvalidValueError(f"Nothing moves in this scene, and {len(state)} values are given.")
         self._missing_state = ""
+
+    @property
+    def values(self) -> Floats:
+        """Values of :attr:`inputs` at the last update; NaN for those that it did not have."""
+        symbols, numbers = self._placed_at
+        if symbols is self.inputs:
+            return numbers.copy()
+        known = dict(zip(symbols, numbers.tolist(), strict=True))
+        return np.array([known.get(s, s.value) for s in self.inputs], dtype=float)
+
+    @property
+    def kinematics_address(self) -> int | None:
+        """Address of the C function from :attr:`inputs` to the poses of moving objects; None without it."""
+        return None if self._function is None else self._function.address
+
+    def compute_poses(self, values: Floats) -> Floats:
+        """Return the poses of the moving objects, (K, 3, 4), at values of :attr:`inputs`."""
+        poses: Floats = self._function(values)
+        return poses
 
     def _select_inputs(self, state: StateLike) -> StateLike:
         """Return the part of a mapping that poses depend on, after checking all other names."""
@@ -205,16 +225,14 @@ class CollisionWorld:
 
     def _restore_poses(self) -> None:
         """Recompute all poses at the last state after an edit, if that state still determines them."""
-        symbols, numbers = self._placed_at
-        known = dict(zip(symbols, numbers.tolist(), strict=True))
-        values = {s: known.get(s, s.value) for s in self.inputs}
-        missing = [str(s) for s, value in values.items() if value is None]
+        values = self.values
+        missing = [str(s) for s, known in zip(self.inputs, ~np.isnan(values), strict=True) if not known]
         more = f" and {len(missing) - 12} more" if len(missing) > 12 else ""
         self._missing_state = f"There is no value for {', '.join(missing[:12])}{more}" if missing else ""
         if self._evaluator is None or missing:
             return
         try:
-            self._evaluator(np.array([values[s] for s in self.inputs], dtype=float))
+            self._evaluator(values)
             self._place()
         except KineverseError as error:  # a loop that does not close, a root of a negative number
             self._missing_state = f"The last state has no poses after the edit ({error})"

@@ -43,7 +43,7 @@ class SceneJudge:
         rules: Sequence[Rule],
         uncovered: Sequence[tuple[str, str]],
     ) -> None:
-        self._scene = scene
+        self._scene, self._coordinates = scene, tuple(coordinates)
         excepted = {frozenset(rule[:2]) for rule in rules}
         left = [pair for pair in uncovered if frozenset(pair) not in excepted]
         moving = {s for a, b in left for s in scene.model.fk(a, b).symbols}
@@ -81,18 +81,21 @@ class SceneJudge:
 
         Pairs that nobody else checks are looked at 160 times a unit at least.
         """
-        for q in sample_path(points, step):
-            found = self.contacts(q)
-            if len(found):
-                return q, found[0]
+        if not len(points):
+            return None
+        found = self._first(self._query, sample_path(points, step))
+        if found is not None:
+            return found
         moved = np.abs(np.diff(points[:, self._concerned], axis=0)).sum(axis=1)
         if not moved.any():
             return None
-        for q in sample_along(points, moved, min(step, _UNCOVERED)):
-            touching = self.uncovered_contacts(q)
-            if touching is not None:
-                return q, touching[0]
-        return None
+        return self._first(self._uncovered, sample_along(points, moved, min(step, _UNCOVERED)))
+
+    def _first(self, query: PreparedQuery, samples: Array) -> tuple[Array, DistanceResult] | None:
+        """Return the first sample (N, n) with a contact, and the contact."""
+        self._update(samples[0])
+        k = query.first_within(self._coordinates, samples)
+        return None if k is None else (samples[k], query()[0])
 
     def uncovered_contacts(self, q: Array) -> DistanceResults | None:
         """Return the touching pairs that nobody else checks, at a configuration (n,); None without any."""
@@ -104,25 +107,23 @@ class SceneJudge:
 
     def free_interval(self, q: Array, column: int, lower: float, upper: float) -> tuple[float, float]:
         """Return bounds of a coordinate about a configuration (n,) between which these pairs are apart."""
+        if not self._concerned.any():
+            return lower, upper
         ends = []
         for bound in (lower, upper):
-            point, free = q.copy(), float(q[column])
-            for value in np.linspace(q[column], bound, max(int(abs(bound - q[column]) / _UNCOVERED), 2)):
-                point[column] = value
-                if self.uncovered_contacts(point) is not None:
-                    break
-                free = float(value)
-            ends.append(free)
+            values = np.linspace(q[column], bound, max(int(abs(bound - q[column]) / _UNCOVERED), 2))
+            samples = np.tile(q, (len(values), 1))
+            samples[:, column] = values
+            self._update(q)
+            k = self._uncovered.first_within(self._coordinates, samples)
+            ends.append(float(q[column] if k == 0 else values[-1 if k is None else k - 1]))
         return min(ends), max(ends)
 
     def clearance(self, points: Array, step: float, radius: float = 0.5) -> float:
         """Return the least distance of a pair at samples of a polyline [m]; infinite beyond a radius."""
-        least = np.inf
-        for q in densify(points, step):
-            found = self.contacts(q, min(radius, max(least, 0.0)))
-            if len(found):
-                least = min(least, float(found.distances[0]))
-        return float(least)
+        samples = densify(points, step)
+        self._update(samples[0])
+        return self._query.least_distance(self._coordinates, samples, radius)
 
 
 def describe_contacts(found: Sequence[DistanceResult], most: int = 3) -> str:
