@@ -86,10 +86,12 @@ class SceneJudge:
         found = self._first(self._query, sample_path(points, step))
         if found is not None:
             return found
-        moved = np.abs(np.diff(points[:, self._concerned], axis=0)).sum(axis=1)
-        if not moved.any():
+        if not self._concerned.any():
             return None
-        return self._first(self._uncovered, sample_along(points, moved, min(step, _UNCOVERED)))
+        moved = np.abs(np.diff(points[:, self._concerned], axis=0)).sum(axis=1)
+        return None if not moved.any() else self._first(
+            self._uncovered, sample_along(points, moved, min(step, _UNCOVERED))
+        )
 
     def _first(self, query: PreparedQuery, samples: Array) -> tuple[Array, DistanceResult] | None:
         """Return the first sample (N, n) with a contact, and the contact."""

@@ -202,17 +202,16 @@ def densify(points: Array, step: float) -> Array:
     """Return the points of a polyline (N, n) with others between them, at most a step apart."""
     if len(points) < 2:
         return points
-    lengths = np.linalg.norm(np.diff(points, axis=0), axis=1)
-    counts = np.maximum(np.ceil(lengths / step), 1).astype(int)
-    at = np.concatenate(
-        [k + np.arange(c) / c for k, c in enumerate(counts)] + [np.array([len(points) - 1.0])]
-    )
-    return np.column_stack([np.interp(at, np.arange(len(points)), column) for column in points.T])
+    counts = np.maximum(np.ceil(_segment_lengths(points) / step), 1).astype(int)
+    ends = np.cumsum(counts)
+    shares = (np.arange(ends[-1]) - np.repeat(ends - counts, counts)) / np.repeat(counts, counts)
+    at = np.append(np.repeat(np.arange(len(counts)), counts) + shares, len(counts))
+    return _interpolate(points, np.arange(len(points)), at)
 
 
 def sample_path(points: Array, step: float) -> Array:
     """Return samples of a polyline (N, n), at most a step apart: its points and others, or some of many."""
-    lengths = np.linalg.norm(np.diff(points, axis=0), axis=1)
+    lengths = _segment_lengths(points)
     count = int(np.ceil(lengths.sum() / step)) + 1
     if len(points) <= 4 * count:
         return densify(points, step)
@@ -223,4 +222,17 @@ def sample_along(points: Array, lengths: Array, step: float) -> Array:
     """Return samples of a polyline (N, n) whose edges have given lengths (N - 1,), at most a step apart."""
     along = np.concatenate([[0.0], np.cumsum(lengths)])
     at = np.linspace(0.0, along[-1], int(np.ceil(along[-1] / step)) + 1)
-    return np.column_stack([np.interp(at, along, column) for column in points.T])
+    return _interpolate(points, along, at)
+
+
+def _segment_lengths(points: Array) -> Array:
+    return np.asarray(np.sqrt(((points[1:] - points[:-1]) ** 2).sum(axis=1)))
+
+
+def _interpolate(points: Array, along: Array, at: Array) -> Array:
+    """Return rows of a polyline (N, n) with knots at (N,), at places (M,) from the first to the last."""
+    lengths = along[1:] - along[:-1]
+    slopes = np.zeros(points.shape)
+    slopes[:-1] = (points[1:] - points[:-1]) / np.where(lengths > 0.0, lengths, 1.0)[:, None]
+    k = np.searchsorted(along, at, side="right") - 1
+    return np.asarray(slopes[k] * (at - along[k])[:, None] + points[k])
