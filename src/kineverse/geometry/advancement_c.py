@@ -71,7 +71,8 @@ EXPORT int64_t settle(const Table *t, const Motion *m, int64_t n) {
 static inline double gap_of(const double *low, const double *high, const double *other_low,
                             const double *other_high) {
   double sum = 0.0;
-  for (int r = 0; r < 3; r++) sum += square(larger(larger(low[r] - other_high[r], other_low[r] - high[r]), 0.0));
+  for (int r = 0; r < 3; r++)
+    sum += square(larger(larger(low[r] - other_high[r], other_low[r] - high[r]), 0.0));
   return sqrt(sum);
 }
 

@@ -62,27 +62,28 @@ class PreparedQuery:
         return find_pairs_within(self._world, within, self._select(), self.per_shape)
 
     def first_within(
-        self, coordinates: Sequence[Symbol], Q: npt.ArrayLike, radius: float | None = None
+        self, coordinates: Sequence[Symbol | str], Q: npt.ArrayLike, radius: float | None = None
     ) -> int | None:
         """Return the index of the first configuration at which a selected pair is within the radius.
 
-        A configuration after the other is looked at, and nothing between them. This takes a tenth of the time
-        of an update and a query at each. Everything else stands as at the scene's last update. The scene is
-        placed at the configuration that is found; without any, it stays where it is.
+        The answer is that of an update and a query at each configuration; nothing between them is looked at.
+        Everything else stands as at the scene's last update. The scene is placed at the configuration that is
+        found; without any, it stays where it is.
 
         Parameters
         ----------
         coordinates
-            The n coordinates that move.
+            The n coordinates that move, as symbols or names.
         Q
-            Configurations (N, n) in the order of a motion, for which this is fastest.
+            Configurations (N, n) in the order of a motion. A pair is looked at only where it may have come
+            near since it was last looked at (conservative advancement).
         radius
             Largest distance [m]; 0 for contacts, None for that of the query.
 
         Raises
         ------
         UnknownNameError
-            If the scene was not updated yet.
+            If the scene was not updated yet, or the model has no such coordinate.
         ShapeError
             If Q has another shape.
         InvalidValueError
@@ -95,7 +96,7 @@ class PreparedQuery:
         return None
 
     def least_distance(
-        self, coordinates: Sequence[Symbol], Q: npt.ArrayLike, radius: float | None = None
+        self, coordinates: Sequence[Symbol | str], Q: npt.ArrayLike, radius: float | None = None
     ) -> float:
         """Return the least distance of the selected pairs at configurations [m]; infinite beyond the radius.
 
@@ -121,12 +122,13 @@ class PreparedQuery:
             self._selection = PairSelection(world.table, flags)
         return self._selection
 
-    def _move(self, coordinates: Sequence[Symbol]) -> SampledMotion:
+    def _move(self, coordinates: Sequence[Symbol | str]) -> SampledMotion:
         """Return the motion of some coordinates, which is kept for the next call."""
         world, selection, last = self._world, self._select(), self._motion
         world.prepare(())
-        if last is None or last.version != world.model.version or last.coordinates != tuple(coordinates):
-            last = self._motion = SampledMotion(world, selection.bodies, coordinates)
+        symbols = tuple(s if isinstance(s, Symbol) else world.model.symbol(s) for s in coordinates)
+        if last is None or last.version != world.model.version or last.coordinates != symbols:
+            last = self._motion = SampledMotion(world, selection.bodies, symbols)
         return last
 
     @property

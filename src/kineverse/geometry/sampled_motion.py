@@ -44,7 +44,7 @@ class SampledMotion:
         wanted, moves = {*coordinates}, np.zeros(world.table.count, dtype=bool)
         for k, item in enumerate(world.objects[: world.table.moving]):
             moves[k] = not wanted.isdisjoint(item.pose.symbols)
-        involved = self._selected.any(axis=1)[world.table.body]
+        involved = np.asarray(self._selected.any(axis=1))[world.table.body]
         self._moving, self._standing = (
             np.flatnonzero(flags & involved).astype(np.int32) for flags in (moves, ~moves)
         )
@@ -112,7 +112,9 @@ class SampledMotion:
         address = self._world.kinematics_address
         if address is not None:
             self.struct.compute = address
-            return int(collision_library.code.trace(ctypes.addressof(self.struct), rows.ctypes.data, len(rows)))
+            return int(
+                collision_library.code.trace(ctypes.addressof(self.struct), rows.ctypes.data, len(rows))
+            )
         for k, row in enumerate(rows):
             self._inputs[self._columns[self._moved]] = row[self._moved]
             try:

@@ -89,8 +89,10 @@ class SceneJudge:
         if not self._concerned.any():
             return None
         moved = np.abs(np.diff(points[:, self._concerned], axis=0)).sum(axis=1)
-        return None if not moved.any() else self._first(
-            self._uncovered, sample_along(points, moved, min(step, _UNCOVERED))
+        return (
+            None
+            if not moved.any()
+            else self._first(self._uncovered, sample_along(points, moved, min(step, _UNCOVERED)))
         )
 
     def _first(self, query: PreparedQuery, samples: Array) -> tuple[Array, DistanceResult] | None:

@@ -206,7 +206,7 @@ def densify(points: Array, step: float) -> Array:
     ends = np.cumsum(counts)
     shares = (np.arange(ends[-1]) - np.repeat(ends - counts, counts)) / np.repeat(counts, counts)
     at = np.append(np.repeat(np.arange(len(counts)), counts) + shares, len(counts))
-    return _interpolate(points, np.arange(len(points)), at)
+    return _interpolate(points, np.arange(float(len(points))), at)
 
 
 def sample_path(points: Array, step: float) -> Array:
