@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
+from kineverse._checks import as_entries
 from kineverse.compile.function import compile as compile_expressions
 from kineverse.errors import (
     InvalidValueError,
@@ -27,7 +28,7 @@ from .broadphase import FURTHEST, TRAVEL_EXCEEDED, Indices, ObjectTable
 from .collision_filter import Rule, allowed_pairs, check_frame_names, parse_known_rules, read_rules
 from .mesh_files import Floats
 from .narrowphase import ACCURACY, Narrowphase
-from .objects import CollisionObject, CollisionObjects, Exclusion, load_solids
+from .objects import CollisionObject, CollisionObjects, Exclusion, load_solids, parse_exclusions
 from .shapes import Solid
 
 _MAX_MEASUREMENTS = 200_000
@@ -72,7 +73,10 @@ class CollisionWorld:
     ) -> None:
         self.model = model
         self._own_rules = parse_known_rules(rules, model)
-        patterns = tuple(_as_names(names) for names in (triangles, decomposed, leave_out))
+        meshes = (("triangles", triangles), ("decomposed", decomposed))
+        wanted = "names or patterns of bodies"
+        some, others = (as_entries(f"{what}=", given, str, wanted) for what, given in meshes)
+        patterns = some, others, parse_exclusions(leave_out)
         for what, names in zip(("triangles", "decomposed", "leave_out"), patterns, strict=True):
             bodies = (name if isinstance(name, str) else name[0] for name in names)
             check_frame_names(f"{what}= names", bodies, model)
@@ -401,7 +405,3 @@ def _static_pose(item: CollisionObject) -> Floats:
             "Scene(model, leave_out=[...])."
         )
     return pose
-
-
-def _as_names(names: Iterable[Any]) -> tuple[Any, ...]:
-    return (names,) if isinstance(names, str) else tuple(names)
