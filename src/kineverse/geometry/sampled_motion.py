@@ -15,7 +15,7 @@ from .broadphase import Flags
 from .collision_world import CollisionWorld
 from .mesh_files import Floats
 
-_ROOM = 256
+_ROOM = 64
 """Number of samples whose poses are kept at a time."""
 
 
