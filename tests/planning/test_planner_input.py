@@ -88,7 +88,12 @@ def test_wrong_arguments_are_refused(ball):
             Planner(ball.model, **wrong)
     with pytest.raises(InvalidValueError, match="takes a model"):
         Planner("kitchen")
-    for wrong in ({"along": None}, {"modes": 5}, {"goals": None}, {"goals": [kv.control.Goal(ball.symbols[0], 1.0), 5]}):
+    for wrong in (
+        {"along": None},
+        {"modes": 5},
+        {"goals": None},
+        {"goals": [kv.control.Goal(ball.symbols[0], 1.0), 5]},
+    ):
         with pytest.raises(InvalidValueError, match=f"{next(iter(wrong))}(=| takes| is)"):
             ball.plan(**({"start": [0, 0], "goals": [0, 0]} | wrong))
     with pytest.raises(InvalidValueError, match="tasks takes"):

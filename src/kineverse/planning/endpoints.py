@@ -17,8 +17,9 @@ from .manifold import EXACT, Manifold
 _DISTANCES = (0.01, 0.02, 0.04, 0.08, 0.15, 0.3, 0.5)
 _TRIES, _WAYS = 256, 6
 _LIMIT = 1e-6
-_SAMPLES, _ENOUGH = 4096, 50
-"""Number of random configurations, and of free ones among them that say where others would be."""
+_SAMPLES, _ENOUGH, _JUDGED = 4096, 50, 64
+"""Number of random configurations, of free ones among them that say where others would be, and of those that
+the scene looks at."""
 _NEAR = 0.01
 """Largest residual of an end that is brought onto a manifold [m], [rad]."""
 
@@ -154,7 +155,9 @@ class Endpoints:
         return None
 
 
-def describe_barrier(space: PlanningSpace, checker: CollisionChecker, start: Array, ends: Array) -> str:
+def describe_barrier(
+    space: PlanningSpace, checker: CollisionChecker, judge: SceneJudge, start: Array, ends: Array
+) -> str:
     """Return a sentence on a coordinate whose values between start (n,) and goals (K, n) are not free.
 
     It is empty if there is no such coordinate. Random configurations tell, so this is no proof.
@@ -175,9 +178,15 @@ def describe_barrier(space: PlanningSpace, checker: CollisionChecker, start: Arr
         inner = (3 * low[k] + high[k]) / 4, (low[k] + 3 * high[k]) / 4
         samples[:, i] = generator.uniform(*inner, _SAMPLES)
         if not checker.valid(samples.astype(np.float32)).any():
+            where = f"'{space.symbols[i]}' between {inner[0]:.4g} and {inner[1]:.4g}"
+            if any(not len(judge.contacts(q)) for q in samples[:_JUDGED]):
+                return (
+                    f" Every way leads through {where}, and {_SAMPLES} random configurations there are not "
+                    "free, though some of them are by the scene: a smaller protrusion= or margin= may help."
+                )
             return (
-                f" The goal may be out of reach: every way leads through '{space.symbols[i]}' between "
-                f"{inner[0]:.4g} and {inner[1]:.4g}, and {_SAMPLES} random configurations there are not free."
+                f" The goal may be out of reach: every way leads through {where}, and {_SAMPLES} random "
+                "configurations there are not free."
             )
         samples[:, i] = generator.uniform(lower[i], upper[i], _SAMPLES)
     return ""

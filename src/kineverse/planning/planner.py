@@ -326,7 +326,7 @@ class Planner:
                 return path
         if path.search_seconds:
             with self.checker.excepting(touching):
-                barrier = describe_barrier(self.space, self.checker, q, ends)
+                barrier = describe_barrier(self.space, self.checker, scene.judge(touching), q, ends)
             path = replace(path, why=path.why + barrier)
         return path
 
