@@ -241,14 +241,8 @@ def sample_path(points: Array, step: float) -> Array:
     count = int(np.ceil(lengths.sum() / step)) + 1
     if len(points) <= 4 * count:
         return densify(points, step)
-    return sample_along(points, lengths, step)
-
-
-def sample_along(points: Array, lengths: Array, step: float) -> Array:
-    """Return samples of a polyline (N, n) whose edges have given lengths (N - 1,), at most a step apart."""
     along = np.concatenate([[0.0], np.cumsum(lengths)])
-    at = np.linspace(0.0, along[-1], int(np.ceil(along[-1] / step)) + 1)
-    return _interpolate(points, along, at)
+    return _interpolate(points, along, np.linspace(0.0, along[-1], count))
 
 
 def _segment_lengths(points: Array) -> Array:
