@@ -152,7 +152,8 @@ class CollisionChecker:
             for j in np.flatnonzero(self._allowed[i]).tolist()
         ]
         solids = [world.solid(k) for k in self._static]
-        self._world = ObstacleSet(solids, numbers.astype(np.int32), self._planes, self.program.lanes)
+        poses, bodies = world.table.poses[self._static], numbers.astype(np.int32)
+        self._world = ObstacleSet(solids, bodies, poses, self._planes, self.program.lanes)
 
     def _place_moving(
         self, members: Sequence[Sequence[tuple[CollisionObject, Solid, Array]]], poses: Sequence[int]
@@ -166,10 +167,8 @@ class CollisionChecker:
         self._carried = np.flatnonzero(np.isin(table.body, numbers))
         for k, items in enumerate(members):
             solids = [solid for _, solid, _ in items]
-            found = ObstacleSet(
-                solids, np.zeros(len(solids), dtype=np.int32), self._planes, lanes, poses[k], k
-            )
-            found.place(np.array([T[:3] for _, _, T in items]))
+            bodies, places = np.zeros(len(solids), dtype=np.int32), np.array([T[:3] for _, _, T in items])
+            found = ObstacleSet(solids, bodies, places, self._planes, lanes, poses[k], k)
             self._sets.append(found)
             self._costs.append(found.cost)
 

@@ -63,7 +63,7 @@ class PlanningSpace:
                 f"{len(self.symbols)} coordinates would move, and a planner moves {MOST_COORDINATES} at "
                 "most. Choose some of them with move=, as move='robot/*'."
             )
-        self._limits: list[tuple[int, Expression, Expression]] = []
+        self._limits: list[tuple[int, Expression | float, Expression | float]] = []
         ranges = self._read_constraints()
         self.lower, self.upper = np.zeros((2, len(self.symbols)))
         self.place(model.default_state())
@@ -88,7 +88,7 @@ class PlanningSpace:
             if is_equality(whole):
                 self.equalities.append(middle - low)
             elif middle in moved and moved.isdisjoint({*low.symbols, *high.symbols}):
-                self._limits.append((place[middle], low, high))
+                self._limits.append((place[middle], *(e if e.symbols else float(e) for e in (low, high))))
             else:
                 excess = [e for e in (low - middle, middle - high) if _is_bounded(e)]
                 if excess:
@@ -107,8 +107,8 @@ class PlanningSpace:
         """Set the limits to those at a state, on which they may depend."""
         self.lower[:], self.upper[:] = -math.inf, math.inf
         for k, low, high in self._limits:
-            self.lower[k] = max(self.lower[k], float(low(state)) if low.symbols else float(low))
-            self.upper[k] = min(self.upper[k], float(high(state)) if high.symbols else float(high))
+            self.lower[k] = max(self.lower[k], low if isinstance(low, float) else float(low(state)))
+            self.upper[k] = min(self.upper[k], high if isinstance(high, float) else float(high(state)))
         # An empty range makes every configuration invalid, and messages name it.
         self.upper[:] = np.maximum(self.lower, self.upper)
 

@@ -157,8 +157,9 @@ class Planner:
         self._synchronize().place(self._whole(state))
 
     def _whole(self, state: StateLike) -> State:
-        known = (*self.model.symbols, *self.model.speeds)
-        return self.planning_scene.state | (state if isinstance(state, State) else as_state(state, known))
+        if not isinstance(state, State):
+            state = as_state(state, (*self.model.symbols, *self.model.speeds))
+        return self.planning_scene.state | state
 
     # -- configurations ------------------------------------------------------------------------------------
 
