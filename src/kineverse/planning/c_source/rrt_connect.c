@@ -1,5 +1,8 @@
-/* RRT-Connect (Kuffner and LaValle 2000) with dynamic domains (Yershova et al. 2005), on the whole space or on a
-   manifold, and shortcuts. */
+/* RRT-Connect (Kuffner and LaValle 2000), in the whole space or on a manifold, and shortcuts.
+
+   Both trees grow step by step until something is in the way. Samples lie in a box around the tree that grows: others
+   would mostly pull nodes at its rim against the same obstacles, as those that dynamic domains reject (Yershova et al.
+   2005). The box grows with the tree. */
 #include <time.h>
 
 static double now(void) {
@@ -23,7 +26,7 @@ typedef struct {
   float *columns;
   float *aims; /* on a manifold, where the edge to each node was aimed at, (room, n) */
   int *parent;
-  float *domain; /* radius of the dynamic domain; infinite until an extension fails */
+  float low[MOST_COORDINATES], high[MOST_COORDINATES]; /* of all configurations */
   long long count, room;
 } Tree;
 
@@ -34,9 +37,7 @@ static int tree_grow(Tree *t, int n) {
   if (aims) t->aims = aims;
   int *parent = realloc(t->parent, room * sizeof(int));
   if (parent) t->parent = parent;
-  float *domain = realloc(t->domain, room * sizeof(float));
-  if (domain) t->domain = domain;
-  if (!columns || !aims || !parent || !domain) {
+  if (!columns || !aims || !parent) {
     free(columns);
     return 1;
   }
@@ -50,10 +51,13 @@ static int tree_grow(Tree *t, int n) {
 static int tree_add(Tree *t, int n, const float *q, const float *aim, int parent) {
   if (t->count == t->room && tree_grow(t, n)) return -1;
   const long long k = t->count++;
-  for (int i = 0; i < n; i++) t->columns[(k / W * n + i) * W + k % W] = q[i];
+  for (int i = 0; i < n; i++) {
+    t->columns[(k / W * n + i) * W + k % W] = q[i];
+    t->low[i] = k ? fminf(t->low[i], q[i]) : q[i];
+    t->high[i] = k ? fmaxf(t->high[i], q[i]) : q[i];
+  }
   memcpy(t->aims + k * n, aim, n * sizeof(float));
   t->parent[k] = parent;
-  t->domain[k] = INFINITY;
   return (int)k;
 }
 
@@ -65,7 +69,6 @@ static void tree_free(Tree *t) {
   free(t->columns);
   free(t->aims);
   free(t->parent);
-  free(t->domain);
 }
 
 static int nearest(const Tree *t, int n, const float *q, float *away) {
@@ -163,6 +166,31 @@ static void towards(const float *a, const float *b, int n, float range, float *o
   for (int i = 0; i < n; i++) out[i] = t < 1.0f ? a[i] + t * (b[i] - a[i]) : b[i];
 }
 
+/* Grow a tree from a node towards a goal, step by step, until something is in the way or no step brings it nearer.
+   Return the last node, or -1 without memory; `met` is set if it is at the goal. */
+static int tree_advance(Walk *k, Tree *t, int first, const float *goal, int *met) {
+  const int n = (int)k->s->checker->coordinates;
+  const float range = (float)k->s->range;
+  float from[MOST_COORDINATES], to[MOST_COORDINATES], reached[MOST_COORDINATES];
+  int node = first;
+  *met = 0;
+  for (int outcome = 2; outcome == 2 && !*met && node >= 0;) {
+    tree_read(t, n, node, from);
+    const float before = distance(from, goal, n);
+    *met = before == 0.0f;
+    if (*met) break;
+    towards(from, goal, n, range, to);
+    outcome = extend(k, from, to, reached);
+    if (!outcome) break;
+    /* Points between two points of a manifold are off it, and their projections are not where they were. */
+    const float after = distance(reached, goal, n);
+    *met = outcome == 2 && before <= range && after < 1e-3f;
+    if (!*met && node != first && after > before - 0.1f * fminf(range, before)) break;
+    node = tree_add(t, n, reached, to, node);
+  }
+  return node;
+}
+
 /* Write the configurations from a root to node j, or backwards; return their number, or -1 without room. On a manifold
    the edges are gone again, with all their points. */
 static long long branch(Walk *k, const Tree *t, int j, int backwards, float *out, long long room) {
@@ -210,7 +238,7 @@ EXPORTED long long kineverse_rrt_connect(Search *s, const float *starts, long lo
   Tree trees[2] = {{0}, {0}};
   Random random = (Random)s->seed * 0x2545f4914f6cdd1dULL + 0x9e3779b97f4a7c15ULL;
   Walk k;
-  float sample[MOST_COORDINATES], from[MOST_COORDINATES], to[MOST_COORDINATES], reached[MOST_COORDINATES];
+  float sample[MOST_COORDINATES];
   const float range = (float)s->range;
   long long count = -1, best = 0;
   float best_gap = INFINITY;
@@ -240,44 +268,22 @@ EXPORTED long long kineverse_rrt_connect(Search *s, const float *starts, long lo
     Tree *own = &trees[grown], *other = &trees[1 - grown];
     float away;
     if (s->iterations < start_count) {
-      tree_read(own, n, s->iterations, from);
-      tree_read(other, n, nearest(other, n, from, &away), sample);
+      tree_read(own, n, s->iterations, sample);
+      tree_read(other, n, nearest(other, n, sample, &away), sample);
     } else {
-      for (int i = 0; i < n; i++) sample[i] = c->lower[i] + random_unit(&random) * (c->upper[i] - c->lower[i]);
+      for (int i = 0; i < n; i++) {
+        const float low = fmaxf(c->lower[i], own->low[i] - range), high = fminf(c->upper[i], own->high[i] + range);
+        sample[i] = low + random_unit(&random) * (high - low);
+      }
     }
-    const int parent = nearest(own, n, sample, &away);
-    if (away > own->domain[parent] || away == 0.0f) continue;
-    tree_read(own, n, parent, from);
-    towards(from, sample, n, range, to);
-    if (!extend(&k, from, to, reached)) {
-      const float d = own->domain[parent];
-      own->domain[parent] = d == INFINITY ? 4.0f * range : fmaxf(d * 0.9999f, range);
-      continue;
-    }
-    if (own->domain[parent] < INFINITY) own->domain[parent] *= 1.0001f;
-    const int fresh = tree_add(own, n, reached, to, parent);
-    if (fresh < 0) {
-      s->status = NO_MEMORY;
-      break;
-    }
-    /* Connect the other tree to the new node. */
-    float goal[MOST_COORDINATES];
-    memcpy(goal, reached, n * sizeof(float));
-    int last = nearest(other, n, goal, &away);
-    if (grown == 0 && away < best_gap) best_gap = away, best = fresh;
-    int met = 0;
-    for (int steps = 0; steps < 1000; steps++) {
-      tree_read(other, n, last, from);
-      const float before = distance(from, goal, n);
-      towards(from, goal, n, range, to);
-      const int outcome = extend(&k, from, to, reached);
-      if (!outcome) break;
-      /* Points between two points of a manifold are off it, and their projections are not where they were. */
-      met = outcome == 2 && before <= range && distance(reached, goal, n) < 1e-3f;
-      if (met && !s->projection) break;
-      if (!met && distance(reached, goal, n) > before - 0.1f * fminf(range, before)) break;
-      last = tree_add(other, n, reached, to, last);
-      if (last < 0 || met || outcome == 1) break;
+    int met, last = -1;
+    const int parent = nearest(own, n, sample, &away), fresh = tree_advance(&k, own, parent, sample, &met);
+    if (fresh == parent) continue;
+    if (fresh >= 0) {
+      tree_read(own, n, fresh, sample);
+      const int near = nearest(other, n, sample, &away);
+      if (grown == 0 && away < best_gap) best_gap = away, best = fresh;
+      last = tree_advance(&k, other, near, sample, &met);
     }
     if (last < 0) {
       s->status = NO_MEMORY;
@@ -286,9 +292,11 @@ EXPORTED long long kineverse_rrt_connect(Search *s, const float *starts, long lo
     if (met) {
       const int a = grown ? last : fresh, b = grown ? fresh : last;
       const long long first = branch(&k, &trees[0], a, 0, path, room);
-      const long long rest = first < 0 ? -1 : branch(&k, &trees[1], b, 1, path + first * n, room - first);
+      /* In the whole space both trees have the same configuration where they meet. */
+      const long long joint = s->projection ? first : first - 1;
+      const long long rest = first < 0 ? -1 : branch(&k, &trees[1], b, 1, path + joint * n, room - joint);
       s->status = rest < 0 ? NO_MEMORY : FOUND;
-      if (rest >= 0) count = first + rest;
+      if (rest >= 0) count = joint + rest;
       best_gap = 0.0f;
       break;
     }
