@@ -133,20 +133,16 @@ class PlanningSpace:
         if not self.turning.any():
             return q[None]
         low, high = self.bounds(start, q[None])
-        found = [q]
+        found = q[None].copy()
         for i in np.flatnonzero(self.turning).tolist():
             first = math.ceil((low[i] - q[i]) / math.tau - 1e-9)
             last = math.floor((high[i] - q[i]) / math.tau + 1e-9)
-            found = [_shifted(p, i, k * math.tau) for p in found for k in range(first, last + 1)] or found
-            found.sort(key=lambda p: float(np.linalg.norm(p - start)))
-            del found[most:]
-        return np.array(found)
-
-
-def _shifted(q: Array, i: int, by: float) -> Array:
-    moved = q.copy()
-    moved[i] += by
-    return moved
+            turned = [float(q[i]) + k * math.tau for k in range(first, last + 1)] or [float(q[i])]
+            found = np.repeat(found, len(turned), axis=0)
+            found[:, i] = turned * (len(found) // len(turned))
+            if len(turned) > 1:
+                found = found[np.argsort(np.linalg.norm(found - start, axis=1), kind="stable")[:most]]
+        return found
 
 
 def _is_bounded(excess: Expression) -> bool:

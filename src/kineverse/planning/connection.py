@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from time import perf_counter
 
@@ -19,11 +19,15 @@ from .roadmap import Roadmap
 from .search import MOST_EDGES, RrtConnect, SearchResult
 
 _SHORTCUTS = 60
+PATIENCE, MORE_PATIENCE = 40, 160
+"""Numbers of shortcuts in a row that may bring nothing: for the first path, and where paths are optimized."""
 _REPAIRS = 12
 _FINER = 8.0
 """Factor of the resolution where an edge collides between its samples."""
 _FINEST = 4000.0
 _ATTEMPTS, _NEXT_SEED = 16, 7919
+_SAME = 1e-5
+"""Difference of lengths that is rounding [rad], [m]."""
 _TELLING = 100
 """Number of samples after which a small tree says that its root cannot be left."""
 _WIDER = 1e-3
@@ -48,6 +52,40 @@ class Connected:
     problem: str
     iterations: int
 
+    @property
+    def length(self) -> float:
+        """Length of the path [rad], [m]."""
+        return float(np.linalg.norm(np.diff(self.points, axis=0), axis=1).sum())
+
+
+def find_shortest(
+    search: Callable[[float, int], Connected], seconds: float, seed: int, least: float
+) -> Connected:
+    """Return the shortest path that searches with different seeds find in a time, or why there is none.
+
+    Parameters
+    ----------
+    search
+        Search in a time [s] with a seed.
+    seconds
+        Largest time of all of them [s].
+    seed
+        Seed of the first one.
+    least
+        Length below which there is no path [rad], [m].
+    """
+    begin = perf_counter()
+    best = search(seconds, seed)
+    while not best.problem and best.length > least + _SAME:
+        left = seconds - (perf_counter() - begin)
+        if left <= 0.0:
+            break
+        seed += 1
+        other = search(left, seed)
+        if not other.problem and other.length < best.length:
+            best = other
+    return best
+
 
 def connect(
     checker: CollisionChecker,
@@ -57,6 +95,7 @@ def connect(
     seed: int,
     edges: int = MOST_EDGES,
     roadmap: Roadmap | None = None,
+    patience: int = PATIENCE,
 ) -> Connected:
     """Return a path from one of (S, n) starts to one of (G, n) goals, certified between its samples.
 
@@ -66,6 +105,8 @@ def connect(
     ----------
     roadmap
         Roadmap that is searched; None for trees (RRT-Connect).
+    patience
+        Number of shortcuts in a row that may bring nothing.
     """
     begin = perf_counter()
     search = RrtConnect(checker, edges=edges)
@@ -84,7 +125,7 @@ def connect(
             return Connected(found.points.astype(float), explain_failure(found, seconds), iterations)
         # Parts of a shortcut that just passes would not be certain by themselves.
         with checker.widened(_WIDER / 2, np.vstack([starts, goals])):
-            points = search.shorten(found.points, seconds - (perf_counter() - begin), seed, _SHORTCUTS)
+            points = search.shorten(found.points, seconds - (perf_counter() - begin), seed, patience)
         certain = _repair(search, checker, points, begin + seconds, seed)
         if certain is not None:
             return Connected(certain.astype(float), "", iterations)

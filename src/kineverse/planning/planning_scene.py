@@ -24,7 +24,7 @@ from kineverse.symbols import Symbol
 
 from .checker import BodyPairs, CollisionChecker
 from .configuration import PlanningSpace
-from .connection import connect, connect_on_manifold
+from .connection import MORE_PATIENCE, PATIENCE, Connected, connect, connect_on_manifold, find_shortest
 from .endpoints import Endpoint, Endpoints
 from .judge import SceneJudge, describe_contacts
 from .manifold import FrameHold, Manifold, hold_targets, manifold_key
@@ -186,6 +186,7 @@ class PlanningScene:
         still: Flags | None = None,
         edges: int = MOST_EDGES,
         roadmap: Roadmap | None = None,
+        optimize: bool = False,
     ) -> Path:
         """Return a path from a configuration (n,) to any of some ends (K, n), see :meth:`.Planner.plan`.
 
@@ -206,7 +207,7 @@ class PlanningScene:
                 return self.no_path(q, usable, begin)
             for _ in range(_NARROWINGS):
                 path, contact = self._connect(
-                    first, usable, manifold, touching, seconds, seed, begin, edges, roadmap
+                    first, usable, manifold, touching, seconds, seed, begin, edges, roadmap, optimize
                 )
                 if contact is None or not self._narrow(contact, q, touching):
                     break
@@ -240,6 +241,7 @@ class PlanningScene:
         begin: float,
         edges: int,
         roadmap: Roadmap | None,
+        optimize: bool,
     ) -> tuple[Path, DistanceResult | None]:
         """Return a path between checked ends, and the contact that the scene finds on it."""
         q = first.inner
@@ -247,10 +249,18 @@ class PlanningScene:
         targets = np.ascontiguousarray([v for _, v in variants], dtype=np.float32)
         starts = np.ascontiguousarray(q[None], dtype=np.float32)
         searched = perf_counter()
-        if manifold is None:
-            found = connect(self.checker, starts, targets, seconds, seed, edges, roadmap)
+        patience = MORE_PATIENCE if optimize else PATIENCE
+
+        def search(seconds: float, seed: int) -> Connected:
+            if manifold is None:
+                return connect(self.checker, starts, targets, seconds, seed, edges, roadmap, patience)
+            return connect_on_manifold(self.checker, manifold, starts, targets, seconds, seed, edges)
+
+        if optimize:
+            straight = float(np.linalg.norm(targets - starts, axis=1).min())
+            found = find_shortest(search, seconds, seed, straight)
         else:
-            found = connect_on_manifold(self.checker, manifold, starts, targets, seconds, seed, edges)
+            found = search(seconds, seed)
         spent = perf_counter() - searched
         if found.problem:
             return self.no_path(found.points, found.problem, begin, spent, found.iterations), None

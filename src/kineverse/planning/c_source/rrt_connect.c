@@ -313,9 +313,10 @@ end:
   return count;
 }
 
-/* Shorten a polyline (count, n) in place: random points on it are connected where the way between them is certain,
-   until `rounds` tries have failed or the time is up. Return the new number of points. */
-EXPORTED long long kineverse_shortcut(Search *s, float *path, long long count, long long room, long long rounds,
+/* Shorten a polyline (count, n) in place: random points on it are joined where the way between them is certain, until
+   `patience` tries in a row have brought less than a hundredth each, or the time is up. Return the new number of
+   points. */
+EXPORTED long long kineverse_shortcut(Search *s, float *path, long long count, long long room, long long patience,
                                     double least) {
   const Checker *c = s->checker;
   const int n = (int)c->coordinates;
@@ -323,39 +324,42 @@ EXPORTED long long kineverse_shortcut(Search *s, float *path, long long count, l
   Random random = (Random)s->seed * 0x2545f4914f6cdd1dULL + 0x9e3779b97f4a7c15ULL;
   Work w;
   if (work_begin(&w, c)) return count;
-  float *along = malloc((room + 2) * sizeof(float));
-  for (long long round = 0; along && round < rounds && count > 2; round++) {
-    if ((round & 7) == 0 && now() - begin > s->seconds) break;
+  float *along = malloc(room * sizeof(float));
+  for (long long tries = 0, failures = 0; along && failures < patience && count > 2; tries++, failures++) {
+    if ((tries & 7) == 0 && now() - begin > s->seconds) break;
     along[0] = 0.0f;
-    for (long long k = 1; k < count; k++)
-      along[k] = along[k - 1] + distance(path + (k - 1) * n, path + k * n, n);
+    for (long long k = 1; k < count; k++) along[k] = along[k - 1] + distance(path + (k - 1) * n, path + k * n, n);
     float one = random_unit(&random) * along[count - 1], other = random_unit(&random) * along[count - 1];
     if (one > other) {
       const float swap = one;
       one = other, other = swap;
     }
-    /* Ends near a node are the node: so nodes vanish. */
     long long i = 0, j = 0;
     while (i + 2 < count && along[i + 1] <= one) i++;
     while (j + 2 < count && along[j + 1] <= other) j++;
     if (i == j) continue;
+    /* Half of the ends are moved to nodes, so that the nodes between them vanish and no others come. */
+    const Random bits = random_bits(&random);
+    if (bits >> 63) one = along[i];
+    if (bits >> 62 & 1) other = along[j + 1];
     float a[MOST_COORDINATES], b[MOST_COORDINATES], where;
     const float u = (one - along[i]) / fmaxf(along[i + 1] - along[i], 1e-9f);
-    const float v = (other - along[j]) / fmaxf(along[j + 1] - along[j], 1e-9f);
+    const float v = (along[j + 1] - other) / fmaxf(along[j + 1] - along[j], 1e-9f);
     for (int e = 0; e < n; e++) {
       a[e] = path[i * n + e] + u * (path[(i + 1) * n + e] - path[i * n + e]);
-      b[e] = path[j * n + e] + v * (path[(j + 1) * n + e] - path[j * n + e]);
+      b[e] = path[(j + 1) * n + e] + v * (path[j * n + e] - path[(j + 1) * n + e]);
     }
     const float gain = other - one - distance(a, b, n);
-    if (gain < 1e-3f * (other - one) || (j == i + 1 && count + 1 > room)) continue;
+    const long long rest = count - j - 1, kept = i + 1 + (u > 0.0f) + (v > 0.0f);
+    if (gain < 1e-3f * (other - one) || kept + rest > room) continue;
     if (!edge_is_free(c, &w, a, b, (float)s->resolution) ||
         !edge_is_certain(c, &w, a, b, (float)s->resolution, (float)least, &where))
       continue;
-    /* Nodes i + 1 ... j give way to a and b. */
-    memmove(path + (i + 3) * n, path + (j + 1) * n, (count - j - 1) * n * sizeof(float));
-    memcpy(path + (i + 1) * n, a, n * sizeof(float));
-    memcpy(path + (i + 2) * n, b, n * sizeof(float));
-    count += i + 2 - j;
+    memmove(path + kept * n, path + (j + 1) * n, rest * n * sizeof(float));
+    if (u > 0.0f) memcpy(path + (i + 1) * n, a, n * sizeof(float));
+    if (v > 0.0f) memcpy(path + (kept - 1) * n, b, n * sizeof(float));
+    if (gain > 1e-2f * along[count - 1]) failures = -1;
+    count = kept + rest;
   }
   free(along);
   work_end(&w);
