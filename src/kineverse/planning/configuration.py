@@ -88,7 +88,7 @@ class PlanningSpace:
             if is_equality(whole):
                 self.equalities.append(middle - low)
             elif middle in moved and moved.isdisjoint({*low.symbols, *high.symbols}):
-                self._limits.append((place[middle], *(e if e.symbols else float(e) for e in (low, high))))
+                self._limits.append((place[middle], _fold(low), _fold(high)))
             else:
                 excess = [e for e in (low - middle, middle - high) if _is_bounded(e)]
                 if excess:
@@ -143,6 +143,11 @@ class PlanningSpace:
             if len(turned) > 1:
                 found = found[np.argsort(np.linalg.norm(found - start, axis=1), kind="stable")[:most]]
         return found
+
+
+def _fold(e: Expression) -> Expression | float:
+    """Return the number that an expression is everywhere, or the expression."""
+    return e if e.symbols else float(e)
 
 
 def _is_bounded(excess: Expression) -> bool:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from time import perf_counter
 
@@ -26,8 +26,6 @@ _FINER = 8.0
 """Factor of the resolution where an edge collides between its samples."""
 _FINEST = 4000.0
 _ATTEMPTS, _NEXT_SEED = 16, 7919
-_SAME = 1e-5
-"""Difference of lengths that is rounding [rad], [m]."""
 _TELLING = 100
 """Number of samples after which a small tree says that its root cannot be left."""
 _WIDER = 1e-3
@@ -51,40 +49,6 @@ class Connected:
     points: Array
     problem: str
     iterations: int
-
-    @property
-    def length(self) -> float:
-        """Length of the path [rad], [m]."""
-        return float(np.linalg.norm(np.diff(self.points, axis=0), axis=1).sum())
-
-
-def find_shortest(
-    search: Callable[[float, int], Connected], seconds: float, seed: int, least: float
-) -> Connected:
-    """Return the shortest path that searches with different seeds find in a time, or why there is none.
-
-    Parameters
-    ----------
-    search
-        Search in a time [s] with a seed.
-    seconds
-        Largest time of all of them [s].
-    seed
-        Seed of the first one.
-    least
-        Length below which there is no path [rad], [m].
-    """
-    begin = perf_counter()
-    best = search(seconds, seed)
-    while not best.problem and best.length > least + _SAME:
-        left = seconds - (perf_counter() - begin)
-        if left <= 0.0:
-            break
-        seed += 1
-        other = search(left, seed)
-        if not other.problem and other.length < best.length:
-            best = other
-    return best
 
 
 def connect(

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import replace
 from time import perf_counter
 from typing import Any, TypeAlias
 
@@ -24,7 +25,7 @@ from kineverse.symbols import Symbol
 
 from .checker import BodyPairs, CollisionChecker
 from .configuration import PlanningSpace
-from .connection import MORE_PATIENCE, PATIENCE, Connected, connect, connect_on_manifold, find_shortest
+from .connection import MORE_PATIENCE, PATIENCE, connect, connect_on_manifold
 from .endpoints import Endpoint, Endpoints
 from .judge import SceneJudge, describe_contacts
 from .manifold import FrameHold, Manifold, hold_targets, manifold_key
@@ -40,7 +41,10 @@ Flags: TypeAlias = npt.NDArray[np.bool_]
 _JUDGED = 0.5
 """Longest step between judged configurations of a path that is certified [rad], [m]."""
 _MOST_MANIFOLDS = 16
-_NARROWINGS = 4
+_MOST_CONTACTS = 6
+"""Number of searches whose paths touch where only the scene looks, after which there is no other one."""
+_SAME = 1e-5
+"""Difference of lengths that is rounding [rad], [m]."""
 
 
 class PlanningScene:
@@ -205,30 +209,38 @@ class PlanningScene:
             usable = endpoints.check_goals(ends)
             if isinstance(usable, str):
                 return self.no_path(q, usable, begin)
-            for _ in range(_NARROWINGS):
+            straight = float(np.linalg.norm(ends - q, axis=1).min())
+            best, left, contacts = None, seconds, 0
+            while best is None or left > 0.0:
                 path, contact = self._connect(
-                    first, usable, manifold, touching, seconds, seed, begin, edges, roadmap, optimize
+                    first, usable, manifold, touching, left, seed, begin, edges, roadmap, optimize
                 )
-                if contact is None or not self._narrow(contact, q, touching):
+                if best is None or (path.found and (not best.found or path.length < best.length)):
+                    best = path
+                if contact is not None:
+                    self._narrow(contact, q, touching)
+                    contacts += 1
+                if best.found:
+                    if not optimize or best.length <= straight + _SAME:
+                        break
+                elif contact is None or contacts == _MOST_CONTACTS:
                     break
-            return path
+                seed, left = seed + 1, seconds - (perf_counter() - begin)
+            return replace(best, seconds=perf_counter() - begin)
 
-    def _narrow(self, contact: DistanceResult, q: Array, touching: BodyPairs) -> bool:
+    def _narrow(self, contact: DistanceResult, q: Array, touching: BodyPairs) -> None:
         """Narrow the bounds of a coordinate to where it keeps a pair apart that only the scene checks.
 
-        Returns False for a pair that several coordinates move, and if the bounds are as narrow already.
+        Nothing is done for a pair that several coordinates move.
         """
         pair = {contact.a, contact.b}
         if not any(pair == set(other) for other in self.checker.uncovered):
-            return False
+            return
         columns = columns_between(self.space, contact.a, contact.b)
-        if len(columns) != 1:
-            return False
-        (i,) = columns
-        before = float(self.checker.lower[i]), float(self.checker.upper[i])
-        lower, upper = self.judge(touching).free_interval(q, i, *before)
-        self.checker.lower[i], self.checker.upper[i] = lower, upper
-        return (lower, upper) != before
+        if len(columns) == 1:
+            (i,) = columns
+            bounds = float(self.checker.lower[i]), float(self.checker.upper[i])
+            self.checker.lower[i], self.checker.upper[i] = self.judge(touching).free_interval(q, i, *bounds)
 
     def _connect(
         self,
@@ -249,18 +261,11 @@ class PlanningScene:
         targets = np.ascontiguousarray([v for _, v in variants], dtype=np.float32)
         starts = np.ascontiguousarray(q[None], dtype=np.float32)
         searched = perf_counter()
-        patience = MORE_PATIENCE if optimize else PATIENCE
-
-        def search(seconds: float, seed: int) -> Connected:
-            if manifold is None:
-                return connect(self.checker, starts, targets, seconds, seed, edges, roadmap, patience)
-            return connect_on_manifold(self.checker, manifold, starts, targets, seconds, seed, edges)
-
-        if optimize:
-            straight = float(np.linalg.norm(targets - starts, axis=1).min())
-            found = find_shortest(search, seconds, seed, straight)
+        if manifold is None:
+            patience = MORE_PATIENCE if optimize else PATIENCE
+            found = connect(self.checker, starts, targets, seconds, seed, edges, roadmap, patience)
         else:
-            found = search(seconds, seed)
+            found = connect_on_manifold(self.checker, manifold, starts, targets, seconds, seed, edges)
         spent = perf_counter() - searched
         if found.problem:
             return self.no_path(found.points, found.problem, begin, spent, found.iterations), None
