@@ -34,14 +34,14 @@ def configurations(planner, count, seed=0):
 
 
 @pytest.mark.parametrize(("base", "tolerance"), [(0.0, 2e-6), (1000.0, 1e-3)])
-def test_valid_is_true_only_without_contact_and_false_only_near_one(arm, base, tolerance):
+def test_valid_is_true_without_contact_and_false_at_one(arm, base, tolerance):
     arm.place({"base": base, "cart": 0.6})
     Q = configurations(arm, 500, seed=int(base))
     found, distances = arm.valid(Q), contacts(arm, Q)
     assert 0.2 < found.mean() < 0.95
     assert distances[found].min() > -1e-6
-    # Spheres stick out of both bodies; of polytopes around round shapes by a part of their size.
-    assert distances[~found].max() <= 0.06 + tolerance
+    # Below 0.01 mm the narrow phase does not tell shapes apart.
+    assert distances[~found].max() <= 1.1e-5 + tolerance
     np.testing.assert_array_equal(found, [arm.valid(q)[0] for q in Q])
 
 
@@ -50,7 +50,7 @@ def test_margin_keeps_bodies_apart(plate):
     Q = np.random.default_rng(0).uniform(-0.2, 0.2, (300, 3))
     found, distances = wide.valid(Q), contacts(wide, Q)
     assert distances[found].min() > 0.05 - 1e-5
-    assert distances[~found].max() < 0.07
+    assert distances[~found].max() < 0.05 + 2e-5
 
 
 def test_place_moves_obstacles_without_compiling(arm, monkeypatch):
@@ -83,7 +83,7 @@ def test_path_of_an_arm_is_free_by_the_scene_and_the_same_for_one_seed(arm):
     arm.place({"base": 0.0, "cart": 0.6})
     Q = configurations(arm, 400, seed=5) / 2.5
     free = Q[arm.valid(Q)]
-    paths = [arm.plan(free[2 * k], free[2 * k + 1], seed=k, seconds=0.2) for k in range(8)]
+    paths = [arm.plan(free[2 * k], free[2 * k + 1], seed=k, seconds=0.2) for k in range(12)]
     found = [k for k, path in enumerate(paths) if path]
     # Some goals are enclosed.
     assert len(found) >= 4

@@ -11,7 +11,8 @@ from typing import Any, TypeAlias
 import numpy as np
 import numpy.typing as npt
 
-from kineverse.compile.c_library import SourceLibrary
+from kineverse.compile.c_library import NO_COMPILER, SourceLibrary
+from kineverse.errors import CompileError
 
 from . import broadphase
 from .broadphase import Indices, ObjectTable, PairSelection, build_static_tree
@@ -41,6 +42,33 @@ class _Struct(ctypes.Structure):
         ("node_count", ctypes.c_int64),
         ("leaf_count", ctypes.c_int64),
     )
+
+
+class ObjectPlacement:
+    """Objects of a table at poses of their own, for other compiled code; the solids are shared.
+
+    Attributes
+    ----------
+    poses, positions
+        (M, 3, 4) poses and (M, 3) centres in the world, which their owner writes.
+    address, is_within
+        Addresses of the table as C reads it, and of the function that compares a distance with a limit.
+
+    Raises
+    ------
+    CompileError
+        Without a C compiler.
+    """
+
+    def __init__(self, table: ObjectTable) -> None:
+        if not collision_library.prepare(wait=True):
+            raise CompileError(f"Distances in other compiled code need a C compiler, and {NO_COMPILER}.")
+        self._table = table
+        self._struct = _Struct.from_buffer_copy(_bind_table(table).struct)
+        self.poses, self.positions = table.poses.copy(), table.position.copy()
+        self._struct.poses, self._struct.position = self.poses.ctypes.data, self.positions.ctypes.data
+        self.address = ctypes.addressof(self._struct)
+        self.is_within = ctypes.cast(collision_library.code.is_within, ctypes.c_void_p).value
 
 
 class CollisionLibrary(SourceLibrary):

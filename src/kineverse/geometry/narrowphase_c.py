@@ -184,6 +184,42 @@ EXPORT void measure(
     }
   }
 }
+
+/* Returns 0 only if two objects are certainly further apart than a limit. The search begins in a direction
+   from the one to the other, in the world, and leaves there the one that it ends with; 0 for none. */
+EXPORT int64_t is_within(const Table *t, int64_t i, int64_t j, double limit, double *direction) {
+  if (lower_bound(t, i, j) > limit) return 0;
+  if (t->corner_count[i] < 0 || t->corner_count[j] < 0) return 1;
+  const Pair pair = pair_of(t, i, j);
+  const double reach = limit + t->round[i] + t->round[j], *p = t->place + 3 * i, *q = t->place + 3 * j;
+  Vector start = {{direction[0], direction[1], direction[2]}};
+  if (!(dot(start, start) > 0.0)) start = (Vector){{q[0] - p[0], q[1] - p[1], q[2] - p[2]}};
+  Vector v = turned(t->poses + 12 * i, 1, 4, start);
+  Simplex s;
+  s.n = 0;
+  double high = INFINITY;
+  for (int step = 0; step < STEPS; step++) {
+    const double length = sqrt(dot(v, v));
+    if (!(length > LEAST)) return 1;
+    Vector a;
+    const Vector w = against(&pair, v, &a);
+    if (dot(v, w) / length > reach) {
+      const Vector way = turned(t->poses + 12 * i, 4, 1, v);
+      for (int r = 0; r < 3; r++) direction[r] = way.x[r] / length;
+      return 0;
+    }
+    s.w[s.n] = w;
+    s.a[s.n++] = a;
+    const Part next = nearest(&s);
+    if (!next.n) return 1;
+    const double nearer = sqrt(next.square);
+    if (nearer <= reach || !(nearer < high)) return 1;
+    keep(&s, &next);
+    v = next.v;
+    high = nearer;
+  }
+  return 1;
+}
 """
 
 

@@ -26,6 +26,7 @@ OBSTACLE = np.dtype(
         ("first", np.int32),
         ("planes", np.int32),
         ("aligned", np.int32),
+        ("object", np.int32),
     ]
 )
 LINK = np.dtype(
@@ -36,9 +37,12 @@ LINK = np.dtype(
         ("pose", np.int32),
         ("first", np.int32),
         ("coarse", np.int32),
-        ("body", np.int32),
+        ("first_shape", np.int32),
+        ("shapes", np.int32),
+        ("exact", np.int32),
     ]
 )
+SHAPE = np.dtype([("pose", np.float64, 12), ("object", np.int64)])
 COARSE = np.dtype([("sphere", np.float32, 4), ("first", np.int32), ("count", np.int32)])
 
 MOST_COORDINATES = 64
@@ -66,9 +70,10 @@ class CheckerStruct(ctypes.Structure):
     """Tables of a collision checker as C reads them."""
 
     _fields_ = _fields(
-        "iiiippppiippppppppiippd",
+        "iiiippppiippppppppiippppppppd",
         "coordinates poses conditions stored compute kept lower upper links bodies link coarse fine planes "
-        "allowed world moving fineness pairs moving_pairs pair moving_pair margin",
+        "allowed world moving fineness pairs moving_pairs pair moving_pair shape objects object_poses "
+        "object_positions object_centres is_within margin",
     )
 
 
@@ -140,7 +145,6 @@ def _declare_signatures(code: Any) -> None:
         "kineverse_edges": (ctypes.c_int, [pointer, pointer, pointer, count, number, number, pointer]),
         "kineverse_certify": (count, [pointer, pointer, count, number, number, pointer]),
         "kineverse_poses": (ctypes.c_int, [pointer, pointer, pointer]),
-        "kineverse_count_touching": (ctypes.c_int, [pointer, pointer, count, pointer, pointer, pointer]),
         "kineverse_rrt_connect": (count, [pointer, pointer, count, pointer, count, pointer, count]),
         "kineverse_project": (ctypes.c_int, [pointer, pointer, pointer, count, pointer]),
         "kineverse_walk": (count, [pointer, pointer, pointer, pointer, count]),

@@ -17,6 +17,7 @@ import numpy.typing as npt
 from kineverse.compile.vector_program import VectorProgram
 from kineverse.expressions.expression import Expression, as_expression
 from kineverse.geometry import Scene
+from kineverse.geometry.bindings import ObjectPlacement
 from kineverse.geometry.collision_filter import rigid_group
 from kineverse.geometry.objects import CollisionObject
 from kineverse.geometry.shapes import Solid
@@ -65,8 +66,6 @@ class CollisionChecker:
     ----------
     moving
         Names of the bodies that move.
-    uncovered
-        Pairs of bodies that are not checked here, but by the scene: spheres are too coarse for them.
     lower, upper
         (n,) limits, which are written in place.
     struct
@@ -111,6 +110,9 @@ class CollisionChecker:
         self._place_moving(members, poses)
         self._choose_pairs(dependence)
         self._margin = margin
+        self._objects = ObjectPlacement(world.table)
+        self._solids = [world.solid(k) for k in range(len(world.objects))]  # C has pointers to them
+        self.links.shapes["object"] = [k for b in self.moving for k in world.members[world.body_index(b)]]
         self._build_struct(margin)
         self._placement: tuple[bytes, bytes] | None = None
         self._placed = next(_placements)
@@ -145,15 +147,11 @@ class CollisionChecker:
         self.standing = tuple(world.bodies[k] for k in used)
         moving = np.array([world.body_index(body) for body in self.moving], dtype=int)
         self._allowed = np.ascontiguousarray(world.table.allowed[np.ix_(moving, used)], dtype=np.uint8)
-        self.uncovered = [
-            (body, self.standing[j])
-            for i, body in enumerate(self.moving)
-            if not len(self.links.spheres[i])
-            for j in np.flatnonzero(self._allowed[i]).tolist()
-        ]
         solids = [world.solid(k) for k in self._static]
         poses, bodies = world.table.poses[self._static], numbers.astype(np.int32)
-        self._world = ObstacleSet(solids, bodies, poses, self._planes, self.program.lanes)
+        self._world = ObstacleSet(
+            solids, bodies, poses, self._planes, self.program.lanes, objects=self._static
+        )
 
     def _place_moving(
         self, members: Sequence[Sequence[tuple[CollisionObject, Solid, Array]]], poses: Sequence[int]
@@ -175,7 +173,7 @@ class CollisionChecker:
     def _choose_pairs(self, dependence: FrameDependence) -> None:
         """Choose for each pair of moving bodies whether shapes or spheres stand for the second one.
 
-        Pairs without any spheres are left to the scene.
+        Where spheres touch, the shapes of both are compared, unless these are spheres.
         """
         world = self.scene.collision_world
         number = [world.body_index(body) for body in self.moving]
@@ -185,17 +183,13 @@ class CollisionChecker:
         for (i, a), (j, b) in combinations(enumerate(self.moving), 2):
             if not world.table.allowed[number[i], number[j]] or not dependence.moves_between(a, b):
                 continue
-            # Shapes are exact, but spheres have a hierarchy.
+            # Shapes stick out less, but spheres have a hierarchy.
             costs = {
                 0: spheres[i] * spheres[j] / 2,
                 1: spheres[i] * self._costs[j],
                 2: spheres[j] * self._costs[i],
             }
-            possible = [k for k, cost in costs.items() if cost > 0]
-            if not possible:
-                self.uncovered.append((a, b))
-                continue
-            choice = min(possible, key=lambda k: costs[k])
+            choice = min((k for k, cost in costs.items() if cost > 0), key=lambda k: costs[k], default=1)
             (moving_pairs if choice else pairs).append((j, i) if choice == 2 else (i, j))
         self.pairs = np.array(pairs, dtype=np.int32).reshape(-1, 2)
         self.moving_pairs = np.array(moving_pairs, dtype=np.int32).reshape(-1, 2)
@@ -232,6 +226,12 @@ class CollisionChecker:
             len(self.moving_pairs),
             self.pairs.ctypes.data,
             self.moving_pairs.ctypes.data,
+            links.shapes.ctypes.data,
+            self._objects.address,
+            self._objects.poses.ctypes.data,
+            self._objects.positions.ctypes.data,
+            self.scene.collision_world.table.centre.ctypes.data,
+            self._objects.is_within,
             margin,
         )
 
@@ -246,6 +246,8 @@ class CollisionChecker:
         table, parameters = self.scene.collision_world.table, state.vector(self.parameters)
         poses = table.poses[self._static]
         self._world.place(poses)
+        self._objects.poses[self._static] = poses
+        self._objects.positions[self._static] = table.position[self._static]
         self._kept = self.program.prepare(parameters)
         self.struct.kept = self._kept.ctypes.data
         places = table.poses[self._carried, :, 3]
@@ -360,33 +362,6 @@ class CollisionChecker:
         if found < -1:
             raise MemoryError("There is no memory for the check of a path.")
         return None if found < 0 else (int(found), where.value)
-
-    def count_touching(self, Q: Floats32) -> dict[tuple[str, str], int]:
-        """Return of each checked pair of bodies at how many configurations (N, n) their spheres touch."""
-        world = np.zeros((len(self.moving), max(len(self.standing), 1)), dtype=np.int32)
-        pairs, moving_pairs = (np.zeros(len(p) + 1, dtype=np.int32) for p in (self.pairs, self.moving_pairs))
-        self._code.kineverse_count_touching(
-            self.address,
-            Q.ctypes.data,
-            len(Q),
-            world.ctypes.data,
-            pairs.ctypes.data,
-            moving_pairs.ctypes.data,
-        )
-        found = {
-            (self.moving[i], self.standing[j]): int(world[i, j])
-            for i, j in np.argwhere(self._allowed).tolist()
-        }
-        for rows, counts in ((self.pairs, pairs), (self.moving_pairs, moving_pairs)):
-            for (i, j), number in zip(rows.tolist(), counts.tolist(), strict=False):
-                found[self.moving[i], self.moving[j]] = number
-        return found
-
-    def leave_to_scene(self, pairs: Sequence[tuple[str, str]]) -> None:
-        """Check pairs of bodies no more, from now on: they are among :attr:`uncovered`."""
-        self.uncovered += pairs
-        self._allowed, self.pairs, self.moving_pairs = self._without(frozenset(map(frozenset, pairs)))
-        self._use(self._allowed, self.pairs, self.moving_pairs)
 
     def outputs(self, q: Floats32) -> tuple[Floats32, Floats32]:
         """Return the poses (K, 3, 4) of the rigid groups and the conditions at a configuration (n,)."""

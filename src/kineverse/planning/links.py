@@ -9,8 +9,9 @@ import numpy as np
 from kineverse.geometry.objects import CollisionObject
 from kineverse.geometry.shapes import Solid
 from kineverse.lie import Array
+from kineverse.model.body import Sphere
 
-from .bindings import COARSE, LINK
+from .bindings import COARSE, LINK, SHAPE
 from .spheres import cover_object, default_protrusion, make_sphere_tree
 
 _MANY = 64
@@ -27,13 +28,13 @@ class LinkTable:
     poses
         Of each body, the number of its pose.
     covered
-        Of each body, whether it has spheres.
+        Of each body, whether it has spheres; the ball around it stands for one without.
     protrusion
         Largest distance of a sphere from the shape that it covers [m]; None for what suits the shape.
 
     Attributes
     ----------
-    links, coarse, fine
+    links, coarse, fine, shapes
         Tables as C reads them.
     spheres
         Of each body, the centres in the frame and radii of its spheres, (N, 4) [m].
@@ -51,9 +52,15 @@ class LinkTable:
         fine: list[Array] = []
         self.spheres: list[Array] = []
         count = 0
+        self.shapes = np.zeros(sum(map(len, members)), dtype=SHAPE)
+        self.shapes["pose"] = [T[:3].ravel() for items in members for _, _, T in items]
+        shapes = 0
         for k, (items, pose) in enumerate(zip(members, poses, strict=True)):
             link = self.links[k]
-            link["pose"], link["body"], link["first"] = pose, k, len(coarse)
+            link["pose"], link["first"] = pose, len(coarse)
+            link["first_shape"], link["shapes"] = shapes, len(items)
+            shapes += len(items)
+            link["exact"] = covered[k] and all(isinstance(solid.surface, Sphere) for _, solid, _ in items)
             corners = np.concatenate([_placed_corners(solid, T) for _, solid, T in items])
             link["low"], link["high"] = corners.min(axis=0), corners.max(axis=0)
             link["ball"] = *(corners.min(axis=0) + corners.max(axis=0)) / 2, 0.0

@@ -41,6 +41,8 @@ class ObstacleSet:
         Table that the planes of hulls are added to; rows of a normal and an offset.
     lanes
         Number of obstacles in a chunk.
+    objects
+        (M,) number of the object of each solid in the scene; for the world only.
     pose, link
         Numbers of the pose and of the link that carries the set; 0 for the world.
 
@@ -61,6 +63,7 @@ class ObstacleSet:
         lanes: int,
         pose: int = 0,
         link: int = 0,
+        objects: npt.ArrayLike = 0,
     ) -> None:
         self._lanes, count = lanes, len(solids)
         self._centre = np.array([solid.centre for solid in solids]).reshape(-1, 3)
@@ -72,6 +75,7 @@ class ObstacleSet:
         padded_chunks = -(-chunks // lanes) * lanes
         self._items = np.zeros(chunks * lanes, dtype=OBSTACLE)
         self._items["body"][:count] = bodies[order]
+        self._items["object"][:count] = np.broadcast_to(objects, count)[order]
         self._sizes = np.zeros((count, 3))
         for k, solid in enumerate(solids[j] for j in order):
             self._describe(k, solid, planes)

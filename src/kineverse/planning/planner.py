@@ -42,7 +42,8 @@ class Planner:
     """Planner of paths without collisions, for any coordinates of a model.
 
     Bodies that move are covered by spheres, everything else is obstacles. A generated function computes the
-    poses of many configurations at once, and compiled code checks edges of trees (RRT-Connect). A path is
+    poses of many configurations at once, and compiled code checks edges of trees (RRT-Connect): spheres
+    against obstacles, then the shapes themselves where spheres touch. A path is
     certified between its samples too, and judged by the collision scene before it is returned.
 
     Everything is computed from the model: an edit of the model is followed at the next call. A planner is
@@ -65,8 +66,8 @@ class Planner:
     leave_out
         Excluded bodies, or patterns, or shapes, see :class:`.Scene`.
     protrusion
-        Largest distance by which spheres stick out of the shape that they cover [m]; None for what suits the
-        shape.
+        Largest distance by which spheres stick out of the shape that they cover [m], a matter of speed alone;
+        None for what suits the shape.
 
     Attributes
     ----------
@@ -166,7 +167,7 @@ class Planner:
     def valid(self, Q: npt.ArrayLike) -> npt.NDArray[np.bool_]:
         """Return flags (N,) of configurations (N, n) that are within limits and free of collisions.
 
-        Bodies are covered by spheres, so that a configuration near a contact may count as invalid.
+        Bodies that are nearer than 0.01 mm count as touching.
         """
         self._synchronize()
         points = self._configurations(Q, "Q")

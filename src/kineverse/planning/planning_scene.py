@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import replace
+from functools import partial
 from time import perf_counter
 from typing import Any, TypeAlias
 
@@ -15,7 +16,6 @@ from kineverse.control.tasks import Hold
 from kineverse.errors import InvalidValueError
 from kineverse.geometry import Rule, Scene
 from kineverse.geometry.prepared_query import flag_subtree
-from kineverse.geometry.results import DistanceResult
 from kineverse.lie import Array
 from kineverse.model.frame import WORLD
 from kineverse.model.kinematics import ancestors
@@ -29,7 +29,7 @@ from .connection import MORE_PATIENCE, PATIENCE, connect, connect_on_manifold
 from .endpoints import Endpoint, Endpoints
 from .judge import SceneJudge, describe_contacts
 from .manifold import FrameHold, Manifold, hold_targets, manifold_key
-from .near_pairs import columns_between, find_overlapping_pairs, leave_near_pairs
+from .overlapping_pairs import find_overlapping_pairs
 from .path import Path
 from .path_checks import PathChecks
 from .roadmap import Roadmap
@@ -41,8 +41,6 @@ Flags: TypeAlias = npt.NDArray[np.bool_]
 _JUDGED = 0.5
 """Longest step between judged configurations of a path that is certified [rad], [m]."""
 _MOST_MANIFOLDS = 16
-_MOST_CONTACTS = 6
-"""Number of searches whose paths touch where only the scene looks, after which there is no other one."""
 _SAME = 1e-5
 """Difference of lengths that is rounding [rad], [m]."""
 
@@ -106,7 +104,6 @@ class PlanningScene:
         self._manifolds: dict[tuple[object, ...], Manifold] = {}
         self._judges: dict[BodyPairs, SceneJudge] = {}
         self._carried_bodies: dict[str, tuple[str, ...]] = {}
-        leave_near_pairs(self.checker, space)
         self.place(state)
 
     def place(self, state: State) -> None:
@@ -210,37 +207,19 @@ class PlanningScene:
             if isinstance(usable, str):
                 return self.no_path(q, usable, begin)
             straight = float(np.linalg.norm(ends - q, axis=1).min())
-            best, left, contacts = None, seconds, 0
-            while best is None or left > 0.0:
-                path, contact = self._connect(
-                    first, usable, manifold, touching, left, seed, begin, edges, roadmap, optimize
-                )
-                if best is None or (path.found and (not best.found or path.length < best.length)):
-                    best = path
-                if contact is not None:
-                    self._narrow(contact, q, touching)
-                    contacts += 1
-                if best.found:
-                    if not optimize or best.length <= straight + _SAME:
-                        break
-                elif contact is None or contacts == _MOST_CONTACTS:
-                    break
+            search = partial(
+                self._connect, first, usable, manifold, touching,
+                begin=begin, edges=edges, roadmap=roadmap, optimize=optimize,
+            )  # fmt: skip
+            best = search(seconds, seed)
+            while optimize and best.found and best.length > straight + _SAME:
                 seed, left = seed + 1, seconds - (perf_counter() - begin)
+                if left <= 0.0:
+                    break
+                path = search(left, seed)
+                if path.found and path.length < best.length:
+                    best = path
             return replace(best, seconds=perf_counter() - begin)
-
-    def _narrow(self, contact: DistanceResult, q: Array, touching: BodyPairs) -> None:
-        """Narrow the bounds of a coordinate to where it keeps a pair apart that only the scene checks.
-
-        Nothing is done for a pair that several coordinates move.
-        """
-        pair = {contact.a, contact.b}
-        if not any(pair == set(other) for other in self.checker.uncovered):
-            return
-        columns = columns_between(self.space, contact.a, contact.b)
-        if len(columns) == 1:
-            (i,) = columns
-            bounds = float(self.checker.lower[i]), float(self.checker.upper[i])
-            self.checker.lower[i], self.checker.upper[i] = self.judge(touching).free_interval(q, i, *bounds)
 
     def _connect(
         self,
@@ -254,11 +233,11 @@ class PlanningScene:
         edges: int,
         roadmap: Roadmap | None,
         optimize: bool,
-    ) -> tuple[Path, DistanceResult | None]:
-        """Return a path between checked ends, and the contact that the scene finds on it."""
-        q = first.inner
-        variants = [(goal, v) for goal in goals for v in self.space.equivalents(goal.inner, q)]
-        targets = np.ascontiguousarray([v for _, v in variants], dtype=np.float32)
+    ) -> Path:
+        """Return a path between checked ends."""
+        q = first.q
+        variants = [v for goal in goals for v in self.space.equivalents(goal.q, q)]
+        targets = np.ascontiguousarray(variants, dtype=np.float32)
         starts = np.ascontiguousarray(q[None], dtype=np.float32)
         searched = perf_counter()
         if manifold is None:
@@ -268,22 +247,18 @@ class PlanningScene:
             found = connect_on_manifold(self.checker, manifold, starts, targets, seconds, seed, edges)
         spent = perf_counter() - searched
         if found.problem:
-            return self.no_path(found.points, found.problem, begin, spent, found.iterations), None
+            return self.no_path(found.points, found.problem, begin, spent, found.iterations)
         points = found.points
         # A roadmap may wind further than the variants do.
         turns = np.where(self.space.turning, np.round((points[-1] - targets) / math.tau), 0.0) * math.tau
         k = int(np.argmin(np.abs(targets + turns - points[-1]).max(axis=1)))
-        goal, variant = variants[k][0], variants[k][1] + turns[k]
-        points[0], points[-1] = q, variant
+        points[0], points[-1] = q, variants[k] + turns[k]
         contact = self.judge(touching).first_contact(points, _JUDGED)
         if contact is not None:
             problem = f"The scene finds a contact on the path: {describe_contacts([contact[1]])}."
-            return self.no_path(points, problem, begin, spent, found.iterations), contact[1]
-        shift = variant - goal.inner
-        whole = np.vstack([first.way[:-1], points, (goal.way[::-1] + shift)[1:]])
+            return self.no_path(points, problem, begin, spent, found.iterations)
         why = f"Found after {found.iterations} samples{'' if roadmap is None else roadmap.describe()}."
-        path = self.path(True, whole, why, begin, spent, found.iterations, touching, manifold)
-        return path, None
+        return self.path(True, points, why, begin, spent, found.iterations, touching, manifold)
 
     def judge(self, touching: BodyPairs = frozenset()) -> SceneJudge:
         """Return the judge of the scene in which some pairs may touch, at the present place."""
@@ -291,7 +266,7 @@ class PlanningScene:
             if len(self._judges) >= _MOST_MANIFOLDS:
                 self._judges.clear()
             rules = [Rule(a, b, False, "held") for a, b in map(sorted, touching)]
-            self._judges[touching] = SceneJudge(self.scene, self.space.symbols, rules, self.checker.uncovered)
+            self._judges[touching] = SceneJudge(self.scene, self.space.symbols, rules, ())
         judge = self._judges[touching]
         judge.place(self.state)
         return judge

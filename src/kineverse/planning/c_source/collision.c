@@ -2,8 +2,9 @@
 
    Links are covered by spheres in three levels: a ball around all, coarse spheres, fine spheres. Obstacles are
    shapes in sets. The set of the world holds all that stands still; every body that moves may have a set of its
-   own, in its own frame. All tests are conservative: a hull is the intersection of its half spaces, so that near
-   an edge a sphere counts as a hit a little too early. */
+   own, in its own frame. These tests are conservative: spheres stick out of the shapes that they cover, and a hull is
+   the intersection of its half spaces, so that near an edge a sphere counts as a hit a little too early. Where they
+   hit, the shapes are compared by the narrow phase of the scene, one lane at a time, in double precision. */
 
 enum { BOX, CYLINDER, CAPSULE, SPHERE, HULL };
 
@@ -11,7 +12,7 @@ enum { BOX, CYLINDER, CAPSULE, SPHERE, HULL };
    edges; of a cylinder or capsule the radius and half the length; of a sphere the radius. */
 typedef struct {
   float rotation[9], translation[3], size[3];
-  int kind, body, first, planes, aligned;
+  int kind, body, first, planes, aligned, object;
 } Obstacle;
 
 /* Obstacles with their bounding boxes in columns, W in a chunk, and a bounding box of every chunk. */
@@ -22,11 +23,21 @@ typedef struct {
   long long count, padded, padded_chunks, pose, link;
 } ObstacleSet;
 
-/* A body with spheres. `low` and `high` bound the centres of its spheres and its shapes, in its frame. */
+/* A body that moves. `low` and `high` bound the centres of its spheres and its shapes, in its frame. If `exact`, its
+   shapes are its spheres; without any spheres, it is inside of its ball. */
 typedef struct {
   float ball[4], low[3], high[3];
-  int pose, first, coarse, body;
+  int pose, first, coarse, first_shape, shapes, exact;
 } Link;
+
+/* A shape of a body that moves: its pose in the frame of the link, rows of 3×4, and the number of its object. */
+typedef struct {
+  double pose[12];
+  long long object;
+} Shape;
+
+/* Return 0 only if two objects are further apart than a limit. */
+typedef long long IsWithin(const void *objects, long long i, long long j, double limit, double *direction);
 
 typedef struct {
   float sphere[4];
@@ -58,6 +69,11 @@ typedef struct {
   long long pairs, moving_pairs;
   const Pair *pair;        /* two links, spheres against spheres */
   const Pair *moving_pair; /* a link, spheres, against a moving set */
+  const Shape *shape;
+  const void *objects; /* of the scene, with the poses and positions that follow */
+  double *object_poses, *object_positions;
+  const double *object_centres;
+  IsWithin *is_within;
   double margin;
 } Checker;
 
@@ -226,9 +242,72 @@ static int box_search_next(BoxSearch *b, const ObstacleSet *s, const unsigned ch
   }
 }
 
-/* Spheres of a link against a set; T is the pose of the link in the set's frame. */
-INLINE I link_against_set(const Checker *c, const Link *l, const V *T, const V *centre,
-                          const ObstacleSet *s, const unsigned char *allowed, float inflation, int early, I hit) {
+#define MOST_DIRECTIONS 32
+
+static void place_shape(const Checker *c, const Shape *s, const V *T, int lane) {
+  double *pose = c->object_poses + 12 * s->object, *position = c->object_positions + 3 * s->object;
+  const double *own = s->pose, *p = c->object_centres + 3 * s->object;
+  for (int i = 0; i < 3; i++) {
+    const double x = T[4 * i][lane], y = T[4 * i + 1][lane], z = T[4 * i + 2][lane];
+    double *row = pose + 4 * i;
+    for (int j = 0; j < 4; j++) row[j] = x * own[j] + y * own[4 + j] + z * own[8 + j];
+    row[3] += T[4 * i + 3][lane];
+    position[i] = row[0] * p[0] + row[1] * p[1] + row[2] * p[2] + row[3];
+  }
+}
+
+/* Those of some lanes in which a link touches another one, or an obstacle of the world, by their shapes. Neighbouring
+   lanes are similar: a direction that separates two shapes in one of them is tried first in the next. */
+static I shapes_touch(const Checker *c, const Work *w, const Link *a, const Link *b, const Obstacle *o, float grown,
+                      int early, I lanes) {
+  double directions[MOST_DIRECTIONS][3];
+  memset(directions, 0, sizeof directions);
+  const int others = b ? b->shapes : 1;
+  I hit = splat(0.0f) < splat(0.0f);
+  for (unsigned bits = lane_bits(lanes); bits; bits &= bits - 1) {
+    const int lane = __builtin_ctz(bits);
+    for (int i = 0; i < a->shapes; i++) place_shape(c, c->shape + a->first_shape + i, w->o + 12 * a->pose, lane);
+    for (int j = 0; b && j < others; j++) place_shape(c, c->shape + b->first_shape + j, w->o + 12 * b->pose, lane);
+    for (int k = 0; k < a->shapes * others && !hit[lane]; k++) {
+      const long long one = c->shape[a->first_shape + k / others].object;
+      const long long other = b ? c->shape[b->first_shape + k % others].object : o->object;
+      double none[3] = {0.0, 0.0, 0.0};
+      if (c->is_within(c->objects, one, other, grown, k < MOST_DIRECTIONS ? directions[k] : none)) hit[lane] = -1;
+    }
+    if (early && hit[lane]) break;
+  }
+  return hit;
+}
+
+#define MOST_NEAR 64
+
+/* The lanes, beside those that were hit, in which some of the coarse spheres of a link, or the spheres in them, touch
+   an obstacle. */
+INLINE I spheres_against(const Checker *c, const Coarse *spheres, int count, const V (*centres)[3], const V *T,
+                         const Obstacle *o, float grown, int early, I hit) {
+  I lanes = splat(0.0f) < splat(0.0f);
+  for (int a = 0; a < count; a++) {
+    const Coarse *q = spheres + a;
+    const I coarse = touches(o, c->planes, centres[a], splat(q->sphere[3] + grown));
+    if (!any(coarse & ~(hit | lanes))) continue;
+    if (q->count == 1) {
+      lanes |= coarse;
+    } else {
+      for (int f = q->first; f < q->first + q->count; f++) {
+        V r[3];
+        transform_point(T, c->fine + 4 * f, r);
+        lanes |= touches(o, c->planes, r, splat(c->fine[4 * f + 3] + grown));
+        if (early && any(lanes)) return lanes & ~hit;
+      }
+    }
+    if (early ? any(lanes) : !any(~(hit | lanes))) break;
+  }
+  return lanes & ~hit;
+}
+
+/* A link against a set; T is the pose of the link in the set's frame. If `shapes`, they decide where spheres touch. */
+INLINE I link_against_set(const Checker *c, const Work *w, const Link *l, const V *T, const V *centre, const ObstacleSet *s,
+                          const unsigned char *allowed, float inflation, int shapes, int early, I hit) {
   const float grown = inflation + (float)c->margin;
   const Obstacle *found[MOST_CANDIDATES];
   BoxSearch search;
@@ -249,26 +328,19 @@ INLINE I link_against_set(const Checker *c, const Link *l, const V *T, const V *
       if ((!allowed || allowed[found[k]->body]) && any(touches(found[k], c->planes, centre, reach) & ~hit))
         found[near++] = found[k];
     if (!near) continue;
-    for (int a = l->first; a < l->first + l->coarse; a++) {
-      const Coarse *q = c->coarse + a;
-      V p[3];
-      transform_point(T, q->sphere, p);
-      const V far = splat(q->sphere[3] + grown);
+    for (int first = 0; first < (l->coarse ? l->coarse : 1); first += MOST_NEAR) {
+      const Coarse *spheres = c->coarse + l->first + first;
+      const int some = l->coarse - first < MOST_NEAR ? l->coarse - first : MOST_NEAR;
+      V centres[MOST_NEAR][3];
+      for (int a = 0; a < some; a++) transform_point(T, spheres[a].sphere, centres[a]);
       for (int k = 0; k < near; k++) {
-        const I coarse = touches(found[k], c->planes, p, far);
-        if (!any(coarse & ~hit)) continue;
-        if (q->count == 1) {
-          hit |= coarse;
-        } else {
-          for (int f = q->first; f < q->first + q->count; f++) {
-            V r[3];
-            transform_point(T, c->fine + 4 * f, r);
-            hit |= touches(found[k], c->planes, r, splat(c->fine[4 * f + 3] + grown));
-            if (early && any(hit)) return hit;
-          }
-        }
-        if (early && any(hit)) return hit;
-        if (!any(~hit)) return hit;
+        const Obstacle *o = found[k];
+        const int decided = !shapes || (l->exact && o->kind != HULL);
+        I lanes = l->coarse ? spheres_against(c, spheres, some, centres, T, o, grown, early && decided, hit)
+                            : touches(o, c->planes, centre, reach) & ~hit;
+        if (!any(lanes)) continue;
+        hit |= decided ? lanes : shapes_touch(c, w, l, 0, o, grown, early, lanes);
+        if (early ? any(hit) : !any(~hit)) return hit;
       }
     }
   }
@@ -279,8 +351,6 @@ INLINE I spheres_touch(const V *p, const V *q, float reach) {
   const V x = p[0] - q[0], y = p[1] - q[1], z = p[2] - q[2];
   return fused(x, x, fused(y, y, z * z)) <= splat(reach * reach);
 }
-
-#define MOST_NEAR 64
 
 /* The coarse spheres of a link that touch a ball: their numbers and centres. */
 INLINE int spheres_near_ball(const Checker *c, const Link *l, const V *T, const V *centre, float reach, I hit, int *first,
@@ -331,29 +401,25 @@ INLINE I link_against_link(const Checker *c, const Link *a, const Link *b, const
   return hit;
 }
 
-/* The lanes in which two links touch, spheres against spheres, and those that were hit before. */
-INLINE I touching_links(const Checker *c, Work *w, const Pair *pair, int early, I hit) {
-  const int i = pair->one, j = pair->other;
-  const Link *a = c->link + i, *b = c->link + j;
-  const V *p = w->centre + 3 * i, *q = w->centre + 3 * j;
-  const float grown = w->inflation[i] + w->inflation[j] + (float)c->margin;
+/* The lanes in which two links touch, and those that were hit before: their spheres, or the spheres of the first one
+   and a set with the shapes of the second one, then the shapes of both. */
+INLINE I links_touch(const Checker *c, Work *w, const Link *a, const Link *b, const ObstacleSet *s, int early, I hit) {
+  const long long i = a - c->link, j = b - c->link;
+  const int decided = a->exact && b->exact;
+  const V *p = w->centre + 3 * i, *q = w->centre + 3 * j, *A = w->o + 12 * a->pose, *B = w->o + 12 * b->pose;
+  const float inflation = w->inflation[i] + w->inflation[j], grown = inflation + (float)c->margin;
   if (!any(spheres_touch(p, q, a->ball[3] + b->ball[3] + grown) & ~hit)) return hit;
-  return link_against_link(c, a, b, w->o + 12 * a->pose, w->o + 12 * b->pose, p, q, grown, early, hit);
-}
-
-/* The lanes in which a link touches the shapes of a body that moves, and those that were hit before. */
-INLINE I touching_set(const Checker *c, Work *w, const Pair *pair, int early, I hit) {
-  const int i = pair->one;
-  const ObstacleSet *s = c->moving + pair->other;
-  const Link *a = c->link + i, *b = c->link + s->link;
-  /* A body that moves has its inflation among those of the links. */
-  const float grown = w->inflation[i] + w->inflation[s->link];
-  const float reach = a->ball[3] + b->ball[3] + grown + (float)c->margin;
-  if (!any(spheres_touch(w->centre + 3 * i, w->centre + 3 * s->link, reach) & ~hit)) return hit;
-  V centre[3];
-  relative_pose(w->o + 12 * s->pose, w->o + 12 * a->pose, w->relative);
-  transform_point(w->relative, a->ball, centre);
-  return link_against_set(c, a, w->relative, centre, s, 0, grown, early, hit);
+  I lanes;
+  if (s) {
+    V centre[3];
+    relative_pose(B, A, w->relative);
+    transform_point(w->relative, a->ball, centre);
+    lanes = link_against_set(c, w, a, w->relative, centre, s, 0, inflation, 0, early && decided, hit);
+  } else {
+    lanes = link_against_link(c, a, b, A, B, p, q, grown, early && decided, hit);
+  }
+  lanes &= ~hit;
+  return any(lanes) ? hit | (decided ? lanes : shapes_touch(c, w, a, b, 0, grown, early, lanes)) : hit;
 }
 
 /* The lanes of w->x that are not free. With `early` all that matters is whether there is any. The outputs of
@@ -370,17 +436,18 @@ INLINE I find_collisions(const Checker *c, Work *w, int early) {
     const Link *l = c->link + k;
     const V *T = w->o + 12 * l->pose;
     transform_point(T, l->ball, w->centre + 3 * k);
-    if (!l->coarse) continue;
-    hit = link_against_set(c, l, T, w->centre + 3 * k, c->world, c->allowed + k * c->bodies, w->inflation[k], early,
+    hit = link_against_set(c, w, l, T, w->centre + 3 * k, c->world, c->allowed + k * c->bodies, w->inflation[k], 1, early,
                            hit);
     RETURN_IF_KNOWN;
   }
   for (int k = 0; k < c->pairs; k++) {
-    hit = touching_links(c, w, c->pair + k, early, hit);
+    const Pair *p = c->pair + k;
+    hit = links_touch(c, w, c->link + p->one, c->link + p->other, 0, early, hit);
     RETURN_IF_KNOWN;
   }
   for (int k = 0; k < c->moving_pairs; k++) {
-    hit = touching_set(c, w, c->moving_pair + k, early, hit);
+    const Pair *p = c->moving_pair + k;
+    hit = links_touch(c, w, c->link + p->one, c->link + p->other, c->moving + p->other, early, hit);
     RETURN_IF_KNOWN;
   }
 #undef RETURN_IF_KNOWN
