@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Iterable
 from operator import index
 from typing import Any
 
@@ -67,6 +68,34 @@ def as_count(name: str, given: int, least: int) -> int:
     if count is None or count < least:
         raise InvalidValueError(f"{name}= is an integer of at least {least}, not {given!r}.")
     return count
+
+
+def as_entries(argument: str, given: Any, kinds: type | tuple[type, ...], wanted: str) -> tuple[Any, ...]:
+    """Return the entries of an argument that takes one value or several.
+
+    Parameters
+    ----------
+    argument
+        Name of the argument, as in ``move=``.
+    given
+        A value, or an iterable of values.
+    kinds
+        Types of values.
+    wanted
+        What the argument takes, for the message.
+
+    Raises
+    ------
+    InvalidValueError
+        For anything else.
+    """
+    if isinstance(given, kinds):
+        return (given,)
+    if isinstance(given, Iterable) and not isinstance(given, str | bytes):
+        found = tuple(given)
+        if all(isinstance(entry, kinds) for entry in found):
+            return found
+    raise InvalidValueError(f"{argument} takes {wanted}, not {given!r:.80}.")
 
 
 def check_flag(name: str, given: object) -> None:

@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+from itertools import pairwise
+
 import numpy as np
 import pytest
 from scene_models import arm_among_boxes, body, brute_force, by_names, random_state
 
 import kineverse as kv
-from kineverse.geometry import Rule, Scene, bindings, collision_world, distance_queries
+from kineverse.geometry import Rule, Scene, bindings, collision_world, distance_queries, sampled_motion
 from kineverse.model.body import Body, Box, Mesh, Pose, Shape, Sphere
 
 
@@ -92,6 +94,54 @@ def test_per_shape_returns_every_pair_of_shapes(either_search):
     np.testing.assert_allclose(each().distances, 0.08, atol=1e-8)
     np.testing.assert_allclose(sorted(each().points_b[:, 2]), [-0.3, 0.0, 0.3], atol=1e-8)
     assert "each pair of shapes" in repr(each)
+
+
+@pytest.mark.compiler
+@pytest.mark.parametrize("rows", [130, pytest.param(90, id="interpreter"), pytest.param(5, id="numpy")])
+def test_motions_match_a_query_at_each_configuration(rows, monkeypatch, tmp_path):
+    if rows < 100:
+        monkeypatch.setattr(collision_world.CollisionWorld, "kinematics_address", None)
+    if rows < 10:
+        monkeypatch.setattr(sampled_motion, "collision_library", bindings.CollisionLibrary())
+    roof = tmp_path / "roof.obj"
+    roof.write_text("v -1 -1 0.9\nv 1 -1 0.9\nv 1 1 0.9\nv -1 1 0.9\nf 1 2 3\nf 1 3 4\n")
+    model = arm_among_boxes()
+    with model.edit() as edit:
+        edit.add_frame("roof", "world", kv.translation(0, 0, kv.position("height")), body(Mesh(str(roof))))
+    scene = Scene(model, triangles="roof")
+    assert rows < 100 or scene.collision_world._function.wait()
+    coordinates = [model.symbol(name) for name in ("j0", "rail", "j3")]
+    queries = [scene.watch(moving=coordinates), scene.watch("hand"), scene.watch("base", "box*")]
+    queries.append(scene.watch("link4", "roof"))
+    columns = [scene.inputs.index(symbol) for symbol in coordinates]
+    rng, found = np.random.default_rng(0), set()
+    for number in range(12):
+        values = random_state(model, rng).vector(scene.inputs)
+        state = values.copy()
+        knots = rng.uniform(-1.0, 1.0, (3, 3)) * (0.3, 1.0)[number % 2]
+        Q = np.concatenate([np.linspace(a, b, rows) for a, b in pairwise(knots)])
+        query, radius = queries[number % 4], (0.0, 0.05, 0.2)[number % 3]
+        distances = []
+        for q in Q:
+            values[columns] = q
+            scene.update(values)
+            near = query(radius)
+            distances.append(near.distances[0] if len(near) else np.inf)
+        scene.update(state)
+        assert query.least_distance(coordinates, Q, radius) == min(distances)
+        before = query(1.0).distances
+        first = query.first_within(coordinates, Q, radius)
+        assert first == next((k for k, d in enumerate(distances) if d <= radius), None)
+        if first is None:
+            assert np.array_equal(query(1.0).distances, before)
+        else:
+            assert query(radius).distances[0] == distances[first]
+        found.add("first" if first == 0 else "later" if first else "none")
+    assert found == {"first", "later", "none"}
+    with pytest.raises(kv.errors.InvalidValueError, match="not finite"):
+        queries[0].first_within(coordinates, np.full((1, 3), np.nan), -0.0)
+    with pytest.raises(kv.errors.ShapeError, match=r"\(N, 3\)"):
+        queries[0].first_within(coordinates, np.zeros(3))
 
 
 def test_the_nearest_pairs_of_shapes_are_those_of_the_bodies(model):

@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import itertools
+import pickle
 from concurrent.futures import ThreadPoolExecutor
+from time import perf_counter
 
 import numpy as np
 import pytest
@@ -12,7 +14,7 @@ from planning_models import body
 import kineverse as kv
 from kineverse.errors import CompileError, InvalidValueError, KineverseError, ShapeError, UnknownNameError
 from kineverse.model.body import Box, Sphere
-from kineverse.planning import Planner, bindings
+from kineverse.planning import Mode, Planner, bindings
 from kineverse.planning.checker import CollisionChecker
 from kineverse.planning.search import RrtConnect
 
@@ -74,11 +76,35 @@ def test_wrong_arguments_are_refused(ball):
         {"margin": -1},
         {"margin": np.nan},
         {"protrusion": 0.0},
+        {"protrusion": "1"},
         {"move": []},
         {"move": "nothing*"},
+        {"move": 5},
+        {"rules": None},
+        {"decomposed": [5]},
+        {"leave_out": [("ball",)]},
     ):
         with pytest.raises(KineverseError):
             Planner(ball.model, **wrong)
+    with pytest.raises(InvalidValueError, match="takes a model"):
+        Planner("kitchen")
+    for wrong in (
+        {"along": None},
+        {"modes": 5},
+        {"goals": None},
+        {"goals": [kv.control.Goal(ball.symbols[0], 1.0), 5]},
+    ):
+        with pytest.raises(InvalidValueError, match=f"{next(iter(wrong))}(=| takes| is)"):
+            ball.plan(**({"start": [0, 0], "goals": [0, 0]} | wrong))
+    with pytest.raises(InvalidValueError, match="tasks takes"):
+        ball.solutions(5)
+    with pytest.raises(InvalidValueError, match="mask="):
+        ball.hold("ball", "world", None)
+    for wrong in ({"along": 5}, {"moves": 5}, {"name": None}):
+        with pytest.raises(InvalidValueError):
+            Mode(**({"name": "free"} | wrong))
+    with pytest.raises(InvalidValueError, match="number from 0 to 1"):
+        ball.plan([0, 0], [1, 1]).at("half")
     for goals in ([], np.zeros((0, 2))):
         with pytest.raises(ShapeError):
             ball.plan([0, 0], goals)
@@ -95,6 +121,56 @@ def test_wrong_arguments_are_refused(ball):
         ball.place({"nothing": 1.0})
     with pytest.raises(ShapeError, match="differ"):
         ball.edges(np.zeros((2, 2)), np.zeros((3, 2)))
+
+
+def test_planners_and_paths_are_pickled():
+    planner = Planner(points(2, 30), "q00", margin=0.01, leave_out=["box3"])
+    planner.place({"q01": -10.0})
+    found = planner.plan([0.0], [0.5])
+    copied, path = pickle.loads(pickle.dumps((planner, found)))
+    again = copied.plan([0.0], [0.5])
+    assert (again.points == found.points).all()
+    assert (copied.margin, copied.planning_scene.state) == (0.01, planner.planning_scene.state)
+    assert "box3" not in copied.scene.bodies
+    assert (path.found, path.at(0.5), path.why) == (True, found.at(0.5), found.why)
+    assert found.clearance() == again.clearance()
+    with pytest.raises(InvalidValueError, match="pickled"):
+        path.trajectory()
+
+
+def test_states_that_stand_elsewhere_are_refused():
+    planner = Planner(points(2), "q00")
+    elsewhere = {"q00": 0.5, "q01": 1.0}
+    for call in (planner.valid, lambda q: planner.plan(q, [0.0]), lambda q: planner.plan([0.0], [q])):
+        with pytest.raises(InvalidValueError, match=r"'q01' is 1 and not 0.*place"):
+            call(elsewhere)
+    planner.place(elsewhere)
+    assert planner.plan(elsewhere, [0.0]).at(0.0)["q01"] == 1.0
+
+
+def test_lack_of_memory_is_no_answer(ball):
+    with pytest.raises(MemoryError):
+        bindings.planning_functions().kineverse_valid.errcheck(-1, None, ())
+
+
+def test_single_solution_does_not_take_the_whole_time(ball):
+    x, y = ball.symbols
+    begin = perf_counter()
+    path = ball.plan([0, 0], [kv.control.Hold(x, 0.5), kv.control.Hold(y, -0.5)], seconds=60)
+    assert path.found, path.why
+    assert perf_counter() - begin < 30
+    np.testing.assert_allclose(path.points[-1], [0.5, -0.5], atol=1e-6)
+
+
+def test_gap_that_is_filled_is_named():
+    model = points(2)
+    x, y = sorted(model.symbols, key=str)
+    with model.edit() as edit:
+        edit.add_frame("plate", "world", np.eye(4), body(Box((0.2, 4.0, 1.0))))
+        edit.constrain("low", -1.8, y, 1.8)
+    planner = Planner(model, [x, y])
+    assert "every way leads through 'q00'" in planner.plan([-1, 0], [1, 0], seconds=0.05).why
+    assert "every way" not in planner.plan([-1, 0], [-1, 1], seconds=0.05).why
 
 
 def test_rolling_base_is_not_moved():

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from itertools import pairwise
 
 import numpy as np
@@ -33,7 +33,7 @@ class ConfigurationCheck:
     """
 
     def __init__(self, scene: Scene, symbols: Sequence[Symbol], state: StateLike | None = None) -> None:
-        self.scene = scene
+        self.scene, self._symbols = scene, tuple(symbols)
         # Faster than the first contact of the scene, which asks about pairs that stand still as well.
         self._query = scene.watch(moving=symbols, radius=0.0)
         inputs = scene.inputs
@@ -62,13 +62,17 @@ class ConfigurationCheck:
         density
             Number of samples over a motion of length 1 in all coordinates [1/rad], [1/m].
         """
-        return sum(not self(q) for q in interpolate_path(points, density))
+        samples, contacts = interpolate_path(points, density), 0
+        self(samples[0])
+        while (k := self._query.first_within(self._symbols, samples)) is not None:
+            samples, contacts = samples[k + 1 :], contacts + 1
+        return contacts
 
 
-def interpolate_path(points: Array, density: float) -> Iterator[Array]:
-    """Yield configurations along a path of straight edges, its points included."""
-    yield points[0]
+def interpolate_path(points: Array, density: float) -> Array:
+    """Return configurations (N, n) along a path of straight edges, its points included."""
+    parts = [points[:1]]
     for a, b in pairwise(points):
         steps = max(1, int(np.ceil(density * np.linalg.norm(b - a))))
-        for k in range(1, steps + 1):
-            yield a + (b - a) * (k / steps)
+        parts.append(a + (b - a) * (np.arange(1, steps + 1) / steps)[:, None])
+    return np.concatenate(parts)

@@ -15,6 +15,7 @@ from kineverse.compile.c_library import NO_COMPILER, SourceLibrary
 from kineverse.errors import CompileError
 
 from . import broadphase
+from .advancement_c import ADVANCE
 from .broadphase import Indices, ObjectTable, PairSelection, build_static_tree
 from .broadphase_c import SEARCH, SWEEP
 from .mesh_files import Floats
@@ -71,17 +72,34 @@ class ObjectPlacement:
         self.is_within = ctypes.cast(collision_library.code.is_within, ctypes.c_void_p).value
 
 
+class MotionStruct(ctypes.Structure):
+    """Motion along samples as C reads it, see :class:`.SampledMotion`."""
+
+    _fields_ = (
+        *((name, ctypes.c_int64) for name in ("moved", "still", "room")),
+        *((name, ctypes.c_void_p) for name in ("moving", "standing", "selected", "placed", "boxes")),
+        *((name, ctypes.c_void_p) for name in ("compute", "inputs", "outputs", "columns")),
+        *((name, ctypes.c_int64) for name in ("coordinates", "first")),
+        *((name, ctypes.c_double) for name in ("limit", "least")),
+    )
+
+
 class CollisionLibrary(SourceLibrary):
     """Compiled broad and narrow phase, once it is built; shared by all scenes of the process."""
 
     def __init__(self) -> None:
-        super().__init__(SWEEP + SUPPORT + SIMPLEX + PENETRATION + NARROW + SEARCH, _declare_signatures)
+        text = SWEEP + SUPPORT + SIMPLEX + PENETRATION + NARROW + SEARCH + ADVANCE
+        super().__init__(text, _declare_signatures)
 
     def place(self, table: ObjectTable, fresh: Floats) -> int:
         """Place objects as :func:`.broadphase.place_objects` does; ``fresh`` is contiguous."""
         if self._code is None:
             return broadphase.place_objects(table, fresh)
         return int(self._code.place(_bind_table(table).address, fresh.ctypes.data))
+
+    def bind(self, table: ObjectTable) -> int:
+        """Return the address of a table as C reads it, valid as long as the table."""
+        return int(_bind_table(table).address)
 
     def near(self, table: ObjectTable, reach: float) -> tuple[Indices, Floats]:
         """Find near pairs as :func:`.broadphase.find_near_pairs` does, among all checked pairs."""
@@ -236,6 +254,10 @@ def _declare_signatures(code: Any) -> None:
     code.gather.restype = None
     code.search.argtypes = (pointer, *(ctypes.c_double,) * 2, *(ctypes.c_int64,) * 2, *(pointer,) * 10)
     code.search.restype = ctypes.c_int64
+    code.trace.argtypes, code.trace.restype = (pointer, pointer, ctypes.c_int64), ctypes.c_int64
+    code.settle.argtypes, code.settle.restype = (pointer, pointer, ctypes.c_int64), ctypes.c_int64
+    code.advance.argtypes = (pointer, pointer, ctypes.c_int64, ctypes.c_int64)
+    code.advance.restype = ctypes.c_int64
 
 
 collision_library = CollisionLibrary()

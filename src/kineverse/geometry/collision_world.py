@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
+from kineverse._checks import as_entries
 from kineverse.compile.function import compile as compile_expressions
 from kineverse.errors import (
     InvalidValueError,
@@ -27,7 +28,7 @@ from .broadphase import FURTHEST, TRAVEL_EXCEEDED, Indices, ObjectTable
 from .collision_filter import Rule, allowed_pairs, check_frame_names, parse_known_rules, read_rules
 from .mesh_files import Floats
 from .narrowphase import ACCURACY, Narrowphase
-from .objects import CollisionObject, CollisionObjects, Exclusion, load_solids
+from .objects import CollisionObject, CollisionObjects, Exclusion, load_solids, parse_exclusions
 from .shapes import Solid
 
 _MAX_MEASUREMENTS = 200_000
@@ -72,7 +73,10 @@ class CollisionWorld:
     ) -> None:
         self.model = model
         self._own_rules = parse_known_rules(rules, model)
-        patterns = tuple(_as_names(names) for names in (triangles, decomposed, leave_out))
+        meshes = (("triangles", triangles), ("decomposed", decomposed))
+        wanted = "names or patterns of bodies"
+        some, others = (as_entries(f"{what}=", given, str, wanted) for what, given in meshes)
+        patterns = some, others, parse_exclusions(leave_out)
         for what, names in zip(("triangles", "decomposed", "leave_out"), patterns, strict=True):
             bodies = (name if isinstance(name, str) else name[0] for name in names)
             check_frame_names(f"{what}= names", bodies, model)
@@ -80,6 +84,7 @@ class CollisionWorld:
         self._version: int | None = None
         self._placed_at: tuple[tuple[Symbol, ...], Floats] = (), np.zeros(0)  # symbols and values
         self._missing_state = ""
+        self._function: Any = None
         self._evaluator: Any = None
         self.inputs: tuple[Symbol, ...] = ()
         self.objects: list[CollisionObject] = []
@@ -155,7 +160,7 @@ class CollisionWorld:
         self._restore_poses()
 
     def _compile(self, poses: list[Any]) -> None:
-        function = compile_expressions(np.stack(poses)) if poses else None
+        self._function = function = compile_expressions(np.stack(poses)) if poses else None
         self.inputs = function.inputs if function else ()
         self._evaluator = function.bind() if function else None
 
@@ -173,6 +178,25 @@ class CollisionWorld:
         elif not isinstance(state, Mapping) and len(state):
             raise InvalidValueError(f"Nothing moves in this scene, and {len(state)} values are given.")
         self._missing_state = ""
+
+    @property
+    def values(self) -> Floats:
+        """Values of :attr:`inputs` at the last update; NaN for those that it did not have."""
+        symbols, numbers = self._placed_at
+        if symbols is self.inputs:
+            return numbers.copy()
+        known = dict(zip(symbols, numbers.tolist(), strict=True))
+        return np.array([known.get(s, s.value) for s in self.inputs], dtype=float)
+
+    @property
+    def kinematics_address(self) -> int | None:
+        """Address of the C function from :attr:`inputs` to the poses of moving objects; None without it."""
+        return None if self._function is None else self._function.address
+
+    def compute_poses(self, values: Floats) -> Floats:
+        """Return the poses of the moving objects, (K, 3, 4), at values of :attr:`inputs`."""
+        poses: Floats = self._function(values)
+        return poses
 
     def _select_inputs(self, state: StateLike) -> StateLike:
         """Return the part of a mapping that poses depend on, after checking all other names."""
@@ -205,16 +229,14 @@ class CollisionWorld:
 
     def _restore_poses(self) -> None:
         """Recompute all poses at the last state after an edit, if that state still determines them."""
-        symbols, numbers = self._placed_at
-        known = dict(zip(symbols, numbers.tolist(), strict=True))
-        values = {s: known.get(s, s.value) for s in self.inputs}
-        missing = [str(s) for s, value in values.items() if value is None]
+        values = self.values
+        missing = [str(s) for s, known in zip(self.inputs, ~np.isnan(values), strict=True) if not known]
         more = f" and {len(missing) - 12} more" if len(missing) > 12 else ""
         self._missing_state = f"There is no value for {', '.join(missing[:12])}{more}" if missing else ""
         if self._evaluator is None or missing:
             return
         try:
-            self._evaluator(np.array([values[s] for s in self.inputs], dtype=float))
+            self._evaluator(values)
             self._place()
         except KineverseError as error:  # a loop that does not close, a root of a negative number
             self._missing_state = f"The last state has no poses after the edit ({error})"
@@ -383,7 +405,3 @@ def _static_pose(item: CollisionObject) -> Floats:
             "Scene(model, leave_out=[...])."
         )
     return pose
-
-
-def _as_names(names: Iterable[Any]) -> tuple[Any, ...]:
-    return (names,) if isinstance(names, str) else tuple(names)

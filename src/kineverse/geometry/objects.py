@@ -6,7 +6,7 @@ import logging
 from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass
 from fnmatch import fnmatchcase
-from typing import TypeAlias
+from typing import Any, TypeAlias
 
 from kineverse.errors import FormatError, InvalidValueError, summarize_error
 from kineverse.expressions.expression import Expression
@@ -24,6 +24,26 @@ logger = logging.getLogger("kineverse.geometry")
 
 Exclusion: TypeAlias = str | tuple[str, int]
 """Excluded bodies, by a name or pattern, or one shape of a body, by the body's name and the shape's index."""
+
+
+def parse_exclusions(entries: Any) -> tuple[Exclusion, ...]:
+    """Return the entries of ``leave_out=``: bodies, patterns, and single shapes (body, number).
+
+    Raises
+    ------
+    InvalidValueError
+        For anything else.
+    """
+    if isinstance(entries, str):
+        return (entries,)
+    found = tuple(entries) if isinstance(entries, Iterable) else (entries,)
+    for entry in found:
+        body, number = entry if isinstance(entry, tuple) and len(entry) == 2 else (entry, 0)
+        if not isinstance(body, str) or not hasattr(number, "__index__"):
+            raise InvalidValueError(
+                f"leave_out= takes bodies, patterns, or shapes (body, number), not {entry!r:.80}."
+            )
+    return found
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -8,7 +8,7 @@ from typing import TypeAlias
 import numpy as np
 import numpy.typing as npt
 
-from kineverse.errors import InvalidValueError, UnknownNameError, suggest
+from kineverse.errors import InvalidValueError, ShapeError, UnknownNameError, suggest
 from kineverse.model.frame import WORLD
 from kineverse.model.frame_dependence import FrameDependence
 from kineverse.model.kinematics import ancestors
@@ -18,8 +18,10 @@ from kineverse.symbols import Symbol
 from .broadphase import Flags, Indices, PairSelection
 from .collision_world import CollisionWorld
 from .distance_queries import check_radius, find_pairs_within
+from .mesh_files import Floats
 from .objects import matches_pattern
 from .results import DistanceResults
+from .sampled_motion import SampledMotion
 
 PairFlags: TypeAlias = npt.NDArray[np.bool_] | Flags
 """Flags (B, B) of pairs of bodies, symmetric."""
@@ -52,17 +54,82 @@ class PreparedQuery:
         self._version: int | None = None
         self._flags: Flags = np.zeros((0, 0), dtype=np.uint8)
         self._selection: PairSelection | None = None
+        self._motion: SampledMotion | None = None
 
     def __call__(self, radius: float | None = None) -> DistanceResults:
         """Return the selected pairs within the radius [m], or within another one, nearest first."""
+        within = self.radius if radius is None else radius
+        return find_pairs_within(self._world, within, self._select(), self.per_shape)
+
+    def first_within(
+        self, coordinates: Sequence[Symbol | str], Q: npt.ArrayLike, radius: float | None = None
+    ) -> int | None:
+        """Return the index of the first configuration at which a selected pair is within the radius.
+
+        The answer is that of an update and a query at each configuration; nothing between them is looked at.
+        Everything else stands as at the scene's last update. The scene is placed at the configuration that is
+        found; without any, it stays where it is.
+
+        Parameters
+        ----------
+        coordinates
+            The n coordinates that move, as symbols or names.
+        Q
+            Configurations (N, n) in the order of a motion. A pair is looked at only where it may have come
+            near since it was last looked at (conservative advancement).
+        radius
+            Largest distance [m]; 0 for contacts, None for that of the query.
+
+        Raises
+        ------
+        UnknownNameError
+            If the scene was not updated yet, or the model has no such coordinate.
+        ShapeError
+            If Q has another shape.
+        InvalidValueError
+            If the radius is negative or NaN, or a pose is not finite.
+        """
+        within = self.radius if radius is None else radius
+        for k in self._move(coordinates).find_rows(_as_rows(Q, len(coordinates)), within, first=True):
+            if len(self(within)):
+                return k
+        return None
+
+    def least_distance(
+        self, coordinates: Sequence[Symbol | str], Q: npt.ArrayLike, radius: float | None = None
+    ) -> float:
+        """Return the least distance of the selected pairs at configurations [m]; infinite beyond the radius.
+
+        Parameters and errors are those of :meth:`first_within`. The scene stays where it is.
+        """
+        within = self.radius if radius is None else radius
+        motion = self._move(coordinates)
+        found = motion.struct
+        for _ in motion.find_rows(_as_rows(Q, len(coordinates)), within, first=False):
+            near = self(found.limit)
+            if len(near):
+                found.least = min(found.least, float(near.distances[0]))
+                found.limit = max(found.least, 0.0)
+        return float(found.least)
+
+    def _select(self) -> PairSelection:
+        """Return the selected pairs, whose objects have solids."""
         world = self._world
         if self._selection is None or self._version != world.model.version:
             flags = self._selected()
             involved = np.asarray(flags.any(axis=1))
             world.prepare(k for k, body in enumerate(world.table.body.tolist()) if involved[body])
             self._selection = PairSelection(world.table, flags)
-        within = self.radius if radius is None else radius
-        return find_pairs_within(world, within, self._selection, self.per_shape)
+        return self._selection
+
+    def _move(self, coordinates: Sequence[Symbol | str]) -> SampledMotion:
+        """Return the motion of some coordinates, which is kept for the next call."""
+        world, selection, last = self._world, self._select(), self._motion
+        world.prepare(())
+        symbols = tuple(s if isinstance(s, Symbol) else world.model.symbol(s) for s in coordinates)
+        if last is None or last.version != world.model.version or last.coordinates != symbols:
+            last = self._motion = SampledMotion(world, selection.bodies, symbols)
+        return last
 
     @property
     def pairs(self) -> Indices:
@@ -81,6 +148,13 @@ class PreparedQuery:
     def __repr__(self) -> str:
         what = "pairs of bodies, each pair of shapes" if self.per_shape else "pairs of bodies"
         return f"<PreparedQuery: {len(self.pairs)} {what}, within {self.radius:g} m>"
+
+
+def _as_rows(Q: npt.ArrayLike, columns: int) -> Floats:
+    rows = np.ascontiguousarray(Q, dtype=float)
+    if rows.ndim != 2 or rows.shape[1] != columns:
+        raise ShapeError(f"Expected configurations of shape (N, {columns}), not {rows.shape}.")
+    return rows
 
 
 def flag_pair(world: CollisionWorld, a: str, b: str) -> Flags:

@@ -154,3 +154,12 @@ def _declare_signatures(code: Any) -> None:
     for name, (result, arguments) in signatures.items():
         function = getattr(code, name)
         function.restype, function.argtypes = result, arguments
+        if result is ctypes.c_int:
+            function.errcheck = _ensure_memory
+
+
+def _ensure_memory(failed: int, function: Any, arguments: tuple[Any, ...]) -> int:
+    """Raise MemoryError where a function of C says that it has failed, which is for lack of memory only."""
+    if failed:
+        raise MemoryError("There is no memory for the check of configurations.")
+    return failed

@@ -3,25 +3,28 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping, Sequence
 from fnmatch import fnmatchcase
+from typing import Any
 
 import numpy as np
 
 from kineverse.control.configuration_space import ConfigurationSpace, find_coordinates
-from kineverse.errors import InvalidValueError, UnknownNameError, suggest
+from kineverse.errors import InvalidValueError, ShapeError, UnknownNameError, suggest
 from kineverse.expressions.expression import Expression, as_expression
 from kineverse.expressions.functions import maximum
 from kineverse.lie import Array
 from kineverse.model.constraint import Constraint
 from kineverse.model.model_view import ModelView
 from kineverse.model.projection import is_equality
-from kineverse.state import State
+from kineverse.state import State, as_state
 from kineverse.symbols import Symbol
 
 from .bindings import MOST_COORDINATES
 
 _WILDCARDS = "*?["
+_LARGEST = 1e6
+"""Largest coordinate of a configuration [rad], [m]; edges are computed in single precision."""
 _HALF_TURN, _BEYOND = math.pi + 0.3, 2.0
 CONDITION_TOLERANCE = 1e-5
 """Largest excess of a constraint that counts as satisfied; float has seven digits."""
@@ -175,6 +178,70 @@ def _rolling_coordinates(model: ModelView) -> set[Symbol]:
         if len(speeds) < len(coordinates):
             found |= coordinates
     return found
+
+
+def read_configurations(space: PlanningSpace, placed: State, Q: Any, name: str) -> Array:
+    """Return configurations (N, n) from one or several vectors or states.
+
+    Parameters
+    ----------
+    space
+        The coordinates.
+    placed
+        State whose values those have that a given state does not name.
+    Q
+        What is given.
+    name
+        Its name in messages.
+
+    Raises
+    ------
+    InvalidValueError, ShapeError, UnknownNameError
+        For anything else, and for states in which something stands elsewhere that the planner does not move.
+    """
+    if isinstance(Q, Mapping):
+        return _read_state(space, placed, Q, name)[None]
+    if isinstance(Q, Sequence) and len(Q) and isinstance(Q[0], Mapping):
+        return np.array([_read_state(space, placed, q, name) for q in Q])
+    n = len(space.symbols)
+    wanted = f"wanted are configurations of {n} coordinates, in the order of planner.symbols, or states"
+    try:
+        points = np.atleast_2d(np.asarray(Q, dtype=float))
+    except (TypeError, ValueError):
+        points = None
+    if points is None or Q is None:
+        raise InvalidValueError(f"{name} is {Q!r:.80}; {wanted}.")
+    if points.ndim != 2 or points.shape[1] != n:
+        raise ShapeError(f"{name} has shape {np.shape(Q)}; {wanted}.")
+    if not np.isfinite(points).all():
+        raise InvalidValueError(f"{name} has values that are not finite.")
+    if len(points) and np.abs(points).max() > _LARGEST:
+        raise InvalidValueError(
+            f"{name} has values beyond {_LARGEST:g}, which have no room in single precision. Choose an "
+            "origin that is nearer."
+        )
+    return np.ascontiguousarray(points)
+
+
+def _read_state(space: PlanningSpace, placed: State, given: Any, name: str) -> Array:
+    if not isinstance(given, Mapping):
+        raise InvalidValueError(f"{name} has {given!r:.80} among states.")
+    state = read_state(space.model, given)
+    moved = {*space.symbols}
+    other = [s for s, v in state.items() if not s.order and s not in moved and placed.get(s, v) != v]
+    if other:
+        listed = ", ".join(f"'{s}' is {state[s]:.6g} and not {placed[s]:.6g}" for s in other[:4])
+        more = f", and {len(other) - 4} more" if len(other) > 4 else ""
+        raise InvalidValueError(
+            f"{name} differs from where things stand that the planner does not move: {listed}{more}. Place "
+            "them first, planner.place(state), or move them as well, Planner(model, move=[...])."
+        )
+    return (placed | state).vector(space.symbols)
+
+
+def read_state(model: ModelView, given: Any) -> State:
+    """Return the state that a state or a mapping from symbols or names of a model says."""
+    return given if isinstance(given, State) else as_state(given, (*model.symbols, *model.speeds))
 
 
 def _find_moving(model: ModelView, move: Iterable[Symbol | str] | Symbol | str) -> tuple[Symbol, ...]:

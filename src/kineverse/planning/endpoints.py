@@ -15,6 +15,8 @@ from .manifold import EXACT, Manifold
 
 _LIMIT = 1e-6
 _ROUNDING = 1e-5
+_SAMPLES, _ENOUGH = 4096, 50
+"""Number of random configurations, and of free ones among them that say where others would be."""
 _NEAR = 0.01
 """Largest residual of an end that is brought onto a manifold [m], [rad]."""
 
@@ -117,3 +119,33 @@ class Endpoints:
             if not low - _LIMIT <= value <= high + _LIMIT
         ]
         return "; ".join(wrong[:4])
+
+
+def describe_barrier(space: PlanningSpace, checker: CollisionChecker, start: Array, ends: Array) -> str:
+    """Return a sentence on a coordinate whose values between start (n,) and goals (K, n) are not free.
+
+    It is empty if there is no such coordinate. Random configurations tell, so this is no proof.
+    """
+    generator = np.random.default_rng(0)
+    lower, upper = checker.lower.astype(float), checker.upper.astype(float)
+    samples = generator.uniform(lower, upper, (_SAMPLES, len(start)))
+    free = samples[checker.valid(samples.astype(np.float32))]
+    for i in np.flatnonzero(~space.turning & (lower < upper)) if len(free) >= _ENOUGH else ():
+        values = np.sort(np.concatenate([free[:, i], ends[:, i], start[i : i + 1]]))
+        low, high = values[:-1], values[1:]
+        above, below = ends[:, i].min(), ends[:, i].max()
+        beyond = (low >= start[i]) & (high <= above) | (high <= start[i]) & (low >= below)
+        if not beyond.any():
+            continue
+        k = int(np.argmax(np.where(beyond, high - low, -1.0)))
+        # Its ends are free.
+        inner = (3 * low[k] + high[k]) / 4, (low[k] + 3 * high[k]) / 4
+        samples[:, i] = generator.uniform(*inner, _SAMPLES)
+        if not checker.valid(samples.astype(np.float32)).any():
+            where = f"'{space.symbols[i]}' between {inner[0]:.4g} and {inner[1]:.4g}"
+            return (
+                f" The goal may be out of reach: every way leads through {where}, and {_SAMPLES} random "
+                "configurations there are not free."
+            )
+        samples[:, i] = generator.uniform(lower[i], upper[i], _SAMPLES)
+    return ""

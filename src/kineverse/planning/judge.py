@@ -6,19 +6,13 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from kineverse.geometry import PreparedQuery, Rule, Scene
-from kineverse.geometry.prepared_query import PairFlags
+from kineverse.geometry import Rule, Scene
 from kineverse.geometry.results import DistanceResult, DistanceResults
 from kineverse.lie import Array
 from kineverse.state import State
 from kineverse.symbols import Symbol
 
-from .path import densify, sample_along, sample_path
-
-FINE = 1 / 640
-"""Step of samples where no certificate vouches for what lies between them [rad], [m]."""
-_UNCOVERED = 4 * FINE
-"""Largest step of samples for pairs without spheres [rad], [m]: 6 mm at the edge of a door."""
+from .path import densify, sample_path
 
 
 class SceneJudge:
@@ -32,23 +26,10 @@ class SceneJudge:
         The n coordinates that move.
     rules
         Rules about pairs that do not count.
-    uncovered
-        Pairs of bodies that nobody else checks: they are looked at more often.
     """
 
-    def __init__(
-        self,
-        scene: Scene,
-        coordinates: Sequence[Symbol],
-        rules: Sequence[Rule],
-        uncovered: Sequence[tuple[str, str]],
-    ) -> None:
-        self._scene = scene
-        excepted = {frozenset(rule[:2]) for rule in rules}
-        left = [pair for pair in uncovered if frozenset(pair) not in excepted]
-        moving = {s for a, b in left for s in scene.model.fk(a, b).symbols}
-        self._concerned = np.array([s in moving for s in coordinates], dtype=bool)
-        self._uncovered = PreparedQuery(scene.collision_world, lambda: self._flag(left), 0.0)
+    def __init__(self, scene: Scene, coordinates: Sequence[Symbol], rules: Sequence[Rule]) -> None:
+        self._scene, self._coordinates = scene, tuple(coordinates)
         self._query = scene.watch(moving=coordinates, rules=rules, radius=0.0)
         place = {s: k for k, s in enumerate(scene.inputs)}
         self._columns = np.array([place.get(s, -1) for s in coordinates], dtype=int)
@@ -68,61 +49,20 @@ class SceneJudge:
         self._values[self._columns[self._moved]] = q[self._moved]
         self._scene.update(self._values)
 
-    def _flag(self, pairs: Sequence[tuple[str, str]]) -> PairFlags:
-        world = self._scene.collision_world
-        flags = np.zeros_like(world.table.allowed)
-        for a, b in pairs:
-            i, j = world.body_index(a), world.body_index(b)
-            flags[i, j] = flags[j, i] = 1
-        return flags
-
     def first_contact(self, points: Array, step: float) -> tuple[Array, DistanceResult] | None:
-        """Return the first sample of a polyline (N, n) with a contact, and the contact.
-
-        Pairs that nobody else checks are looked at 160 times a unit at least.
-        """
-        for q in sample_path(points, step):
-            found = self.contacts(q)
-            if len(found):
-                return q, found[0]
-        moved = np.abs(np.diff(points[:, self._concerned], axis=0)).sum(axis=1)
-        if not moved.any():
+        """Return the first sample of a polyline (N, n) with a contact, and the contact."""
+        if not len(points):
             return None
-        for q in sample_along(points, moved, min(step, _UNCOVERED)):
-            touching = self.uncovered_contacts(q)
-            if touching is not None:
-                return q, touching[0]
-        return None
-
-    def uncovered_contacts(self, q: Array) -> DistanceResults | None:
-        """Return the touching pairs that nobody else checks, at a configuration (n,); None without any."""
-        if not self._concerned.any():
-            return None
-        self._update(q)
-        found = self._uncovered()
-        return found if len(found) else None
-
-    def free_interval(self, q: Array, column: int, lower: float, upper: float) -> tuple[float, float]:
-        """Return bounds of a coordinate about a configuration (n,) between which these pairs are apart."""
-        ends = []
-        for bound in (lower, upper):
-            point, free = q.copy(), float(q[column])
-            for value in np.linspace(q[column], bound, max(int(abs(bound - q[column]) / _UNCOVERED), 2)):
-                point[column] = value
-                if self.uncovered_contacts(point) is not None:
-                    break
-                free = float(value)
-            ends.append(free)
-        return min(ends), max(ends)
+        samples = sample_path(points, step)
+        self._update(samples[0])
+        k = self._query.first_within(self._coordinates, samples)
+        return None if k is None else (samples[k], self._query()[0])
 
     def clearance(self, points: Array, step: float, radius: float = 0.5) -> float:
         """Return the least distance of a pair at samples of a polyline [m]; infinite beyond a radius."""
-        least = np.inf
-        for q in densify(points, step):
-            found = self.contacts(q, min(radius, max(least, 0.0)))
-            if len(found):
-                least = min(least, float(found.distances[0]))
-        return float(least)
+        samples = densify(points, step)
+        self._update(samples[0])
+        return self._query.least_distance(self._coordinates, samples, radius)
 
 
 def describe_contacts(found: Sequence[DistanceResult], most: int = 3) -> str:

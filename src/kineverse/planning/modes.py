@@ -9,6 +9,7 @@ from time import perf_counter
 import numpy as np
 import numpy.typing as npt
 
+from kineverse._checks import as_entries
 from kineverse.control.configuration_space import find_coordinates
 from kineverse.control.tasks import Hold
 from kineverse.errors import DuplicateNameError, InvalidValueError
@@ -50,9 +51,12 @@ class Mode:
     moves: tuple[Symbol | str, ...] = ()
 
     def __post_init__(self) -> None:
-        along, moves = self.along, self.moves
-        object.__setattr__(self, "along", (along,) if isinstance(along, Hold) else tuple(along))
-        object.__setattr__(self, "moves", (moves,) if isinstance(moves, str | Symbol) else tuple(moves))
+        if not isinstance(self.name, str):
+            raise InvalidValueError(f"The name of a mode is a text, not {self.name!r:.80}.")
+        holds = as_entries("along=", self.along, Hold, "holds, one or several")
+        moves = as_entries("moves=", self.moves, (str, Symbol), "coordinates, as symbols or names")
+        object.__setattr__(self, "along", holds)
+        object.__setattr__(self, "moves", moves)
 
 
 @dataclass(frozen=True, slots=True)
@@ -124,10 +128,11 @@ class ModeSearch:
         seconds: float,
         seed: int,
     ) -> None:
-        self._scene, self._modes = scene, tuple(modes)
+        self._scene = scene
+        self._modes = as_entries("modes=", modes, Mode, "kv.planning.Mode, one or several")
         self._tasks, self._ends, self._seconds, self._seed = tasks, ends, seconds, seed
-        if not self._modes or not all(isinstance(mode, Mode) for mode in self._modes):
-            raise InvalidValueError("modes= takes one or several kv.planning.Mode.")
+        if not self._modes:
+            raise InvalidValueError("modes= takes kv.planning.Mode, one at least.")
         names = [mode.name for mode in self._modes]
         if len(set(names)) < len(names):
             raise DuplicateNameError(f"Two modes have one name: {', '.join(map(repr, names))}.")

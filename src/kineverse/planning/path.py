@@ -6,10 +6,12 @@ import os
 from collections.abc import Iterator
 from dataclasses import dataclass, field
 from functools import cached_property
+from typing import Any
 
 import numpy as np
 import numpy.typing as npt
 
+from kineverse._checks import finite_number
 from kineverse.errors import InvalidValueError
 from kineverse.lie import Array
 from kineverse.state import State
@@ -54,7 +56,7 @@ class Path:
     state
         State in which everything else stands.
     checks
-        Checks of configurations.
+        Checks of configurations; None for a path that was pickled.
     modes
         Of a path through modes, the name of each with the indices of its first and last point.
     sections
@@ -69,7 +71,7 @@ class Path:
     search_seconds: float
     iterations: int
     state: State
-    checks: PathChecks = field(repr=False)
+    checks: PathChecks | None = field(repr=False)
     modes: tuple[tuple[str, int, int], ...] = ()
     sections: tuple[PathSection, ...] = field(default=(), repr=False)
 
@@ -87,7 +89,7 @@ class Path:
 
     @cached_property
     def _clearance(self) -> float:
-        return self.checks.clearance(self.points)
+        return self._own_checks().clearance(self.points)
 
     def trajectory(
         self,
@@ -149,17 +151,31 @@ class Path:
     ) -> list[TimedSection]:
         if not self.found:
             raise InvalidValueError(f"There is no path to move along. {self.why}")
-        self.checks.ensure_current()
-        stated = motion_limits(self.checks.model, self.symbols, ramp=ramp, state=self.state)
-        given = (velocity, acceleration)
+        checks = self._own_checks()
+        checks.ensure_current()
+        stated = motion_limits(checks.model, self.symbols, ramp=ramp, state=self.state)
+        given = {"velocity=": velocity, "acceleration=": acceleration}
         limits = MotionLimits(
             *(
-                own if other is None else np.asarray(other, dtype=float)
-                for own, other in zip(stated, given, strict=True)
+                own if other is None else _as_numbers(name, other)
+                for own, (name, other) in zip(stated, given.items(), strict=True)
             )
         )
-        sections = self.sections or (PathSection(0, len(self.points) - 1, self.checks),)
+        deviation = _as_numbers("deviation=", deviation)
+        sections = self.sections or (PathSection(0, len(self.points) - 1, checks),)
         return parameterize_sections(self.points, self.symbols, limits, deviation, sections)
+
+    def _own_checks(self) -> PathChecks:
+        if self.checks is None:
+            raise InvalidValueError(
+                "This path was pickled, and what checks it stayed behind: take path.trajectory() and "
+                "path.clearance() in the process that planned it. Trajectories can be pickled."
+            )
+        return self.checks
+
+    def __getstate__(self) -> dict[str, Any]:
+        """Return the path without its checks, which are of one process."""
+        return {**self.__dict__, "checks": None, "sections": ()}
 
     def save(self, path: str | os.PathLike[str]) -> None:
         """Write the :meth:`trajectory` to a JSON file, see :meth:`.Trajectory.save`.
@@ -176,7 +192,10 @@ class Path:
     def at(self, fraction: float) -> State:
         """Return the state at a fraction of the length, from 0 at the start to 1 at the end."""
         lengths = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(self.points, axis=0), axis=1))])
-        along = min(max(float(fraction), 0.0), 1.0) * lengths[-1]
+        share = finite_number(fraction)
+        if share is None:
+            raise InvalidValueError(f"A fraction of a path is a number from 0 to 1, not {fraction!r}.")
+        along = min(max(share, 0.0), 1.0) * lengths[-1]
         return self._state(np.array([np.interp(along, lengths, column) for column in self.points.T]))
 
     def states(self) -> Iterator[State]:
@@ -198,29 +217,42 @@ class Path:
         return f"<Path: not found. {self.why}>"
 
 
+def _as_numbers(name: str, given: Any) -> Array:
+    try:
+        return np.asarray(given, dtype=float)
+    except (TypeError, ValueError):
+        raise InvalidValueError(f"{name} is a number or an array of numbers, not {given!r:.80}.") from None
+
+
 def densify(points: Array, step: float) -> Array:
     """Return the points of a polyline (N, n) with others between them, at most a step apart."""
     if len(points) < 2:
         return points
-    lengths = np.linalg.norm(np.diff(points, axis=0), axis=1)
-    counts = np.maximum(np.ceil(lengths / step), 1).astype(int)
-    at = np.concatenate(
-        [k + np.arange(c) / c for k, c in enumerate(counts)] + [np.array([len(points) - 1.0])]
-    )
-    return np.column_stack([np.interp(at, np.arange(len(points)), column) for column in points.T])
+    counts = np.maximum(np.ceil(_segment_lengths(points) / step), 1).astype(int)
+    ends = np.cumsum(counts)
+    shares = (np.arange(ends[-1]) - np.repeat(ends - counts, counts)) / np.repeat(counts, counts)
+    at = np.append(np.repeat(np.arange(len(counts)), counts) + shares, len(counts))
+    return _interpolate(points, np.arange(float(len(points))), at)
 
 
 def sample_path(points: Array, step: float) -> Array:
     """Return samples of a polyline (N, n), at most a step apart: its points and others, or some of many."""
-    lengths = np.linalg.norm(np.diff(points, axis=0), axis=1)
+    lengths = _segment_lengths(points)
     count = int(np.ceil(lengths.sum() / step)) + 1
     if len(points) <= 4 * count:
         return densify(points, step)
-    return sample_along(points, lengths, step)
-
-
-def sample_along(points: Array, lengths: Array, step: float) -> Array:
-    """Return samples of a polyline (N, n) whose edges have given lengths (N - 1,), at most a step apart."""
     along = np.concatenate([[0.0], np.cumsum(lengths)])
-    at = np.linspace(0.0, along[-1], int(np.ceil(along[-1] / step)) + 1)
-    return np.column_stack([np.interp(at, along, column) for column in points.T])
+    return _interpolate(points, along, np.linspace(0.0, along[-1], count))
+
+
+def _segment_lengths(points: Array) -> Array:
+    return np.asarray(np.sqrt(((points[1:] - points[:-1]) ** 2).sum(axis=1)))
+
+
+def _interpolate(points: Array, along: Array, at: Array) -> Array:
+    """Return rows of a polyline (N, n) with knots at (N,), at places (M,) from the first to the last."""
+    lengths = along[1:] - along[:-1]
+    slopes = np.zeros(points.shape)
+    slopes[:-1] = (points[1:] - points[:-1]) / np.where(lengths > 0.0, lengths, 1.0)[:, None]
+    k = np.searchsorted(along, at, side="right") - 1
+    return np.asarray(slopes[k] * (at - along[k])[:, None] + points[k])

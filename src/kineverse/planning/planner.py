@@ -10,20 +10,22 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from kineverse._checks import as_count, as_tolerance
+from kineverse._checks import as_count, as_entries, as_tolerance
 from kineverse.control.tasks import Goal, Hold
 from kineverse.errors import InvalidValueError, ShapeError
 from kineverse.expressions.expression import ExpressionLike
 from kineverse.geometry import Rule, Scene
-from kineverse.geometry.objects import Exclusion
+from kineverse.geometry.collision_filter import parse_rules
+from kineverse.geometry.objects import Exclusion, parse_exclusions
 from kineverse.lie import Array
 from kineverse.model.model_view import ModelView
-from kineverse.state import State, StateLike, as_state
+from kineverse.state import State, StateLike
 from kineverse.symbols import Symbol
 
 from .bindings import planning_functions
 from .checker import CollisionChecker
-from .configuration import PlanningSpace
+from .configuration import PlanningSpace, read_configurations, read_state
+from .endpoints import describe_barrier
 from .manifold import FrameHold, hold_frames
 from .modes import Mode, ModeSearch
 from .path import Path
@@ -33,8 +35,6 @@ from .roadmap import Roadmap
 
 _TASK_GOALS = 32
 """Number of configurations that are looked for where tasks are the goal."""
-_LARGEST = 1e6
-"""Largest coordinate of a configuration [rad], [m]; edges are computed in single precision."""
 _METHODS = ("rrt-connect", "prm")
 
 
@@ -47,7 +47,7 @@ class Planner:
     certified between its samples too, and judged by the collision scene before it is returned.
 
     Everything is computed from the model: an edit of the model is followed at the next call. A planner is
-    for one thread at a time.
+    for one thread at a time. Pickled, it is built again in the other process, without its roadmap.
 
     Parameters
     ----------
@@ -95,12 +95,17 @@ class Planner:
         leave_out: Iterable[Exclusion] = (),
         protrusion: float | None = None,
     ) -> None:
+        if not isinstance(model, ModelView):
+            raise InvalidValueError(f"A planner takes a model, such as kv.load(...), not {model!r:.80}.")
         planning_functions()  # says at once that there is no compiler
         self.model = model
         self.margin = as_tolerance(margin, "The margin")
-        self._move = move if move is None or isinstance(move, Symbol | str) else tuple(move)
-        self._rules, self._protrusion = tuple(rules), protrusion
-        self._options: dict[str, Any] = {"decomposed": decomposed, "leave_out": leave_out}
+        wanted = "coordinates, as symbols, names or patterns"
+        self._move = None if move is None else as_entries("move=", move, (Symbol, str), wanted)
+        self._rules = parse_rules(rules)
+        self._protrusion = None if protrusion is None else as_tolerance(protrusion, "protrusion=")
+        bodies = as_entries("decomposed=", decomposed, str, "names or patterns of bodies")
+        self._options: dict[str, Any] = {"decomposed": bodies, "leave_out": parse_exclusions(leave_out)}
         self.roadmap: Roadmap | None = None
         self.planning_scene = self._build(model.default_state())
 
@@ -108,6 +113,11 @@ class Planner:
         return PlanningScene(
             self.model, self._move, self._rules, self.margin, self._protrusion, self._options, state
         )
+
+    def __reduce__(self) -> tuple[Any, ...]:
+        """Return how the planner is made again in another process, with everything where it stands."""
+        options = {"rules": self._rules, "margin": self.margin, "protrusion": self._protrusion}
+        return _restore, (self.model, self._move, {**options, **self._options}, self.planning_scene.state)
 
     def _synchronize(self) -> PlanningScene:
         """Return everything about the present version of the model, which is built if it is another one."""
@@ -158,9 +168,7 @@ class Planner:
         self._synchronize().place(self._whole(state))
 
     def _whole(self, state: StateLike) -> State:
-        if not isinstance(state, State):
-            state = as_state(state, (*self.model.symbols, *self.model.speeds))
-        return self.planning_scene.state | state
+        return self.planning_scene.state | read_state(self.model, state)
 
     # -- configurations ------------------------------------------------------------------------------------
 
@@ -193,7 +201,7 @@ class Planner:
     def _start(self, start: Any) -> Array:
         """Return a start (n,) from a vector or a state."""
         found = self._configurations(start, "start")
-        if len(found) > 1:
+        if len(found) != 1:
             raise ShapeError(
                 f"start has {len(found)} configurations; there is one start. Goals may be several."
             )
@@ -201,26 +209,7 @@ class Planner:
 
     def _configurations(self, Q: Any, name: str) -> Array:
         """Return configurations (N, n) from one or several vectors or states."""
-        n = len(self.space.symbols)
-        if isinstance(Q, dict | State):
-            return self._whole(Q).vector(self.space.symbols)[None]
-        if isinstance(Q, Sequence) and len(Q) and isinstance(Q[0], dict | State):
-            return np.array([self._whole(q).vector(self.space.symbols) for q in Q])
-        wanted = f"wanted are configurations of {n} coordinates, in the order of planner.symbols, or states"
-        try:
-            points = np.atleast_2d(np.asarray(Q, dtype=float))
-        except (TypeError, ValueError):
-            raise InvalidValueError(f"{name} is {Q!r:.80}; {wanted}.") from None
-        if points.ndim != 2 or points.shape[1] != n:
-            raise ShapeError(f"{name} has shape {np.shape(Q)}; {wanted}.")
-        if not np.isfinite(points).all():
-            raise InvalidValueError(f"{name} has values that are not finite.")
-        if len(points) and np.abs(points).max() > _LARGEST:
-            raise InvalidValueError(
-                f"{name} has values beyond {_LARGEST:g}, which have no room in single precision. Choose an "
-                "origin that is nearer."
-            )
-        return np.ascontiguousarray(points)
+        return read_configurations(self.space, self.planning_scene.state, Q, name)
 
     # -- holds and solutions -------------------------------------------------------------------------------
 
@@ -229,9 +218,13 @@ class Planner:
     ) -> FrameHold:
         """Return the hold of a frame by another one, such as a grasp: see :func:`.hold_frames`.
 
-        While it lasts, the bodies at and below both frames may touch each other. They may not if one frame
-        carries the other, as the world carries a hand that is kept upright.
+        While it lasts, the bodies at and below both frames may touch each other; of a frame that never moves,
+        only the body at it, or the next one above. They may not if one frame carries the other, as the world
+        carries a hand that is kept upright.
         """
+        for what, text in (("a", a), ("b", b), ("mask=", mask)):
+            if not isinstance(text, str):
+                raise InvalidValueError(f"{what} of a hold is a text, not {text!r:.80}.")
         return hold_frames(self.model, a, b, mask, offset)
 
     def solutions(
@@ -258,7 +251,7 @@ class Planner:
         self._synchronize()
         count, seed = as_count("count", count, 1), as_count("seed", seed, 0)
         seconds = as_tolerance(seconds, "seconds=")
-        given = as_holds(tasks)
+        given = as_holds("tasks", tasks)
         if not given and not self.space.equalities:
             raise InvalidValueError("There is no hold and no goal, so every configuration is a solution.")
         scene = self.planning_scene
@@ -312,10 +305,10 @@ class Planner:
         begin = perf_counter()
         scene = self._synchronize()
         seconds, seed = as_tolerance(seconds, "seconds="), as_count("seed", seed, 0)
-        holds = as_holds(along)
+        holds = as_holds("along=", along)
         roadmap = self._choose_roadmap(method, holds)
         q = self.planning_scene.here if start is None else self._start(start)
-        tasks = () if not _are_tasks(goals) else as_holds(goals)
+        tasks = () if not _are_tasks(goals) else as_holds("goals", goals)
         touching = scene.touching_pairs([*holds, *tasks])
         if modes is not None:
             if holds:
@@ -338,7 +331,11 @@ class Planner:
         for allowed in dict.fromkeys((scene.touching_pairs(holds), touching)):
             path = scene.between(q, ends, holds, allowed, seconds, seed, roadmap=roadmap, optimize=optimize)
             if path.found:
-                break
+                return path
+        if path.search_seconds:
+            with self.checker.excepting(touching):
+                barrier = describe_barrier(self.space, self.checker, q, ends)
+            path = replace(path, why=path.why + barrier)
         return path
 
     def _plan_modes(self, search: ModeSearch, q: Array, begin: float) -> Path:
@@ -387,12 +384,17 @@ class Planner:
         return f"<Planner: {len(self.symbols)} coordinates, {len(self.checker.moving)} bodies that move>"
 
 
-def as_holds(tasks: Any) -> tuple[Hold, ...]:
+def _restore(
+    model: ModelView, move: tuple[Symbol | str, ...] | None, options: dict[str, Any], state: State
+) -> Planner:
+    planner = Planner(model, move, **options)
+    planner.place(state)
+    return planner
+
+
+def as_holds(argument: str, tasks: Any) -> tuple[Hold, ...]:
     """Return holds from holds and goals, one or several."""
-    given = (tasks,) if isinstance(tasks, Hold | Goal) else tuple(tasks)
-    for task in given:
-        if not isinstance(task, Hold | Goal):
-            raise InvalidValueError(f"Expected kv.control.Hold or Goal, not {task!r}.")
+    given = as_entries(argument, tasks, (Hold, Goal), "kv.control.Hold or Goal, or planner.hold(a, b)")
     return tuple(t if isinstance(t, Hold) else Hold(t.expression, t.target, name=t.name) for t in given)
 
 

@@ -266,7 +266,7 @@ class PlanningScene:
             if len(self._judges) >= _MOST_MANIFOLDS:
                 self._judges.clear()
             rules = [Rule(a, b, False, "held") for a, b in map(sorted, touching)]
-            self._judges[touching] = SceneJudge(self.scene, self.space.symbols, rules, ())
+            self._judges[touching] = SceneJudge(self.scene, self.space.symbols, rules)
         judge = self._judges[touching]
         judge.place(self.state)
         return judge
@@ -302,11 +302,12 @@ class PlanningScene:
 def find_carried_bodies(model: ModelView, bodies: Sequence[str], frame: str) -> tuple[str, ...]:
     """Return the bodies at and below a frame; without any, those below the next frame above that has some.
 
-    So a tool frame between the fingers stands for the palm and the fingers.
+    So a tool frame between the fingers stands for the palm and the fingers. A frame that never moves stands
+    for one body: a whole kitchen may be below it.
     """
-    frames = model.frames
+    frames, fixed = model.frames, frame != WORLD and not model.fk(frame).symbols
     while frame != WORLD:
-        flags = flag_subtree(model, bodies, frame)
+        flags = np.array([body == frame for body in bodies]) if fixed else flag_subtree(model, bodies, frame)
         if flags.any():
             return tuple(body for body, flag in zip(bodies, flags, strict=True) if flag)
         frame = frames[frame].parent

@@ -15,6 +15,8 @@ from .manifold import EXACT, Manifold
 _BATCH = 2048
 MOST_BATCHES = 1_000_000
 """Number of batches of a search that only its time ends."""
+_IDLE = 8
+"""Number of batches without anything new after which there is nothing more to find."""
 _APART = 0.05
 """Least distance of two solutions that count as different [rad], [m]."""
 
@@ -48,7 +50,7 @@ def find_solutions(
     generator = np.random.default_rng(seed)
     begin = perf_counter()
     lower, upper = checker.lower.astype(float), checker.upper.astype(float)
-    found = np.zeros((0, len(near)))
+    found, idle = np.zeros((0, len(near))), 0
     for k in range(batches):
         if k == 0:
             tries = near + generator.standard_normal((_BATCH, len(near))) * (upper - lower) / 8
@@ -57,7 +59,7 @@ def find_solutions(
             tries = generator.uniform(lower, upper, (_BATCH, len(near)))
         rows = np.ascontiguousarray(np.clip(tries, lower, upper), dtype=np.float32)
         rows = np.ascontiguousarray(rows[manifold.project(rows)])
-        rows = rows[checker.valid(rows)]
+        rows, before = rows[checker.valid(rows)], len(found)
         if len(rows):
             exact, residuals = manifold.polish(rows[: 4 * count].astype(float))
             inside = (exact >= lower - 1e-9).all(axis=1) & (exact <= upper + 1e-9).all(axis=1)
@@ -66,6 +68,7 @@ def find_solutions(
             free = checker.valid(np.ascontiguousarray(np.clip(exact, lower, upper), dtype=np.float32))
             found = np.vstack([found, exact[free]])
             found = found[unique_rows(found, _APART)]
-        if len(found) >= count or perf_counter() - begin > seconds:
+        idle = 0 if len(found) > before else idle + 1
+        if len(found) >= count or (len(found) and idle >= _IDLE) or perf_counter() - begin > seconds:
             break
     return found[np.argsort(np.linalg.norm(found - near, axis=1), kind="stable")][:count]
