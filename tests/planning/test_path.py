@@ -137,6 +137,13 @@ def test_motion_rests_between_sections(path):
     assert np.allclose(trajectory.velocities_at(parts.times[k]), 0.0)
 
 
+def test_time_that_is_left_shortens_the_path(planner, path):
+    best = planner.plan(LEFT, RIGHT, seconds=0.1, optimize=True)
+    assert best.found
+    assert best.length < 0.99 * path.length
+    assert _clearance(planner, best.points) > 0.0
+
+
 def test_path_that_was_not_found_has_no_trajectory(planner, tmp_path):
     path = planner.plan(INSIDE, RIGHT)
     assert not path.found
@@ -180,6 +187,7 @@ def test_start_that_is_its_goal_takes_no_time(planner):
         (LEFT, RIGHT, {"seconds": np.nan}, "seconds="),
         (LEFT, RIGHT, {"seconds": -1.0}, "seconds="),
         (LEFT, RIGHT, {"seed": -1}, "seed="),
+        (LEFT, RIGHT, {"modes": (), "optimize": True}, "optimize="),
     ],
 )
 def test_wrong_questions_are_refused(planner, start, goals, options, message):

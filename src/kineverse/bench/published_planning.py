@@ -106,10 +106,12 @@ def _planners(problems: ProblemSet) -> Iterator[tuple[str, tuple[Place, Plan]]]:
         return attempt_with_kineverse(planner, problem.start, problem.goal, SECONDS, seed)
 
     def search(problem: PublishedProblem, seed: int) -> Attempt:
-        start = np.ascontiguousarray(problem.start[None], dtype=np.float32)
-        goal = np.ascontiguousarray(problem.goal[None], dtype=np.float32)
+        # The goals of the planner: the given one where it is nearest, and full turns away from there.
+        nearest = planner.space.equivalents(problem.goal, problem.start, most=1)[0]
+        variants = planner.space.equivalents(nearest, problem.start)
+        start, goals = (np.ascontiguousarray(Q, dtype=np.float32) for Q in (problem.start[None], variants))
         begin = perf_counter()
-        found = RrtConnect(planner.checker).solve(start, goal, SECONDS, seed)
+        found = RrtConnect(planner.checker).solve(start, goals, SECONDS, seed)
         seconds = perf_counter() - begin
         return Attempt(found.found, seconds, seconds)
 

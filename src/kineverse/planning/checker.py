@@ -148,8 +148,9 @@ class CollisionChecker:
         moving = np.array([world.body_index(body) for body in self.moving], dtype=int)
         self._allowed = np.ascontiguousarray(world.table.allowed[np.ix_(moving, used)], dtype=np.uint8)
         solids = [world.solid(k) for k in self._static]
+        poses, bodies = world.table.poses[self._static], numbers.astype(np.int32)
         self._world = ObstacleSet(
-            solids, numbers.astype(np.int32), self._planes, self.program.lanes, objects=self._static
+            solids, bodies, poses, self._planes, self.program.lanes, objects=self._static
         )
 
     def _place_moving(
@@ -164,10 +165,8 @@ class CollisionChecker:
         self._carried = np.flatnonzero(np.isin(table.body, numbers))
         for k, items in enumerate(members):
             solids = [solid for _, solid, _ in items]
-            found = ObstacleSet(
-                solids, np.zeros(len(solids), dtype=np.int32), self._planes, lanes, poses[k], k
-            )
-            found.place(np.array([T[:3] for _, _, T in items]))
+            bodies, places = np.zeros(len(solids), dtype=np.int32), np.array([T[:3] for _, _, T in items])
+            found = ObstacleSet(solids, bodies, places, self._planes, lanes, poses[k], k)
             self._sets.append(found)
             self._costs.append(found.cost)
 

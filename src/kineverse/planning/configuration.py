@@ -66,7 +66,7 @@ class PlanningSpace:
                 f"{len(self.symbols)} coordinates would move, and a planner moves {MOST_COORDINATES} at "
                 "most. Choose some of them with move=, as move='robot/*'."
             )
-        self._limits: list[tuple[int, Expression, Expression]] = []
+        self._limits: list[tuple[int, Expression | float, Expression | float]] = []
         ranges = self._read_constraints()
         self.lower, self.upper = np.zeros((2, len(self.symbols)))
         self.place(model.default_state())
@@ -91,7 +91,7 @@ class PlanningSpace:
             if is_equality(whole):
                 self.equalities.append(middle - low)
             elif middle in moved and moved.isdisjoint({*low.symbols, *high.symbols}):
-                self._limits.append((place[middle], low, high))
+                self._limits.append((place[middle], _fold(low), _fold(high)))
             else:
                 excess = [e for e in (low - middle, middle - high) if _is_bounded(e)]
                 if excess:
@@ -110,8 +110,8 @@ class PlanningSpace:
         """Set the limits to those at a state, on which they may depend."""
         self.lower[:], self.upper[:] = -math.inf, math.inf
         for k, low, high in self._limits:
-            self.lower[k] = max(self.lower[k], float(low(state)) if low.symbols else float(low))
-            self.upper[k] = min(self.upper[k], float(high(state)) if high.symbols else float(high))
+            self.lower[k] = max(self.lower[k], low if isinstance(low, float) else float(low(state)))
+            self.upper[k] = min(self.upper[k], high if isinstance(high, float) else float(high(state)))
         # An empty range makes every configuration invalid, and messages name it.
         self.upper[:] = np.maximum(self.lower, self.upper)
 
@@ -136,20 +136,21 @@ class PlanningSpace:
         if not self.turning.any():
             return q[None]
         low, high = self.bounds(start, q[None])
-        found = [q]
+        found = q[None].copy()
         for i in np.flatnonzero(self.turning).tolist():
             first = math.ceil((low[i] - q[i]) / math.tau - 1e-9)
             last = math.floor((high[i] - q[i]) / math.tau + 1e-9)
-            found = [_shifted(p, i, k * math.tau) for p in found for k in range(first, last + 1)] or found
-            found.sort(key=lambda p: float(np.linalg.norm(p - start)))
-            del found[most:]
-        return np.array(found)
+            turned = [float(q[i]) + k * math.tau for k in range(first, last + 1)] or [float(q[i])]
+            found = np.repeat(found, len(turned), axis=0)
+            found[:, i] = turned * (len(found) // len(turned))
+            if len(turned) > 1:
+                found = found[np.argsort(np.linalg.norm(found - start, axis=1), kind="stable")[:most]]
+        return found
 
 
-def _shifted(q: Array, i: int, by: float) -> Array:
-    moved = q.copy()
-    moved[i] += by
-    return moved
+def _fold(e: Expression) -> Expression | float:
+    """Return the number that an expression is everywhere, or the expression."""
+    return e if e.symbols else float(e)
 
 
 def _is_bounded(excess: Expression) -> bool:

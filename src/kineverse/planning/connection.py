@@ -18,6 +18,8 @@ from .roadmap import Roadmap
 from .search import MOST_EDGES, RrtConnect, SearchResult
 
 _SHORTCUTS = 60
+PATIENCE, MORE_PATIENCE = 40, 160
+"""Numbers of shortcuts in a row that may bring nothing: for the first path, and where paths are optimized."""
 _REPAIRS = 12
 _FINER = 8.0
 """Factor of the resolution where an edge collides between its samples."""
@@ -56,6 +58,7 @@ def connect(
     seed: int,
     edges: int = MOST_EDGES,
     roadmap: Roadmap | None = None,
+    patience: int = PATIENCE,
 ) -> Connected:
     """Return a path from one of (S, n) starts to one of (G, n) goals, certified between its samples.
 
@@ -65,6 +68,8 @@ def connect(
     ----------
     roadmap
         Roadmap that is searched; None for trees (RRT-Connect).
+    patience
+        Number of shortcuts in a row that may bring nothing.
     """
     begin = perf_counter()
     search = RrtConnect(checker, edges=edges)
@@ -83,7 +88,7 @@ def connect(
             return Connected(found.points.astype(float), explain_failure(found, seconds), iterations)
         # Parts of a shortcut that just passes would not be certain by themselves.
         with checker.widened(_WIDER / 2, np.vstack([starts, goals])):
-            points = search.shorten(found.points, seconds - (perf_counter() - begin), seed, _SHORTCUTS)
+            points = search.shorten(found.points, seconds - (perf_counter() - begin), seed, patience)
         certain = _repair(search, checker, points, begin + seconds, seed)
         if certain is not None:
             return Connected(certain.astype(float), "", iterations)

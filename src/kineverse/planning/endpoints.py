@@ -111,6 +111,8 @@ class Endpoints:
 
     def _beyond_limits(self, q: Array) -> str:
         lower, upper = self._space.lower, self._space.upper
+        if ((q >= lower - _LIMIT) & (q <= upper + _LIMIT)).all():
+            return ""
         wrong = [
             f"'{s}' is {value:.6g}, and its range is {low:.6g} to {high:.6g}"
             for s, value, low, high in zip(self._space.symbols, q, lower, upper, strict=True)

@@ -34,6 +34,9 @@ class ObstacleSet:
         Convex solids.
     bodies
         (M,) number of the body of each solid.
+    poses
+        (M, 3, 4) poses of the solids [m]. Those that are near to each other are in one chunk, also when they
+        are placed elsewhere later.
     planes
         Table that the planes of hulls are added to; rows of a normal and an offset.
     lanes
@@ -55,6 +58,7 @@ class ObstacleSet:
         self,
         solids: Sequence[Solid],
         bodies: npt.NDArray[np.int32],
+        poses: Array,
         planes: list[Array],
         lanes: int,
         pose: int = 0,
@@ -62,24 +66,28 @@ class ObstacleSet:
         objects: npt.ArrayLike = 0,
     ) -> None:
         self._lanes, count = lanes, len(solids)
-        self._items = np.zeros(count, dtype=OBSTACLE)
-        self._items["body"], self._items["object"] = bodies, objects
-        self._sizes = np.zeros((count, 3))
-        self._order: npt.NDArray[np.intp] | None = None
-        for k, solid in enumerate(solids):
-            self._describe(k, solid, planes)
-        # About the numbers of operations.
-        planes_each = self._items["planes"]
-        self.cost = float(np.where(planes_each > 0, planes_each / 2, _COSTS[self._items["kind"]]).sum())
         self._centre = np.array([solid.centre for solid in solids]).reshape(-1, 3)
         self._half = np.array([solid.half for solid in solids]).reshape(-1, 3)
+        centres = np.einsum("kij,kj->ki", poses[:, :, :3], self._centre) + poses[:, :, 3]
+        self._order = order = _spatial_order(centres, lanes)
+        self._centre, self._half = self._centre[order], self._half[order]
         chunks = -(-max(count, 1) // lanes)
         padded_chunks = -(-chunks // lanes) * lanes
+        self._items = np.zeros(chunks * lanes, dtype=OBSTACLE)
+        self._items["body"][:count] = bodies[order]
+        self._items["object"][:count] = np.broadcast_to(objects, count)[order]
+        self._sizes = np.zeros((count, 3))
+        for k, solid in enumerate(solids[j] for j in order):
+            self._describe(k, solid, planes)
+        # About the numbers of operations.
+        items = self._items[:count]
+        self.cost = float(np.where(items["planes"] > 0, items["planes"] / 2, _COSTS[items["kind"]]).sum())
         self._boxes = _aligned_rows(6, chunks * lanes)
         self._chunks = _aligned_rows(6, padded_chunks)
-        self._sorted = np.zeros(chunks * lanes, dtype=OBSTACLE)
+        for boxes in (self._boxes, self._chunks):
+            boxes[:3], boxes[3:] = _EMPTY, -_EMPTY
         self.struct = ObstacleSetStruct(
-            self._sorted.ctypes.data,
+            self._items.ctypes.data,
             self._boxes.ctypes.data,
             self._chunks.ctypes.data,
             count,
@@ -88,7 +96,8 @@ class ObstacleSet:
             pose,
             link,
         )
-        self.place(np.tile(np.eye(4)[:3], (count, 1, 1)))
+        self._poses = np.full((count, 3, 4), np.nan)
+        self.place(poses)
 
     def _describe(self, k: int, solid: Solid, planes: list[Array]) -> None:
         item, shape = self._items[k], solid.surface
@@ -112,33 +121,29 @@ class ObstacleSet:
         poses
             (M, 3, 4) poses [m].
         """
-        items, lanes, count = self._items, self._lanes, len(self._items)
+        poses = poses[self._order]
+        moved = np.flatnonzero((poses != self._poses).any(axis=(1, 2)))
+        if not len(moved):
+            return
+        self._poses, poses = poses, poses[moved]
         rotation, translation = poses[:, :, :3], poses[:, :, 3]
-        extent = np.einsum("kij,kj->ki", np.abs(rotation), self._half)
-        centre = np.einsum("kij,kj->ki", rotation, self._centre) + translation
-        if self._order is None:
-            self._order = _spatial_order(centre, lanes)
-        order = self._order
+        extent = np.einsum("kij,kj->ki", np.abs(rotation), self._half[moved])
+        centre = np.einsum("kij,kj->ki", rotation, self._centre[moved]) + translation
         # A box along the axes is the same box with its edges in another order.
+        items = self._items[moved]
         turned = np.all(np.any(np.abs(rotation) > 1 - _ALIGNED, axis=2), axis=1)
-        boxes = items["kind"] == BOX
-        upright = np.abs(rotation[:, 2, 2]) > 1 - _ALIGNED
+        boxes = turned & (items["kind"] == BOX)
         round_ = (items["kind"] == CYLINDER) | (items["kind"] == CAPSULE)
-        items["aligned"] = (turned & boxes) | (upright & round_)
-        sizes = self._sizes
-        if turned.any():
-            sizes = np.where((turned & boxes)[:, None], extent, sizes)
-        items["rotation"], items["translation"], items["size"] = rotation.reshape(-1, 9), translation, sizes
-        self._sorted[:count] = items[order]
-        self._boxes[:3], self._boxes[3:] = _EMPTY, -_EMPTY
+        items["aligned"] = boxes | (round_ & (np.abs(rotation[:, 2, 2]) > 1 - _ALIGNED))
+        items["rotation"], items["translation"] = rotation.reshape(-1, 9), translation
+        items["size"] = np.where(boxes[:, None], extent, self._sizes[moved])
+        self._items[moved] = items
         # The largest rounding of float at these places.
-        slack = 1e-6 * (1.0 + np.abs(centre) + extent)
-        self._boxes[:3, :count] = (centre - extent - slack)[order].T
-        self._boxes[3:, :count] = (centre + extent + slack)[order].T
-        chunks = self._boxes.reshape(6, -1, lanes)
-        self._chunks[:3], self._chunks[3:] = _EMPTY, -_EMPTY
-        self._chunks[:3, : chunks.shape[1]] = chunks[:3].min(axis=2)
-        self._chunks[3:, : chunks.shape[1]] = chunks[3:].max(axis=2)
+        extent += 1e-6 * (1.0 + np.abs(centre) + extent)
+        self._boxes[:3, moved], self._boxes[3:, moved] = (centre - extent).T, (centre + extent).T
+        chunks = self._boxes.reshape(6, -1, self._lanes)
+        chunks[:3].min(axis=2, out=self._chunks[:3, : chunks.shape[1]])
+        chunks[3:].max(axis=2, out=self._chunks[3:, : chunks.shape[1]])
 
 
 def _aligned_rows(rows: int, columns: int) -> Floats32:

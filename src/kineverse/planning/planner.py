@@ -269,6 +269,7 @@ class Planner:
         seconds: float = 1.0,
         seed: int = 0,
         method: str = "rrt-connect",
+        optimize: bool = False,
     ) -> Path:
         """Return a path without collisions from a start to any of some goals.
 
@@ -291,11 +292,15 @@ class Planner:
         method
             ``"rrt-connect"`` grows new trees for each call. ``"prm"`` keeps a :class:`.Roadmap` between
             calls, so that its paths depend on the calls before as well; it has no holds along the path.
+        optimize
+            False for the first path, shortened. True to use all ``seconds``: searches with other seeds go
+            on, and the shortest path is returned. It depends on the time, so the same seed may lead to
+            another path.
 
         Raises
         ------
         InvalidValueError
-            For an unknown method, or one that cannot do holds.
+            For an unknown method, or one that cannot do holds; for modes that are optimized.
         """
         begin = perf_counter()
         scene = self._synchronize()
@@ -310,6 +315,8 @@ class Planner:
                 raise InvalidValueError(
                     "along= is for a path of one mode; with modes= each mode has its own holds."
                 )
+            if optimize:
+                raise InvalidValueError("optimize= is for a path of one mode; leave it out with modes=.")
             ends = None if tasks else self._configurations(goals, "goals")
             return self._plan_modes(ModeSearch(scene, modes, tasks, ends, seconds, seed), q, begin)
         if tasks:
@@ -322,7 +329,7 @@ class Planner:
                 raise ShapeError("There is no goal: goals has no rows.")
         # What a goal lets touch does not touch on the way, unless there is no other one.
         for allowed in dict.fromkeys((scene.touching_pairs(holds), touching)):
-            path = scene.between(q, ends, holds, allowed, seconds, seed, roadmap=roadmap)
+            path = scene.between(q, ends, holds, allowed, seconds, seed, roadmap=roadmap, optimize=optimize)
             if path.found:
                 return path
         if path.search_seconds:

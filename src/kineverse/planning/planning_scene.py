@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import replace
+from functools import partial
 from time import perf_counter
 from typing import Any, TypeAlias
 
@@ -23,7 +25,7 @@ from kineverse.symbols import Symbol
 
 from .checker import BodyPairs, CollisionChecker
 from .configuration import PlanningSpace
-from .connection import connect, connect_on_manifold
+from .connection import MORE_PATIENCE, PATIENCE, connect, connect_on_manifold
 from .endpoints import Endpoint, Endpoints
 from .judge import SceneJudge, describe_contacts
 from .manifold import FrameHold, Manifold, hold_targets, manifold_key
@@ -39,6 +41,8 @@ Flags: TypeAlias = npt.NDArray[np.bool_]
 _JUDGED = 0.5
 """Longest step between judged configurations of a path that is certified [rad], [m]."""
 _MOST_MANIFOLDS = 16
+_SAME = 1e-5
+"""Difference of lengths that is rounding [rad], [m]."""
 
 
 class PlanningScene:
@@ -187,6 +191,7 @@ class PlanningScene:
         still: Flags | None = None,
         edges: int = MOST_EDGES,
         roadmap: Roadmap | None = None,
+        optimize: bool = False,
     ) -> Path:
         """Return a path from a configuration (n,) to any of some ends (K, n), see :meth:`.Planner.plan`.
 
@@ -205,7 +210,20 @@ class PlanningScene:
             usable = endpoints.check_goals(ends)
             if isinstance(usable, str):
                 return self.no_path(q, usable, begin)
-            return self._connect(first, usable, manifold, touching, seconds, seed, begin, edges, roadmap)
+            straight = float(np.linalg.norm(ends - q, axis=1).min())
+            search = partial(
+                self._connect, first, usable, manifold, touching,
+                begin=begin, edges=edges, roadmap=roadmap, optimize=optimize,
+            )  # fmt: skip
+            best = search(seconds, seed)
+            while optimize and best.found and best.length > straight + _SAME:
+                seed, left = seed + 1, seconds - (perf_counter() - begin)
+                if left <= 0.0:
+                    break
+                path = search(left, seed)
+                if path.found and path.length < best.length:
+                    best = path
+            return replace(best, seconds=perf_counter() - begin)
 
     def _connect(
         self,
@@ -218,6 +236,7 @@ class PlanningScene:
         begin: float,
         edges: int,
         roadmap: Roadmap | None,
+        optimize: bool,
     ) -> Path:
         """Return a path between checked ends."""
         q = first.q
@@ -226,7 +245,8 @@ class PlanningScene:
         starts = np.ascontiguousarray(q[None], dtype=np.float32)
         searched = perf_counter()
         if manifold is None:
-            found = connect(self.checker, starts, targets, seconds, seed, edges, roadmap)
+            patience = MORE_PATIENCE if optimize else PATIENCE
+            found = connect(self.checker, starts, targets, seconds, seed, edges, roadmap, patience)
         else:
             found = connect_on_manifold(self.checker, manifold, starts, targets, seconds, seed, edges)
         spent = perf_counter() - searched

@@ -48,9 +48,9 @@ class Roadmap:
     as nothing moves but the coordinates; nodes stay even then. The same queries in the same order lead to
     the same paths, unless the time is up.
 
-    It pays for many queries at one place through the same narrow passage: searches into a cage take a
-    quarter of the time of RRT-Connect, once the first one has taken five times as long. In the open its
-    median is up to 1.8 times as long, and its mean up to 2.7 times.
+    It pays for many queries at one place through the same narrow passage: most searches into a cage take
+    less than half of the time of RRT-Connect, once the first one has taken six times as long. In the open
+    its median is up to 1.5 times as long, and its mean up to 2.3 times.
 
     Sources: Kavraki et al. 1996; Bohlin and Kavraki 2000 (lazy checks); Cohen, Phillips and Likhachev 2014
     (edges checked in the order of A*). There are as many neighbours for all numbers of nodes, since more

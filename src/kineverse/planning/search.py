@@ -54,7 +54,7 @@ class RrtConnect:
     ) -> None:
         self._edges = edges
         self._checker, self._manifold, self._code = checker, manifold, planning_functions()
-        self._path = np.zeros((PATH_ROOM, len(checker.coordinates)), dtype=np.float32)
+        self._path = np.empty((PATH_ROOM, len(checker.coordinates)), dtype=np.float32)
         self._struct = SearchStruct()
 
     def solve(
@@ -89,14 +89,26 @@ class RrtConnect:
         points = self._path[: max(count, 0)].copy()
         return SearchResult(points, s.status, s.iterations, (s.count_start, s.count_goal), s.gap)
 
-    def shorten(self, points: Floats32, seconds: float, seed: int, rounds: int) -> Floats32:
-        """Return a shorter path: points on it are joined where the way between them is certainly free."""
+    def shorten(self, points: Floats32, seconds: float, seed: int, patience: int) -> Floats32:
+        """Return a shorter path: points on it are joined where the way between them is certainly free.
+
+        Parameters
+        ----------
+        points
+            Points (N, n) of the path.
+        seconds
+            Largest time [s].
+        seed
+            Seed of the choice of points.
+        patience
+            Number of tries in a row that may bring less than a hundredth each.
+        """
         s = self._setup(seconds, seed, RESOLUTION, 0)
         room = len(points) + 64
         work = np.zeros((room, points.shape[1]), dtype=np.float32)
         work[: len(points)] = points
         count = self._code.kineverse_shortcut(
-            ctypes.addressof(s), work.ctypes.data, len(points), room, rounds, LEAST_INFLATION
+            ctypes.addressof(s), work.ctypes.data, len(points), room, patience, LEAST_INFLATION
         )
         found = work[:count]
         apart = np.abs(np.diff(found, axis=0)).max(axis=1, initial=0.0) > 1e-6

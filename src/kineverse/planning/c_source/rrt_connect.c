@@ -1,5 +1,8 @@
-/* RRT-Connect (Kuffner and LaValle 2000) with dynamic domains (Yershova et al. 2005), on the whole space or on a
-   manifold, and shortcuts. */
+/* RRT-Connect (Kuffner and LaValle 2000), in the whole space or on a manifold, and shortcuts.
+
+   Both trees grow step by step until something is in the way. Samples lie in a box around the tree that grows: others
+   would mostly pull nodes at its rim against the same obstacles, as those that dynamic domains reject (Yershova et al.
+   2005). The box grows with the tree. */
 #include <time.h>
 
 static double now(void) {
@@ -23,7 +26,7 @@ typedef struct {
   float *columns;
   float *aims; /* on a manifold, where the edge to each node was aimed at, (room, n) */
   int *parent;
-  float *domain; /* radius of the dynamic domain; infinite until an extension fails */
+  float low[MOST_COORDINATES], high[MOST_COORDINATES]; /* of all configurations */
   long long count, room;
 } Tree;
 
@@ -34,9 +37,7 @@ static int tree_grow(Tree *t, int n) {
   if (aims) t->aims = aims;
   int *parent = realloc(t->parent, room * sizeof(int));
   if (parent) t->parent = parent;
-  float *domain = realloc(t->domain, room * sizeof(float));
-  if (domain) t->domain = domain;
-  if (!columns || !aims || !parent || !domain) {
+  if (!columns || !aims || !parent) {
     free(columns);
     return 1;
   }
@@ -50,10 +51,13 @@ static int tree_grow(Tree *t, int n) {
 static int tree_add(Tree *t, int n, const float *q, const float *aim, int parent) {
   if (t->count == t->room && tree_grow(t, n)) return -1;
   const long long k = t->count++;
-  for (int i = 0; i < n; i++) t->columns[(k / W * n + i) * W + k % W] = q[i];
+  for (int i = 0; i < n; i++) {
+    t->columns[(k / W * n + i) * W + k % W] = q[i];
+    t->low[i] = k ? fminf(t->low[i], q[i]) : q[i];
+    t->high[i] = k ? fmaxf(t->high[i], q[i]) : q[i];
+  }
   memcpy(t->aims + k * n, aim, n * sizeof(float));
   t->parent[k] = parent;
-  t->domain[k] = INFINITY;
   return (int)k;
 }
 
@@ -65,7 +69,6 @@ static void tree_free(Tree *t) {
   free(t->columns);
   free(t->aims);
   free(t->parent);
-  free(t->domain);
 }
 
 static int nearest(const Tree *t, int n, const float *q, float *away) {
@@ -163,6 +166,31 @@ static void towards(const float *a, const float *b, int n, float range, float *o
   for (int i = 0; i < n; i++) out[i] = t < 1.0f ? a[i] + t * (b[i] - a[i]) : b[i];
 }
 
+/* Grow a tree from a node towards a goal, step by step, until something is in the way or no step brings it nearer.
+   Return the last node, or -1 without memory; `met` is set if it is at the goal. */
+static int tree_advance(Walk *k, Tree *t, int first, const float *goal, int *met) {
+  const int n = (int)k->s->checker->coordinates;
+  const float range = (float)k->s->range;
+  float from[MOST_COORDINATES], to[MOST_COORDINATES], reached[MOST_COORDINATES];
+  int node = first;
+  *met = 0;
+  for (int outcome = 2; outcome == 2 && !*met && node >= 0;) {
+    tree_read(t, n, node, from);
+    const float before = distance(from, goal, n);
+    *met = before == 0.0f;
+    if (*met) break;
+    towards(from, goal, n, range, to);
+    outcome = extend(k, from, to, reached);
+    if (!outcome) break;
+    /* Points between two points of a manifold are off it, and their projections are not where they were. */
+    const float after = distance(reached, goal, n);
+    *met = outcome == 2 && before <= range && after < 1e-3f;
+    if (!*met && node != first && after > before - 0.1f * fminf(range, before)) break;
+    node = tree_add(t, n, reached, to, node);
+  }
+  return node;
+}
+
 /* Write the configurations from a root to node j, or backwards; return their number, or -1 without room. On a manifold
    the edges are gone again, with all their points. */
 static long long branch(Walk *k, const Tree *t, int j, int backwards, float *out, long long room) {
@@ -211,7 +239,7 @@ EXPORTED long long kineverse_rrt_connect(Search *s, const float *starts, long lo
   Tree trees[2] = {{0}, {0}};
   Random random = (Random)s->seed * 0x2545f4914f6cdd1dULL + 0x9e3779b97f4a7c15ULL;
   Walk k;
-  float sample[MOST_COORDINATES], from[MOST_COORDINATES], to[MOST_COORDINATES], reached[MOST_COORDINATES];
+  float sample[MOST_COORDINATES];
   const float range = (float)s->range;
   long long count = -1, best = 0;
   float best_gap = INFINITY;
@@ -241,44 +269,22 @@ EXPORTED long long kineverse_rrt_connect(Search *s, const float *starts, long lo
     Tree *own = &trees[grown], *other = &trees[1 - grown];
     float away;
     if (s->iterations < start_count) {
-      tree_read(own, n, s->iterations, from);
-      tree_read(other, n, nearest(other, n, from, &away), sample);
+      tree_read(own, n, s->iterations, sample);
+      tree_read(other, n, nearest(other, n, sample, &away), sample);
     } else {
-      for (int i = 0; i < n; i++) sample[i] = c->lower[i] + random_unit(&random) * (c->upper[i] - c->lower[i]);
+      for (int i = 0; i < n; i++) {
+        const float low = fmaxf(c->lower[i], own->low[i] - range), high = fminf(c->upper[i], own->high[i] + range);
+        sample[i] = low + random_unit(&random) * (high - low);
+      }
     }
-    const int parent = nearest(own, n, sample, &away);
-    if (away > own->domain[parent] || away == 0.0f) continue;
-    tree_read(own, n, parent, from);
-    towards(from, sample, n, range, to);
-    if (!extend(&k, from, to, reached)) {
-      const float d = own->domain[parent];
-      own->domain[parent] = d == INFINITY ? 4.0f * range : fmaxf(d * 0.9999f, range);
-      continue;
-    }
-    if (own->domain[parent] < INFINITY) own->domain[parent] *= 1.0001f;
-    const int fresh = tree_add(own, n, reached, to, parent);
-    if (fresh < 0) {
-      s->status = NO_MEMORY;
-      break;
-    }
-    /* Connect the other tree to the new node. */
-    float goal[MOST_COORDINATES];
-    memcpy(goal, reached, n * sizeof(float));
-    int last = nearest(other, n, goal, &away);
-    if (grown == 0 && away < best_gap) best_gap = away, best = fresh;
-    int met = 0;
-    for (int steps = 0; steps < 1000; steps++) {
-      tree_read(other, n, last, from);
-      const float before = distance(from, goal, n);
-      towards(from, goal, n, range, to);
-      const int outcome = extend(&k, from, to, reached);
-      if (!outcome) break;
-      /* Points between two points of a manifold are off it, and their projections are not where they were. */
-      met = outcome == 2 && before <= range && distance(reached, goal, n) < 1e-3f;
-      if (met && !s->projection) break;
-      if (!met && distance(reached, goal, n) > before - 0.1f * fminf(range, before)) break;
-      last = tree_add(other, n, reached, to, last);
-      if (last < 0 || met || outcome == 1) break;
+    int met, last = -1;
+    const int parent = nearest(own, n, sample, &away), fresh = tree_advance(&k, own, parent, sample, &met);
+    if (fresh == parent) continue;
+    if (fresh >= 0) {
+      tree_read(own, n, fresh, sample);
+      const int near = nearest(other, n, sample, &away);
+      if (grown == 0 && away < best_gap) best_gap = away, best = fresh;
+      last = tree_advance(&k, other, near, sample, &met);
     }
     if (last < 0) {
       s->status = NO_MEMORY;
@@ -287,9 +293,11 @@ EXPORTED long long kineverse_rrt_connect(Search *s, const float *starts, long lo
     if (met) {
       const int a = grown ? last : fresh, b = grown ? fresh : last;
       const long long first = branch(&k, &trees[0], a, 0, path, room);
-      const long long rest = first < 0 ? -1 : branch(&k, &trees[1], b, 1, path + first * n, room - first);
+      /* In the whole space both trees have the same configuration where they meet. */
+      const long long joint = s->projection ? first : first - 1;
+      const long long rest = first < 0 ? -1 : branch(&k, &trees[1], b, 1, path + joint * n, room - joint);
       s->status = rest < 0 ? NO_MEMORY : FOUND;
-      if (rest >= 0) count = first + rest;
+      if (rest >= 0) count = joint + rest;
       best_gap = 0.0f;
       break;
     }
@@ -306,9 +314,10 @@ end:
   return count;
 }
 
-/* Shorten a polyline (count, n) in place: random points on it are connected where the way between them is certain,
-   until `rounds` tries have failed or the time is up. Return the new number of points. */
-EXPORTED long long kineverse_shortcut(Search *s, float *path, long long count, long long room, long long rounds,
+/* Shorten a polyline (count, n) in place: random points on it are joined where the way between them is certain, until
+   `patience` tries in a row have brought less than a hundredth each, or the time is up. Return the new number of
+   points. */
+EXPORTED long long kineverse_shortcut(Search *s, float *path, long long count, long long room, long long patience,
                                     double least) {
   const Checker *c = s->checker;
   const int n = (int)c->coordinates;
@@ -316,39 +325,42 @@ EXPORTED long long kineverse_shortcut(Search *s, float *path, long long count, l
   Random random = (Random)s->seed * 0x2545f4914f6cdd1dULL + 0x9e3779b97f4a7c15ULL;
   Work w;
   if (work_begin(&w, c)) return count;
-  float *along = malloc((room + 2) * sizeof(float));
-  for (long long round = 0; along && round < rounds && count > 2; round++) {
-    if ((round & 7) == 0 && now() - begin > s->seconds) break;
+  float *along = malloc(room * sizeof(float));
+  for (long long tries = 0, failures = 0; along && failures < patience && count > 2; tries++, failures++) {
+    if ((tries & 7) == 0 && now() - begin > s->seconds) break;
     along[0] = 0.0f;
-    for (long long k = 1; k < count; k++)
-      along[k] = along[k - 1] + distance(path + (k - 1) * n, path + k * n, n);
+    for (long long k = 1; k < count; k++) along[k] = along[k - 1] + distance(path + (k - 1) * n, path + k * n, n);
     float one = random_unit(&random) * along[count - 1], other = random_unit(&random) * along[count - 1];
     if (one > other) {
       const float swap = one;
       one = other, other = swap;
     }
-    /* Ends near a node are the node: so nodes vanish. */
     long long i = 0, j = 0;
     while (i + 2 < count && along[i + 1] <= one) i++;
     while (j + 2 < count && along[j + 1] <= other) j++;
     if (i == j) continue;
+    /* Half of the ends are moved to nodes, so that the nodes between them vanish and no others come. */
+    const Random bits = random_bits(&random);
+    if (bits >> 63) one = along[i];
+    if (bits >> 62 & 1) other = along[j + 1];
     float a[MOST_COORDINATES], b[MOST_COORDINATES], where;
     const float u = (one - along[i]) / fmaxf(along[i + 1] - along[i], 1e-9f);
-    const float v = (other - along[j]) / fmaxf(along[j + 1] - along[j], 1e-9f);
+    const float v = (along[j + 1] - other) / fmaxf(along[j + 1] - along[j], 1e-9f);
     for (int e = 0; e < n; e++) {
       a[e] = path[i * n + e] + u * (path[(i + 1) * n + e] - path[i * n + e]);
-      b[e] = path[j * n + e] + v * (path[(j + 1) * n + e] - path[j * n + e]);
+      b[e] = path[(j + 1) * n + e] + v * (path[j * n + e] - path[(j + 1) * n + e]);
     }
     const float gain = other - one - distance(a, b, n);
-    if (gain < 1e-3f * (other - one) || (j == i + 1 && count + 1 > room)) continue;
+    const long long rest = count - j - 1, kept = i + 1 + (u > 0.0f) + (v > 0.0f);
+    if (gain < 1e-3f * (other - one) || kept + rest > room) continue;
     if (!edge_is_free(c, &w, a, b, (float)s->resolution) ||
         !edge_is_certain(c, &w, a, b, (float)s->resolution, (float)least, &where))
       continue;
-    /* Nodes i + 1 ... j give way to a and b. */
-    memmove(path + (i + 3) * n, path + (j + 1) * n, (count - j - 1) * n * sizeof(float));
-    memcpy(path + (i + 1) * n, a, n * sizeof(float));
-    memcpy(path + (i + 2) * n, b, n * sizeof(float));
-    count += i + 2 - j;
+    memmove(path + kept * n, path + (j + 1) * n, rest * n * sizeof(float));
+    if (u > 0.0f) memcpy(path + (i + 1) * n, a, n * sizeof(float));
+    if (v > 0.0f) memcpy(path + (kept - 1) * n, b, n * sizeof(float));
+    if (gain > 1e-2f * along[count - 1]) failures = -1;
+    count = kept + rest;
   }
   free(along);
   work_end(&w);
