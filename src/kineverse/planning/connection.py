@@ -17,7 +17,6 @@ from .obstacles import Floats32
 from .roadmap import Roadmap
 from .search import MOST_EDGES, RrtConnect, SearchResult
 
-_SHORTCUTS = 60
 PATIENCE, MORE_PATIENCE = 40, 160
 """Numbers of shortcuts in a row that may bring nothing: for the first path, and where paths are optimized."""
 _REPAIRS = 12
