@@ -80,7 +80,7 @@ def test_damaged_files_count_as_absent(fits, folder, damage, caplog):
 
 
 def test_the_cache_is_bounded_and_can_be_emptied(monkeypatch):
-    monkeypatch.setattr(sphere_cache, "MAXIMUM_BYTES", 3000)
+    monkeypatch.setattr(sphere_cache.COVERS, "most_bytes", 500)
     for k in range(5):
         cover_object(collision_object(Box((0.1, 0.1, 0.1 + 0.01 * k))), 0.2)
     assert 0 < len(sphere_cache.list_covers()) < 5

@@ -111,7 +111,7 @@ class ContentCache:
             if content is not None:
                 yield content, size
 
-    def keys(self) -> list[str]:
+    def list_keys(self) -> list[str]:
         """Return the keys of all files."""
         return [key for _, _, key in self._files()]
 
@@ -148,7 +148,7 @@ class ContentCache:
     def clear(self) -> int:
         """Remove all files, and return their number."""
         folder = self.folder
-        return sum(folder.remove(key + self._ending) for key in self.keys())
+        return sum(folder.remove(key + self._ending) for key in self.list_keys())
 
     def path(self, key: str) -> str:
         """Return the path of a file, which need not exist."""

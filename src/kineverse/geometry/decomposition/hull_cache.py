@@ -1,4 +1,4 @@
-"""Disk cache of decompositions, by mesh content and settings, in a folder of the cache of compiled functions."""
+"""Disk cache of decompositions, by mesh content and settings."""
 
 from __future__ import annotations
 
@@ -42,7 +42,7 @@ def find_entry(mesh: str, settings: str | None = None) -> Decomposition | None:
     """
     if settings is not None:
         return DECOMPOSITIONS.read(_key(mesh, settings), Decomposition.from_bytes)
-    keys = [key for key in DECOMPOSITIONS.keys() if key.startswith(_key(mesh, ""))]
+    keys = [key for key in DECOMPOSITIONS.list_keys() if key.startswith(_key(mesh, ""))]
     found = [DECOMPOSITIONS.read(key, Decomposition.from_bytes) for key in keys]
     return max((some for some in found if some), key=lambda some: some.made, default=None)
 

@@ -1,7 +1,4 @@
-"""Cache of sphere covers and sphere trees, by the content of solids and the settings: in memory and on the disk.
-
-The files lie in a folder of the cache of compiled functions.
-"""
+"""Cache of sphere covers and trees, by the content of solids and the settings: in memory and on the disk."""
 
 from __future__ import annotations
 
@@ -70,10 +67,10 @@ def cover_key(
         if isinstance(solid.surface, Hull):
             assert solid.core is not None
             digest.update(b"hull %d " % solid.core.corners.size)
-            digest.update(np.ascontiguousarray(solid.core.corners))
+            digest.update(solid.core.corners.tobytes())
         else:
             digest.update(repr(solid.surface).encode())
-        digest.update(np.ascontiguousarray(pose))
+        digest.update(pose.tobytes())
     return digest.hexdigest()[:40]
 
 
@@ -149,27 +146,27 @@ def _pack(head: dict[str, Any], *arrays: Floats) -> bytes:
     return json.dumps(head).encode() + b"\n" + b"".join(array.astype("<f8").tobytes() for array in arrays)
 
 
-def _unpack(content: bytes) -> tuple[dict[str, Any], list[Floats]]:
-    """Return what :func:`_pack` was given, with centres (N, 3) and radii (N,) of each of the sizes."""
+def _unpack(content: bytes) -> tuple[dict[str, Any], list[tuple[Floats, Floats]]]:
+    """Return what :func:`_pack` was given: the head, and centres (N, 3) and radii (N,) of each of its sizes."""
     try:
         line, _, numbers = content.partition(b"\n")
         head = json.loads(line)
         rows = np.frombuffer(numbers, dtype="<f8")
-        arrays: list[Floats] = []
+        spheres = []
         for size in head["sizes"]:
-            arrays += rows[: 3 * size].reshape(size, 3), rows[3 * size : 4 * size]
+            spheres.append((rows[: 3 * size].reshape(size, 3), rows[3 * size : 4 * size]))
             rows = rows[4 * size :]
     except (ValueError, KeyError, TypeError) as error:
         raise FormatError("These are no spheres.") from error
-    return head, arrays
+    return head, spheres
 
 
 def _parse_cover(content: bytes) -> tuple[str, SphereCover]:
-    head, spheres = _unpack(content)
-    return head["name"], SphereCover(*spheres, head["protrusion"], head["excess"])
+    head, ((centres, radii),) = _unpack(content)
+    return head["name"], SphereCover(centres, radii, head["protrusion"], head["excess"])
 
 
 def _parse_tree(content: bytes) -> SphereTree:
-    head, (centres, radii, *coarse) = _unpack(content)
+    head, ((centres, radii), (coarse_centres, coarse_radii)) = _unpack(content)
     order, first, ball = (np.array(head[name]) for name in ("order", "first", "ball"))
-    return SphereTree(centres, radii, order, *coarse, first, ball[:3], float(ball[3]))
+    return SphereTree(centres, radii, order, coarse_centres, coarse_radii, first, ball[:3], float(ball[3]))

@@ -81,7 +81,9 @@ def cover_solid(solid: Solid, protrusion: float | None = None, most: int = MOST)
     # A hull may be longer than any sensible protrusion, and one ball is then enough.
     protrusion = min(protrusion, 2.0 * solid.radius)
     if isinstance(solid.surface, Sphere):
-        return _make_cover(np.zeros((1, 3)), np.array([float(solid.surface.radius)]), 0.0, solid_volume(solid))
+        return _make_cover(
+            np.zeros((1, 3)), np.array([float(solid.surface.radius)]), 0.0, solid_volume(solid)
+        )
     if isinstance(solid.surface, Capsule):
         centres, radii, reached = _capsule_chain(solid.surface, protrusion, most)
         return _make_cover(centres, radii, reached, solid_volume(solid))
