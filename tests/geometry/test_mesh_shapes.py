@@ -77,6 +77,36 @@ def test_flat_mesh_is_thickened(tmp_path):
     np.testing.assert_allclose(2 * solid.half, [1, 1, THICKNESS], atol=1e-9)
 
 
+def test_hulls_of_mesh_files_are_kept_on_the_disk(tmp_path, monkeypatch, caplog):
+    monkeypatch.setenv("KINEVERSE_CACHE_DIR", str(tmp_path / "cache"))
+    reads = []
+    monkeypatch.setattr(shapes, "read_faces", lambda file: reads.append(file) or mesh_files.read_faces(file))
+    ball = trimesh.creation.icosphere(2)
+
+    def make(mesh: Mesh) -> shapes.Solid:
+        monkeypatch.setattr(shapes, "_by_content", {})  # as in another process
+        return solid_from_geometry(mesh)
+
+    mesh = saved(ball, tmp_path, "ball.stl")
+    first, again = make(mesh), make(mesh)
+    assert len(reads) == 1
+    assert np.array_equal(first.core.corners, again.core.corners)
+    assert np.array_equal(first.surface.normals, again.surface.normals)
+    assert make(Mesh(mesh.uri, (1, 2, 3), mesh.folder)).half[2] == pytest.approx(3 * first.half[2])
+    assert len(reads) == 2
+    assert make(saved(ball.apply_scale(2), tmp_path, "ball.stl")).radius == pytest.approx(2 * first.radius)
+    assert len(reads) == 3
+    for kept in (tmp_path / "cache" / "mesh_hulls").iterdir():
+        kept.write_bytes(b"x" + kept.read_bytes()[1:])
+    make(mesh)
+    assert len(reads) == 4
+    assert "damaged" in caplog.text
+    # The corners of such a file may lie in another one.
+    for _ in range(2):
+        make(saved(ball, tmp_path, "ball.glb"))
+    assert len(reads) == 6
+
+
 BAD_MESHES = {
     "missing.stl": None,
     "empty.stl": b"",

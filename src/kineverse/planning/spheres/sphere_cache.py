@@ -147,7 +147,7 @@ def _pack(head: dict[str, Any], *arrays: Floats) -> bytes:
 
 
 def _unpack(content: bytes) -> tuple[dict[str, Any], list[tuple[Floats, Floats]]]:
-    """Return what :func:`_pack` was given: the head, and centres (N, 3) and radii (N,) of each of its sizes."""
+    """Return the head that :func:`_pack` was given, and centres (N, 3) and radii (N,) for each size in it."""
     try:
         line, _, numbers = content.partition(b"\n")
         head = json.loads(line)
