@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import os
+
 import numpy as np
 import pytest
 import trimesh
@@ -101,10 +103,15 @@ def test_hulls_of_mesh_files_are_kept_on_the_disk(tmp_path, monkeypatch, caplog)
     make(mesh)
     assert len(reads) == 4
     assert "damaged" in caplog.text
+    with monkeypatch.context() as patch:
+        patch.setattr("tempfile.mkstemp", lambda **_: os.mkdir(tmp_path))  # an OSError
+        make(saved(ball.apply_scale(3), tmp_path, "large.stl"))
+    assert "cannot be written" in caplog.text
+    reads.clear()
     # The corners of such a file may lie in another one.
     for _ in range(2):
         make(saved(ball, tmp_path, "ball.glb"))
-    assert len(reads) == 6
+    assert len(reads) == 2
 
 
 BAD_MESHES = {

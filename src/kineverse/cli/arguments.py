@@ -131,29 +131,17 @@ def add_cache_options(parser: argparse.ArgumentParser, force: str) -> None:
 
 def manage_cache(
     arguments: argparse.Namespace,
-    named: str | Sequence[str] | None,
+    named: object,
     what: str,
     folder: Path,
     clear: Callable[[], int],
     head: Sequence[str],
-    list_entries: Callable[[], Iterable[tuple[dict[str, Any], Sequence[str]]]],
+    entries: Sequence[tuple[dict[str, Any], Sequence[str]]],
 ) -> int:
     """List or empty a cache, see :func:`add_cache_options`, and return the status.
 
-    Parameters
-    ----------
-    arguments
-        The arguments.
-    named
-        What the command line names, which is an error.
-    what
-        What is in the cache, in the plural.
-    folder
-        Its folder.
-    clear
-        Function that empties it, and returns the number of entries.
-    head, list_entries
-        Titles of the columns of a list, and function that returns the facts and the row of each entry.
+    ``named`` is what the command line names, which is an error, ``what`` the plural of what lies in the
+    folder. Each entry has its facts and its row below ``head``.
     """
     if named or (arguments.list and arguments.clear):
         raise InvalidValueError("--list and --clear are about the whole cache, and one at a time.")
@@ -161,11 +149,11 @@ def manage_cache(
         count = clear()
         print(json.dumps({"removed": count}) if arguments.json else f"{count} removed from {folder}")
         return 0
-    entries = list(list_entries())
+    facts, rows = [entry[0] for entry in entries], [entry[1] for entry in entries]
     if arguments.json:
-        print(json.dumps({"folder": str(folder), what: [facts for facts, _ in entries]}, allow_nan=False))
-    elif entries:
-        print(format_cells(head, [row for _, row in entries]))
+        print(json.dumps({"folder": str(folder), what: facts}, allow_nan=False))
+    elif rows:
+        print(format_cells(head, rows))
     else:
         print(f"There are no {what} in {folder}.")
     return 0

@@ -244,13 +244,5 @@ def _manage_cache(arguments: argparse.Namespace) -> int:
         facts = {**_decomposition_to_json(entry.decomposition), "made": made, "bytes": entry.bytes}
         return facts, (Path(entry.decomposition.name).name, *_format_row(entry.decomposition), when)
 
-    head = ("mesh", *HEAD, "made")
-    return manage_cache(
-        arguments,
-        arguments.names,
-        "decompositions",
-        folder(),
-        clear,
-        head,
-        lambda: map(describe, list_entries()),
-    )
+    head, entries = ("mesh", *HEAD, "made"), [*map(describe, list_entries())]
+    return manage_cache(arguments, arguments.names, "decompositions", folder(), clear, head, entries)

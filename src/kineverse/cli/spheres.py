@@ -262,13 +262,5 @@ def _manage_cache(arguments: argparse.Namespace) -> int:
         row = one.name, str(spheres), format_number(1e3 * protrusion, 3), f"{excess:.0%}"
         return {**facts, "bytes": one.bytes}, row
 
-    head = ("shape", "spheres", "protrusion [mm]", "excess")
-    return manage_cache(
-        arguments,
-        arguments.model,
-        "covers",
-        cover_folder(),
-        clear_covers,
-        head,
-        lambda: map(describe, list_covers()),
-    )
+    head, entries = ("shape", "spheres", "protrusion [mm]", "excess"), [*map(describe, list_covers())]
+    return manage_cache(arguments, arguments.model, "covers", cover_folder(), clear_covers, head, entries)

@@ -116,16 +116,19 @@ class ContentCache:
         return [key for _, _, key in self._files()]
 
     def write(self, key: str, content: bytes) -> None:
-        """Write a file atomically."""
-        handle, path = tempfile.mkstemp(prefix=UNFINISHED, dir=self.folder.path)
+        """Write a file atomically; where that fails, such as on a full disk, the log says so."""
+        path = None
         try:
+            handle, path = tempfile.mkstemp(prefix=UNFINISHED, dir=self.folder.path)
             with open(handle, "wb") as file:
                 file.write(content)
             self.adopt(path, key)
-        except BaseException:
-            with contextlib.suppress(OSError):
-                os.unlink(path)
-            raise
+        except OSError as error:
+            self._logger.warning("%s cannot be written: %s.", self.path(key), error.strerror)
+        finally:
+            if path is not None:
+                with contextlib.suppress(OSError):
+                    os.unlink(path)
 
     def adopt(self, path: str, key: str) -> None:
         """Move a file of the same file system into the folder."""
