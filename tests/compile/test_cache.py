@@ -181,11 +181,11 @@ def test_a_folder_of_another_user_is_refused(
 
 def test_least_recently_used_libraries_are_removed(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     store = library_cache()
-    monkeypatch.setattr(cache, "MAXIMUM_BYTES", 350)
+    monkeypatch.setattr(store._files, "most_bytes", 350)
     place = store.create_build_folder()
     for i, name in enumerate("abcde"):
         path = Path(place, name)
-        path.write_bytes(bytes(100 - cache._TRAILER))
+        path.write_bytes(bytes(100 - len(cache._MARK) - 32))
         os.utime(path, (1000 + i, 1000 + i))
         store.store(name, str(path))
         os.utime(folder / f"{name}.so", (1000 + i, 1000 + i))

@@ -294,7 +294,8 @@ def test_cache_is_bounded_listed_and_cleared(file, plain, monkeypatch):
         "large.stl",
         "small.stl",
     ]
-    monkeypatch.setattr(hull_cache, "MAXIMUM_BYTES", max(kept.bytes for kept in list_entries()) + 100)
+    room = max(kept.bytes for kept in list_entries()) + 100
+    monkeypatch.setattr(hull_cache.DECOMPOSITIONS, "most_bytes", room)
     decompose(file(finger(), "finger.stl"))
     assert [os.path.basename(kept.decomposition.name) for kept in list_entries()] == ["finger.stl"]
     assert clear() == 1

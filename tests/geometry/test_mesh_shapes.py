@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import os
+
 import numpy as np
 import pytest
 import trimesh
@@ -75,6 +77,41 @@ def test_flat_mesh_is_thickened(tmp_path):
     pane = trimesh.Trimesh([[0, 0, 0], [1, 0, 0], [1, 1, 0], [0, 1, 0]], [[0, 1, 2], [0, 2, 3]])
     solid = solid_from_geometry(saved(pane, tmp_path, "pane.stl"))
     np.testing.assert_allclose(2 * solid.half, [1, 1, THICKNESS], atol=1e-9)
+
+
+def test_hulls_of_mesh_files_are_kept_on_the_disk(tmp_path, monkeypatch, caplog):
+    monkeypatch.setenv("KINEVERSE_CACHE_DIR", str(tmp_path / "cache"))
+    reads = []
+    monkeypatch.setattr(shapes, "read_faces", lambda file: reads.append(file) or mesh_files.read_faces(file))
+    ball = trimesh.creation.icosphere(2)
+
+    def make(mesh: Mesh) -> shapes.Solid:
+        monkeypatch.setattr(shapes, "_by_content", {})  # as in another process
+        return solid_from_geometry(mesh)
+
+    mesh = saved(ball, tmp_path, "ball.stl")
+    first, again = make(mesh), make(mesh)
+    assert len(reads) == 1
+    assert np.array_equal(first.core.corners, again.core.corners)
+    assert np.array_equal(first.surface.normals, again.surface.normals)
+    assert make(Mesh(mesh.uri, (1, 2, 3), mesh.folder)).half[2] == pytest.approx(3 * first.half[2])
+    assert len(reads) == 2
+    assert make(saved(ball.apply_scale(2), tmp_path, "ball.stl")).radius == pytest.approx(2 * first.radius)
+    assert len(reads) == 3
+    for kept in (tmp_path / "cache" / "mesh_hulls").iterdir():
+        kept.write_bytes(b"x" + kept.read_bytes()[1:])
+    make(mesh)
+    assert len(reads) == 4
+    assert "damaged" in caplog.text
+    with monkeypatch.context() as patch:
+        patch.setattr("tempfile.mkstemp", lambda **_: os.mkdir(tmp_path))  # an OSError
+        make(saved(ball.apply_scale(3), tmp_path, "large.stl"))
+    assert "cannot be written" in caplog.text
+    reads.clear()
+    # The corners of such a file may lie in another one.
+    for _ in range(2):
+        make(saved(ball, tmp_path, "ball.glb"))
+    assert len(reads) == 2
 
 
 BAD_MESHES = {

@@ -1,4 +1,4 @@
-"""Sphere covers by the content of shapes: in memory, on the disk, damaged."""
+"""Sphere covers and trees by the content of shapes: in memory, on the disk, damaged."""
 
 from __future__ import annotations
 
@@ -9,7 +9,8 @@ import kineverse as kv
 from kineverse.errors import InvalidValueError
 from kineverse.geometry.objects import CollisionObjects
 from kineverse.model.body import Body, Box, Mesh, Shape
-from kineverse.planning.spheres import cover_object, object_covers, sphere_cache
+from kineverse.planning.spheres import cover_object, make_sphere_tree, object_covers, sphere_cache
+from kineverse.planning.spheres.sphere_cache import cover_key, find_or_make_tree
 
 
 @pytest.fixture(autouse=True)
@@ -68,6 +69,33 @@ def test_the_disk_gives_back_the_same_cover(fits):
     assert [one.name for one in sphere_cache.list_covers()] == ["part: box"]
 
 
+def test_trees_are_kept_by_solids_poses_and_settings():
+    box, made = collision_object(Box((0.1, 0.1, 0.1))).make_solid(), []
+    spheres = np.random.default_rng(0).uniform(0.1, 0.2, (9, 4))
+    moved = np.eye(4)
+    moved[0, 3] = 0.1
+
+    def make():
+        made.append(make_sphere_tree(spheres[:, :3], spheres[:, 3]))
+        return made[-1]
+
+    def find(*parts, protrusion=0.02):
+        sphere_cache._in_memory.clear()
+        return find_or_make_tree(cover_key(parts, protrusion), make)
+
+    first, again = find((box, np.eye(4))), find((box, np.eye(4)))
+    assert len(made) == 1
+    for name in first.__slots__:
+        assert np.array_equal(getattr(first, name), getattr(again, name)), name
+    find((box, moved))
+    find((box, np.eye(4)), (box, moved))
+    find((box, np.eye(4)), protrusion=None)
+    assert len(made) == 4
+    sphere_cache.clear_covers()
+    find((box, np.eye(4)))
+    assert len(made) == 5
+
+
 @pytest.mark.parametrize("damage", [b"", b"nonsense", None])
 def test_damaged_files_count_as_absent(fits, folder, damage, caplog):
     cover_object(collision_object(Box((0.1, 0.1, 0.1))), 0.02)
@@ -80,7 +108,7 @@ def test_damaged_files_count_as_absent(fits, folder, damage, caplog):
 
 
 def test_the_cache_is_bounded_and_can_be_emptied(monkeypatch):
-    monkeypatch.setattr(sphere_cache, "MAXIMUM_BYTES", 3000)
+    monkeypatch.setattr(sphere_cache.COVERS, "most_bytes", 500)
     for k in range(5):
         cover_object(collision_object(Box((0.1, 0.1, 0.1 + 0.01 * k))), 0.2)
     assert 0 < len(sphere_cache.list_covers()) < 5

@@ -198,8 +198,15 @@ class KitchenArm:
                 count -= 1
 
 
-def make_kitchen_arm(robot: str, kitchen: str) -> KitchenArm:
+def make_kitchen_arm(robot: str, kitchen: str, except_touching: bool = True) -> KitchenArm:
     """Return a robot of :data:`ARMS` in a kitchen of :data:`KITCHENS`.
+
+    Parameters
+    ----------
+    robot, kitchen
+        Their names.
+    except_touching
+        Whether the rules except pairs of the robot that always touch. Otherwise no mesh is read.
 
     Raises
     ------
@@ -211,13 +218,14 @@ def make_kitchen_arm(robot: str, kitchen: str) -> KitchenArm:
     with model.edit() as edit:
         _include_robot(edit, arm)
         rules = [Rule(f"{KITCHEN}/*", f"{KITCHEN}/*", why="the kitchen stands still")]
-    # Before there is a kitchen that these pairs could touch.
-    alone = KitchenArm(robot, model, arm, ())
-    scene = Scene(model)
-    own = (
-        *scene.find_always_colliding(alone.random_states(_STATES)),
-        *scene.find_always_colliding([model.default_state()]),
-    )
+    own: tuple[Rule, ...] = ()
+    if except_touching:  # before there is a kitchen that these pairs could touch
+        alone = KitchenArm(robot, model, arm, ())
+        scene = Scene(model)
+        own = (
+            *scene.find_always_colliding(alone.random_states(_STATES)),
+            *scene.find_always_colliding([model.default_state()]),
+        )
     with model.edit() as edit:
         edit.include(room, KITCHEN)
         edit.write(RULES, rules_as_data((*own, *rules)))

@@ -3,12 +3,15 @@
 from __future__ import annotations
 
 import argparse
+import json
 import math
 import re
 import sys
-from collections.abc import Iterable, Mapping
-from typing import TYPE_CHECKING
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
 
+from kineverse.cli.output import format_cells
 from kineverse.errors import DuplicateNameError, InvalidValueError
 from kineverse.expressions.printing import format_number
 
@@ -116,6 +119,44 @@ def parse_value(text: str) -> float:
     if not math.isfinite(value):
         raise InvalidValueError(f"{text.strip()!r} is not finite")
     return value
+
+
+def add_cache_options(parser: argparse.ArgumentParser, force: str) -> None:
+    """Declare the options of a command about its cache; ``force`` is the help of ``--force``."""
+    parser.add_argument("--force", action="store_true", help=force)
+    parser.add_argument("--json", action="store_true", help="everything, as one JSON object")
+    parser.add_argument("--list", action="store_true", help="list the cache and exit")
+    parser.add_argument("--clear", action="store_true", help="empty the cache and exit")
+
+
+def manage_cache(
+    arguments: argparse.Namespace,
+    named: object,
+    what: str,
+    folder: Path,
+    clear: Callable[[], int],
+    head: Sequence[str],
+    entries: Sequence[tuple[dict[str, Any], Sequence[str]]],
+) -> int:
+    """List or empty a cache, see :func:`add_cache_options`, and return the status.
+
+    ``named`` is what the command line names, which is an error, ``what`` the plural of what lies in the
+    folder. Each entry has its facts and its row below ``head``.
+    """
+    if named or (arguments.list and arguments.clear):
+        raise InvalidValueError("--list and --clear are about the whole cache, and one at a time.")
+    if arguments.clear:
+        count = clear()
+        print(json.dumps({"removed": count}) if arguments.json else f"{count} removed from {folder}")
+        return 0
+    facts, rows = [entry[0] for entry in entries], [entry[1] for entry in entries]
+    if arguments.json:
+        print(json.dumps({"folder": str(folder), what: facts}, allow_nan=False))
+    elif rows:
+        print(format_cells(head, rows))
+    else:
+        print(f"There are no {what} in {folder}.")
+    return 0
 
 
 def add_model_options(

@@ -11,8 +11,14 @@ from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from kineverse.cli.arguments import add_model_options, load_model, parse_length
-from kineverse.cli.output import colorize, format_table, join_lines, show_activity, show_progress
+from kineverse.cli.arguments import (
+    add_cache_options,
+    add_model_options,
+    load_model,
+    manage_cache,
+    parse_length,
+)
+from kineverse.cli.output import colorize, format_cells, join_lines, show_activity, show_progress
 from kineverse.errors import InvalidValueError, KineverseError, UnknownNameError, suggest
 from kineverse.expressions.printing import format_number
 from kineverse.model.body import Mesh
@@ -78,10 +84,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     )
     parser.add_argument("--timeout", metavar="S", type=float, help="time limit of a mesh [s] (600)")
     parser.add_argument("--memory", metavar="GIB", type=float, help="memory limit of a mesh [GiB] (4)")
-    parser.add_argument("--force", action="store_true", help="decompose cached meshes again")
-    parser.add_argument("--list", action="store_true", help="list the cache and exit")
-    parser.add_argument("--clear", action="store_true", help="empty the cache and exit")
-    parser.add_argument("--json", action="store_true", help="everything, as one JSON object")
+    add_cache_options(parser, "decompose cached meshes again")
 
 
 def run(arguments: argparse.Namespace) -> int:
@@ -187,7 +190,7 @@ def _format_results(
         time_ = "cached" if outcome.cached else f"{decomposition.seconds:.1f} s"
         rows.append((task.name, *_format_row(decomposition), time_))
         remarks += [f"  {task.name}: {remark}" for remark in decomposition.remarks]
-    sections = [_table(("mesh", *HEAD, "time"), rows)] if rows else []
+    sections = [format_cells(("mesh", *HEAD, "time"), rows)] if rows else []
     sections += ["\n".join(["remarks", *remarks])] if remarks else []
     sections += ["\n".join([colorize("not decomposed", "!"), *errors])] if errors else []
     unread_lines = [f"  {name}: {reason}" for name, reason in unread.items()]
@@ -205,10 +208,6 @@ def _format_row(decomposition: Decomposition) -> tuple[str, ...]:
     ]
     lengths = [format_number(1e3 * length, 3) for length in (decomposition.error, a.excess, a.uncovered)]
     return (str(len(decomposition.hulls)), *volumes, *lengths)
-
-
-def _table(head: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
-    return format_table(head, rows, "<" + ">" * (len(head) - 1))
 
 
 def _decomposition_to_json(decomposition: Decomposition) -> dict[str, Any]:
@@ -239,31 +238,11 @@ def _outcome_to_json(task: MeshTask, outcome: DecompositionOutcome) -> dict[str,
 def _manage_cache(arguments: argparse.Namespace) -> int:
     from kineverse.geometry.decomposition import clear, folder, list_entries
 
-    if arguments.names or (arguments.list and arguments.clear):
-        raise InvalidValueError("--list and --clear are about the whole cache, and one at a time.")
-    if arguments.clear:
-        count = clear()
-        print(json.dumps({"removed": count}) if arguments.json else f"{count} removed from {folder()}")
-        return 0
-    cached = list_entries()
-    if arguments.json:
-        entries = [
-            {
-                **_decomposition_to_json(entry.decomposition),
-                "made": entry.decomposition.made,
-                "bytes": entry.bytes,
-            }
-            for entry in cached
-        ]
-        print(json.dumps({"folder": str(folder()), "decompositions": entries}, allow_nan=False))
-    elif cached:
-        print(_table(("mesh", *HEAD, "made"), [_cache_row(entry) for entry in cached]))
-    else:
-        print(f"There are no decompositions in {folder()}.")
-    return 0
+    def describe(entry: CacheEntry) -> tuple[dict[str, Any], tuple[str, ...]]:
+        made = entry.decomposition.made
+        when = time.strftime("%Y-%m-%d %H:%M", time.localtime(made))
+        facts = {**_decomposition_to_json(entry.decomposition), "made": made, "bytes": entry.bytes}
+        return facts, (Path(entry.decomposition.name).name, *_format_row(entry.decomposition), when)
 
-
-def _cache_row(entry: CacheEntry) -> tuple[str, ...]:
-    decomposition = entry.decomposition
-    when = time.strftime("%Y-%m-%d %H:%M", time.localtime(decomposition.made))
-    return (Path(decomposition.name).name, *_format_row(decomposition), when)
+    head, entries = ("mesh", *HEAD, "made"), [*map(describe, list_entries())]
+    return manage_cache(arguments, arguments.names, "decompositions", folder(), clear, head, entries)

@@ -64,6 +64,11 @@ def format_table(
     return "\n".join(lines)
 
 
+def format_cells(head: Sequence[str], rows: Iterable[Sequence[str]]) -> str:
+    """Return a table of names and, aligned to the right, of what is known about them."""
+    return format_table(head, rows, "<" + ">" * (len(head) - 1))
+
+
 def join_lines(message: object) -> str:
     """Return a message, such as an exception, on one line."""
     return " ".join(str(message).split())

@@ -11,13 +11,15 @@ from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any
 
 from kineverse.cli.arguments import (
+    add_cache_options,
     add_model_options,
     add_set_option,
     load_model,
+    manage_cache,
     parse_assignments,
     parse_length,
 )
-from kineverse.cli.output import colorize, format_table, join_lines, show_activity, show_progress
+from kineverse.cli.output import colorize, format_cells, join_lines, show_activity, show_progress
 from kineverse.cli.view import add_page_options, handle_interrupts, page_options, print_address
 from kineverse.errors import InvalidValueError, KineverseError, UnknownNameError, suggest
 from kineverse.expressions.printing import format_number
@@ -85,10 +87,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--protrusion", metavar="M", help="how far spheres may stick out: 0.005, 5mm")
     parser.add_argument("--most", metavar="N", type=int, help="largest number of spheres of a shape (32)")
     parser.add_argument("--decomposed", action="store_true", help="cover the hulls of kineverse decompose")
-    parser.add_argument("--force", action="store_true", help="compute cached covers again")
-    parser.add_argument("--json", action="store_true", help="everything, as one JSON object")
-    parser.add_argument("--list", action="store_true", help="list the cache and exit")
-    parser.add_argument("--clear", action="store_true", help="empty the cache and exit")
+    add_cache_options(parser, "compute cached covers again")
     parser.add_argument("--view", action="store_true", help="show model and spheres in the browser")
     parser.add_argument("--picture", metavar="PATH", help="write a picture (.png) of model and spheres")
     add_set_option(parser)
@@ -168,7 +167,7 @@ def _format_links(links: Sequence[LinkCovers]) -> list[str]:
     rows = [_format_row(link.link, [link]) for link in links if link.covers]
     if len(rows) > 1:
         rows.append(_format_row("total", links))
-    sections = [format_table(HEAD, rows, "<>>>>>")] if rows else []
+    sections = [format_cells(HEAD, rows)] if rows else []
     errors = [f"  {reason}" for link in links for reason in link.errors]
     return sections + (["\n".join([colorize("not covered", "!"), *errors])] if errors else [])
 
@@ -255,38 +254,13 @@ def _view(
 
 
 def _manage_cache(arguments: argparse.Namespace) -> int:
-    from kineverse.planning.spheres.sphere_cache import clear_covers, cover_folder, list_covers
+    from kineverse.planning.spheres.sphere_cache import CachedCover, clear_covers, cover_folder, list_covers
 
-    if arguments.model is not None or (arguments.list and arguments.clear):
-        raise InvalidValueError("--list and --clear are about the whole cache, and one at a time.")
-    if arguments.clear:
-        count = clear_covers()
-        print(json.dumps({"removed": count}) if arguments.json else f"{count} removed from {cover_folder()}")
-        return 0
-    kept = list_covers()
-    if arguments.json:
-        entries = [
-            {
-                "name": one.name,
-                "spheres": len(one.cover),
-                "protrusion": one.cover.protrusion,
-                "excess": one.cover.excess,
-                "bytes": one.bytes,
-            }
-            for one in kept
-        ]
-        print(json.dumps({"folder": str(cover_folder()), "covers": entries}, allow_nan=False))
-    elif kept:
-        rows = [
-            (
-                one.name,
-                str(len(one.cover)),
-                format_number(1e3 * one.cover.protrusion, 3),
-                f"{one.cover.excess:.0%}",
-            )
-            for one in kept
-        ]
-        print(format_table(("shape", "spheres", "protrusion [mm]", "excess"), rows, "<>>>"))
-    else:
-        print(f"There are no covers in {cover_folder()}.")
-    return 0
+    def describe(one: CachedCover) -> tuple[dict[str, Any], tuple[str, ...]]:
+        spheres, protrusion, excess = len(one.cover), one.cover.protrusion, one.cover.excess
+        facts = {"name": one.name, "spheres": spheres, "protrusion": protrusion, "excess": excess}
+        row = one.name, str(spheres), format_number(1e3 * protrusion, 3), f"{excess:.0%}"
+        return {**facts, "bytes": one.bytes}, row
+
+    head, entries = ("shape", "spheres", "protrusion [mm]", "excess"), [*map(describe, list_covers())]
+    return manage_cache(arguments, arguments.model, "covers", cover_folder(), clear_covers, head, entries)

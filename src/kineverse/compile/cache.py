@@ -11,17 +11,15 @@ from __future__ import annotations
 
 import contextlib
 import functools
-import hashlib
 import itertools
 import logging
 import os
-import shutil
 import tempfile
-import time
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import TypeVar
 
+from .content_cache import UNFINISHED, ContentCache
 from .private_folder import NotPrivateError, PrivateFolder
 
 logger = logging.getLogger("kineverse.compile")
@@ -31,9 +29,6 @@ MAXIMUM_BYTES = 512 * 2**20
 # The end of every library: this, then the SHA-256 of everything before it. Loaders ignore what follows the
 # image.
 _MARK = b"\nkineverse library sha256 "
-_TRAILER = len(_MARK) + 32
-_STALE_SECONDS = 3600.0
-_LAST_USE_RESOLUTION = 3600.0
 
 _DESCRIPTORS = "/proc/self/fd/"
 _loaded = itertools.count(1)
@@ -61,7 +56,9 @@ class LibraryCache:
 
     def __init__(self, folder: Path, made: bool = False) -> None:
         self.folder = folder
-        self._inside = PrivateFolder(folder, made)
+        self._inside = inside = PrivateFolder(folder, made)
+        complaint = "The compiled library %s %s and will be made anew."
+        self._files = ContentCache(lambda: inside, ".so", MAXIMUM_BYTES, logger, complaint, _MARK)
 
     @property
     def is_still_private(self) -> bool:
@@ -70,11 +67,11 @@ class LibraryCache:
 
     def find(self, key: str) -> str | None:
         """Return the path of a library that exists and is undamaged, else None."""
-        found = self._opened(key)
+        found = self._files.open(key)
         if found is None:
             return None
         os.close(found[0])
-        return str(self.folder / _name(key))
+        return self._files.path(key)
 
     def load(self, key: str, load: Callable[[str], Code]) -> Code | None:
         """Return the code of a library; None if it does not exist or cannot be used.
@@ -87,42 +84,17 @@ class LibraryCache:
             Function from a path to the code. The path is valid only during the call, and unique: the loader
             would take a library with the path of a loaded one for that one.
         """
-        found = self._opened(key)
+        found = self._files.open(key)
         if found is None:
             return None
         try:
             with _path_of(*found) as path:
                 return load(path)
         except (OSError, RuntimeError, AttributeError, ImportError) as error:
-            self._discard(key, f"cannot be used ({error})")
+            self._files.discard(key, f"cannot be used ({error})")
             return None
         finally:
             os.close(found[0])
-
-    def _opened(self, key: str) -> tuple[int, bytes] | None:
-        """Open and read a library that exists and is undamaged; the caller closes the descriptor."""
-        try:
-            descriptor = self._inside.open(_name(key))
-        except NotPrivateError as error:
-            self._discard(key, str(error))
-            return None
-        except OSError:
-            return None
-        with open(descriptor, "rb", closefd=False) as file:
-            content = file.read()
-        if not _is_whole(content):
-            os.close(descriptor)
-            self._discard(key, "is damaged")
-            return None
-        if time.time() - os.fstat(descriptor).st_mtime > _LAST_USE_RESOLUTION:
-            with contextlib.suppress(OSError):
-                os.utime(descriptor)
-        return descriptor, content
-
-    def _discard(self, key: str, reason: str) -> None:
-        path = self.folder / _name(key)
-        logger.warning("The compiled library %s %s and will be made anew.", path, reason)
-        self._inside.remove(_name(key))
 
     def store(self, key: str, library: str) -> str:
         """Move a compiled library into the folder, and return its path.
@@ -134,32 +106,12 @@ class LibraryCache:
         library
             A file on the same file system (see :meth:`create_build_folder`).
         """
-        with open(library, "rb") as file:
-            digest = hashlib.sha256(file.read()).digest()
-        self._inside.adopt(library, _name(key), _MARK + digest)
-        self._make_room()
-        return str(self.folder / _name(key))
+        self._files.adopt(library, key)
+        return self._files.path(key)
 
     def create_build_folder(self) -> str:
         """Create a folder to compile in, which the caller removes, and return its path."""
-        return tempfile.mkdtemp(prefix=".build-", dir=self.folder)
-
-    def _make_room(self) -> None:
-        """Remove the least recently used libraries, and build folders of killed processes."""
-        files: list[tuple[float, int, str]] = []
-        now = time.time()
-        for name, status in self._inside.entries():
-            if name.startswith(".build-"):
-                if now - status.st_mtime > _STALE_SECONDS:
-                    shutil.rmtree(self.folder / name, ignore_errors=True)
-            elif name.endswith(".so"):
-                files.append((status.st_mtime, status.st_size, name))
-        excess = sum(size for _, size, _ in files) - MAXIMUM_BYTES
-        for _, size, name in sorted(files):
-            if excess <= 0:
-                break
-            self._inside.remove(name)
-            excess -= size
+        return tempfile.mkdtemp(prefix=UNFINISHED, dir=self.folder)
 
 
 def library_cache() -> LibraryCache:
@@ -220,15 +172,6 @@ def _describe_failure(folder: Path, error: Exception) -> str:
         f"{folder} {error}. Others may have left code in it: remove it with all it holds, or set "
         "KINEVERSE_CACHE_DIR to a folder of your own."
     )
-
-
-def _name(key: str) -> str:
-    return f"{key}.so"
-
-
-def _is_whole(content: bytes) -> bool:
-    digest = hashlib.sha256(memoryview(content)[:-_TRAILER]).digest()
-    return len(content) > _TRAILER and content[-_TRAILER:] == _MARK + digest
 
 
 @contextlib.contextmanager

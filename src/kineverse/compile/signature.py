@@ -166,7 +166,7 @@ def as_doubles(x: Any, wanted: str) -> Array:
     ShapeError
         For other values; the message says what was ``wanted``.
     """
-    if isinstance(x, np.ma.MaskedArray):
+    if type(x) is not np.ndarray and isinstance(x, np.ndarray) and isinstance(x, np.ma.MaskedArray):
         raise ShapeError(
             f"Expected {wanted}, not a masked array, some of whose entries have no value. Write "
             "x.filled(number) to give them one."

@@ -587,7 +587,9 @@ def as_expression(value: ExpressionLike) -> Expression:
         return array(value)
     if isinstance(value, np.ndarray) and value.dtype == object and not isinstance(value, np.ma.MaskedArray):
         return array(value)
-    if isinstance(value, (np.ma.MaskedArray, np.matrix)):
+    # The import of numpy.ma takes 10 ms.
+    is_special = isinstance(value, np.ndarray) and type(value) is not np.ndarray
+    if is_special and isinstance(value, (np.ma.MaskedArray, np.matrix)):
         _refuse(value)
     if isinstance(value, (str, bytes, Mapping)) or value is None:
         raise ExpressionError(

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterable, Mapping, Sequence
+from itertools import groupby
 from typing import Any
 
 import numpy as np
@@ -25,7 +26,14 @@ from kineverse.symbols import Symbol
 
 from .bindings import collision_library
 from .broadphase import FURTHEST, TRAVEL_EXCEEDED, Indices, ObjectTable
-from .collision_filter import Rule, allowed_pairs, check_frame_names, parse_known_rules, read_rules
+from .collision_filter import (
+    Rule,
+    allowed_pairs,
+    apply_rules,
+    check_frame_names,
+    parse_known_rules,
+    read_rules,
+)
 from .mesh_files import Floats
 from .narrowphase import ACCURACY, Narrowphase
 from .objects import CollisionObject, CollisionObjects, Exclusion, load_solids, parse_exclusions
@@ -146,9 +154,10 @@ class CollisionWorld:
             self._solids[new] = old_solids[previous]
         table.inherit(old, np.array(kept, dtype=int).reshape(-1, 2))
         known = {new for new, _ in kept}
+        poses: dict[str, Floats] = {}
         for k in range(len(moving), len(self.objects)):
             if k not in known:
-                table.poses[k] = _static_pose(self.objects[k])
+                table.poses[k] = _static_pose(self.objects[k], poses)
         table.update_boxes(np.arange(table.count))
         self._all_loaded = all(solid is not None for solid in self._solids)
         self.narrowphase = Narrowphase(self._solids, table.poses)
@@ -156,13 +165,26 @@ class CollisionWorld:
         self._bounds: Any = None if table.bounds is None else table.bounds.data
         self._measurements: dict[tuple[int, int], tuple[float, float, float, Floats]] = {}
         if not same:
-            self._compile([item.pose for item in moving])
+            self._compile(moving)
         self._restore_poses()
 
-    def _compile(self, poses: list[Any]) -> None:
-        self._function = function = compile_expressions(np.stack(poses)) if poses else None
+    def _compile(self, moving: list[CollisionObject]) -> None:
+        """Compile the poses of moving objects, those of a body together: (M, 3, 4)."""
+        poses = []
+        for _, group in groupby(moving, lambda item: item.body):
+            items = [*group]
+            origins = np.hstack([item.shape.origin.matrix for item in items])
+            rows = items[0].body_pose[:3] @ origins
+            poses.append(rows.reshape(3, len(items), 4).transpose(1, 0, 2))
+        self._function = function = compile_expressions(np.concatenate(poses)) if poses else None
         self.inputs = function.inputs if function else ()
         self._evaluator = function.bind() if function else None
+
+    def add_rules(self, rules: Iterable[Rule]) -> None:
+        """Add rules behind all others, from now on."""
+        added = parse_known_rules(rules, self.model)
+        self._own_rules += added
+        self.table.allowed[:] = apply_rules(self.table.allowed, self.bodies, added)
 
     # -- the state -----------------------------------------------------------------------------------------
 
@@ -396,9 +418,11 @@ class _NearestByBodies:
         return low > self._least.get(self._keys[k], math.inf) + ACCURACY
 
 
-def _static_pose(item: CollisionObject) -> Floats:
-    """Return the (3, 4) pose of an object that never moves."""
-    pose: Floats = item.pose({})
+def _static_pose(item: CollisionObject, poses: dict[str, Floats]) -> Floats:
+    """Return the (3, 4) pose of an object that never moves; those of bodies are kept in ``poses``."""
+    if item.body not in poses:
+        poses[item.body] = item.body_pose({})
+    pose: Floats = poses[item.body][:3] @ item.shape.origin.matrix
     if not (np.abs(pose) <= FURTHEST).all():
         raise InvalidValueError(
             f"Body '{item.body}' stands further than {FURTHEST:g} m away. Mend the model, or leave it out: "

@@ -60,8 +60,10 @@ class CollisionObject:
         Geometry and its pose in the frame.
     triangles
         True if a mesh stays a triangle mesh rather than its convex hull.
-    pose
-        The first three rows of world_T_object: a (3, 4) expression.
+    body_pose
+        The pose of the body, world_T_body: a (4, 4) expression.
+    moves
+        True if it depends on any symbol.
     hull
         Corners of the hull, (n, 3) in the frame of the shape [m]; None for the shape itself.
     """
@@ -70,13 +72,9 @@ class CollisionObject:
     number: int
     shape: Shape
     triangles: bool
-    pose: Expression
+    body_pose: Expression
+    moves: bool
     hull: Floats | None = None
-
-    @property
-    def moves(self) -> bool:
-        """True if the pose depends on any symbol."""
-        return bool(self.pose.symbols)
 
     def make_solid(self) -> Solid:
         """Make the solid of the object, for distance computation.
@@ -168,14 +166,14 @@ class CollisionObjects:
 
     def _make_objects(self, model: ModelView, name: str, body: Body) -> Iterator[CollisionObject]:
         world_T_body = model.fk(name)
+        moves = bool(world_T_body.symbols)
         triangles = matches_pattern(name, self._triangles)
         decomposed = not triangles and matches_pattern(name, self._decomposed)
         for number, shape in enumerate(collision_shapes(body)):
             if (name, number) in self._excluded_shapes:
                 continue
-            pose = (world_T_body @ shape.origin.matrix)[:3]
             for hull in _decomposed_hulls(name, shape) if decomposed else (None,):
-                yield CollisionObject(name, number, shape, triangles, pose, hull)
+                yield CollisionObject(name, number, shape, triangles, world_T_body, moves, hull)
 
 
 def _decomposed_hulls(name: str, shape: Shape) -> tuple[Floats | None, ...]:

@@ -43,7 +43,7 @@ class SampledMotion:
         self._selected = np.ascontiguousarray(selected, dtype=np.uint8)
         wanted, moves = {*coordinates}, np.zeros(world.table.count, dtype=bool)
         for k, item in enumerate(world.objects[: world.table.moving]):
-            moves[k] = not wanted.isdisjoint(item.pose.symbols)
+            moves[k] = not wanted.isdisjoint(item.body_pose.symbols)
         involved = np.asarray(self._selected.any(axis=1))[world.table.body]
         self._moving, self._standing = (
             np.flatnonzero(flags & involved).astype(np.int32) for flags in (moves, ~moves)

@@ -2,16 +2,20 @@
 
 from __future__ import annotations
 
+import hashlib
+import logging
 import math
 import threading
 from dataclasses import dataclass, field, replace
-from functools import lru_cache
+from functools import lru_cache, partial
 from typing import Any, TypeAlias
 
 import numpy as np
 
 from kineverse._extras import install_command
-from kineverse.errors import InvalidValueError, MissingDependencyError
+from kineverse.compile.cache import private_subfolder
+from kineverse.compile.content_cache import ContentCache
+from kineverse.errors import FormatError, InvalidValueError, MissingDependencyError
 from kineverse.model.body import Box, Capsule, Cone, Cylinder, Ellipsoid, Geometry, Mesh, Sphere
 
 from .mesh_files import Faces, Floats, Integers, MeshFile, find_mesh_file, read_faces
@@ -21,6 +25,19 @@ SMALLEST_MESH, LARGEST_MESH = 1e-6, 1e6
 
 THICKNESS = 2e-5
 """Least thickness of a hull [m]; flat hulls are thickened to it, or to 1e-5 of their size if that is more."""
+
+_MESH_HULLS = ContentCache(
+    partial(private_subfolder, "mesh_hulls"),
+    ".corners",
+    64 * 2**20,
+    logging.getLogger("kineverse.geometry"),
+    "The hull of a mesh %s %s and counts as absent.",
+)
+_WHOLE_FILES = (".stl", ".obj", ".dae", ".ply", ".off")
+"""Suffixes of mesh files whose triangles lie in no other file."""
+
+# Raise the number when the hulls of equal meshes change.
+_HULL_VERSION = 1
 
 
 def convex_hull(points: Floats) -> Any:
@@ -34,10 +51,14 @@ def convex_hull(points: Floats) -> Any:
     InvalidValueError
         If the points are too close together or too far apart, lie on a line, or are not finite.
     """
+    return _find_hull(thicken_flat(points))
+
+
+def _find_hull(points: Floats) -> Any:
     import coal
 
     vector = coal.StdVec_Vec3s()
-    for point in thicken_flat(points):
+    for point in points:
         vector.append(point)
     try:
         return coal.Convex.convexHull(vector, True, "Qt")
@@ -242,16 +263,42 @@ def import_coal() -> Any:
 
 
 def _from_file(file: MeshFile, scale: Floats, triangles: bool) -> Solid:
+    if not triangles:
+        return _solid_of_hull(_find_hull(_hull_corners(file, scale)))
     mesh = read_faces(file)
     vertices = mesh.vertices * scale
-    if not triangles:
-        return _hull_solid(vertices[np.unique(mesh.faces)])
     check_extent(vertices)
     return _triangle_solid(vertices, mesh.faces[:, ::-1] if np.prod(scale) < 0 else mesh.faces)
 
 
+def _hull_corners(file: MeshFile, scale: Floats) -> Floats:
+    """Return the sorted corners (n, 3) of the hull of a mesh [m].
+
+    They are kept on the disk, since to import trimesh takes longer than to build a whole scene.
+    """
+    content = repr((_HULL_VERSION, file.digest, file.kind, scale.tolist())).encode()
+    key = hashlib.sha256(content).hexdigest()[:40]
+    corners = _MESH_HULLS.read(key, _parse_corners) if file.kind in _WHOLE_FILES else None
+    if corners is None:
+        mesh = read_faces(file)
+        corners = np.unique(convex_hull((mesh.vertices * scale)[np.unique(mesh.faces)]).points(), axis=0)
+        if file.kind in _WHOLE_FILES:
+            _MESH_HULLS.write(key, corners.astype("<f8").tobytes())
+    return corners
+
+
+def _parse_corners(content: bytes) -> Floats:
+    try:
+        return np.frombuffer(content, dtype="<f8").reshape(-1, 3)
+    except ValueError as error:
+        raise FormatError("These are no corners.") from error
+
+
 def _hull_solid(points: Floats) -> Solid:
-    convex = convex_hull(points)
+    return _solid_of_hull(convex_hull(points))
+
+
+def _solid_of_hull(convex: Any) -> Solid:
     corners = np.array(convex.points())
     low, high = corners.min(axis=0), corners.max(axis=0)
     surface = Hull(np.array(convex.normals()), -np.array(convex.offsets()).reshape(-1))

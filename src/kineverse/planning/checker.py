@@ -92,13 +92,7 @@ class CollisionChecker:
         self.groups = tuple(dict.fromkeys(groups.values()))
         poses = [self.groups.index(groups[body]) for body in self.moving]
         self.program = self._make_program([model.fk(g)[:3] for g in self.groups], conditions)
-        members = [
-            [
-                (world.objects[k], world.solid(k), self._in_group(groups[body], k))
-                for k in world.members[world.body_index(body)]
-            ]
-            for body in self.moving
-        ]
+        members = [self._in_group(body, groups[body]) for body in self.moving]
         # A plate that one joint moves, such as a door: spheres would fill the gaps beside it.
         covered = [
             len(dependence.moving_ancestors(body)) > 1 or not any(is_thin(solid) for _, solid, _ in items)
@@ -130,11 +124,12 @@ class CollisionChecker:
         self.conditions = len(outputs) - len(poses)
         return VectorProgram(outputs, self.coordinates, self.parameters, scalar="float")
 
-    def _in_group(self, group: str, index: int) -> Array:
-        """Return the pose of an object in the frame of its rigid group, (4, 4)."""
-        item = self.scene.collision_world.objects[index]
-        offset = self.scene.model.fk(item.body, group)
-        return np.asarray(offset({}) @ item.shape.origin.matrix, dtype=float)
+    def _in_group(self, body: str, group: str) -> list[tuple[CollisionObject, Solid, Array]]:
+        """Return the objects of a body with their solids and their poses in its rigid group, (4, 4)."""
+        world = self.scene.collision_world
+        offset = self.scene.model.fk(body, group)({})
+        items = ((world.objects[k], world.solid(k)) for k in world.members[world.body_index(body)])
+        return [(item, solid, offset @ item.shape.origin.matrix) for item, solid in items]
 
     def _place_static(self, dependence: FrameDependence) -> None:
         """Collect the obstacles of the world: all objects that stand still."""

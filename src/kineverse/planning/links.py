@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
+from functools import partial
 
 import numpy as np
 
@@ -12,7 +13,8 @@ from kineverse.lie import Array
 from kineverse.model.body import Sphere
 
 from .bindings import COARSE, LINK, SHAPE
-from .spheres import cover_object, default_protrusion, make_sphere_tree
+from .spheres import SphereTree, cover_object, default_protrusion, make_sphere_tree
+from .spheres.sphere_cache import cover_key, find_or_make_tree
 
 _MANY = 64
 """Number of spheres beyond which a shape counts as thin."""
@@ -68,8 +70,8 @@ class LinkTable:
             self.spheres.append(np.zeros((0, 4)))
             if not covered[k]:
                 continue
-            spheres = np.concatenate([_placed_cover(item, T, protrusion) for item, _, T in items])
-            tree = make_sphere_tree(spheres[:, :3], spheres[:, 3])
+            key = cover_key([(solid, T) for _, solid, T in items], protrusion)
+            tree = find_or_make_tree(key, partial(_make_tree, items, protrusion))
             link["coarse"] = len(tree.coarse_radii)
             link["ball"] = *tree.ball_centre, tree.ball_radius
             ends = tree.first.tolist()
@@ -92,6 +94,11 @@ def is_thin(solid: Solid) -> bool:
     least, *others = sorted(solid.half.tolist())
     e = default_protrusion(solid)
     return bool(2.0 * others[0] * others[1] > _MANY * (2.0 * least * e + e * e))
+
+
+def _make_tree(items: Sequence[tuple[CollisionObject, Solid, Array]], protrusion: float | None) -> SphereTree:
+    spheres = np.concatenate([_placed_cover(item, T, protrusion) for item, _, T in items])
+    return make_sphere_tree(spheres[:, :3], spheres[:, 3])
 
 
 def _placed_cover(item: CollisionObject, T: Array, protrusion: float | None) -> Array:

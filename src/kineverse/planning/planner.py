@@ -11,6 +11,7 @@ import numpy as np
 import numpy.typing as npt
 
 from kineverse._checks import as_count, as_entries, as_tolerance
+from kineverse._gc import no_collection
 from kineverse.control.tasks import Goal, Hold
 from kineverse.errors import InvalidValueError, ShapeError
 from kineverse.expressions.expression import ExpressionLike
@@ -109,6 +110,7 @@ class Planner:
         self.roadmap: Roadmap | None = None
         self.planning_scene = self._build(model.default_state())
 
+    @no_collection()
     def _build(self, state: State) -> PlanningScene:
         return PlanningScene(
             self.model, self._move, self._rules, self.margin, self._protrusion, self._options, state

@@ -90,15 +90,13 @@ class PlanningScene:
     ) -> None:
         self.model, self.version = model, model.version
         self.space = space = PlanningSpace(model, move)
-        scene = Scene(model, rules=rules, **options)
+        self.scene = scene = Scene(model, rules=rules, **options)
         if not scene.bodies:
             raise InvalidValueError(
                 "No body of the model has a shape, so nothing can collide: add collision or visual shapes."
             )
         self.excluded = find_overlapping_pairs(scene, space)
-        if self.excluded:
-            scene = Scene(model, rules=(*rules, *self.excluded), **options)
-        self.scene = scene
+        scene.collision_world.add_rules(self.excluded)
         self.checker = CollisionChecker(scene, space.symbols, space.conditions, margin, protrusion)
         space.turning &= self.checker.find_periodic(space.turning)
         self._manifolds: dict[tuple[object, ...], Manifold] = {}

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
+from functools import lru_cache
 
 import numpy as np
 
@@ -116,25 +117,43 @@ def bound_solid(solid: Solid, protrusion: float) -> CoverPolytope:
     if isinstance(surface, Sphere | Ellipsoid):
         radii = np.ones(3) * (surface.radius if isinstance(surface, Sphere) else surface.radii)
         inner, widening = _sphere_points(_count_sides(float(radii.max()), protrusion))
-        return _between(inner * radii, inner * radii * widening, 4 / 3 * math.pi * float(radii.prod()))
+        return _between(inner * radii, inner * radii * widening, solid_volume(solid))
     radius, half = float(surface.radius), float(surface.length) / 2
     up = np.array([0.0, 0.0, half])
     count = _count_sides(radius, protrusion)
-    disc = math.pi * radius**2
     if isinstance(surface, Capsule):
         inner, widening = _sphere_points(count)
         inner = radius * inner
         ends = [np.concatenate([points + up, points - up]) for points in (inner, widening * inner)]
-        return _between(ends[0], ends[1], disc * (2 * half + 4 / 3 * radius))
+        return _between(ends[0], ends[1], solid_volume(solid))
     angles = 2 * math.pi * np.arange(count) / count
     inner = radius * np.column_stack([np.cos(angles), np.sin(angles), np.zeros(count)])
     outer = inner / math.cos(math.pi / count)
     if isinstance(surface, Cylinder):
         ends = [np.concatenate([points + up, points - up]) for points in (inner, outer)]
-        return _between(ends[0], ends[1], disc * 2 * half)
+        return _between(ends[0], ends[1], solid_volume(solid))
     assert isinstance(surface, Cone)
     ends = [np.concatenate([points - up, up[None]]) for points in (inner, outer)]
-    return _between(ends[0], ends[1], disc * 2 * half / 3)
+    return _between(ends[0], ends[1], solid_volume(solid))
+
+
+@lru_cache(maxsize=4096)
+def solid_volume(solid: Solid) -> float:
+    """Return the volume of a convex solid [m³]."""
+    surface = solid.surface
+    assert not isinstance(surface, Faces)
+    if isinstance(surface, Hull):
+        return _bound_hull(solid).volume
+    if isinstance(surface, Box):
+        return float(8.0 * solid.half.prod())
+    if isinstance(surface, Ellipsoid):
+        return 4 / 3 * math.pi * math.prod(surface.radii)
+    disc = math.pi * surface.radius**2
+    if isinstance(surface, Sphere):
+        return 4 / 3 * disc * surface.radius
+    if isinstance(surface, Capsule):
+        return disc * (surface.length + 4 / 3 * surface.radius)
+    return disc * surface.length / (3 if isinstance(surface, Cone) else 1)
 
 
 def _bound_hull(solid: Solid) -> CoverPolytope:

@@ -1,48 +1,43 @@
-"""Disk cache of sphere covers, by the content of the solid and the settings.
-
-The files lie in a folder of the cache of compiled functions; only this user can write to the folder and its
-files. A file ends in the SHA-256 of its content; a damaged file counts as absent. Files are renamed into
-place, so any number of processes can share the folder.
-"""
+"""Cache of sphere covers and trees, by the content of solids and the settings: in memory and on the disk."""
 
 from __future__ import annotations
 
-import contextlib
 import hashlib
-import io
+import json
 import logging
-import os
-import tempfile
 import threading
-import time
 from collections import OrderedDict
-from collections.abc import Iterator
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
+from typing import Any, TypeVar
 
 import numpy as np
 
 from kineverse.compile.cache import private_subfolder
-from kineverse.compile.private_folder import NotPrivateError, PrivateFolder
+from kineverse.compile.content_cache import ContentCache
 from kineverse.errors import FormatError
+from kineverse.geometry.mesh_files import Floats
 from kineverse.geometry.shapes import Hull, Solid
 
 from .sphere_cover import SphereCover
+from .sphere_tree import SphereTree
 
-logger = logging.getLogger("kineverse.planning")
+_OPEN, _LOG = partial(private_subfolder, "spheres"), logging.getLogger("kineverse.planning")
 
-MAXIMUM_BYTES = 64 * 2**20
-"""Largest size of the cache [bytes]; beyond it, the least recently used files are removed."""
+COVERS = ContentCache(_OPEN, ".spheres", 64 * 2**20, _LOG, "The sphere cover %s %s and counts as absent.")
+TREES = ContentCache(_OPEN, ".tree", 64 * 2**20, _LOG, "The sphere tree %s %s and counts as absent.")
+"""Covers and trees on the disk."""
 
-_VERSION = 1
-_ENDING, _UNFINISHED = ".spheres", ".making-"
-_STALE_SECONDS = 3600.0
-_LAST_USE_RESOLUTION = 3600.0
-_DIGEST = 32
+# Raise the number when the covers or trees of equal solids and settings change.
+_VERSION = 2
 _MOST_IN_MEMORY = 4096
 
-_in_memory: OrderedDict[str, SphereCover] = OrderedDict()
+_in_memory: OrderedDict[str, SphereCover | SphereTree] = OrderedDict()
 _lock = threading.Lock()
+
+Kept = TypeVar("Kept", SphereCover, SphereTree)
 
 
 @dataclass(frozen=True, slots=True)
@@ -54,134 +49,124 @@ class CachedCover:
     bytes: int
 
 
-def cover_key(solid: Solid, protrusion: float, most: int) -> str:
-    """Return the key of the cover of a convex solid with a protrusion [m] and a number of spheres."""
-    if isinstance(solid.surface, Hull):
-        assert solid.core is not None
-        content = np.ascontiguousarray(solid.core.corners).tobytes()
-    else:
-        content = repr(solid.surface).encode()
-    settings = f"{_VERSION} {protrusion.hex()} {most} {type(solid.surface).__name__} "
-    return hashlib.sha256(settings.encode() + content).hexdigest()[:40]
+def cover_key(
+    solids: Solid | Iterable[tuple[Solid, Floats]], protrusion: float | None, most: int | None = None
+) -> str:
+    """Return the key of the cover or tree of convex solids.
+
+    Parameters
+    ----------
+    solids
+        A solid, or several with their poses (4, 4) [m].
+    protrusion, most
+        Settings: largest protrusion [m] and number of spheres; None for the default.
+    """
+    settings = (_VERSION, None if protrusion is None else float(protrusion).hex(), most)
+    digest = hashlib.sha256(repr(settings).encode())
+    for solid, pose in [(solids, np.eye(4))] if isinstance(solids, Solid) else solids:
+        if isinstance(solid.surface, Hull):
+            assert solid.core is not None
+            digest.update(b"hull %d " % solid.core.corners.size)
+            digest.update(solid.core.corners.tobytes())
+        else:
+            digest.update(repr(solid.surface).encode())
+        digest.update(pose.tobytes())
+    return digest.hexdigest()[:40]
 
 
 def find_cover(key: str) -> SphereCover | None:
     """Return the cover of a key, see :func:`cover_key`, from memory or the disk; None if there is none."""
-    with _lock:
-        if key in _in_memory:
-            _in_memory.move_to_end(key)
-            return _in_memory[key]
-    found = _read(_folder(), key + _ENDING)
-    if found is None:
-        return None
-    _remember(key, found[1])
-    return found[1]
+    return _find(COVERS, key, lambda content: _parse_cover(content)[1])
 
 
 def keep_cover(key: str, name: str, cover: SphereCover) -> None:
     """Keep a cover in memory, and atomically on the disk, with the name of what it covers."""
     _remember(key, cover)
-    folder = _folder()
-    buffer = io.BytesIO()
-    np.savez(
-        buffer,
-        name=np.frombuffer(name.encode(), dtype=np.uint8),
-        spheres=np.column_stack([cover.centres, cover.radii]),
-        quality=np.array([cover.protrusion, cover.excess]),
-    )
-    content = buffer.getvalue()
-    handle, path = tempfile.mkstemp(prefix=_UNFINISHED, dir=folder.path)
-    try:
-        with open(handle, "wb") as file:
-            file.write(content)
-        folder.adopt(path, key + _ENDING, hashlib.sha256(content).digest())
-    except BaseException:
-        with contextlib.suppress(OSError):
-            os.unlink(path)
-        raise
-    _make_room(folder)
+    head = {"name": name, "protrusion": cover.protrusion, "excess": cover.excess, "sizes": [len(cover)]}
+    COVERS.write(key, _pack(head, cover.centres, cover.radii))
+
+
+def find_or_make_tree(key: str, make: Callable[[], SphereTree]) -> SphereTree:
+    """Return the tree of a key, see :func:`cover_key`, from memory or the disk, or a new one."""
+    tree = _find(TREES, key + "t", _parse_tree)
+    if tree is None:
+        tree = make()
+        _remember(key + "t", tree)
+        head = {
+            "order": tree.order.tolist(),
+            "first": tree.first.tolist(),
+            "ball": [*tree.ball_centre.tolist(), tree.ball_radius],
+            "sizes": [len(tree.radii), len(tree.coarse_radii)],
+        }
+        spheres = (tree.centres, tree.radii, tree.coarse_centres, tree.coarse_radii)
+        TREES.write(key + "t", _pack(head, *spheres))
+    return tree
 
 
 def list_covers() -> list[CachedCover]:
     """Return all covers on the disk, sorted by the name of what they cover."""
-    folder = _folder()
-    found = [(_read(folder, name, used=False), size) for _, size, name in _files(folder)]
-    kept = [CachedCover(entry[0], entry[1], size) for entry, size in found if entry]
+    kept = [CachedCover(*named, size) for named, size in COVERS.read_all(_parse_cover)]
     return sorted(kept, key=lambda one: (one.name, len(one.cover), one.cover.protrusion))
 
 
 def clear_covers() -> int:
-    """Remove all covers from memory and from the disk, and return the number of files."""
+    """Remove all covers and trees from memory and from the disk, and return the number of covers."""
     with _lock:
         _in_memory.clear()
-    folder = _folder()
-    return sum(folder.remove(name) for _, _, name in list(_files(folder)))
+    TREES.clear()
+    return COVERS.clear()
 
 
 def cover_folder() -> Path:
     """Return the path of the cache folder."""
-    return _folder().path
+    return COVERS.folder.path
 
 
-def _folder() -> PrivateFolder:
-    return private_subfolder("spheres")
-
-
-def _remember(key: str, cover: SphereCover) -> None:
+def _find(cache: ContentCache, key: str, parse: Callable[[bytes], Kept]) -> Kept | None:
     with _lock:
-        _in_memory[key] = cover
+        if key in _in_memory:
+            _in_memory.move_to_end(key)
+            return _in_memory[key]  # type: ignore[return-value]
+    found = cache.read(key, parse)
+    if found is not None:
+        _remember(key, found)
+    return found
+
+
+def _remember(key: str, content: SphereCover | SphereTree) -> None:
+    with _lock:
+        _in_memory[key] = content
         _in_memory.move_to_end(key)
         while len(_in_memory) > _MOST_IN_MEMORY:
             _in_memory.popitem(last=False)
 
 
-def _read(folder: PrivateFolder, name: str, used: bool = True) -> tuple[str, SphereCover] | None:
-    """Return the name of the solid and the cover of a file; None if there is none, or it is damaged."""
+def _pack(head: dict[str, Any], *arrays: Floats) -> bytes:
+    """Return a line of JSON and the numbers of some arrays; an archive of numpy takes longer to read."""
+    return json.dumps(head).encode() + b"\n" + b"".join(array.astype("<f8").tobytes() for array in arrays)
+
+
+def _unpack(content: bytes) -> tuple[dict[str, Any], list[tuple[Floats, Floats]]]:
+    """Return the head that :func:`_pack` was given, and centres (N, 3) and radii (N,) for each size in it."""
     try:
-        with open(folder.open(name), "rb") as file:
-            content, last_use = file.read(), os.fstat(file.fileno()).st_mtime
-            if used and time.time() - last_use > _LAST_USE_RESOLUTION:
-                with contextlib.suppress(OSError):
-                    os.utime(file.fileno())
-        if hashlib.sha256(content[:-_DIGEST]).digest() != content[-_DIGEST:]:
-            raise FormatError("It does not end in its digest.")
-        return _parse(content[:-_DIGEST])
-    except OSError:
-        return None
-    except NotPrivateError as error:
-        reason = str(error)
-    except FormatError:
-        reason = "is damaged"
-    logger.warning("The sphere cover %s %s and counts as absent.", folder.path / name, reason)
-    folder.remove(name)
-    return None
+        line, _, numbers = content.partition(b"\n")
+        head = json.loads(line)
+        rows = np.frombuffer(numbers, dtype="<f8")
+        spheres = []
+        for size in head["sizes"]:
+            spheres.append((rows[: 3 * size].reshape(size, 3), rows[3 * size : 4 * size]))
+            rows = rows[4 * size :]
+    except (ValueError, KeyError, TypeError) as error:
+        raise FormatError("These are no spheres.") from error
+    return head, spheres
 
 
-def _parse(content: bytes) -> tuple[str, SphereCover]:
-    try:
-        with np.load(io.BytesIO(content), allow_pickle=False) as arrays:
-            name = arrays["name"].tobytes().decode()
-            spheres, (protrusion, excess) = arrays["spheres"], arrays["quality"].tolist()
-    except Exception as error:  # zip and numpy raise all kinds of errors for a damaged archive.
-        raise FormatError("This is no sphere cover.") from error
-    spheres.flags.writeable = False
-    return name, SphereCover(spheres[:, :3], spheres[:, 3], protrusion, excess)
+def _parse_cover(content: bytes) -> tuple[str, SphereCover]:
+    head, ((centres, radii),) = _unpack(content)
+    return head["name"], SphereCover(centres, radii, head["protrusion"], head["excess"])
 
 
-def _files(folder: PrivateFolder) -> Iterator[tuple[float, int, str]]:
-    """Yield the time of the last use, the size and the name of every cover."""
-    for name, status in folder.entries():
-        if name.endswith(_ENDING):
-            yield status.st_mtime, status.st_size, name
-        elif name.startswith(_UNFINISHED) and time.time() - status.st_mtime > _STALE_SECONDS:
-            folder.remove(name)
-
-
-def _make_room(folder: PrivateFolder) -> None:
-    files = sorted(_files(folder))
-    excess = sum(size for _, size, _ in files) - MAXIMUM_BYTES
-    for _, size, name in files:
-        if excess <= 0:
-            break
-        folder.remove(name)
-        excess -= size
+def _parse_tree(content: bytes) -> SphereTree:
+    head, ((centres, radii), (coarse_centres, coarse_radii)) = _unpack(content)
+    order, first, ball = (np.array(head[name]) for name in ("order", "first", "ball"))
+    return SphereTree(centres, radii, order, coarse_centres, coarse_radii, first, ball[:3], float(ball[3]))

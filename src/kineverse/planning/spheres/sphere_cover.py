@@ -13,7 +13,7 @@ from kineverse.geometry.shapes import Solid
 from kineverse.model.body import Capsule, Sphere
 
 from .cover_fit import FittedSpheres, fit_spheres
-from .polytope import bound_solid
+from .polytope import bound_solid, solid_volume
 from .union_volume import union_volume
 
 MOST = 32
@@ -81,10 +81,12 @@ def cover_solid(solid: Solid, protrusion: float | None = None, most: int = MOST)
     # A hull may be longer than any sensible protrusion, and one ball is then enough.
     protrusion = min(protrusion, 2.0 * solid.radius)
     if isinstance(solid.surface, Sphere):
-        return _make_cover(np.zeros((1, 3)), np.array([float(solid.surface.radius)]), 0.0, _volume(solid))
+        return _make_cover(
+            np.zeros((1, 3)), np.array([float(solid.surface.radius)]), 0.0, solid_volume(solid)
+        )
     if isinstance(solid.surface, Capsule):
         centres, radii, reached = _capsule_chain(solid.surface, protrusion, most)
-        return _make_cover(centres, radii, reached, _volume(solid))
+        return _make_cover(centres, radii, reached, solid_volume(solid))
     polytope = bound_solid(solid, protrusion)
     origin = polytope.find_deepest_point()
     unit = solid.radius
@@ -99,7 +101,7 @@ def default_protrusion(solid: Solid) -> float:
 
     The size is the edge of a cube with the volume of the solid.
     """
-    size = math.cbrt(_volume(solid))
+    size = math.cbrt(solid_volume(solid))
     return min(max(PROTRUSION_OF_SIZE * size, LEAST_PROTRUSION), LARGEST_PROTRUSION)
 
 
@@ -109,10 +111,6 @@ def check_cover_settings(protrusion: float | None, most: int) -> None:
         raise InvalidValueError(f"A protrusion of {protrusion:g} m: spheres stick out by a positive length.")
     if not 1 <= most <= _MOST_OF_ALL:
         raise InvalidValueError(f"most={most}: a cover has 1 to {_MOST_OF_ALL} spheres.")
-
-
-def _volume(solid: Solid) -> float:
-    return bound_solid(solid, 0.1 * solid.radius).volume
 
 
 def _make_cover(centres: Floats, radii: Floats, protrusion: float, volume: float) -> SphereCover:
