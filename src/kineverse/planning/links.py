@@ -11,7 +11,7 @@ from kineverse.geometry.shapes import Solid
 from kineverse.lie import Array
 
 from .bindings import COARSE, LINK
-from .spheres import cover_object, default_protrusion, make_sphere_tree
+from .spheres import cover_objects, default_protrusion, make_sphere_tree
 
 _MANY = 64
 """Number of spheres beyond which a shape counts as thin."""
@@ -61,8 +61,8 @@ class LinkTable:
             self.spheres.append(np.zeros((0, 4)))
             if not covered[k]:
                 continue
-            spheres = np.concatenate([_placed_cover(item, T, protrusion) for item, _, T in items])
-            tree = make_sphere_tree(spheres[:, :3], spheres[:, 3])
+            cover, T = cover_objects([item for item, _, _ in items], protrusion), items[0][2]
+            tree = make_sphere_tree(cover.centres @ T[:3, :3].T + T[:3, 3], cover.radii)
             link["coarse"] = len(tree.coarse_radii)
             link["ball"] = *tree.ball_centre, tree.ball_radius
             ends = tree.first.tolist()
@@ -83,14 +83,8 @@ def is_thin(solid: Solid) -> bool:
     A sphere that sticks out by e covers a disc of area π (2 c e + e²) of a plate of the thickness 2 c.
     """
     least, *others = sorted(solid.half.tolist())
-    e = default_protrusion(solid)
+    e = default_protrusion([(solid, np.eye(4))])
     return bool(2.0 * others[0] * others[1] > _MANY * (2.0 * least * e + e * e))
-
-
-def _placed_cover(item: CollisionObject, T: Array, protrusion: float | None) -> Array:
-    cover = cover_object(item, protrusion)
-    centres = cover.centres @ T[:3, :3].T + T[:3, 3]
-    return np.column_stack([centres, cover.radii])
 
 
 def _placed_corners(solid: Solid, T: Array) -> Array:

@@ -16,7 +16,7 @@ import tempfile
 import threading
 import time
 from collections import OrderedDict
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -25,6 +25,7 @@ import numpy as np
 from kineverse.compile.cache import private_subfolder
 from kineverse.compile.private_folder import NotPrivateError, PrivateFolder
 from kineverse.errors import FormatError
+from kineverse.geometry.mesh_files import Floats
 from kineverse.geometry.shapes import Hull, Solid
 
 from .sphere_cover import SphereCover
@@ -34,7 +35,7 @@ logger = logging.getLogger("kineverse.planning")
 MAXIMUM_BYTES = 64 * 2**20
 """Largest size of the cache [bytes]; beyond it, the least recently used files are removed."""
 
-_VERSION = 1
+_VERSION = 2
 _ENDING, _UNFINISHED = ".spheres", ".making-"
 _STALE_SECONDS = 3600.0
 _LAST_USE_RESOLUTION = 3600.0
@@ -54,15 +55,17 @@ class CachedCover:
     bytes: int
 
 
-def cover_key(solid: Solid, protrusion: float, most: int) -> str:
-    """Return the key of the cover of a convex solid with a protrusion [m] and a number of spheres."""
-    if isinstance(solid.surface, Hull):
-        assert solid.core is not None
-        content = np.ascontiguousarray(solid.core.corners).tobytes()
-    else:
-        content = repr(solid.surface).encode()
-    settings = f"{_VERSION} {protrusion.hex()} {most} {type(solid.surface).__name__} "
-    return hashlib.sha256(settings.encode() + content).hexdigest()[:40]
+def cover_key(solids: Sequence[tuple[Solid, Floats]], protrusion: float, most: int) -> str:
+    """Return the key of the cover of convex solids at poses, with a protrusion [m] and a number of spheres."""
+    digest = hashlib.sha256(f"{_VERSION} {protrusion.hex()} {most}".encode())
+    for solid, pose in solids:
+        digest.update(f" {type(solid.surface).__name__} ".encode() + pose.tobytes())
+        if isinstance(solid.surface, Hull):
+            assert solid.core is not None
+            digest.update(np.ascontiguousarray(solid.core.corners).tobytes())
+        else:
+            digest.update(repr(solid.surface).encode())
+    return digest.hexdigest()[:40]
 
 
 def find_cover(key: str) -> SphereCover | None:

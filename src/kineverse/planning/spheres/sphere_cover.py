@@ -1,19 +1,20 @@
-"""Covers of convex solids by few spheres."""
+"""Covers of convex solids, and of unions of them, by few spheres."""
 
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
 
 from kineverse.errors import InvalidValueError
-from kineverse.geometry.mesh_files import Faces, Floats
+from kineverse.geometry.mesh_files import Floats
 from kineverse.geometry.shapes import Solid
 from kineverse.model.body import Capsule, Sphere
 
 from .cover_fit import FittedSpheres, fit_spheres
-from .polytope import bound_solid
+from .polytope import CoverRegion, bound_solid
 from .union_volume import union_volume
 
 MOST = 32
@@ -27,16 +28,16 @@ _MOST_OF_ALL = 1024
 
 @dataclass(frozen=True, slots=True, eq=False)
 class SphereCover:
-    """Spheres whose union contains a solid.
+    """Spheres whose union contains solids.
 
     Attributes
     ----------
     centres, radii
-        (N, 3) and (N,) in the frame of the solid [m]; read-only.
+        (N, 3) and (N,) in the frame of the solids' poses [m]; read-only.
     protrusion
-        Upper bound of the distance of any point of a sphere from the solid [m].
+        Upper bound of the distance of any point of a sphere from the solids [m].
     excess
-        Volume of the union of the spheres over that of the solid, minus 1.
+        Volume of the union of the spheres over that of the union of the solids, minus 1.
     """
 
     centres: Floats
@@ -50,17 +51,24 @@ class SphereCover:
 
 
 def cover_solid(solid: Solid, protrusion: float | None = None, most: int = MOST) -> SphereCover:
-    """Return few spheres that cover a convex solid.
+    """Return few spheres that cover a convex solid, in its frame; see :func:`cover_solids`."""
+    return cover_solids([(solid, np.eye(4))], protrusion, most)
 
-    Every point of the solid lies in a sphere: subdivision proves it, up to rounding. The same solid has the
+
+def cover_solids(
+    solids: Sequence[tuple[Solid, Floats]], protrusion: float | None = None, most: int = MOST
+) -> SphereCover:
+    """Return few spheres that cover the union of convex solids at poses (4, 4).
+
+    Every point of the solids lies in a sphere: subdivision proves it, up to rounding. The same solids have the
     same cover in every run on one machine.
 
     Parameters
     ----------
-    solid
-        The solid.
+    solids
+        The solids with their poses.
     protrusion
-        Largest distance of a point of a sphere from the solid [m]; None for :func:`default_protrusion`. It is
+        Largest distance of a point of a sphere from the union [m]; None for :func:`default_protrusion`. It is
         exceeded where ``most`` spheres are not enough; :attr:`SphereCover.protrusion` has what was reached.
     most
         Largest number of spheres.
@@ -71,35 +79,33 @@ def cover_solid(solid: Solid, protrusion: float | None = None, most: int = MOST)
         For a triangle mesh, which has no inside; or if the protrusion is not a positive length, or ``most``
         not between 1 and 1024.
     """
-    if isinstance(solid.surface, Faces):
-        raise InvalidValueError(
-            "A triangle mesh has no inside to be covered by spheres: use its hull or its decomposition."
-        )
     if protrusion is None:
-        protrusion = default_protrusion(solid)
+        protrusion = default_protrusion(solids)
     check_cover_settings(protrusion, most)
-    # A hull may be longer than any sensible protrusion, and one ball is then enough.
-    protrusion = min(protrusion, 2.0 * solid.radius)
-    if isinstance(solid.surface, Sphere):
-        return _make_cover(np.zeros((1, 3)), np.array([float(solid.surface.radius)]), 0.0, _volume(solid))
-    if isinstance(solid.surface, Capsule):
+    # Solids may be longer than any sensible protrusion, and one ball is then enough.
+    protrusion = min(protrusion, 2.0 * sum(solid.radius for solid, _ in solids))
+    if len(solids) == 1 and isinstance(solids[0][0].surface, Sphere | Capsule):
+        solid, pose = solids[0]
         centres, radii, reached = _capsule_chain(solid.surface, protrusion, most)
-        return _make_cover(centres, radii, reached, _volume(solid))
-    polytope = bound_solid(solid, protrusion)
-    origin = polytope.find_deepest_point()
-    unit = solid.radius
-    fitted: FittedSpheres = fit_spheres(polytope.normalize(origin, unit), protrusion / unit, most)
-    return _make_cover(
-        fitted.centres * unit + origin, fitted.radii * unit, fitted.protrusion * unit, polytope.volume
-    )
+        return _make_cover(centres @ pose[:3, :3].T + pose[:3, 3], radii, reached, _volume(solids))
+    parts = [bound_solid(solid, protrusion).move(pose) for solid, pose in solids]
+    corners = np.concatenate([part.corners for part in parts])
+    low, high = corners.min(axis=0), corners.max(axis=0)
+    origin, unit = (low + high) / 2, float(np.linalg.norm(high - low)) / 2
+    shift = np.eye(4)
+    shift[:3, 3] = -origin
+    region = CoverRegion([part.move(shift, 1.0 / unit) for part in parts])
+    fitted: FittedSpheres = fit_spheres(region, protrusion / unit, most)
+    volume = region.measure_volume() * unit**3
+    return _make_cover(fitted.centres * unit + origin, fitted.radii * unit, fitted.protrusion * unit, volume)
 
 
-def default_protrusion(solid: Solid) -> float:
+def default_protrusion(solids: Sequence[tuple[Solid, Floats]]) -> float:
     """Return the protrusion of covers where none is asked for: a tenth of the size, from 5 mm to 25 mm [m].
 
-    The size is the edge of a cube with the volume of the solid.
+    The size is the edge of a cube with the volume of the union.
     """
-    size = math.cbrt(_volume(solid))
+    size = math.cbrt(_volume(solids))
     return min(max(PROTRUSION_OF_SIZE * size, LEAST_PROTRUSION), LARGEST_PROTRUSION)
 
 
@@ -111,8 +117,9 @@ def check_cover_settings(protrusion: float | None, most: int) -> None:
         raise InvalidValueError(f"most={most}: a cover has 1 to {_MOST_OF_ALL} spheres.")
 
 
-def _volume(solid: Solid) -> float:
-    return bound_solid(solid, 0.1 * solid.radius).volume
+def _volume(solids: Sequence[tuple[Solid, Floats]]) -> float:
+    parts = [bound_solid(solid, 0.1 * solid.radius).move(pose) for solid, pose in solids]
+    return CoverRegion(parts).measure_volume()
 
 
 def _make_cover(centres: Floats, radii: Floats, protrusion: float, volume: float) -> SphereCover:
@@ -121,13 +128,16 @@ def _make_cover(centres: Floats, radii: Floats, protrusion: float, volume: float
     return SphereCover(centres, radii, protrusion, excess)
 
 
-def _capsule_chain(capsule: Capsule, protrusion: float, most: int) -> tuple[Floats, Floats, float]:
-    """Return equal spheres along the axis of a capsule, and their protrusion [m].
+def _capsule_chain(capsule: Sphere | Capsule, protrusion: float, most: int) -> tuple[Floats, Floats, float]:
+    """Return equal spheres along the axis of a capsule, and their protrusion [m]; a sphere covers itself.
 
     With radius r + e they reach beyond both ends by e if the outermost are e inside of the ends of the axis,
     and cover the side as long as neighbours are no further than 2 √((r + e)² - r²) apart.
     """
-    radius, length = float(capsule.radius), float(capsule.length)
+    radius = float(capsule.radius)
+    if isinstance(capsule, Sphere):
+        return np.zeros((1, 3)), np.full(1, radius), 0.0
+    length = float(capsule.length)
 
     def count_spheres(e: float) -> int:
         span = max(length - 2 * e, 0.0)
