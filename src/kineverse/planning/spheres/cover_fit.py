@@ -32,7 +32,7 @@ _WARM, _COLD = 0.2, 0.015
 """First and last temperature of the smoothed maximum, as a fraction of the protrusion."""
 
 _MOMENTUM = 0.6
-_SAMPLES, _HARD = 300, 0.6
+_SAMPLES, _SAMPLES_EACH, _HARD = 300, 8, 0.6
 _TRIALS = 4
 _REMOVALS, _FEW_SPHERES = 3, 12
 _PROOF, _ALLOWANCE, _ATTEMPTS = 0.01, 1.04, 4
@@ -60,13 +60,17 @@ class FittedSpheres:
 class _Problem:
     """Region, with the points of it that a cover is fitted to."""
 
-    def __init__(self, region: CoverRegion, protrusion: float, most: int) -> None:
-        self.region = region.simplify()
-        a, b, c = np.moveaxis(region.corners[region.faces], 1, 0)
-        samples = max(_SAMPLES, 10 * most)
-        area = float(np.linalg.norm(np.cross(b - a, c - a), axis=1).sum()) / 2
-        self.mesh = CoverMesh(self.region, max(protrusion, math.sqrt(area / samples)))
+    def __init__(self, region: CoverRegion, protrusion: float) -> None:
+        self.region, self._protrusion = region.simplify(), protrusion
         self.gaps: Floats = np.zeros((0, 3))
+        self.expect(0)
+
+    def expect(self, spheres: int) -> None:
+        """Make the points close enough for a number of spheres."""
+        region, samples = self.region, max(_SAMPLES, _SAMPLES_EACH * spheres)
+        a, b, c = np.moveaxis(region.corners[region.faces], 1, 0)
+        area = float(np.linalg.norm(np.cross(b - a, c - a), axis=1).sum()) / 2
+        self.mesh = CoverMesh(region, max(self._protrusion, math.sqrt(area / samples)))
 
     def find_critical(self, centres: Floats, radii: Floats) -> tuple[Floats, Integers]:
         """Return the points that are hardest to cover by spheres, and the sphere of each."""
@@ -89,7 +93,7 @@ def fit_spheres(region: CoverRegion, protrusion: float, most: int) -> FittedSphe
     most
         Largest number of spheres.
     """
-    problem = _Problem(region, protrusion, most)
+    problem = _Problem(region, protrusion)
     aim = protrusion / _ALLOWANCE
     for _ in range(_ATTEMPTS):
         fitted = _fit_to_points(problem, aim, most)
@@ -113,7 +117,9 @@ def _fit_to_points(problem: _Problem, aim: float, most: int) -> FittedSpheres:
     best = descend(problem, middle[None], aim, _FEW_ROUNDS)
     if best.protrusion <= aim or most == 1:
         return best
-    best = _search_start(problem, CoverStarts(problem.region, aim), aim, most, best)
+    starts = CoverStarts(problem.region, aim)
+    problem.expect(min(len(starts.greedy(1.2 * aim)), most))
+    best = _search_start(problem, starts, aim, most, best)
     if best.protrusion > aim and len(best.radii) < most:
         added = descend(problem, _split_worst(problem, best, most), aim)
         best = added if added.is_better(best, aim) else best

@@ -83,25 +83,35 @@ class CoverStarts:
         return self._candidates[chosen]
 
     def lattice(self, protrusion: float, most: int) -> Floats:
-        """Return the centres of equal boxes along the principal axes.
+        """Return the centres of equal boxes along the principal axes of each solid.
 
         They are the fewest whose balls protrude no further, or at most so many with the least protrusion.
         """
-        corners = self._region.corners
-        axes = _principal_axes(corners)
-        low, high = (corners @ axes.T).min(axis=0), (corners @ axes.T).max(axis=0)
-        numbers = range(1, most + 1)
-        counts = np.array(
-            [(i, j, k) for i in numbers for j in numbers[: most // i] for k in numbers[: most // (i * j)]]
-        )
-        half = (high - low) / 2 / counts
-        protrusions = np.linalg.norm(half, axis=1) - half.min(axis=1)
-        totals = np.where(protrusions <= protrusion, counts.prod(axis=1), np.inf)
-        best = counts[totals.argmin() if np.isfinite(totals).any() else protrusions.argmin()]
-        ticks = [low[k] + (high[k] - low[k]) * (np.arange(best[k]) + 0.5) / best[k] for k in range(3)]
-        centres = np.stack(np.meshgrid(*ticks, indexing="ij"), axis=-1).reshape(-1, 3) @ axes
-        inside: Floats = centres[self._region.depths(centres) > -protrusion]
-        return inside if len(inside) else self._region.middles[:1]
+        region = self._region
+        centres = [_box_centres(part.corners, protrusion, most) for part in region.parts]
+        owners = np.repeat(np.arange(len(centres)), [len(found) for found in centres])
+        points = np.concatenate(centres)
+        depths = region.part_depths(points)
+        # What lies deeper in another solid is left to that one.
+        kept = (depths.max(axis=1) > -protrusion) & (depths.argmax(axis=1) == owners)
+        found: Floats = points[kept]
+        return found if len(found) else region.middles[:1]
+
+
+def _box_centres(corners: Floats, protrusion: float, most: int) -> Floats:
+    """Return the centres (n, 3) of equal boxes that a box around some corners consists of."""
+    axes = _principal_axes(corners)
+    low, high = (corners @ axes.T).min(axis=0), (corners @ axes.T).max(axis=0)
+    numbers = range(1, most + 1)
+    counts = np.array(
+        [(i, j, k) for i in numbers for j in numbers[: most // i] for k in numbers[: most // (i * j)]]
+    )
+    half = (high - low) / 2 / counts
+    protrusions = np.linalg.norm(half, axis=1) - half.min(axis=1)
+    totals = np.where(protrusions <= protrusion, counts.prod(axis=1), np.inf)
+    best = counts[totals.argmin() if np.isfinite(totals).any() else protrusions.argmin()]
+    ticks = [low[k] + (high[k] - low[k]) * (np.arange(best[k]) + 0.5) / best[k] for k in range(3)]
+    return np.stack(np.meshgrid(*ticks, indexing="ij"), axis=-1).reshape(-1, 3) @ axes
 
 
 def _principal_axes(corners: Floats) -> Floats:

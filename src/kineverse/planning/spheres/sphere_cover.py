@@ -17,7 +17,7 @@ from .cover_fit import FittedSpheres, fit_spheres
 from .polytope import CoverRegion, bound_solid
 from .union_volume import union_volume
 
-MOST = 32
+MOST = 64
 """Default largest number of spheres of a cover."""
 
 PROTRUSION_OF_SIZE, LEAST_PROTRUSION, LARGEST_PROTRUSION = 0.1, 5e-3, 25e-3
