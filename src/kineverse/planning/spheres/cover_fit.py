@@ -31,7 +31,7 @@ _ROUNDS, _FEW_ROUNDS, _STEPS = 20, 10, 6
 _WARM, _COLD = 0.2, 0.015
 """First and last temperature of the smoothed maximum, as a fraction of the protrusion."""
 
-_MOMENTUM = 0.6
+_MOMENTUM, _SIDES = 0.6, 12
 _SAMPLES, _SAMPLES_EACH, _HARD = 300, 8, 0.6
 _TRIALS = 4
 _REMOVALS, _FEW_SPHERES = 3, 12
@@ -239,8 +239,10 @@ def _relax(
     group = np.cumsum(np.diff(owners, prepend=-1) > 0) - 1
     found = centres.copy()
     centres, speed = centres[moving], np.zeros((len(moving), 3))
+    slack, normals = region.nearest_sides(centres, solids, _SIDES)
+    offsets = slack + np.einsum("nfj,nj->nf", normals, centres)
     for _ in range(_STEPS):
-        slack, normals = region.slacks(centres, solids)
+        slack = offsets - np.einsum("nfj,nj->nf", normals, centres)
         apart = centres[group] - points
         lengths = np.sqrt(np.einsum("ij,ij->i", apart, apart))
         weights = np.exp((lengths - np.maximum.reduceat(lengths, first)[group]) / temperature)

@@ -18,7 +18,7 @@ import numpy.typing as npt
 
 from kineverse.geometry.mesh_files import Floats, Integers
 
-from .polytope import CoverRegion
+from .polytope import CoverRegion, dot
 
 Flags: TypeAlias = npt.NDArray[np.bool_]
 
@@ -51,6 +51,7 @@ class CoverMesh:
         marks = np.round(triangles @ np.array([1.0, math.sqrt(2.0), math.pi]), 9)
         _, first, which = np.unique(marks, return_index=True, return_inverse=True)
         self.points: Floats = np.concatenate([triangles[first], region.middles])
+        self._single = self.points.astype(np.float32)
         self._triangles: Integers = which.reshape(-1, 3)
         pairs = np.concatenate([self._triangles[:, [i, j]] for i, j in ((0, 1), (1, 2), (2, 0))])
         pairs.sort(axis=1)
@@ -62,28 +63,30 @@ class CoverMesh:
 
         They are all corners of triangles, and points of equal power on edges and in triangles.
         """
-        # Powers without the common |x|² are linear.
-        powers = (centres**2).sum(axis=1) - radii**2 - 2.0 * self.points @ centres.T
+        # Powers without the common |x|² are linear. Which sphere a point belongs to need not be exact.
+        squares = ((centres**2).sum(axis=1) - radii**2).astype(np.float32)
+        twice = (2.0 * centres).astype(np.float32)
+        powers = squares - dot(self._single, twice)
         owners = powers.argmin(axis=1)
         a, b = self._edges.T
         cut = owners[a] != owners[b]
         a, b = a[cut], b[cut]
         before = powers[a, owners[b]] - powers[a, owners[a]]
         after = powers[b, owners[a]] - powers[b, owners[b]]
-        part = before / np.maximum(before + after, 1e-300)
+        part = before / np.maximum(before + after, 1e-30)
         on_edges = self.points[a] + part[:, None] * (self.points[b] - self.points[a])
         own = owners[self._triangles]
         mixed = (own[:, 0] != own[:, 1]) & (own[:, 1] != own[:, 2]) & (own[:, 2] != own[:, 0])
         corners, own = self._triangles[mixed], own[mixed]
         u, v = (powers[corners, own[:, :1]] - powers[corners, own[:, k : k + 1]] for k in (1, 2))
         weights = np.cross(u, v)
-        weights = np.maximum(weights * np.sign(weights.sum(axis=1, keepdims=True)), 0.0) + 1e-300
+        weights = np.maximum(weights * np.sign(weights.sum(axis=1, keepdims=True)), 0.0) + 1e-30
         weights /= weights.sum(axis=1, keepdims=True)
         inside = np.einsum("nk,nkj->nj", weights, self.points[corners])
         points = np.concatenate([self.points, on_edges, inside])
         # Points between two triangles may belong to yet another sphere.
         added = points[len(self.points) :]
-        others = (centres**2).sum(axis=1) - radii**2 - 2.0 * added @ centres.T
+        others = squares - dot(added.astype(np.float32), twice)
         return points, np.concatenate([owners, others.argmin(axis=1)])
 
 

@@ -26,6 +26,7 @@ _ASCENT = 120
 
 _MANY_CORNERS, _DIRECTIONS = 200, 400
 
+_BLOCK = 80_000
 _SAMPLES = 1000
 _SEQUENCE = 1.2207440846057596 ** -np.arange(1.0, 4.0)
 """Steps of the sequence R3 (Roberts 2018), whose points fill the cube evenly."""
@@ -167,7 +168,7 @@ class CoverRegion:
     def part_depths(self, points: Floats) -> Floats:
         """Return the depths (n, P) of points (n, 3) in each solid [m]; negative outside."""
         shape = len(points), *self._offsets.shape
-        flat = (self._offsets.reshape(-1) - points @ self._normals.reshape(-1, 3).T).reshape(shape).min(axis=2)
+        flat = (self._offsets.reshape(-1) - dot(points, self._normals.reshape(-1, 3))).reshape(shape).min(axis=2)
         round_ = self._round_depths(points[:, None], np.arange(len(self.parts)))[0]
         return np.asarray(np.minimum(flat, round_))
 
@@ -175,17 +176,18 @@ class CoverRegion:
         """Return lower bounds (n,) of the depths of points (n, 3) in the union [m]; negative outside."""
         return np.asarray(self.part_depths(points).max(axis=1))
 
-    def slacks(self, points: Floats, owners: Integers) -> tuple[Floats, Floats]:
-        """Return how far points (n, 3) are inside of each side of their solids (n,), and those sides' normals.
+    def nearest_sides(self, points: Floats, owners: Integers, count: int) -> tuple[Floats, Floats]:
+        """Return how far points (n, 3) are inside of the nearest sides of their solids (n,), and the normals there.
 
-        They have the shapes (n, F) and (n, F, 3).
+        They have the shapes (n, F) and (n, F, 3), F at most the count and 1.
         """
-        normals = self._normals[owners]
-        flat = self._offsets[owners] - np.einsum("nfj,nj->nf", normals, points)
+        flat = self._offsets[owners] - np.einsum("nfj,nj->nf", self._normals[owners], points)
+        count, rows = min(count, flat.shape[1]), np.arange(len(points))[:, None]
+        near = np.argpartition(flat, count - 1, axis=1)[:, :count]
         depths, away = self._round_depths(points, owners)
         return (
-            np.concatenate([flat, depths[:, None]], axis=1),
-            np.concatenate([normals, away[:, None]], axis=1),
+            np.concatenate([flat[rows, near], depths[:, None]], axis=1),
+            np.concatenate([self._normals[owners[:, None], near], away[:, None]], axis=1),
         )
 
     def measure_volume(self) -> float:
@@ -215,7 +217,7 @@ class CoverRegion:
         points, widths = self.middles, np.full(len(self.parts), -math.inf)
         steps = np.array([0.5 * float(np.ptp(part.corners, axis=0).max()) for part in self.parts])
         for _ in range(_ASCENT):
-            slacks, normals = self.slacks(points, everyone)
+            slacks, normals = self.nearest_sides(points, everyone, 1)
             nearest = slacks.argmin(axis=1)
             least = slacks[everyone, nearest]
             better = least > widths
@@ -224,6 +226,18 @@ class CoverRegion:
             # From outside, at least to the inner side.
             points = points - normals[everyone, nearest] * np.maximum(steps, -1.1 * least)[:, None]
             steps *= 0.93
+
+
+def dot(points: Floats, others: Floats) -> Floats:
+    """Return the scalar products (n, m) of vectors (n, 3) and (m, 3).
+
+    It is computed in blocks: libraries share a large product among threads, which takes longer if these are busy.
+    """
+    found = np.empty((len(points), len(others)), dtype=points.dtype)
+    rows = max(_BLOCK // max(len(others), 1), 1)
+    for k in range(0, len(points), rows):
+        np.matmul(points[k : k + rows], others.T, out=found[k : k + rows])
+    return found
 
 
 def _sample_inside(part: CoverPolytope, middle: Floats) -> Floats:
