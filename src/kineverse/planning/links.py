@@ -29,7 +29,7 @@ class LinkTable:
     covered
         Of each body, whether it has spheres.
     protrusion
-        Largest distance of a sphere from the shape that it covers [m]; None for what suits the shape.
+        Largest distance of a sphere from the shapes that it covers [m]; None for what suits their size.
 
     Attributes
     ----------
@@ -61,8 +61,8 @@ class LinkTable:
             self.spheres.append(np.zeros((0, 4)))
             if not covered[k]:
                 continue
-            cover, T = cover_objects([item for item, _, _ in items], protrusion), items[0][2]
-            tree = make_sphere_tree(cover.centres @ T[:3, :3].T + T[:3, 3], cover.radii)
+            cover = cover_objects([item for item, _, _ in items], protrusion).move(items[0][2])
+            tree = make_sphere_tree(cover.centres, cover.radii)
             link["coarse"] = len(tree.coarse_radii)
             link["ball"] = *tree.ball_centre, tree.ball_radius
             ends = tree.first.tolist()

@@ -25,7 +25,7 @@ from .cover_mesh import CoverMesh
 from .cover_starts import CoverStarts
 from .polytope import CoverRegion
 
-_ROUNDS, _FEW_ROUNDS, _STEPS = 20, 10, 6
+_ROUNDS, _FEW_ROUNDS, _STEPS = 14, 10, 6
 """Power diagrams of a descent and of a short one, and steps between two of them."""
 
 _WARM, _COLD = 0.2, 0.015
@@ -230,7 +230,7 @@ def _relax(
     owners: Integers,
     temperature: float,
 ) -> Floats:
-    """Return centres in solids (n,) after gradient steps on the smoothed largest need of each sphere's points."""
+    """Return centres in solids (n,) after gradient steps on the smoothed largest need of their points."""
     order = np.argsort(owners, kind="stable")
     points, owners = points[order], owners[order]
     first = np.flatnonzero(np.diff(owners, prepend=-1))

@@ -91,7 +91,7 @@ class CoverMesh:
 
 
 def is_deep_in_others(region: CoverRegion, triangles: Floats, owners: Integers, least: float) -> Flags:
-    """Return flags (n,) of triangles (n, 3, 3) of solids (n,) that are deeper than some length in another one."""
+    """Return flags (n,) of triangles (n, 3, 3) of solids (n,) that are deeper in another one than a length."""
     if len(region.parts) == 1:
         return np.zeros(len(triangles), dtype=bool)
     depths = region.part_depths(triangles.reshape(-1, 3)).reshape(len(triangles), 3, -1).min(axis=1)

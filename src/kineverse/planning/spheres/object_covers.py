@@ -27,9 +27,9 @@ def cover_objects(
     *,
     force: bool = False,
 ) -> SphereCover:
-    """Return the cover of the collision objects of one body, in the frame of the first; see :func:`.cover_solids`.
+    """Return the cover of the collision objects of a body in the frame of the first one.
 
-    It is computed once for equal shapes and settings, and then kept in memory and in the user's cache; with
+    See :func:`.cover_solids`. It is computed once for equal shapes and settings, and then kept in memory and in the user's cache; with
     ``force`` it is computed again.
 
     Raises
@@ -53,7 +53,7 @@ def are_covered(items: Sequence[CollisionObject], protrusion: float | None = Non
 def _request(
     items: Sequence[CollisionObject], protrusion: float | None, most: int
 ) -> tuple[list[tuple[Solid, Floats]], float, str]:
-    """Return the solids of objects with their poses, the protrusion of the cover [m], and the key in the cache."""
+    """Return the solids of objects with their poses, the protrusion of their cover [m], and its key."""
     check_cover_settings(protrusion, most)
     base = np.linalg.inv(items[0].shape.origin.matrix)
     solids: list[tuple[Solid, Floats]] = []
@@ -61,8 +61,8 @@ def _request(
         solid = item.make_solid()
         if not solid.is_convex:
             raise InvalidValueError(
-                f"Shape {item.number} of body '{item.body}' is a triangle mesh, which has no inside for spheres "
-                "to cover: leave the body out of triangles=, so that its hulls are covered."
+                f"Shape {item.number} of body '{item.body}' is a triangle mesh, which has no inside for "
+                "spheres to cover: leave the body out of triangles=, so that its hulls are covered."
             )
         # Zeros have one sign.
         solids.append((solid, np.round(base @ item.shape.origin.matrix, _DIGITS) + 0.0))

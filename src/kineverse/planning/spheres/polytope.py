@@ -1,7 +1,7 @@
 """Solids that spheres shall cover: polytopes around them, and depths of points in them.
 
-A cover of the outer polytopes covers the solids. Depths are exact but for an ellipsoid, which lies between the
-hull of points on its surface and that of points around it; those in the inner hull are lower bounds.
+A cover of the outer polytopes covers the solids. Depths are exact but for an ellipsoid, which lies between
+the hull of points on its surface and that of points around it; those in the inner hull are lower bounds.
 """
 
 from __future__ import annotations
@@ -9,8 +9,10 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
+import numpy.typing as npt
 
 from kineverse.errors import InvalidValueError
 from kineverse.geometry.mesh_files import Faces, Floats, Integers
@@ -168,7 +170,9 @@ class CoverRegion:
     def part_depths(self, points: Floats) -> Floats:
         """Return the depths (n, P) of points (n, 3) in each solid [m]; negative outside."""
         shape = len(points), *self._offsets.shape
-        flat = (self._offsets.reshape(-1) - dot(points, self._normals.reshape(-1, 3))).reshape(shape).min(axis=2)
+        flat = (
+            (self._offsets.reshape(-1) - dot(points, self._normals.reshape(-1, 3))).reshape(shape).min(axis=2)
+        )
         round_ = self._round_depths(points[:, None], np.arange(len(self.parts)))[0]
         return np.asarray(np.minimum(flat, round_))
 
@@ -177,7 +181,7 @@ class CoverRegion:
         return np.asarray(self.part_depths(points).max(axis=1))
 
     def nearest_sides(self, points: Floats, owners: Integers, count: int) -> tuple[Floats, Floats]:
-        """Return how far points (n, 3) are inside of the nearest sides of their solids (n,), and the normals there.
+        """Return how far points (n, 3) are inside of the nearest sides of their solids (n,), and the normals.
 
         They have the shapes (n, F) and (n, F, 3), F at most the count and 1.
         """
@@ -228,10 +232,10 @@ class CoverRegion:
             steps *= 0.93
 
 
-def dot(points: Floats, others: Floats) -> Floats:
+def dot(points: npt.NDArray[Any], others: npt.NDArray[Any]) -> npt.NDArray[Any]:
     """Return the scalar products (n, m) of vectors (n, 3) and (m, 3).
 
-    It is computed in blocks: libraries share a large product among threads, which takes longer if these are busy.
+    It is computed in blocks: libraries share a large product among threads, which may have other work.
     """
     found = np.empty((len(points), len(others)), dtype=points.dtype)
     rows = max(_BLOCK // max(len(others), 1), 1)
@@ -284,7 +288,9 @@ def bound_solid(solid: Solid, protrusion: float) -> CoverPolytope:
         points, widening = _sphere_points(count)
         points *= radius * widening
         side = RoundSide(np.zeros(3), _Z, half, radius)
-        return _bound_round(np.concatenate([points + up, points - up]), disc * (2 * half + 4 / 3 * radius), side)
+        return _bound_round(
+            np.concatenate([points + up, points - up]), disc * (2 * half + 4 / 3 * radius), side
+        )
     angles = 2 * math.pi * np.arange(count) / count
     rim = radius / math.cos(math.pi / count) * np.column_stack([np.cos(angles), np.sin(angles), 0.0 * angles])
     if isinstance(surface, Cylinder):

@@ -56,7 +56,7 @@ class CachedCover:
 
 
 def cover_key(solids: Sequence[tuple[Solid, Floats]], protrusion: float, most: int) -> str:
-    """Return the key of the cover of convex solids at poses, with a protrusion [m] and a number of spheres."""
+    """Return the key of the cover of solids at poses with a protrusion [m] and a number of spheres."""
     digest = hashlib.sha256(f"{_VERSION} {protrusion.hex()} {most}".encode())
     for solid, pose in solids:
         digest.update(f" {type(solid.surface).__name__} ".encode() + pose.tobytes())

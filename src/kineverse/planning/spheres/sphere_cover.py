@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -49,6 +49,12 @@ class SphereCover:
         """Return the number of spheres."""
         return len(self.radii)
 
+    def move(self, pose: Floats) -> SphereCover:
+        """Return the cover with its solids at a pose (4, 4)."""
+        centres: Floats = self.centres @ pose[:3, :3].T + pose[:3, 3]
+        centres.flags.writeable = False
+        return replace(self, centres=centres)
+
 
 def cover_solid(solid: Solid, protrusion: float | None = None, most: int = MOST) -> SphereCover:
     """Return few spheres that cover a convex solid, in its frame; see :func:`cover_solids`."""
@@ -60,8 +66,8 @@ def cover_solids(
 ) -> SphereCover:
     """Return few spheres that cover the union of convex solids at poses (4, 4).
 
-    Every point of the solids lies in a sphere: subdivision proves it, up to rounding. The same solids have the
-    same cover in every run on one machine.
+    Every point of the solids lies in a sphere: subdivision proves it, up to rounding. The same solids have
+    the same cover in every run on one machine.
 
     Parameters
     ----------
@@ -84,10 +90,10 @@ def cover_solids(
     check_cover_settings(protrusion, most)
     # Solids may be longer than any sensible protrusion, and one ball is then enough.
     protrusion = min(protrusion, 2.0 * sum(solid.radius for solid, _ in solids))
-    if len(solids) == 1 and isinstance(solids[0][0].surface, Sphere | Capsule):
-        solid, pose = solids[0]
-        centres, radii, reached = _capsule_chain(solid.surface, protrusion, most)
-        return _make_cover(centres @ pose[:3, :3].T + pose[:3, 3], radii, reached, _volume(solids))
+    (first, pose), *others = solids
+    if isinstance(first.surface, Sphere | Capsule) and not others:
+        centres, radii, reached = _capsule_chain(first.surface, protrusion, most)
+        return _make_cover(centres, radii, reached, _volume(solids)).move(pose)
     parts = [bound_solid(solid, protrusion).move(pose) for solid, pose in solids]
     corners = np.concatenate([part.corners for part in parts])
     low, high = corners.min(axis=0), corners.max(axis=0)

@@ -13,7 +13,6 @@ from kineverse.errors import InvalidValueError, ShapeError
 from kineverse.geometry.mesh_files import Floats, Integers
 
 _ALWAYS_FLAT = 4
-_COARSE = 1.0
 _LLOYD_ROUNDS = 10
 _BALL_STEPS = 100
 _ROUNDING = 1e-9
@@ -71,7 +70,7 @@ def make_sphere_tree(centres: npt.ArrayLike, radii: npt.ArrayLike) -> SphereTree
         return SphereTree(
             where, sizes, order, where, sizes, np.arange(len(sizes) + 1), ball_centre, ball_radius
         )
-    clusters = _cluster(where, sizes, max(1, round(_COARSE * math.sqrt(len(sizes)))))
+    clusters = _cluster(where, sizes, round(math.sqrt(len(sizes))))
     order = np.argsort(clusters, kind="stable")
     where, sizes, clusters = where[order], sizes[order], clusters[order]
     first = np.append(np.flatnonzero(np.diff(clusters, prepend=-1)), len(sizes))
