@@ -14,7 +14,7 @@ import numpy as np
 
 from kineverse.geometry.mesh_files import Floats, Integers
 
-from .polytope import CoverRegion, dot
+from .polytope import CoverRegion, scalar_products
 
 _EDGES = np.array([[0, 1], [0, 2], [0, 3], [1, 2], [1, 3], [2, 3]])
 _MOST_CELLS = 60_000
@@ -116,5 +116,5 @@ def _measure_gaps(
 def distances(points: Floats, centres: Floats) -> Floats:
     """Return the distances (n, N) of points (n, 3) from centres (N, 3) [m]."""
     square: Floats = np.square(points).sum(axis=1)[:, None] + np.square(centres).sum(axis=1)
-    square -= dot(2.0 * points, centres)
+    square -= scalar_products(2.0 * points, centres)
     return np.sqrt(np.maximum(square, 0.0, out=square), out=square)

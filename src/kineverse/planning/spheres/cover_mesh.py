@@ -18,7 +18,7 @@ import numpy.typing as npt
 
 from kineverse.geometry.mesh_files import Floats, Integers
 
-from .polytope import CoverRegion, dot
+from .polytope import CoverRegion, scalar_products
 
 Flags: TypeAlias = npt.NDArray[np.bool_]
 
@@ -66,7 +66,7 @@ class CoverMesh:
         # Powers without the common |x|² are linear. Which sphere a point belongs to need not be exact.
         squares = ((centres**2).sum(axis=1) - radii**2).astype(np.float32)
         twice = (2.0 * centres).astype(np.float32)
-        powers = squares - dot(self._single, twice)
+        powers = squares - scalar_products(self._single, twice)
         owners = powers.argmin(axis=1)
         a, b = self._edges.T
         cut = owners[a] != owners[b]
@@ -86,12 +86,12 @@ class CoverMesh:
         points = np.concatenate([self.points, on_edges, inside])
         # Points between two triangles may belong to yet another sphere.
         added = points[len(self.points) :]
-        others = squares - dot(added.astype(np.float32), twice)
+        others = squares - scalar_products(added.astype(np.float32), twice)
         return points, np.concatenate([owners, others.argmin(axis=1)])
 
 
 def is_deep_in_others(region: CoverRegion, triangles: Floats, owners: Integers, least: float) -> Flags:
-    """Return flags (n,) of triangles (n, 3, 3) of solids (n,) that are deeper in another one than a length."""
+    """Return flags (n,) of triangles (n, 3, 3) of solids (n,) deeper in another one than a length."""
     if len(region.parts) == 1:
         return np.zeros(len(triangles), dtype=bool)
     depths = region.part_depths(triangles.reshape(-1, 3)).reshape(len(triangles), 3, -1).min(axis=1)

@@ -29,8 +29,8 @@ def cover_objects(
 ) -> SphereCover:
     """Return the cover of the collision objects of a body in the frame of the first one.
 
-    See :func:`.cover_solids`. It is computed once for equal shapes and settings, and then kept in memory and in the user's cache; with
-    ``force`` it is computed again.
+    See :func:`.cover_solids`. It is computed once for equal shapes and settings, and then kept in memory and
+    in the user's cache; with ``force`` it is computed again.
 
     Raises
     ------

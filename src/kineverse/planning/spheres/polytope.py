@@ -171,7 +171,9 @@ class CoverRegion:
         """Return the depths (n, P) of points (n, 3) in each solid [m]; negative outside."""
         shape = len(points), *self._offsets.shape
         flat = (
-            (self._offsets.reshape(-1) - dot(points, self._normals.reshape(-1, 3))).reshape(shape).min(axis=2)
+            (self._offsets.reshape(-1) - scalar_products(points, self._normals.reshape(-1, 3)))
+            .reshape(shape)
+            .min(axis=2)
         )
         round_ = self._round_depths(points[:, None], np.arange(len(self.parts)))[0]
         return np.asarray(np.minimum(flat, round_))
@@ -232,7 +234,7 @@ class CoverRegion:
             steps *= 0.93
 
 
-def dot(points: npt.NDArray[Any], others: npt.NDArray[Any]) -> npt.NDArray[Any]:
+def scalar_products(points: npt.NDArray[Any], others: npt.NDArray[Any]) -> npt.NDArray[Any]:
     """Return the scalar products (n, m) of vectors (n, 3) and (m, 3).
 
     It is computed in blocks: libraries share a large product among threads, which may have other work.
