@@ -35,7 +35,7 @@ shapes and the settings.
 
 "protrusion" is the largest distance of a sphere's points from the shapes, "excess" the volume of the spheres
 over that of the shapes, minus 1. By default spheres stick out by a tenth of the size of a link, from 5 mm to
-25 mm, or by more where the largest number of spheres would not do.
+25 mm; by up to 25 mm where more than 48 spheres would be needed; or by more where all would not do.
 
 The exit status is 0 if all went well, 1 if a link could not be covered.
 
@@ -77,7 +77,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     add_model_options(parser)
     parser.add_argument("--links", metavar="LINK", nargs="+", help="only the shapes of these links")
     parser.add_argument("--protrusion", metavar="M", help="how far spheres may stick out: 0.005, 5mm")
-    parser.add_argument("--most", metavar="N", type=int, help="largest number of spheres of a link (64)")
+    parser.add_argument("--most", metavar="N", type=int, help="largest number of spheres of a link (128)")
     parser.add_argument("--decomposed", action="store_true", help="cover the hulls of kineverse decompose")
     parser.add_argument("--force", action="store_true", help="compute cached covers again")
     parser.add_argument("--json", action="store_true", help="everything, as one JSON object")

@@ -135,8 +135,10 @@ def _search_start(
     wanted = max(1.2 * aim, least)
     tried: set[int] = set()
     for _ in range(_TRIALS):
-        centres = start.greedy(wanted)
-        if len(centres) in tried or len(centres) > most:
+        # A greedy choice may need more spheres for a larger protrusion.
+        while len(centres := start.greedy(wanted)) > most:
+            wanted *= 1.1
+        if len(centres) in tried:
             break
         tried.add(len(centres))
         found = descend(problem, centres, aim, _FEW_ROUNDS)

@@ -14,7 +14,7 @@ from kineverse.geometry.shapes import Solid
 from kineverse.model.body import Mesh
 
 from .sphere_cache import cover_key, find_cover, keep_cover
-from .sphere_cover import MOST, SphereCover, check_cover_settings, cover_solids, default_protrusion
+from .sphere_cover import MOST, SphereCover, check_cover_settings, cover_solids
 
 _DIGITS = 12
 """Digits to which poses in a body are told apart."""
@@ -37,23 +37,23 @@ def cover_objects(
     KineverseError
         If a shape cannot be used, or is a triangle mesh; the message names the body.
     """
-    solids, wanted, key = _request(items, protrusion, most)
+    solids, key = _request(items, protrusion, most)
     found = None if force else find_cover(key)
     if found is None:
-        found = cover_solids(solids, wanted, most)
+        found = cover_solids(solids, protrusion, most)
         keep_cover(key, _name(items), found)
     return found
 
 
 def are_covered(items: Sequence[CollisionObject], protrusion: float | None = None, most: int = MOST) -> bool:
     """Return True if the cover of collision objects is kept; for errors see :func:`cover_objects`."""
-    return find_cover(_request(items, protrusion, most)[2]) is not None
+    return find_cover(_request(items, protrusion, most)[1]) is not None
 
 
 def _request(
     items: Sequence[CollisionObject], protrusion: float | None, most: int
-) -> tuple[list[tuple[Solid, Floats]], float, str]:
-    """Return the solids of objects with their poses, the protrusion of their cover [m], and its key."""
+) -> tuple[list[tuple[Solid, Floats]], str]:
+    """Return the solids of objects with their poses, and the key of their cover."""
     check_cover_settings(protrusion, most)
     base = np.linalg.inv(items[0].shape.origin.matrix)
     solids: list[tuple[Solid, Floats]] = []
@@ -66,8 +66,7 @@ def _request(
             )
         # Zeros have one sign.
         solids.append((solid, np.round(base @ item.shape.origin.matrix, _DIGITS) + 0.0))
-    wanted = default_protrusion(solids) if protrusion is None else protrusion
-    return solids, wanted, cover_key(solids, wanted, most)
+    return solids, cover_key(solids, protrusion, most)
 
 
 def _name(items: Sequence[CollisionObject]) -> str:

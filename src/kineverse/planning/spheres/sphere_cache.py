@@ -55,9 +55,9 @@ class CachedCover:
     bytes: int
 
 
-def cover_key(solids: Sequence[tuple[Solid, Floats]], protrusion: float, most: int) -> str:
+def cover_key(solids: Sequence[tuple[Solid, Floats]], protrusion: float | None, most: int) -> str:
     """Return the key of the cover of solids at poses with a protrusion [m] and a number of spheres."""
-    digest = hashlib.sha256(f"{_VERSION} {protrusion.hex()} {most}".encode())
+    digest = hashlib.sha256(f"{_VERSION} {protrusion} {most}".encode())
     for solid, pose in solids:
         digest.update(f" {type(solid.surface).__name__} ".encode() + pose.tobytes())
         if isinstance(solid.surface, Hull):

@@ -17,8 +17,8 @@ from .cover_fit import FittedSpheres, fit_spheres
 from .polytope import CoverRegion, bound_solid
 from .union_volume import union_volume
 
-MOST = 64
-"""Default largest number of spheres of a cover."""
+MOST, FEW = 128, 48
+"""Default largest numbers of spheres of a cover: of any, and of one that protrudes no further than 25 mm."""
 
 PROTRUSION_OF_SIZE, LEAST_PROTRUSION, LARGEST_PROTRUSION = 0.1, 5e-3, 25e-3
 """Default protrusion, as a fraction of the edge of a cube with the volume of the solid; its bounds [m]."""
@@ -74,8 +74,9 @@ def cover_solids(
     solids
         The solids with their poses.
     protrusion
-        Largest distance of a point of a sphere from the union [m]; None for :func:`default_protrusion`. It is
-        exceeded where ``most`` spheres are not enough; :attr:`SphereCover.protrusion` has what was reached.
+        Largest distance of a point of a sphere from the union [m]; None for :func:`default_protrusion`, or up
+        to 25 mm where 48 spheres are not enough. It is exceeded where ``most`` spheres are not enough;
+        :attr:`SphereCover.protrusion` has what was reached.
     most
         Largest number of spheres.
 
@@ -85,9 +86,17 @@ def cover_solids(
         For a triangle mesh, which has no inside; or if the protrusion is not a positive length, or ``most``
         not between 1 and 1024.
     """
-    if protrusion is None:
-        protrusion = default_protrusion(solids)
     check_cover_settings(protrusion, most)
+    if protrusion is not None:
+        return _cover(solids, protrusion, most)
+    cover = _cover(solids, default_protrusion(solids), min(most, FEW))
+    if cover.protrusion <= LARGEST_PROTRUSION or most <= FEW:
+        return cover
+    return _cover(solids, LARGEST_PROTRUSION, most)
+
+
+def _cover(solids: Sequence[tuple[Solid, Floats]], protrusion: float, most: int) -> SphereCover:
+    """Return few spheres that cover the union of convex solids, for :func:`cover_solids`."""
     # Solids may be longer than any sensible protrusion, and one ball is then enough.
     protrusion = min(protrusion, 2.0 * sum(solid.radius for solid, _ in solids))
     (first, pose), *others = solids
