@@ -79,7 +79,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     add_model_options(parser)
     parser.add_argument("--links", metavar="LINK", nargs="+", help="only the shapes of these links")
     parser.add_argument("--protrusion", metavar="M", help="how far spheres may stick out: 0.005, 5mm")
-    parser.add_argument("--most", metavar="N", type=int, help="largest number of spheres of a link (128)")
+    parser.add_argument("--most", metavar="N", type=int, help="largest number of spheres of a link (48)")
     parser.add_argument("--decomposed", action="store_true", help="cover the hulls of kineverse decompose")
     add_cache_options(parser, "compute cached covers again")
     parser.add_argument("--view", action="store_true", help="show model and spheres in the browser")

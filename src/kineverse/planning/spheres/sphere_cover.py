@@ -17,8 +17,8 @@ from .cover_fit import FittedSpheres, fit_spheres
 from .polytope import CoverRegion, bound_solid, solid_volume
 from .union_volume import union_volume
 
-MOST, FEW = 128, 48
-"""Default largest numbers of spheres of a cover: of any, and of one that protrudes no further than 25 mm."""
+MOST = 48
+"""Default largest number of spheres of a cover."""
 
 PROTRUSION_OF_SIZE, LEAST_PROTRUSION, LARGEST_PROTRUSION = 0.1, 5e-3, 25e-3
 """Default protrusion, as a fraction of the edge of a cube with the volume of the solid; its bounds [m]."""
@@ -74,9 +74,8 @@ def cover_solids(
     solids
         The solids with their poses.
     protrusion
-        Largest distance of a point of a sphere from the union [m]; None for :func:`default_protrusion`, or up
-        to 25 mm where 48 spheres are not enough. It is exceeded where ``most`` spheres are not enough;
-        :attr:`SphereCover.protrusion` has what was reached.
+        Largest distance of a point of a sphere from the union [m]; None for :func:`default_protrusion`. It is
+        exceeded where ``most`` spheres are not enough; :attr:`SphereCover.protrusion` has what was reached.
     most
         Largest number of spheres.
 
@@ -89,18 +88,11 @@ def cover_solids(
     check_cover_settings(protrusion, most)
     spheres = [(pose, solid.surface) for solid, pose in solids if isinstance(solid.surface, Sphere)]
     if len(spheres) == len(solids) <= most:
-        centres, radii = [pose[:3, 3] for pose, _ in spheres], [sphere.radius for _, sphere in spheres]
-        return _make_cover(np.array(centres), np.array(radii, dtype=float), 0.0, _volume(solids))
-    if protrusion is not None:
-        return _cover(solids, protrusion, most)
-    cover = _cover(solids, default_protrusion(solids), min(most, FEW))
-    if cover.protrusion <= LARGEST_PROTRUSION or most <= FEW:
-        return cover
-    return _cover(solids, LARGEST_PROTRUSION, most)
-
-
-def _cover(solids: Sequence[tuple[Solid, Floats]], protrusion: float, most: int) -> SphereCover:
-    """Return few spheres that cover the union of convex solids, for :func:`cover_solids`."""
+        places = np.array([pose[:3, 3] for pose, _ in spheres])
+        sizes = np.array([sphere.radius for _, sphere in spheres], dtype=float)
+        return _make_cover(places, sizes, 0.0, _volume(solids))
+    if protrusion is None:
+        protrusion = default_protrusion(solids)
     # Solids may be longer than any sensible protrusion, and one ball is then enough.
     protrusion = min(protrusion, 2.0 * sum(solid.radius for solid, _ in solids))
     (first, pose), *others = solids
