@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field
+from time import perf_counter
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -47,6 +48,21 @@ def attempt_with_kineverse(
     """Return the attempt of our planner, whose obstacles are placed."""
     path = planner.plan(start, goals, seconds=seconds, seed=seed)
     return Attempt(path.found, path.search_seconds, path.seconds, path.points, path.why)
+
+
+def attempt_first_path(planner: Planner, start: Array, goal: Array, seconds: float, seed: int) -> Attempt:
+    """Return the attempt of our search alone: its path is neither shortened nor judged, as those of peers."""
+    from kineverse.planning.search import RrtConnect
+
+    # The goals of the planner: the given one where it is nearest, and full turns away from there.
+    nearest = planner.space.equivalents(goal, start, most=1)
+    planner.planning_scene.set_bounds(start, nearest)
+    variants = planner.space.equivalents(nearest[0], start)
+    starts, goals = (np.ascontiguousarray(Q, dtype=np.float32) for Q in (start[None], variants))
+    begin = perf_counter()
+    found = RrtConnect(planner.checker).solve(starts, goals, seconds, seed)
+    spent = perf_counter() - begin
+    return Attempt(found.found, spent, spent, found.points.astype(float))
 
 
 @dataclass(frozen=True)

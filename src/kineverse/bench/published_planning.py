@@ -5,17 +5,13 @@ from __future__ import annotations
 import importlib
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass
-from time import perf_counter
 from types import MappingProxyType
 from typing import Any
 
-import numpy as np
-
 from kineverse.planning import Planner
-from kineverse.planning.search import RrtConnect
 
 from .harness import Progress, has_peer
-from .planning_attempts import Attempt, AttemptSummary, attempt_with_kineverse
+from .planning_attempts import Attempt, AttemptSummary, attempt_first_path, attempt_with_kineverse
 from .planning_problems import ProblemSet, PublishedProblem, load_problem_sets
 from .result import Bar, Comparison
 
@@ -106,17 +102,9 @@ def _planners(problems: ProblemSet) -> Iterator[tuple[str, tuple[Place, Plan]]]:
         return attempt_with_kineverse(planner, problem.start, problem.goal, SECONDS, seed)
 
     def search(problem: PublishedProblem, seed: int) -> Attempt:
-        # The goals of the planner: the given one where it is nearest, and full turns away from there.
-        nearest = planner.space.equivalents(problem.goal, problem.start, most=1)[0]
-        variants = planner.space.equivalents(nearest, problem.start)
-        start, goals = (np.ascontiguousarray(Q, dtype=np.float32) for Q in (problem.start[None], variants))
-        begin = perf_counter()
-        found = RrtConnect(planner.checker).solve(start, goals, SECONDS, seed)
-        seconds = perf_counter() - begin
-        return Attempt(found.found, seconds, seconds)
+        return attempt_first_path(planner, problem.start, problem.goal, SECONDS, seed)
 
     yield OURS, (lambda problem: planner.place(problem.state), plan)
-    # After the planner, which sets the limits.
     yield SEARCH, (lambda problem: None, search)
     if has_peer(VAMP):
         module: Any = importlib.import_module(f"{__package__}.peers.vamp_rrt_connect")
