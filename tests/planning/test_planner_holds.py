@@ -159,7 +159,7 @@ def test_latch_is_not_slipped_through():
     assert pressed, pressed.why
 
 
-def test_door_without_spheres_stops_at_a_pin():
+def test_door_stops_at_a_pin():
     model = kv.Model()
     with model.edit() as edit:
         edit.apply(kv.Revolute(name="door", parent="world", child="door", axis=(0, 0, 1), lower=0, upper=2))
@@ -167,7 +167,6 @@ def test_door_without_spheres_stops_at_a_pin():
         place = kv.translation(0.9 * np.cos(1), 0.9 * np.sin(1), 0)
         edit.add_frame("pin", "world", place, body(Cylinder(0.002, 0.2)))
     planner = Planner(model)
-    assert not planner.checker.links.links["coarse"].any()
     for k in range(20):
         assert not planner.plan([0.002 * k], [1.5 + 0.01 * k], seconds=0.02)
     assert planner.plan([0.0], [0.9])

@@ -9,7 +9,7 @@ import kineverse as kv
 from kineverse.errors import InvalidValueError
 from kineverse.geometry.objects import CollisionObjects
 from kineverse.model.body import Body, Box, Mesh, Shape
-from kineverse.planning.spheres import cover_object, make_sphere_tree, object_covers, sphere_cache
+from kineverse.planning.spheres import cover_objects, make_sphere_tree, object_covers, sphere_cache
 from kineverse.planning.spheres.sphere_cache import cover_key, find_or_make_tree
 
 
@@ -35,32 +35,32 @@ def collision_object(geometry, triangles=()):
 def fits(monkeypatch):
     """Count the covers that are computed."""
     made = []
-    original = object_covers.cover_solid
+    original = object_covers.cover_solids
 
     def count(*arguments):
         made.append(arguments)
         return original(*arguments)
 
-    monkeypatch.setattr(object_covers, "cover_solid", count)
+    monkeypatch.setattr(object_covers, "cover_solids", count)
     return made
 
 
 def test_equal_shapes_and_settings_are_covered_once(fits):
-    first = cover_object(collision_object(Box((0.1, 0.1, 0.1))), 0.02)
-    assert cover_object(collision_object(Box((0.1, 0.1, 0.1))), 0.02) is first
+    first = cover_objects([collision_object(Box((0.1, 0.1, 0.1)))], 0.02)
+    assert cover_objects([collision_object(Box((0.1, 0.1, 0.1)))], 0.02) is first
     assert len(fits) == 1
-    cover_object(collision_object(Box((0.1, 0.1, 0.1))), 0.03)
-    cover_object(collision_object(Box((0.1, 0.1, 0.1))), 0.02, 4)
-    cover_object(collision_object(Box((0.1, 0.1, 0.11))), 0.02)
+    cover_objects([collision_object(Box((0.1, 0.1, 0.1)))], 0.03)
+    cover_objects([collision_object(Box((0.1, 0.1, 0.1)))], 0.02, 4)
+    cover_objects([collision_object(Box((0.1, 0.1, 0.11)))], 0.02)
     assert len(fits) == 4
-    cover_object(collision_object(Box((0.1, 0.1, 0.1))), 0.02, force=True)
+    cover_objects([collision_object(Box((0.1, 0.1, 0.1)))], 0.02, force=True)
     assert len(fits) == 5
 
 
 def test_the_disk_gives_back_the_same_cover(fits):
-    first = cover_object(collision_object(Box((0.1, 0.1, 0.1))), 0.02)
+    first = cover_objects([collision_object(Box((0.1, 0.1, 0.1)))], 0.02)
     sphere_cache._in_memory.clear()
-    again = cover_object(collision_object(Box((0.1, 0.1, 0.1))), 0.02)
+    again = cover_objects([collision_object(Box((0.1, 0.1, 0.1)))], 0.02)
     assert len(fits) == 1
     assert np.array_equal(again.centres, first.centres)
     assert np.array_equal(again.radii, first.radii)
@@ -98,11 +98,11 @@ def test_trees_are_kept_by_solids_poses_and_settings():
 
 @pytest.mark.parametrize("damage", [b"", b"nonsense", None])
 def test_damaged_files_count_as_absent(fits, folder, damage, caplog):
-    cover_object(collision_object(Box((0.1, 0.1, 0.1))), 0.02)
+    cover_objects([collision_object(Box((0.1, 0.1, 0.1)))], 0.02)
     sphere_cache._in_memory.clear()
     (file,) = (folder / "spheres").glob("*.spheres")
     file.write_bytes(file.read_bytes()[:-40] if damage is None else damage)
-    cover_object(collision_object(Box((0.1, 0.1, 0.1))), 0.02)
+    cover_objects([collision_object(Box((0.1, 0.1, 0.1)))], 0.02)
     assert len(fits) == 2
     assert "damaged" in caplog.text
 
@@ -110,7 +110,7 @@ def test_damaged_files_count_as_absent(fits, folder, damage, caplog):
 def test_the_cache_is_bounded_and_can_be_emptied(monkeypatch):
     monkeypatch.setattr(sphere_cache.COVERS, "most_bytes", 500)
     for k in range(5):
-        cover_object(collision_object(Box((0.1, 0.1, 0.1 + 0.01 * k))), 0.2)
+        cover_objects([collision_object(Box((0.1, 0.1, 0.1 + 0.01 * k)))], 0.2)
     assert 0 < len(sphere_cache.list_covers()) < 5
     assert sphere_cache.clear_covers() > 0
     assert not sphere_cache.list_covers()
@@ -127,5 +127,5 @@ def test_triangle_meshes_are_refused(tmp_path):
     path.write_text("\n".join([*lines, "endsolid x"]))
     mesh = Mesh(str(path), (0.1, 0.1, 0.1))
     with pytest.raises(InvalidValueError, match="body 'part' is a triangle mesh"):
-        cover_object(collision_object(mesh, triangles=["part"]))
-    assert len(cover_object(collision_object(mesh))) > 1
+        cover_objects([collision_object(mesh, triangles=["part"])])
+    assert len(cover_objects([collision_object(mesh)])) > 1

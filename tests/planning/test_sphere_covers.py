@@ -11,9 +11,9 @@ from hypothesis import strategies as st
 from kineverse.errors import InvalidValueError, ShapeError
 from kineverse.geometry.shapes import Solid, scale_solid, solid_from_geometry, solid_from_points
 from kineverse.model.body import Box, Capsule, Cone, Cylinder, Ellipsoid, Sphere
-from kineverse.planning.spheres import cover_solid, default_protrusion, measure_cover
+from kineverse.planning.spheres import cover_solid, cover_solids, default_protrusion, measure_cover
 from kineverse.planning.spheres.certificate import find_uncovered
-from kineverse.planning.spheres.polytope import bound_solid
+from kineverse.planning.spheres.polytope import CoverRegion, bound_solid
 from kineverse.planning.spheres.union_volume import union_volume
 
 KINDS = ("box", "hull", "cylinder", "cone", "ellipsoid", "capsule", "sphere")
@@ -66,22 +66,29 @@ def distances_outside(centres: np.ndarray, radii: np.ndarray, points: np.ndarray
     return (np.linalg.norm(points[:, None] - centres, axis=2) - radii).min(axis=1)
 
 
-def protrusions_by_coal(solid: Solid, centres: np.ndarray, radii: np.ndarray, points: np.ndarray) -> float:
-    """Return the largest distance from the solid of points on spheres, by coal."""
-    largest = 0.0
-    for centre, radius in zip(centres, radii, strict=True):
-        for point in centre + radius * points:
-            result = coal.DistanceResult()
-            coal.distance(
-                solid.engine,
-                coal.Transform3s.Identity(),
-                coal.Sphere(1e-9),
-                coal.Transform3s(np.eye(3), point),
-                coal.DistanceRequest(),
-                result,
-            )
-            largest = max(largest, result.min_distance)
-    return largest
+def protrusions_by_coal(placed, centres: np.ndarray, radii: np.ndarray, points: np.ndarray) -> float:
+    """Return the largest distance from solids at poses of points on spheres, by coal."""
+
+    def distance(solid: Solid, pose: np.ndarray, point: np.ndarray) -> float:
+        result, place = (
+            coal.DistanceResult(),
+            coal.Transform3s(np.eye(3), pose[:3, :3].T @ (point - pose[:3, 3])),
+        )
+        here, ball = coal.Transform3s.Identity(), coal.Sphere(1e-9)
+        coal.distance(solid.engine, here, ball, place, coal.DistanceRequest(), result)
+        return result.min_distance
+
+    return max(
+        min(distance(solid, pose, point) for solid, pose in placed)
+        for centre, radius in zip(centres, radii, strict=True)
+        for point in centre + radius * points
+    )
+
+
+def random_directions(count: int) -> np.ndarray:
+    """Return random unit vectors (count, 3)."""
+    directions = np.random.default_rng(2).normal(size=(count, 3))
+    return directions / np.linalg.norm(directions, axis=1, keepdims=True)
 
 
 @settings(max_examples=12, deadline=None)
@@ -90,12 +97,10 @@ def test_cover_solid_contains_the_solid_and_keeps_to_its_protrusion(solid, protr
     cover = cover_solid(solid, protrusion, most)
     points = sample(solid, 400)
     assert distances_outside(cover.centres, cover.radii, points).max() <= 1e-9
-    directions = np.random.default_rng(2).normal(size=(6, 3))
-    directions /= np.linalg.norm(directions, axis=1, keepdims=True)
-    reached = protrusions_by_coal(solid, cover.centres, cover.radii, directions)
+    reached = protrusions_by_coal([(solid, np.eye(4))], cover.centres, cover.radii, random_directions(6))
     assert reached <= cover.protrusion + 1e-6
     assert len(cover) <= most
-    wanted = default_protrusion(solid) if protrusion is None else protrusion
+    wanted = default_protrusion([(solid, np.eye(4))]) if protrusion is None else protrusion
     assert cover.protrusion <= wanted + 1e-9 or len(cover) >= 0.6 * most
     assert cover.excess >= 0.0
 
@@ -109,6 +114,39 @@ def test_cover_solid_scales_with_the_solid(seed, factor):
     one, other = cover_solid(solid, 0.05), cover_solid(large, 0.05 * factor)
     assert other.protrusion <= 0.05 * factor * (1 + 1e-9)
     assert abs(len(one) - len(other)) <= 0.25 * len(one) + 1
+
+
+@settings(max_examples=3, deadline=None)
+@given(st.lists(st.tuples(solids(), st.integers(0, 1000)), min_size=2, max_size=3), st.sampled_from([6, 64]))
+def test_cover_solids_contains_the_union_and_keeps_to_its_protrusion(drawn, most):
+    placed = []
+    for solid, seed in drawn:
+        pose, random = np.eye(4), np.random.default_rng(seed)
+        pose[:3, :3] = np.linalg.qr(random.normal(size=(3, 3)))[0]
+        pose[:3, 3] = random.uniform(-0.1, 0.1, 3) - pose[:3, :3] @ solid.centre
+        placed.append((solid, pose))
+    cover = cover_solids(placed, 0.04, most)
+    assert len(cover) <= most
+    assert cover.protrusion <= 0.04 + 1e-9 or len(cover) >= 0.6 * most
+    for solid, pose in placed:
+        points = sample(solid, 300) @ pose[:3, :3].T + pose[:3, 3]
+        assert distances_outside(cover.centres, cover.radii, points).max() <= 1e-9
+    reached = protrusions_by_coal(placed, cover.centres, cover.radii, random_directions(6))
+    assert reached <= cover.protrusion + 1e-6
+
+
+def test_shapes_inside_of_others_need_no_spheres():
+    box = solid_from_geometry(Box((0.2, 0.2, 0.2)))
+    inside = solid_from_geometry(Cylinder(0.05, 0.1))
+    aside = np.eye(4)
+    aside[0, 3] = 0.02
+    alone, both = (
+        cover_solids([(box, np.eye(4))], 0.03),
+        cover_solids([(box, np.eye(4)), (inside, aside)], 0.03),
+    )
+    assert len(both) <= 1.25 * len(alone)
+    assert both.protrusion <= 0.03
+    assert both.excess == pytest.approx(alone.excess, abs=0.1)
 
 
 def test_cover_solid_is_deterministic():
@@ -153,7 +191,7 @@ def test_cover_solid_covers_a_cube_by_few_spheres():
 )
 def test_cover_solid_covers_degenerate_hulls(points):
     solid = solid_from_points(points.astype(float))
-    cover = cover_solid(solid)
+    cover = cover_solid(solid, most=32)
     assert distances_outside(cover.centres, cover.radii, sample(solid, 500)).max() <= 1e-9
     assert len(cover) <= 32
 
@@ -169,14 +207,14 @@ def test_cover_solid_refuses_impossible_settings(settings_, part):
 
 def test_find_uncovered_finds_a_gap_between_spheres():
     """Two balls about a bar leave its middle; the least growth that closes the gap is known."""
-    polytope = bound_solid(solid_from_geometry(Box((0.4, 0.02, 0.02))), 0.01)
+    region = CoverRegion([bound_solid(solid_from_geometry(Box((0.4, 0.02, 0.02))), 0.01)])
     centres, radii = np.array([[-0.1, 0, 0], [0.1, 0, 0]]), np.full(2, 0.09)
-    uncovered = find_uncovered(polytope, centres, radii, 1e-4)
+    uncovered = find_uncovered(region, centres, radii, 1e-4)
     needed = np.linalg.norm([0.1, 0.01, 0.01]) - 0.09
     assert uncovered.growth.max() >= needed
     assert uncovered.growth.max() <= needed + 2e-4
     assert distances_outside(centres, radii, uncovered.points).min() > 0.0
-    grown = find_uncovered(polytope, centres, radii + uncovered.growth, 1e-4)
+    grown = find_uncovered(region, centres, radii + uncovered.growth, 1e-4)
     assert not len(grown.points)
 
 

@@ -272,7 +272,7 @@ def test_overlaid_parts_move_with_their_frames_and_survive_edits():
     frame = next(iter(model.bodies))
     cover = cover_solid(solid_from_geometry(Box((0.1, 0.1, 0.1))), 0.03)
     with view(model, port=0) as page:
-        page.show_overlay([draw_cover(frame, cover, np.eye(4)), draw_cover("gone", cover, np.eye(4))])
+        page.show_overlay([draw_cover(frame, cover), draw_cover("gone", cover)])
         (node,) = page._scene._overlay_nodes
         assert node.name.startswith(page._scene._nodes[frame].name)
         page.refresh()

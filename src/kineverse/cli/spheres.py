@@ -7,7 +7,7 @@ import json
 import sys
 import time
 from collections.abc import Iterable, Iterator, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
 from kineverse.cli.arguments import (
@@ -31,14 +31,15 @@ if TYPE_CHECKING:
 
 HELP = """cover collision shapes by spheres, and show how far these stick out
 
-Every point of a shape lies in a sphere. Meshes are covered as the convex hulls that distances are computed
-to. The spheres are stored in the user's cache by the content of the shape and the settings.
+Every point of a shape lies in a sphere; the shapes of a link are covered together. Meshes are covered as the
+convex hulls that distances are computed to. The spheres are stored in the user's cache by the content of the
+shapes and the settings.
 
-"protrusion" is the largest distance of a sphere's points from the shape, "excess" the volume of the spheres
-over that of the shapes, minus 1. By default spheres stick out by a tenth of the size of a shape, from 5 mm to
-25 mm, or by more where the largest number of spheres would not do.
+"protrusion" is the largest distance of a sphere's points from the shapes, "excess" the volume of the spheres
+over that of the shapes, minus 1. By default spheres stick out by a tenth of the size of a link, from 5 mm to
+25 mm; by up to 25 mm where more than 48 spheres would be needed; or by more where all would not do.
 
-The exit status is 0 if all went well, 1 if a shape could not be covered.
+The exit status is 0 if all went well, 1 if a link could not be covered.
 
 examples:
   kineverse spheres fetch
@@ -50,33 +51,26 @@ WRONG_SHAPE = 1
 
 
 @dataclass
-class LinkCovers:
-    """Covers of the shapes of a link.
+class LinkCover:
+    """Cover of the shapes of a link.
 
     Attributes
     ----------
-    covers
-        Covered shapes.
-    errors
-        Reasons of shapes that cannot be covered.
+    items
+        The shapes.
+    cover
+        Their cover, in the frame of the link; None if there is none.
+    error
+        Why there is none.
     seconds
-        Computation time [s]; 0 if all covers were cached.
+        Computation time [s]; 0 for a cover that was cached.
     """
 
     link: str
-    covers: list[tuple[CollisionObject, SphereCover]] = field(default_factory=list)
-    errors: list[str] = field(default_factory=list)
+    items: Sequence[CollisionObject]
+    cover: SphereCover | None = None
+    error: str = ""
     seconds: float = 0.0
-
-    @property
-    def count(self) -> int:
-        """Number of spheres."""
-        return sum(len(cover) for _, cover in self.covers)
-
-    @property
-    def protrusion(self) -> float:
-        """Largest protrusion [m]."""
-        return max((cover.protrusion for _, cover in self.covers), default=0.0)
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -87,7 +81,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     add_model_options(parser)
     parser.add_argument("--links", metavar="LINK", nargs="+", help="only the shapes of these links")
     parser.add_argument("--protrusion", metavar="M", help="how far spheres may stick out: 0.005, 5mm")
-    parser.add_argument("--most", metavar="N", type=int, help="largest number of spheres of a shape (32)")
+    parser.add_argument("--most", metavar="N", type=int, help="largest number of spheres of a link (48)")
     parser.add_argument("--decomposed", action="store_true", help="cover the hulls of kineverse decompose")
     add_cache_options(parser, "compute cached covers again")
     parser.add_argument("--view", action="store_true", help="show model and spheres in the browser")
@@ -116,24 +110,23 @@ def run(arguments: argparse.Namespace) -> int:
         model = load_model(arguments, arguments.model)
     for name in state:
         model.symbol(name)  # raises for unknown names, with similar ones
-    objects = _objects(model, arguments)
-    links: dict[str, LinkCovers] = {}
-    for item in show_progress(objects, "covering", "shape"):
-        _cover(item, links.setdefault(item.body, LinkCovers(item.body)), protrusion, most, arguments.force)
-    status = WRONG_SHAPE if any(link.errors for link in links.values()) else 0
+    links = [LinkCover(body, items) for body, items in _objects(model, arguments).items()]
+    for link in show_progress(links, "covering", "link"):
+        _cover(link, protrusion, most, arguments.force)
+    status = WRONG_SHAPE if any(link.error for link in links) else 0
     if arguments.json:
-        print(json.dumps(_to_json(links.values(), status), allow_nan=False))
+        print(json.dumps(_to_json(links, status), allow_nan=False))
     else:
-        print("\n\n".join(_format_links(list(links.values()))), flush=True)
+        print("\n\n".join(_format_links(links)), flush=True)
     if arguments.picture is not None:
-        _write_picture(arguments.picture, model, state, links.values())
+        _write_picture(arguments.picture, model, state, links)
     if arguments.view:
-        _view(arguments, model, state, links.values())
+        _view(arguments, model, state, links)
     return status
 
 
-def _objects(model: kv.Model, arguments: argparse.Namespace) -> list[CollisionObject]:
-    """Return the collision objects of the wanted links."""
+def _objects(model: kv.Model, arguments: argparse.Namespace) -> dict[str, Sequence[CollisionObject]]:
+    """Return the collision objects of each of the wanted links."""
     from kineverse.geometry.objects import CollisionObjects
     from kineverse.geometry.shapes import import_coal
 
@@ -145,103 +138,84 @@ def _objects(model: kv.Model, arguments: argparse.Namespace) -> list[CollisionOb
     for link in arguments.links or ():
         if link not in source.by_body:
             raise UnknownNameError(f"No link {link!r} has shapes. {suggest(link, source.by_body, 'link')}")
-    return [
-        item
+    return {
+        body: items
         for body, items in source.by_body.items()
-        for item in items
-        if not arguments.links or body in arguments.links
-    ]
+        if items and (not arguments.links or body in arguments.links)
+    }
 
 
-def _cover(item: CollisionObject, link: LinkCovers, protrusion: float | None, most: int, force: bool) -> None:
-    """Add the cover of an object to those of its link, or the reason why there is none."""
-    from kineverse.planning.spheres import cover_object
-    from kineverse.planning.spheres.object_covers import is_covered
+def _cover(link: LinkCover, protrusion: float | None, most: int, force: bool) -> None:
+    """Add the cover of a link, or the reason why there is none."""
+    from kineverse.planning.spheres import cover_objects
+    from kineverse.planning.spheres.object_covers import are_covered
 
-    begin = time.perf_counter()
     try:
-        cached = not force and is_covered(item, protrusion, most)
+        cached = not force and are_covered(link.items, protrusion, most)
         begin = time.perf_counter()
-        link.covers.append((item, cover_object(item, protrusion, most, force=force)))
-        link.seconds += 0.0 if cached else time.perf_counter() - begin
+        cover = cover_objects(link.items, protrusion, most, force=force)
+        link.seconds = 0.0 if cached else time.perf_counter() - begin
+        link.cover = cover.move(link.items[0].shape.origin.matrix)
     except KineverseError as error:
-        link.errors.append(join_lines(error))
+        link.error = join_lines(error)
 
 
 HEAD = ("link", "shapes", "spheres", "protrusion [mm]", "excess", "time")
 
 
-def _format_links(links: Sequence[LinkCovers]) -> list[str]:
-    rows = [_format_row(link.link, [link]) for link in links if link.covers]
+def _format_links(links: Sequence[LinkCover]) -> list[str]:
+    covered = [(link, link.cover) for link in links if link.cover is not None]
+    rows = [_format_row(link.link, [(link, cover)]) for link, cover in covered]
     if len(rows) > 1:
-        rows.append(_format_row("total", links))
+        rows.append(_format_row("total", covered))
     sections = [format_cells(HEAD, rows)] if rows else []
-    errors = [f"  {reason}" for link in links for reason in link.errors]
+    errors = [f"  {link.error}" for link in links if link.error]
     return sections + (["\n".join([colorize("not covered", "!"), *errors])] if errors else [])
 
 
-def _format_row(name: str, links: Sequence[LinkCovers]) -> tuple[str, ...]:
-    seconds = sum(link.seconds for link in links)
+def _format_row(name: str, links: Sequence[tuple[LinkCover, SphereCover]]) -> tuple[str, ...]:
+    from kineverse.planning.spheres.union_volume import union_volume
+
+    seconds = sum(link.seconds for link, _ in links)
+    volumes = [union_volume(cover.centres, cover.radii) for _, cover in links]
+    inside = sum(v / (1.0 + cover.excess) for v, (_, cover) in zip(volumes, links, strict=True))
     return (
         name,
-        str(sum(len(link.covers) for link in links)),
-        str(sum(link.count for link in links)),
-        format_number(1e3 * max(link.protrusion for link in links), 3),
-        f"{_excess(links):.0%}",
+        str(sum(len(link.items) for link, _ in links)),
+        str(sum(len(cover) for _, cover in links)),
+        format_number(1e3 * max(cover.protrusion for _, cover in links), 3),
+        f"{sum(volumes) / inside - 1.0:.0%}",
         f"{seconds:.1f} s" if seconds else "cached",
     )
 
 
-def _excess(links: Iterable[LinkCovers]) -> float:
-    """Return the volume of all spheres over that of the shapes, minus 1; overlaps of shapes count twice."""
-    from kineverse.planning.spheres.union_volume import union_volume
-
-    covers = [cover for link in links for _, cover in link.covers]
-    volumes = [union_volume(cover.centres, cover.radii) for cover in covers]
-    inside = sum(volume / (1.0 + cover.excess) for volume, cover in zip(volumes, covers, strict=True))
-    return sum(volumes) / inside - 1.0 if inside else 0.0
-
-
-def _to_json(links: Iterable[LinkCovers], status: int) -> dict[str, Any]:
+def _to_json(links: Iterable[LinkCover], status: int) -> dict[str, Any]:
     return {
         "status": status,
         "links": [
-            {
-                "link": link.link,
-                "seconds": link.seconds,
-                "excess": _excess([link]),
-                "shapes": [
-                    {
-                        "number": item.number,
-                        "pose": _pose(item).tolist(),
-                        "protrusion": cover.protrusion,
-                        "excess": cover.excess,
-                        "centres": cover.centres.tolist(),
-                        "radii": cover.radii.tolist(),
-                    }
-                    for item, cover in link.covers
-                ],
-                "errors": link.errors,
-            }
+            {"link": link.link, "shapes": len(link.items), "seconds": link.seconds, "error": link.error}
+            | ({} if link.cover is None else _cover_to_json(link.cover))
             for link in links
         ],
     }
 
 
-def _pose(item: CollisionObject) -> Any:
-    """Return the pose of a shape in the frame of its body, 4×4 [m]."""
-    return item.shape.origin.matrix
+def _cover_to_json(cover: SphereCover) -> dict[str, Any]:
+    return {
+        "protrusion": cover.protrusion,
+        "excess": cover.excess,
+        "centres": cover.centres.tolist(),
+        "radii": cover.radii.tolist(),
+    }
 
 
-def _drawables(links: Iterable[LinkCovers]) -> Iterator[Any]:
+def _drawables(links: Iterable[LinkCover]) -> Iterator[Any]:
     from kineverse.view.sphere_drawables import draw_cover
 
-    for link in links:
-        for item, cover in link.covers:
-            yield draw_cover(link.link, cover, _pose(item))
+    return (draw_cover(link.link, link.cover) for link in links if link.cover is not None)
 
 
-def _write_picture(path: str, model: kv.Model, state: dict[str, float], links: Iterable[LinkCovers]) -> None:
+def _write_picture(path: str, model: kv.Model, state: dict[str, float], links: Iterable[LinkCover]) -> None:
     from kineverse.view.pictures import save_picture
 
     save_picture(path, model, state, overlay=list(_drawables(links)))
@@ -249,7 +223,7 @@ def _write_picture(path: str, model: kv.Model, state: dict[str, float], links: I
 
 
 def _view(
-    arguments: argparse.Namespace, model: kv.Model, state: dict[str, float], links: Iterable[LinkCovers]
+    arguments: argparse.Namespace, model: kv.Model, state: dict[str, float], links: Iterable[LinkCover]
 ) -> None:
     from kineverse.view.title import read_title
     from kineverse.view.viewer import Viewer

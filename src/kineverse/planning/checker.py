@@ -27,7 +27,7 @@ from kineverse.state import State
 from kineverse.symbols import Symbol
 
 from .bindings import CheckerStruct, ObstacleSetStruct, planning_functions
-from .links import LinkTable, is_thin
+from .links import LinkTable
 from .obstacles import Floats32, ObstacleSet
 
 BodyPairs: TypeAlias = frozenset[frozenset[str]]
@@ -93,12 +93,7 @@ class CollisionChecker:
         poses = [self.groups.index(groups[body]) for body in self.moving]
         self.program = self._make_program([model.fk(g)[:3] for g in self.groups], conditions)
         members = [self._in_group(body, groups[body]) for body in self.moving]
-        # A plate that one joint moves, such as a door: spheres would fill the gaps beside it.
-        covered = [
-            len(dependence.moving_ancestors(body)) > 1 or not any(is_thin(solid) for _, solid, _ in items)
-            for body, items in zip(self.moving, members, strict=True)
-        ]
-        self.links = LinkTable(members, poses, covered, protrusion)
+        self.links = LinkTable(members, poses, protrusion)
         self._planes: list[Array] = []
         self._place_static(dependence)
         self._place_moving(members, poses)
@@ -184,7 +179,7 @@ class CollisionChecker:
                 1: spheres[i] * self._costs[j],
                 2: spheres[j] * self._costs[i],
             }
-            choice = min((k for k, cost in costs.items() if cost > 0), key=lambda k: costs[k], default=1)
+            choice = min(costs, key=lambda k: costs[k])
             (moving_pairs if choice else pairs).append((j, i) if choice == 2 else (i, j))
         self.pairs = np.array(pairs, dtype=np.int32).reshape(-1, 2)
         self.moving_pairs = np.array(moving_pairs, dtype=np.int32).reshape(-1, 2)

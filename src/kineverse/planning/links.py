@@ -13,11 +13,8 @@ from kineverse.lie import Array
 from kineverse.model.body import Sphere
 
 from .bindings import COARSE, LINK, SHAPE
-from .spheres import SphereTree, cover_object, default_protrusion, make_sphere_tree
+from .spheres import SphereTree, cover_objects, make_sphere_tree
 from .spheres.sphere_cache import cover_key, find_or_make_tree
-
-_MANY = 64
-"""Number of spheres beyond which a shape counts as thin."""
 
 
 class LinkTable:
@@ -29,10 +26,8 @@ class LinkTable:
         Of each body, its objects with their solids and their poses in the frame, (4, 4).
     poses
         Of each body, the number of its pose.
-    covered
-        Of each body, whether it has spheres; the ball around it stands for one without.
     protrusion
-        Largest distance of a sphere from the shape that it covers [m]; None for what suits the shape.
+        Largest distance of a sphere from the shapes that it covers [m]; None for what suits their size.
 
     Attributes
     ----------
@@ -46,7 +41,6 @@ class LinkTable:
         self,
         members: Sequence[Sequence[tuple[CollisionObject, Solid, Array]]],
         poses: Sequence[int],
-        covered: Sequence[bool],
         protrusion: float | None,
     ) -> None:
         self.links = np.zeros(len(members), dtype=LINK)
@@ -62,22 +56,21 @@ class LinkTable:
             link["pose"], link["first"] = pose, len(coarse)
             link["first_shape"], link["shapes"] = shapes, len(items)
             shapes += len(items)
-            link["exact"] = covered[k] and all(isinstance(solid.surface, Sphere) for _, solid, _ in items)
             corners = np.concatenate([_placed_corners(solid, T) for _, solid, T in items])
             link["low"], link["high"] = corners.min(axis=0), corners.max(axis=0)
             link["ball"] = *(corners.min(axis=0) + corners.max(axis=0)) / 2, 0.0
             link["ball"][3] = np.linalg.norm(corners - link["ball"][:3], axis=1).max() + 1e-6
-            self.spheres.append(np.zeros((0, 4)))
-            if not covered[k]:
-                continue
             key = cover_key([(solid, T) for _, solid, T in items], protrusion)
             tree = find_or_make_tree(key, partial(_make_tree, items, protrusion))
             link["coarse"] = len(tree.coarse_radii)
+            link["exact"] = len(tree.radii) == len(items) and all(
+                isinstance(solid.surface, Sphere) for _, solid, _ in items
+            )
             link["ball"] = *tree.ball_centre, tree.ball_radius
             ends = tree.first.tolist()
             for j, (centre, radius) in enumerate(zip(tree.coarse_centres, tree.coarse_radii, strict=True)):
                 coarse.append((np.array([*centre, radius]), count + ends[j], ends[j + 1] - ends[j]))
-            self.spheres[-1] = np.column_stack([tree.centres, tree.radii])
+            self.spheres.append(np.column_stack([tree.centres, tree.radii]))
             fine.append(self.spheres[-1])
             count += len(tree.radii)
         self.coarse = np.zeros(max(len(coarse), 1), dtype=COARSE)
@@ -86,25 +79,9 @@ class LinkTable:
         self.fine = np.concatenate(fine or [np.zeros((1, 4))]).astype(np.float32)
 
 
-def is_thin(solid: Solid) -> bool:
-    """Return True for a solid like a plate, for which many spheres are needed.
-
-    A sphere that sticks out by e covers a disc of area π (2 c e + e²) of a plate of the thickness 2 c.
-    """
-    least, *others = sorted(solid.half.tolist())
-    e = default_protrusion(solid)
-    return bool(2.0 * others[0] * others[1] > _MANY * (2.0 * least * e + e * e))
-
-
 def _make_tree(items: Sequence[tuple[CollisionObject, Solid, Array]], protrusion: float | None) -> SphereTree:
-    spheres = np.concatenate([_placed_cover(item, T, protrusion) for item, _, T in items])
-    return make_sphere_tree(spheres[:, :3], spheres[:, 3])
-
-
-def _placed_cover(item: CollisionObject, T: Array, protrusion: float | None) -> Array:
-    cover = cover_object(item, protrusion)
-    centres = cover.centres @ T[:3, :3].T + T[:3, 3]
-    return np.column_stack([centres, cover.radii])
+    cover = cover_objects([item for item, _, _ in items], protrusion).move(items[0][2])
+    return make_sphere_tree(cover.centres, cover.radii)
 
 
 def _placed_corners(solid: Solid, T: Array) -> Array:

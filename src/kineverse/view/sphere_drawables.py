@@ -14,20 +14,9 @@ SPHERES: Rgba = (0.16, 0.47, 0.86, 0.3)
 """Colour of the spheres of a cover."""
 
 
-def draw_cover(frame: str, cover: SphereCover, frame_T_solid: Floats) -> Drawable:
-    """Return the spheres of a cover as one drawable.
-
-    Parameters
-    ----------
-    frame
-        Frame of the body.
-    cover
-        The cover.
-    frame_T_solid
-        (4, 4) pose of the covered solid in the frame [m].
-    """
-    surface = build_spheres(cover.centres, cover.radii).transform(frame_T_solid)
-    return Drawable(frame, surface, SPHERES, "collision")
+def draw_cover(frame: str, cover: SphereCover) -> Drawable:
+    """Return the spheres of a cover in a frame as one drawable."""
+    return Drawable(frame, build_spheres(cover.centres, cover.radii), SPHERES, "collision")
 
 
 def build_spheres(centres: Floats, radii: Floats) -> TriangleMesh:

@@ -24,7 +24,7 @@ typedef struct {
 } ObstacleSet;
 
 /* A body that moves. `low` and `high` bound the centres of its spheres and its shapes, in its frame. If `exact`, its
-   shapes are its spheres; without any spheres, it is inside of its ball. */
+   shapes are its spheres. */
 typedef struct {
   float ball[4], low[3], high[3];
   int pose, first, coarse, first_shape, shapes, exact;
@@ -328,7 +328,7 @@ INLINE I link_against_set(const Checker *c, const Work *w, const Link *l, const 
       if ((!allowed || allowed[found[k]->body]) && any(touches(found[k], c->planes, centre, reach) & ~hit))
         found[near++] = found[k];
     if (!near) continue;
-    for (int first = 0; first < (l->coarse ? l->coarse : 1); first += MOST_NEAR) {
+    for (int first = 0; first < l->coarse; first += MOST_NEAR) {
       const Coarse *spheres = c->coarse + l->first + first;
       const int some = l->coarse - first < MOST_NEAR ? l->coarse - first : MOST_NEAR;
       V centres[MOST_NEAR][3];
@@ -336,8 +336,7 @@ INLINE I link_against_set(const Checker *c, const Work *w, const Link *l, const 
       for (int k = 0; k < near; k++) {
         const Obstacle *o = found[k];
         const int decided = !shapes || (l->exact && o->kind != HULL);
-        I lanes = l->coarse ? spheres_against(c, spheres, some, centres, T, o, grown, early && decided, hit)
-                            : touches(o, c->planes, centre, reach) & ~hit;
+        const I lanes = spheres_against(c, spheres, some, centres, T, o, grown, early && decided, hit);
         if (!any(lanes)) continue;
         hit |= decided ? lanes : shapes_touch(c, w, l, 0, o, grown, early, lanes);
         if (early ? any(hit) : !any(~hit)) return hit;

@@ -1,20 +1,21 @@
 """Covers of collision shapes by few spheres, with a hierarchy.
 
-:func:`cover_object` covers a collision object of a scene, :func:`cover_solid` any convex solid. Covers
-contain what they cover, provably, and say how far they stick out of it.
+:func:`cover_objects` covers the collision objects of a body, :func:`cover_solid` and :func:`cover_solids` any
+convex solids. Covers contain what they cover, provably, and say how far they stick out of it.
 """
 
-from .object_covers import cover_object
+from .object_covers import cover_objects
 from .quality import CoverQuality, measure_cover
-from .sphere_cover import SphereCover, cover_solid, default_protrusion
+from .sphere_cover import SphereCover, cover_solid, cover_solids, default_protrusion
 from .sphere_tree import SphereTree, enclosing_ball, make_sphere_tree
 
 __all__ = [
     "CoverQuality",
     "SphereCover",
     "SphereTree",
-    "cover_object",
+    "cover_objects",
     "cover_solid",
+    "cover_solids",
     "default_protrusion",
     "enclosing_ball",
     "make_sphere_tree",

@@ -1,6 +1,6 @@
-"""Proof that spheres cover a polytope: subdivision until each tetrahedron lies in one sphere.
+"""Proof that spheres cover a region: subdivision until each tetrahedron lies in one sphere.
 
-A sphere is convex, so it contains a tetrahedron if it contains the four corners. The polytope is the union
+A sphere is convex, so it contains a tetrahedron if it contains the four corners. A polytope is the union
 of the tetrahedra between an inner point and its triangles. One that no sphere contains is cut at the middle
 of its longest edge. It is final once the sphere that lacks least of it would have to grow by a small length
 only, or hardly more than for one corner alone. By that much the sphere does grow.
@@ -14,7 +14,7 @@ import numpy as np
 
 from kineverse.geometry.mesh_files import Floats, Integers
 
-from .polytope import CoverPolytope
+from .polytope import CoverRegion, scalar_products
 
 _EDGES = np.array([[0, 1], [0, 2], [0, 3], [1, 2], [1, 3], [2, 3]])
 _MOST_CELLS = 60_000
@@ -38,12 +38,12 @@ class Uncovered:
     points: Floats
 
 
-def find_uncovered(polytope: CoverPolytope, centres: Floats, radii: Floats, tolerance: float) -> Uncovered:
-    """Return the part of a polytope that spheres do not cover.
+def find_uncovered(region: CoverRegion, centres: Floats, radii: Floats, tolerance: float) -> Uncovered:
+    """Return the part of a region that spheres do not cover.
 
     Parameters
     ----------
-    polytope
+    region
         What is to be covered.
     centres, radii
         (N, 3) and (N,) spheres [m].
@@ -52,9 +52,7 @@ def find_uncovered(polytope: CoverPolytope, centres: Floats, radii: Floats, tole
     """
     growth = np.zeros(len(radii))
     points: list[Floats] = []
-    middle = polytope.corners.mean(axis=0)
-    corners = polytope.corners[polytope.faces]
-    cells = np.concatenate([np.broadcast_to(middle, (len(corners), 1, 3)), corners], axis=1)
+    cells = np.concatenate([region.middles[region.owners][:, None], region.corners[region.faces]], axis=1)
     # A small cell is tried with the spheres around it only. A large one may lie in others, and is cut.
     near = _nearest_spheres(cells, centres, radii)
     least = _SMALL * float(np.median(radii)) if len(radii) > _NEAR else np.inf
@@ -118,5 +116,5 @@ def _measure_gaps(
 def distances(points: Floats, centres: Floats) -> Floats:
     """Return the distances (n, N) of points (n, 3) from centres (N, 3) [m]."""
     square: Floats = np.square(points).sum(axis=1)[:, None] + np.square(centres).sum(axis=1)
-    square -= 2.0 * points @ centres.T
+    square -= scalar_products(2.0 * points, centres)
     return np.sqrt(np.maximum(square, 0.0, out=square), out=square)

@@ -1,4 +1,4 @@
-"""Few spheres that cover a polytope within a protrusion.
+"""Few spheres that cover a region within a protrusion.
 
 A ball about a point c inside of a convex solid sticks out of it by its radius less the depth d(c), exactly.
 A point p therefore needs the protrusion min_i |p - c_i| - d(c_i), and a cover with N spheres is the location
@@ -23,16 +23,16 @@ from kineverse.geometry.mesh_files import Floats, Integers
 from .certificate import distances, find_uncovered
 from .cover_mesh import CoverMesh
 from .cover_starts import CoverStarts
-from .polytope import CoverPolytope
+from .polytope import CoverRegion
 
-_ROUNDS, _FEW_ROUNDS, _STEPS = 20, 10, 6
+_ROUNDS, _FEW_ROUNDS, _STEPS = 14, 10, 6
 """Power diagrams of a descent and of a short one, and steps between two of them."""
 
 _WARM, _COLD = 0.2, 0.015
 """First and last temperature of the smoothed maximum, as a fraction of the protrusion."""
 
-_MOMENTUM = 0.6
-_SAMPLES, _HARD = 300, 0.6
+_MOMENTUM, _SIDES = 0.6, 12
+_SAMPLES, _SAMPLES_EACH, _HARD = 300, 8, 0.6
 _TRIALS = 4
 _REMOVALS, _FEW_SPHERES = 3, 12
 _PROOF, _ALLOWANCE, _ATTEMPTS = 0.01, 1.04, 4
@@ -44,7 +44,7 @@ _ROUNDING = 1e-9
 
 @dataclass(frozen=True, slots=True, eq=False)
 class FittedSpheres:
-    """Spheres that cover a polytope: (N, 3) centres, (N,) radii and their largest protrusion."""
+    """Spheres that cover a region: (N, 3) centres, (N,) radii and their largest protrusion."""
 
     centres: Floats
     radii: Floats
@@ -58,15 +58,19 @@ class FittedSpheres:
 
 
 class _Problem:
-    """Polytope, with the points of it that a cover is fitted to."""
+    """Region, with the points of it that a cover is fitted to."""
 
-    def __init__(self, polytope: CoverPolytope, protrusion: float, most: int) -> None:
-        self.polytope = polytope.simplify()
-        a, b, c = np.moveaxis(polytope.corners[polytope.faces], 1, 0)
-        samples = max(_SAMPLES, 10 * most)
-        area = float(np.linalg.norm(np.cross(b - a, c - a), axis=1).sum()) / 2
-        self.mesh = CoverMesh(self.polytope, max(protrusion, math.sqrt(area / samples)))
+    def __init__(self, region: CoverRegion, protrusion: float) -> None:
+        self.region, self._protrusion = region.simplify(), protrusion
         self.gaps: Floats = np.zeros((0, 3))
+        self.expect(0)
+
+    def expect(self, spheres: int) -> None:
+        """Make the points close enough for a number of spheres."""
+        region, samples = self.region, max(_SAMPLES, _SAMPLES_EACH * spheres)
+        a, b, c = np.moveaxis(region.corners[region.faces], 1, 0)
+        area = float(np.linalg.norm(np.cross(b - a, c - a), axis=1).sum()) / 2
+        self.mesh = CoverMesh(region, max(self._protrusion, math.sqrt(area / samples)))
 
     def find_critical(self, centres: Floats, radii: Floats) -> tuple[Floats, Integers]:
         """Return the points that are hardest to cover by spheres, and the sphere of each."""
@@ -77,28 +81,28 @@ class _Problem:
         return np.concatenate([points, self.gaps]), np.concatenate([owners, powers.argmin(axis=1)])
 
 
-def fit_spheres(polytope: CoverPolytope, protrusion: float, most: int) -> FittedSpheres:
-    """Return few spheres that cover a polytope.
+def fit_spheres(region: CoverRegion, protrusion: float, most: int) -> FittedSpheres:
+    """Return few spheres that cover a region.
 
     Parameters
     ----------
-    polytope
-        Polytopes of a solid about the origin, whose extent is of order 1.
+    region
+        The region, which is near the origin, and has an extent of order 1.
     protrusion
         Largest protrusion; it is exceeded where ``most`` spheres are not enough.
     most
         Largest number of spheres.
     """
-    problem = _Problem(polytope, protrusion, most)
+    problem = _Problem(region, protrusion)
     aim = protrusion / _ALLOWANCE
     for _ in range(_ATTEMPTS):
         fitted = _fit_to_points(problem, aim, most)
-        proved, gaps = prove(polytope, fitted)
+        proved, gaps = prove(region, fitted)
         if len(gaps) and proved.protrusion > _ALLOWANCE * fitted.protrusion:
             # The proof found points between those of the mesh.
             problem.gaps = gaps[:: len(gaps) // _SAMPLES + 1]
             fitted = descend(problem, fitted.centres, aim)
-            mended, _ = prove(polytope, fitted)
+            mended, _ = prove(region, fitted)
             proved = min(proved, mended, key=lambda cover: cover.protrusion)
         if proved.protrusion <= protrusion or fitted.protrusion > aim:
             break
@@ -108,10 +112,14 @@ def fit_spheres(polytope: CoverPolytope, protrusion: float, most: int) -> Fitted
 
 def _fit_to_points(problem: _Problem, aim: float, most: int) -> FittedSpheres:
     """Return few spheres that cover the points of a problem."""
-    best = descend(problem, np.zeros((1, 3)), aim, _FEW_ROUNDS)
+    corners = problem.region.corners
+    middle = (corners.min(axis=0) + corners.max(axis=0)) / 2
+    best = descend(problem, middle[None], aim, _FEW_ROUNDS)
     if best.protrusion <= aim or most == 1:
         return best
-    best = _search_start(problem, CoverStarts(problem.polytope, aim), aim, most, best)
+    starts = CoverStarts(problem.region, aim)
+    problem.expect(min(len(starts.greedy(1.2 * aim)), most))
+    best = _search_start(problem, starts, aim, most, best)
     if best.protrusion > aim and len(best.radii) < most:
         added = descend(problem, _split_worst(problem, best, most), aim)
         best = added if added.is_better(best, aim) else best
@@ -127,8 +135,10 @@ def _search_start(
     wanted = max(1.2 * aim, least)
     tried: set[int] = set()
     for _ in range(_TRIALS):
-        centres = start.greedy(wanted)
-        if len(centres) in tried or len(centres) > most:
+        # A greedy choice may need more spheres for a larger protrusion.
+        while len(centres := start.greedy(wanted)) > most:
+            wanted *= 1.1
+        if len(centres) in tried:
             break
         tried.add(len(centres))
         found = descend(problem, centres, aim, _FEW_ROUNDS)
@@ -148,7 +158,7 @@ def _search_start(
 
 def _split_worst(problem: _Problem, cover: FittedSpheres, most: int) -> Floats:
     """Return the centres with one more beside each of those that protrude most, at most so many."""
-    depths = problem.polytope.depths(cover.centres)
+    depths = problem.region.depths(cover.centres)
     points, owners = problem.find_critical(cover.centres, depths + cover.protrusion)
     needs = np.linalg.norm(points - cover.centres[owners], axis=1) - depths[owners]
     order = np.argsort(-needs, kind="stable")
@@ -159,12 +169,11 @@ def _split_worst(problem: _Problem, cover: FittedSpheres, most: int) -> Floats:
 
 def descend(problem: _Problem, centres: Floats, aim: float, rounds: int = _ROUNDS) -> FittedSpheres:
     """Return the cover with the least protrusion on the way down from some centres (N, 3)."""
-    polytope = problem.polytope
+    region = problem.region
     best = FittedSpheres(centres, np.zeros(0), math.inf)
     estimate = aim
     for k in range(rounds):
-        centres = _pull_inside(polytope, centres)
-        depths = polytope.depths(centres)
+        centres, solids, depths = _pull_inside(region, centres)
         points, owners = problem.find_critical(centres, depths + estimate)
         lengths = np.linalg.norm(points - centres[owners], axis=1)
         radii = np.zeros(len(centres))
@@ -181,19 +190,27 @@ def descend(problem: _Problem, centres: Floats, aim: float, rounds: int = _ROUND
         if not used.all():
             centres = _relocate(centres, radii, protrusions, points)
         temperature = estimate * _WARM * (_COLD / _WARM) ** (k / (rounds - 1))
-        centres = _relax(polytope, centres, points[hard], owners[hard], temperature)
+        centres = _relax(region, centres, solids, points[hard], owners[hard], temperature)
     return best
 
 
-def _pull_inside(polytope: CoverPolytope, centres: Floats) -> Floats:
-    """Return the centres, those outside of the solid moved towards the origin up to its surface.
+def _pull_inside(region: CoverRegion, centres: Floats) -> tuple[Floats, Integers, Floats]:
+    """Return the centres, those outside of all solids moved towards the middle of one up to its surface.
 
-    The depth is a concave function along the way.
+    Further, the solid in which each is deepest, and its depth there. Depths are concave along the way.
     """
-    depths = polytope.depths(centres)
-    middle = float(polytope.depths(np.zeros((1, 3)))[0])
-    part = np.where(depths < 0.0, -depths / np.maximum(middle - depths, 1e-300), 0.0)
-    return centres * (1.0 - np.minimum(1.0001 * part, 1.0))[:, None]
+    depths = region.part_depths(centres)
+    solids = depths.argmax(axis=1)
+    outside = np.flatnonzero(depths[np.arange(len(centres)), solids] < 0.0)
+    if len(outside):
+        goals, least = region.middles[solids[outside]], depths[outside, solids[outside]]
+        deepest = region.depths(goals)
+        part = np.minimum(-1.0001 * least / np.maximum(deepest - least, 1e-300), 1.0)[:, None]
+        centres = centres.copy()
+        centres[outside] += part * (goals - centres[outside])
+        depths = region.part_depths(centres)
+        solids = depths.argmax(axis=1)
+    return centres, solids, depths[np.arange(len(centres)), solids]
 
 
 def _relocate(centres: Floats, radii: Floats, protrusions: Floats, corners: Floats) -> Floats:
@@ -208,25 +225,33 @@ def _relocate(centres: Floats, radii: Floats, protrusions: Floats, corners: Floa
 
 
 def _relax(
-    polytope: CoverPolytope, centres: Floats, points: Floats, owners: Integers, temperature: float
+    region: CoverRegion,
+    centres: Floats,
+    solids: Integers,
+    points: Floats,
+    owners: Integers,
+    temperature: float,
 ) -> Floats:
-    """Return centres after gradient steps on the smoothed largest need of the points of each sphere."""
+    """Return centres in solids (n,) after gradient steps on the smoothed largest need of their points."""
     order = np.argsort(owners, kind="stable")
     points, owners = points[order], owners[order]
     first = np.flatnonzero(np.diff(owners, prepend=-1))
     moving = owners[first]
+    solids = solids[moving]
     group = np.cumsum(np.diff(owners, prepend=-1) > 0) - 1
     found = centres.copy()
     centres, speed = centres[moving], np.zeros((len(moving), 3))
+    slack, normals = region.nearest_sides(centres, solids, _SIDES)
+    offsets = slack + np.einsum("nfj,nj->nf", normals, centres)
     for _ in range(_STEPS):
-        slack = polytope.offsets - centres @ polytope.normals.T
+        slack = offsets - np.einsum("nfj,nj->nf", normals, centres)
         apart = centres[group] - points
         lengths = np.sqrt(np.einsum("ij,ij->i", apart, apart))
         weights = np.exp((lengths - np.maximum.reduceat(lengths, first)[group]) / temperature)
         pulls = apart * (weights / np.maximum(lengths, 1e-12))[:, None]
         gradient = np.add.reduceat(pulls, first) / np.add.reduceat(weights, first)[:, None]
         near = np.exp((slack.min(axis=1, keepdims=True) - slack) / temperature)
-        gradient += (near @ polytope.normals) / near.sum(axis=1, keepdims=True)
+        gradient += np.einsum("nf,nfj->nj", near, normals) / near.sum(axis=1, keepdims=True)
         speed = _MOMENTUM * speed - temperature * gradient
         centres = centres + speed
     found[moving] = centres
@@ -255,7 +280,7 @@ def _remove(problem: _Problem, cover: FittedSpheres, aim: float) -> FittedSphere
 
 def _removal_losses(problem: _Problem, cover: FittedSpheres) -> Floats:
     """Return for each sphere the protrusion (N,) that the others would need for what it covers."""
-    depths = problem.polytope.depths(cover.centres)
+    depths = problem.region.depths(cover.centres)
     points = problem.find_critical(cover.centres, depths + cover.protrusion)[0]
     needs = distances(points, cover.centres) - depths
     rows, owners = np.arange(len(points)), needs.argmin(axis=1)
@@ -265,14 +290,14 @@ def _removal_losses(problem: _Problem, cover: FittedSpheres) -> Floats:
     return losses
 
 
-def prove(polytope: CoverPolytope, cover: FittedSpheres) -> tuple[FittedSpheres, Floats]:
+def prove(region: CoverRegion, cover: FittedSpheres) -> tuple[FittedSpheres, Floats]:
     """Return a cover whose radii have grown as far as the proof by subdivision needs.
 
     Further, points (n, 3) that the given spheres do not cover.
     """
     tolerance = _PROOF * cover.protrusion
     radii = cover.radii + tolerance
-    uncovered = find_uncovered(polytope, cover.centres, radii, tolerance)
+    uncovered = find_uncovered(region, cover.centres, radii, tolerance)
     radii = (radii + uncovered.growth) * (1.0 + _ROUNDING)
-    protrusion = float((radii - polytope.depths(cover.centres)).max())
+    protrusion = float((radii - region.depths(cover.centres)).max())
     return FittedSpheres(cover.centres, radii, protrusion), uncovered.points

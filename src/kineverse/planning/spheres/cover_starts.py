@@ -9,44 +9,48 @@ import numpy as np
 from kineverse.geometry.mesh_files import Floats, Integers
 
 from .certificate import distances
-from .cover_mesh import split_triangles
-from .polytope import CoverPolytope
+from .cover_mesh import is_deep_in_others, split_triangles
+from .polytope import CoverRegion
 
 _SAMPLES, _CANDIDATES = 150, 1500
 
 
 class CoverStarts:
-    """Points of a polytope, and candidates for centres, for a protrusion.
+    """Points of a region, and candidates for centres, for a protrusion.
 
     Candidates lie below the surface at several depths, where balls that touch it on both sides have their
     centres.
     """
 
-    def __init__(self, polytope: CoverPolytope, protrusion: float) -> None:
-        self._polytope = polytope
-        triangles = polytope.corners[polytope.faces]
+    def __init__(self, region: CoverRegion, protrusion: float) -> None:
+        self._region = region
+        triangles = region.corners[region.faces]
         a, b, c = np.moveaxis(triangles, 1, 0)
         area = float(np.linalg.norm(np.cross(b - a, c - a), axis=1).sum()) / 2
         spacing = max(1.1 * protrusion, math.sqrt(area / _SAMPLES))
-        triangles = split_triangles(triangles, spacing)
-        surface = _thin(triangles.reshape(-1, 3), 0.6 * spacing)[0]
-        self._points = np.concatenate([surface, 0.7 * surface, 0.35 * surface])
+        triangles, owners = split_triangles(triangles, region.owners, spacing)
+        outside = ~is_deep_in_others(region, triangles, owners, spacing)
+        triangles, owners = triangles[outside], owners[outside]
+        surface, kept = _thin(triangles.reshape(-1, 3), 0.6 * spacing)
+        origins = region.middles[owners[kept // 3]]
+        surface = surface - origins
+        self._points = np.concatenate([origins + size * surface for size in (1.0, 0.7, 0.35)])
         middles, kept = _thin(triangles.mean(axis=1), spacing)
         a, b, c = np.moveaxis(triangles[kept], 1, 0)
         normals = np.cross(b - a, c - a)
         normals /= np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), 1e-300)
-        deepest = max(float(polytope.depths(np.zeros((1, 3)))[0]), protrusion)
+        deepest = max(float(region.depths(region.middles).max()), protrusion)
         levels = protrusion * np.geomspace(0.7, max(1.2 * deepest / protrusion, 1.5), 5)
         candidates = np.concatenate(
             [
-                np.zeros((1, 3)),
-                *(f * surface for f in (0.3, 0.6, 0.8, 0.9)),
+                region.middles,
+                *(origins + size * surface for size in (0.3, 0.6, 0.8, 0.9)),
                 *(middles - t * normals for t in levels),
             ]
         )
-        candidates = candidates[polytope.depths(candidates) > 0.0]
+        candidates = candidates[region.depths(candidates) > 0.0]
         self._candidates = candidates[:: len(candidates) // _CANDIDATES + 1]
-        self._depths = polytope.depths(self._candidates)
+        self._depths = region.depths(self._candidates)
         self._apart = distances(self._points, self._candidates)
         self._protrusion = protrusion
 
@@ -79,25 +83,35 @@ class CoverStarts:
         return self._candidates[chosen]
 
     def lattice(self, protrusion: float, most: int) -> Floats:
-        """Return the centres of equal boxes along the principal axes.
+        """Return the centres of equal boxes along the principal axes of each solid.
 
         They are the fewest whose balls protrude no further, or at most so many with the least protrusion.
         """
-        corners = self._polytope.corners
-        axes = _principal_axes(corners)
-        low, high = (corners @ axes.T).min(axis=0), (corners @ axes.T).max(axis=0)
-        numbers = range(1, most + 1)
-        counts = np.array(
-            [(i, j, k) for i in numbers for j in numbers[: most // i] for k in numbers[: most // (i * j)]]
-        )
-        half = (high - low) / 2 / counts
-        protrusions = np.linalg.norm(half, axis=1) - half.min(axis=1)
-        totals = np.where(protrusions <= protrusion, counts.prod(axis=1), np.inf)
-        best = counts[totals.argmin() if np.isfinite(totals).any() else protrusions.argmin()]
-        ticks = [low[k] + (high[k] - low[k]) * (np.arange(best[k]) + 0.5) / best[k] for k in range(3)]
-        centres = np.stack(np.meshgrid(*ticks, indexing="ij"), axis=-1).reshape(-1, 3) @ axes
-        inside: Floats = centres[self._polytope.depths(centres) > -protrusion]
-        return inside if len(inside) else np.zeros((1, 3))
+        region = self._region
+        centres = [_box_centres(part.corners, protrusion, most) for part in region.parts]
+        owners = np.repeat(np.arange(len(centres)), [len(found) for found in centres])
+        points = np.concatenate(centres)
+        depths = region.part_depths(points)
+        # What lies deeper in another solid is left to that one.
+        kept = (depths.max(axis=1) > -protrusion) & (depths.argmax(axis=1) == owners)
+        found: Floats = points[kept]
+        return found if len(found) else region.middles[:1]
+
+
+def _box_centres(corners: Floats, protrusion: float, most: int) -> Floats:
+    """Return the centres (n, 3) of equal boxes that a box around some corners consists of."""
+    axes = _principal_axes(corners)
+    low, high = (corners @ axes.T).min(axis=0), (corners @ axes.T).max(axis=0)
+    numbers = range(1, most + 1)
+    counts = np.array(
+        [(i, j, k) for i in numbers for j in numbers[: most // i] for k in numbers[: most // (i * j)]]
+    )
+    half = (high - low) / 2 / counts
+    protrusions = np.linalg.norm(half, axis=1) - half.min(axis=1)
+    totals = np.where(protrusions <= protrusion, counts.prod(axis=1), np.inf)
+    best = counts[totals.argmin() if np.isfinite(totals).any() else protrusions.argmin()]
+    ticks = [low[k] + (high[k] - low[k]) * (np.arange(best[k]) + 0.5) / best[k] for k in range(3)]
+    return np.stack(np.meshgrid(*ticks, indexing="ij"), axis=-1).reshape(-1, 3) @ axes
 
 
 def _principal_axes(corners: Floats) -> Floats:

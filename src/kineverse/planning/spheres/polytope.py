@@ -1,17 +1,19 @@
-"""Polytopes around and inside of convex solids, for sphere covers.
+"""Solids that spheres shall cover: polytopes around them, and depths of points in them.
 
-A cover of the outer polytope covers the solid. The depth of a point in the inner polytope is a lower bound of
-its depth in the solid. Boxes and hulls are both polytopes themselves; round primitives lie between the hull
-of points on their surface and that of points around them.
+A cover of the outer polytopes covers the solids. Depths are exact but for an ellipsoid, which lies between
+the hull of points on its surface and that of points around it; those in the inner hull are lower bounds.
 """
 
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
 from functools import lru_cache
+from typing import Any
 
 import numpy as np
+import numpy.typing as npt
 
 from kineverse.errors import InvalidValueError
 from kineverse.geometry.mesh_files import Faces, Floats, Integers
@@ -19,7 +21,7 @@ from kineverse.geometry.shapes import Hull, Solid, solid_from_points, solid_surf
 from kineverse.model.body import Box, Capsule, Cone, Cylinder, Ellipsoid, Sphere
 
 _ROUNDNESS = 0.03
-"""Gap between a round solid and either polytope, as a fraction of the protrusion of a cover."""
+"""Gap between a round solid and its polytope, as a fraction of the protrusion of a cover."""
 
 _FEWEST_SIDES, _MOST_SIDES = 12, 192
 
@@ -27,21 +29,60 @@ _ASCENT = 120
 
 _MANY_CORNERS, _DIRECTIONS = 200, 400
 
+_BLOCK = 80_000
+_SAMPLES = 1000
+_SEQUENCE = 1.2207440846057596 ** -np.arange(1.0, 4.0)
+"""Steps of the sequence R3 (Roberts 2018), whose points fill the cube evenly."""
+
+_FAR = 1e9
+"""Offset of a plane that bounds nothing."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class RoundSide:
+    """Round side of a solid, in which a point x has the depth ``offset - slope z - width |x - a|``.
+
+    z is the place of x along the axis, and a the point of the axis next to x, no further than ``reach`` from
+    the origin. A sphere has the reach 0; cylinders and cones have an infinite one, and a cone has a slope.
+
+    Attributes
+    ----------
+    origin, axis
+        (3,) origin of the axis [m], and its direction.
+    reach, offset
+        Lengths of the formula [m].
+    slope, width
+        Its factors.
+    """
+
+    origin: Floats
+    axis: Floats
+    reach: float
+    offset: float
+    slope: float = 0.0
+    width: float = 1.0
+
+
+_Z = np.array([0.0, 0.0, 1.0])
+_NO_SIDE = RoundSide(np.zeros(3), _Z, 0.0, _FAR, width=0.0)
+
 
 @dataclass(frozen=True, slots=True, eq=False)
 class CoverPolytope:
-    """Polytopes that bound a convex solid from outside and from inside.
+    """Convex solid, with a polytope that contains it.
 
     Attributes
     ----------
     corners, faces
         Outer polytope: (V, 3) corners [m] and (T, 3) triangles, counter-clockwise seen from outside.
     normals, offsets
-        Inner polytope: the points x with ``normals @ x <= offsets``; (F, 3) unit vectors and (F,) [m].
+        Flat sides of the solid, which has ``normals @ x <= offsets``; (F, 3) unit vectors and (F,) [m].
     volume
         Volume of the solid itself [m³].
-    is_round
-        True if the solid lies between the two; False if both are the solid.
+    side
+        Its round side.
+    is_hull
+        True if the polytope is the solid.
     """
 
     corners: Floats
@@ -49,19 +90,15 @@ class CoverPolytope:
     normals: Floats
     offsets: Floats
     volume: float
-    is_round: bool = False
-
-    def depths(self, points: Floats) -> Floats:
-        """Return lower bounds (n,) of the depths of points (n, 3) in the solid [m]; negative outside."""
-        depths: Floats = (self.offsets - points @ self.normals.T).min(axis=1)
-        return depths
+    side: RoundSide = _NO_SIDE
+    is_hull: bool = False
 
     def simplify(self) -> CoverPolytope:
         """Return the hull of the corners that are extreme along some directions, if there are many corners.
 
         It lies inside of the solid, and is returned for hulls only.
         """
-        if self.is_round or len(self.corners) <= _MANY_CORNERS:
+        if not self.is_hull or len(self.corners) <= _MANY_CORNERS:
             return self
         extreme = np.unique((self.corners @ _sphere_lattice(_DIRECTIONS).T).argmax(axis=0))
         try:
@@ -69,35 +106,161 @@ class CoverPolytope:
         except InvalidValueError:  # those of a very thin hull may be flat
             return self
 
-    def find_deepest_point(self) -> Floats:
-        """Return a point (3,) of the solid that is far from all planes [m]."""
-        point = best = self.corners.mean(axis=0)
-        width = -math.inf
-        step = 0.5 * float(np.ptp(self.corners, axis=0).max())
-        for _ in range(_ASCENT):
-            slack = self.offsets - self.normals @ point
-            nearest = int(slack.argmin())
-            if slack[nearest] > width:
-                best, width = point, float(slack[nearest])
-            # Away from the nearest plane; from outside, at least to its inner side.
-            point = point - self.normals[nearest] * max(step, -1.1 * float(slack[nearest]))
-            step *= 0.93
-        return np.asarray(best)
-
-    def normalize(self, centre: Floats, radius: float) -> CoverPolytope:
-        """Return the polytopes about a point (3,) as the origin, with a radius [m] as the unit of length."""
-        return CoverPolytope(
-            (self.corners - centre) / radius,
-            self.faces,
-            self.normals,
-            (self.offsets - self.normals @ centre) / radius,
-            self.volume / radius**3,
-            self.is_round,
+    def move(self, pose: Floats, factor: float = 1.0) -> CoverPolytope:
+        """Return the solid at a pose (4, 4), everything scaled by a factor."""
+        rotation, place = pose[:3, :3], pose[:3, 3]
+        normals, side = self.normals @ rotation.T, self.side
+        moved = replace(
+            side,
+            origin=factor * (rotation @ side.origin + place),
+            axis=rotation @ side.axis,
+            reach=factor * side.reach,
+            offset=factor * side.offset,
+        )
+        return replace(
+            self,
+            corners=factor * (self.corners @ rotation.T + place),
+            normals=normals,
+            offsets=factor * (self.offsets + normals @ place),
+            volume=factor**3 * self.volume,
+            side=moved,
         )
 
 
+class CoverRegion:
+    """Union of convex solids.
+
+    Attributes
+    ----------
+    parts
+        The P solids.
+    corners, faces
+        Corners (V, 3) of all outer polytopes, and their triangles (T, 3) [m].
+    owners
+        (T,) solid of each triangle.
+    middles
+        (P, 3) a point of each solid that is far from all of its sides [m].
+    """
+
+    def __init__(self, parts: Sequence[CoverPolytope]) -> None:
+        self.parts = tuple(parts)
+        first = np.cumsum([0, *(len(part.corners) for part in parts)])
+        self.corners: Floats = np.concatenate([part.corners for part in parts])
+        self.faces = np.concatenate([part.faces + k for part, k in zip(parts, first.tolist(), strict=False)])
+        self.owners = np.repeat(np.arange(len(parts)), [len(part.faces) for part in parts])
+        # Rows of planes are filled up by some that bound nothing.
+        most = max(1, *(len(part.normals) for part in parts))
+        self._normals = np.zeros((len(parts), most, 3))
+        self._offsets = np.full((len(parts), most), _FAR)
+        for k, part in enumerate(parts):
+            self._normals[k, : len(part.normals)] = part.normals
+            self._offsets[k, : len(part.offsets)] = part.offsets
+        sides = [part.side for part in parts]
+        self._origins = np.array([side.origin for side in sides])
+        self._axes = np.array([side.axis for side in sides])
+        self._sides = np.array([[side.reach, side.offset, side.slope, side.width] for side in sides])
+        self.middles: Floats = np.array([part.corners.mean(axis=0) for part in parts])
+        self._find_middles()
+
+    def simplify(self) -> CoverRegion:
+        """Return the region of the simplified solids."""
+        simple = [part.simplify() for part in self.parts]
+        changed = any(one is not other for one, other in zip(simple, self.parts, strict=True))
+        return CoverRegion(simple) if changed else self
+
+    def part_depths(self, points: Floats) -> Floats:
+        """Return the depths (n, P) of points (n, 3) in each solid [m]; negative outside."""
+        shape = len(points), *self._offsets.shape
+        flat = (
+            (self._offsets.reshape(-1) - scalar_products(points, self._normals.reshape(-1, 3)))
+            .reshape(shape)
+            .min(axis=2)
+        )
+        round_ = self._round_depths(points[:, None], np.arange(len(self.parts)))[0]
+        return np.asarray(np.minimum(flat, round_))
+
+    def depths(self, points: Floats) -> Floats:
+        """Return lower bounds (n,) of the depths of points (n, 3) in the union [m]; negative outside."""
+        return np.asarray(self.part_depths(points).max(axis=1))
+
+    def nearest_sides(self, points: Floats, owners: Integers, count: int) -> tuple[Floats, Floats]:
+        """Return how far points (n, 3) are inside of the nearest sides of their solids (n,), and the normals.
+
+        They have the shapes (n, F) and (n, F, 3), F at most the count and 1.
+        """
+        flat = self._offsets[owners] - np.einsum("nfj,nj->nf", self._normals[owners], points)
+        count, rows = min(count, flat.shape[1]), np.arange(len(points))[:, None]
+        near = np.argpartition(flat, count - 1, axis=1)[:, :count]
+        depths, away = self._round_depths(points, owners)
+        return (
+            np.concatenate([flat[rows, near], depths[:, None]], axis=1),
+            np.concatenate([self._normals[owners[:, None], near], away[:, None]], axis=1),
+        )
+
+    def measure_volume(self) -> float:
+        """Return the volume of the union, to about a percent where solids overlap [m³]."""
+        if len(self.parts) == 1:
+            return self.parts[0].volume
+        volume = 0.0
+        for k, part in enumerate(self.parts):
+            # Each point counts as often as one solid contains it.
+            shared = (self.part_depths(_sample_inside(part, self.middles[k])) >= 0.0).sum(axis=1)
+            volume += part.volume * float((1.0 / np.maximum(shared, 1)).mean())
+        return volume
+
+    def _round_depths(self, points: Floats, owners: Integers) -> tuple[Floats, Floats]:
+        """Return the depths of points (..., 3) in the round sides of solids (...,), and the normals there."""
+        axis, (reach, offset, slope, width) = self._axes[owners], np.moveaxis(self._sides[owners], -1, 0)
+        apart = points - self._origins[owners]
+        along = np.einsum("...j,...j->...", apart, axis)
+        apart = apart - np.clip(along, -reach, reach)[..., None] * axis
+        lengths = np.sqrt(np.einsum("...j,...j->...", apart, apart))
+        away = (width / np.maximum(lengths, 1e-12))[..., None] * apart + slope[..., None] * axis
+        return offset - slope * along - width * lengths, away
+
+    def _find_middles(self) -> None:
+        """Move the middles away from the nearest sides, by ever smaller steps."""
+        everyone = np.arange(len(self.parts))
+        points, widths = self.middles, np.full(len(self.parts), -math.inf)
+        steps = np.array([0.5 * float(np.ptp(part.corners, axis=0).max()) for part in self.parts])
+        for _ in range(_ASCENT):
+            slacks, normals = self.nearest_sides(points, everyone, 1)
+            nearest = slacks.argmin(axis=1)
+            least = slacks[everyone, nearest]
+            better = least > widths
+            self.middles = np.where(better[:, None], points, self.middles)
+            widths = np.where(better, least, widths)
+            # From outside, at least to the inner side.
+            points = points - normals[everyone, nearest] * np.maximum(steps, -1.1 * least)[:, None]
+            steps *= 0.93
+
+
+def scalar_products(points: npt.NDArray[Any], others: npt.NDArray[Any]) -> npt.NDArray[Any]:
+    """Return the scalar products (n, m) of vectors (n, 3) and (m, 3).
+
+    It is computed in blocks: libraries share a large product among threads, which may have other work.
+    """
+    found = np.empty((len(points), len(others)), dtype=points.dtype)
+    rows = max(_BLOCK // max(len(others), 1), 1)
+    for k in range(0, len(points), rows):
+        np.matmul(points[k : k + rows], others.T, out=found[k : k + rows])
+    return found
+
+
+def _sample_inside(part: CoverPolytope, middle: Floats) -> Floats:
+    """Return evenly spread points (n, 3) of an outer polytope around a point of it."""
+    corners = part.corners[part.faces] - middle
+    shares = np.cumsum(np.abs(np.linalg.det(corners)))
+    places = (np.arange(_SAMPLES) + 0.5) / _SAMPLES
+    chosen = corners[np.minimum(np.searchsorted(shares / shares[-1], places), len(corners) - 1)]
+    # Weights of the corners of each tetrahedron, from a sequence that fills the cube.
+    u = np.sort(np.arange(_SAMPLES)[:, None] * _SEQUENCE % 1.0, axis=1)
+    weights = np.diff(u, axis=1, prepend=0.0)
+    return np.asarray(middle + np.einsum("nk,nkj->nj", weights, chosen))
+
+
 def bound_solid(solid: Solid, protrusion: float) -> CoverPolytope:
-    """Return the polytopes of a convex solid, close enough for covers with a protrusion [m].
+    """Return a convex solid with a polytope, close enough for covers with a protrusion [m].
 
     Raises
     ------
@@ -114,27 +277,28 @@ def bound_solid(solid: Solid, protrusion: float) -> CoverPolytope:
     if isinstance(surface, Box):
         signs = np.array([[i, j, k] for i in (-1.0, 1.0) for j in (-1.0, 1.0) for k in (-1.0, 1.0)])
         return _bound_hull(solid_from_points(signs * solid.half))
-    if isinstance(surface, Sphere | Ellipsoid):
-        radii = np.ones(3) * (surface.radius if isinstance(surface, Sphere) else surface.radii)
-        inner, widening = _sphere_points(_count_sides(float(radii.max()), protrusion))
-        return _between(inner * radii, inner * radii * widening, solid_volume(solid))
-    radius, half = float(surface.radius), float(surface.length) / 2
-    up = np.array([0.0, 0.0, half])
-    count = _count_sides(radius, protrusion)
-    if isinstance(surface, Capsule):
-        inner, widening = _sphere_points(count)
-        inner = radius * inner
-        ends = [np.concatenate([points + up, points - up]) for points in (inner, widening * inner)]
-        return _between(ends[0], ends[1], solid_volume(solid))
+    if isinstance(surface, Ellipsoid):
+        radii = np.asarray(surface.radii, dtype=float)
+        points, widening = _sphere_points(_count_sides(float(radii.max()), protrusion))
+        inner, outer = (_bound_hull(solid_from_points(factor * points * radii)) for factor in (1.0, widening))
+        return CoverPolytope(outer.corners, outer.faces, inner.normals, inner.offsets, solid_volume(solid))
+    radius = float(surface.radius)
+    half = 0.0 if isinstance(surface, Sphere) else float(surface.length) / 2
+    count, up = _count_sides(radius, protrusion), half * _Z
+    if isinstance(surface, Sphere | Capsule):
+        points, widening = _sphere_points(count)
+        points *= radius * widening
+        side = RoundSide(np.zeros(3), _Z, half, radius)
+        return _bound_round(np.concatenate([points + up, points - up]), solid_volume(solid), side)
     angles = 2 * math.pi * np.arange(count) / count
-    inner = radius * np.column_stack([np.cos(angles), np.sin(angles), np.zeros(count)])
-    outer = inner / math.cos(math.pi / count)
+    rim = radius / math.cos(math.pi / count) * np.column_stack([np.cos(angles), np.sin(angles), 0.0 * angles])
     if isinstance(surface, Cylinder):
-        ends = [np.concatenate([points + up, points - up]) for points in (inner, outer)]
-        return _between(ends[0], ends[1], solid_volume(solid))
+        side = RoundSide(np.zeros(3), _Z, math.inf, radius)
+        return _bound_round(np.concatenate([rim + up, rim - up]), solid_volume(solid), side, half, half)
     assert isinstance(surface, Cone)
-    ends = [np.concatenate([points - up, up[None]]) for points in (inner, outer)]
-    return _between(ends[0], ends[1], solid_volume(solid))
+    slant = math.hypot(radius, 2 * half)
+    side = RoundSide(np.zeros(3), _Z, math.inf, half * radius / slant, radius / slant, 2 * half / slant)
+    return _bound_round(np.concatenate([rim - up, up[None]]), solid_volume(solid), side, half)
 
 
 @lru_cache(maxsize=4096)
@@ -165,13 +329,19 @@ def _bound_hull(solid: Solid) -> CoverPolytope:
     # Triangles of one flat face share a plane.
     planes = np.column_stack([surface.normals, surface.offsets / solid.radius])
     kept = np.unique(np.round(planes, 9), axis=0, return_index=True)[1]
-    return CoverPolytope(mesh.vertices, mesh.faces, surface.normals[kept], surface.offsets[kept], volume)
+    normals, offsets = surface.normals[kept], surface.offsets[kept]
+    return CoverPolytope(mesh.vertices, mesh.faces, normals, offsets, volume, is_hull=True)
 
 
-def _between(inner: Floats, outer: Floats, volume: float) -> CoverPolytope:
-    """Return the bounds of a solid between the hulls of two sets of points."""
-    inside, outside = _bound_hull(solid_from_points(inner)), _bound_hull(solid_from_points(outer))
-    return CoverPolytope(outside.corners, outside.faces, inside.normals, inside.offsets, volume, True)
+def _bound_round(
+    corners: Floats, volume: float, side: RoundSide, below: float | None = None, above: float | None = None
+) -> CoverPolytope:
+    """Return a solid with a round side, which may be cut flat below and above the origin [m]."""
+    around = _bound_hull(solid_from_points(corners))
+    cuts = [(-_Z, below), (_Z, above)]
+    normals = np.array([normal for normal, height in cuts if height is not None]).reshape(-1, 3)
+    offsets = np.array([height for _, height in cuts if height is not None])
+    return CoverPolytope(around.corners, around.faces, normals, offsets, volume, side)
 
 
 def _count_sides(radius: float, protrusion: float) -> int:

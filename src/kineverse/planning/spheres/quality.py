@@ -12,7 +12,7 @@ from kineverse.geometry.mesh_files import Floats
 from kineverse.geometry.shapes import Solid, import_coal
 
 from .certificate import distances, find_uncovered
-from .polytope import bound_solid
+from .polytope import CoverRegion, bound_solid
 from .union_volume import union_volume
 
 _ACCURACY, _FINENESS = 2e-3, 0.01
@@ -62,9 +62,10 @@ def measure_cover(solid: Solid, centres: npt.ArrayLike, radii: npt.ArrayLike) ->
     if not (np.isfinite(where).all() and np.isfinite(sizes).all() and (sizes > 0.0).all()):
         raise InvalidValueError("Spheres have finite centres and positive radii.")
     polytope = bound_solid(solid, _FINENESS * solid.radius)
-    missed = find_uncovered(polytope, where, sizes, _ACCURACY * solid.radius).points
+    region = CoverRegion([polytope])
+    missed = find_uncovered(region, where, sizes, _ACCURACY * solid.radius).points
     gaps = (distances(missed, where) - sizes).min(axis=1) if len(missed) else np.zeros(1)
-    depths = polytope.depths(where)
+    depths = region.depths(where)
     for k in np.flatnonzero(depths < 0.0).tolist():
         depths[k] = -_distance_from(solid, where[k])
     return CoverQuality(

@@ -7,7 +7,7 @@ import json
 import logging
 import threading
 from collections import OrderedDict
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
@@ -31,7 +31,7 @@ TREES = ContentCache(_OPEN, ".tree", 64 * 2**20, _LOG, "The sphere tree %s %s an
 """Covers and trees on the disk."""
 
 # Raise the number when the covers or trees of equal solids and settings change.
-_VERSION = 2
+_VERSION = 3
 _MOST_IN_MEMORY = 4096
 
 _in_memory: OrderedDict[str, SphereCover | SphereTree] = OrderedDict()
@@ -50,27 +50,21 @@ class CachedCover:
 
 
 def cover_key(
-    solids: Solid | Iterable[tuple[Solid, Floats]], protrusion: float | None, most: int | None = None
+    solids: Sequence[tuple[Solid, Floats]], protrusion: float | None, most: int | None = None
 ) -> str:
-    """Return the key of the cover or tree of convex solids.
+    """Return the key of the cover or tree of convex solids at poses (4, 4) [m].
 
-    Parameters
-    ----------
-    solids
-        A solid, or several with their poses (4, 4) [m].
-    protrusion, most
-        Settings: largest protrusion [m] and number of spheres; None for the default.
+    Settings are the largest protrusion [m] and number of spheres; None for the default.
     """
     settings = (_VERSION, None if protrusion is None else float(protrusion).hex(), most)
     digest = hashlib.sha256(repr(settings).encode())
-    for solid, pose in [(solids, np.eye(4))] if isinstance(solids, Solid) else solids:
+    for solid, pose in solids:
+        digest.update(f" {type(solid.surface).__name__} ".encode() + pose.tobytes())
         if isinstance(solid.surface, Hull):
             assert solid.core is not None
-            digest.update(b"hull %d " % solid.core.corners.size)
-            digest.update(solid.core.corners.tobytes())
+            digest.update(np.ascontiguousarray(solid.core.corners).tobytes())
         else:
             digest.update(repr(solid.surface).encode())
-        digest.update(pose.tobytes())
     return digest.hexdigest()[:40]
 
 

@@ -1,22 +1,23 @@
-"""Covers of convex solids by few spheres."""
+"""Covers of convex solids, and of unions of them, by few spheres."""
 
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
 
 import numpy as np
 
 from kineverse.errors import InvalidValueError
-from kineverse.geometry.mesh_files import Faces, Floats
+from kineverse.geometry.mesh_files import Floats
 from kineverse.geometry.shapes import Solid
 from kineverse.model.body import Capsule, Sphere
 
 from .cover_fit import FittedSpheres, fit_spheres
-from .polytope import bound_solid, solid_volume
+from .polytope import CoverRegion, bound_solid, solid_volume
 from .union_volume import union_volume
 
-MOST = 32
+MOST = 48
 """Default largest number of spheres of a cover."""
 
 PROTRUSION_OF_SIZE, LEAST_PROTRUSION, LARGEST_PROTRUSION = 0.1, 5e-3, 25e-3
@@ -27,16 +28,16 @@ _MOST_OF_ALL = 1024
 
 @dataclass(frozen=True, slots=True, eq=False)
 class SphereCover:
-    """Spheres whose union contains a solid.
+    """Spheres whose union contains solids.
 
     Attributes
     ----------
     centres, radii
-        (N, 3) and (N,) in the frame of the solid [m]; read-only.
+        (N, 3) and (N,) in the frame of the solids' poses [m]; read-only.
     protrusion
-        Upper bound of the distance of any point of a sphere from the solid [m].
+        Upper bound of the distance of any point of a sphere from the solids [m].
     excess
-        Volume of the union of the spheres over that of the solid, minus 1.
+        Volume of the union of the spheres over that of the union of the solids, minus 1.
     """
 
     centres: Floats
@@ -48,19 +49,32 @@ class SphereCover:
         """Return the number of spheres."""
         return len(self.radii)
 
+    def move(self, pose: Floats) -> SphereCover:
+        """Return the cover with its solids at a pose (4, 4)."""
+        centres: Floats = self.centres @ pose[:3, :3].T + pose[:3, 3]
+        centres.flags.writeable = False
+        return replace(self, centres=centres)
+
 
 def cover_solid(solid: Solid, protrusion: float | None = None, most: int = MOST) -> SphereCover:
-    """Return few spheres that cover a convex solid.
+    """Return few spheres that cover a convex solid, in its frame; see :func:`cover_solids`."""
+    return cover_solids([(solid, np.eye(4))], protrusion, most)
 
-    Every point of the solid lies in a sphere: subdivision proves it, up to rounding. The same solid has the
-    same cover in every run on one machine.
+
+def cover_solids(
+    solids: Sequence[tuple[Solid, Floats]], protrusion: float | None = None, most: int = MOST
+) -> SphereCover:
+    """Return few spheres that cover the union of convex solids at poses (4, 4).
+
+    Every point of the solids lies in a sphere: subdivision proves it, up to rounding. Spheres cover
+    themselves. The same solids have the same cover in every run on one machine.
 
     Parameters
     ----------
-    solid
-        The solid.
+    solids
+        The solids with their poses.
     protrusion
-        Largest distance of a point of a sphere from the solid [m]; None for :func:`default_protrusion`. It is
+        Largest distance of a point of a sphere from the union [m]; None for :func:`default_protrusion`. It is
         exceeded where ``most`` spheres are not enough; :attr:`SphereCover.protrusion` has what was reached.
     most
         Largest number of spheres.
@@ -71,37 +85,38 @@ def cover_solid(solid: Solid, protrusion: float | None = None, most: int = MOST)
         For a triangle mesh, which has no inside; or if the protrusion is not a positive length, or ``most``
         not between 1 and 1024.
     """
-    if isinstance(solid.surface, Faces):
-        raise InvalidValueError(
-            "A triangle mesh has no inside to be covered by spheres: use its hull or its decomposition."
-        )
-    if protrusion is None:
-        protrusion = default_protrusion(solid)
     check_cover_settings(protrusion, most)
-    # A hull may be longer than any sensible protrusion, and one ball is then enough.
-    protrusion = min(protrusion, 2.0 * solid.radius)
-    if isinstance(solid.surface, Sphere):
-        return _make_cover(
-            np.zeros((1, 3)), np.array([float(solid.surface.radius)]), 0.0, solid_volume(solid)
-        )
-    if isinstance(solid.surface, Capsule):
-        centres, radii, reached = _capsule_chain(solid.surface, protrusion, most)
-        return _make_cover(centres, radii, reached, solid_volume(solid))
-    polytope = bound_solid(solid, protrusion)
-    origin = polytope.find_deepest_point()
-    unit = solid.radius
-    fitted: FittedSpheres = fit_spheres(polytope.normalize(origin, unit), protrusion / unit, most)
-    return _make_cover(
-        fitted.centres * unit + origin, fitted.radii * unit, fitted.protrusion * unit, polytope.volume
-    )
+    spheres = [(pose, solid.surface) for solid, pose in solids if isinstance(solid.surface, Sphere)]
+    if len(spheres) == len(solids) <= most:
+        places = np.array([pose[:3, 3] for pose, _ in spheres])
+        sizes = np.array([sphere.radius for _, sphere in spheres], dtype=float)
+        return _make_cover(places, sizes, 0.0, _volume(solids))
+    if protrusion is None:
+        protrusion = default_protrusion(solids)
+    # Solids may be longer than any sensible protrusion, and one ball is then enough.
+    protrusion = min(protrusion, 2.0 * sum(solid.radius for solid, _ in solids))
+    (first, pose), *others = solids
+    if isinstance(first.surface, Capsule) and not others:
+        centres, radii, reached = _capsule_chain(first.surface, protrusion, most)
+        return _make_cover(centres, radii, reached, _volume(solids)).move(pose)
+    parts = [bound_solid(solid, protrusion).move(pose) for solid, pose in solids]
+    corners = np.concatenate([part.corners for part in parts])
+    low, high = corners.min(axis=0), corners.max(axis=0)
+    origin, unit = (low + high) / 2, float(np.linalg.norm(high - low)) / 2
+    shift = np.eye(4)
+    shift[:3, 3] = -origin
+    region = CoverRegion([part.move(shift, 1.0 / unit) for part in parts])
+    fitted: FittedSpheres = fit_spheres(region, protrusion / unit, most)
+    volume = region.measure_volume() * unit**3
+    return _make_cover(fitted.centres * unit + origin, fitted.radii * unit, fitted.protrusion * unit, volume)
 
 
-def default_protrusion(solid: Solid) -> float:
+def default_protrusion(solids: Sequence[tuple[Solid, Floats]]) -> float:
     """Return the protrusion of covers where none is asked for: a tenth of the size, from 5 mm to 25 mm [m].
 
-    The size is the edge of a cube with the volume of the solid.
+    The size is the edge of a cube with the volume of the union.
     """
-    size = math.cbrt(solid_volume(solid))
+    size = math.cbrt(_volume(solids))
     return min(max(PROTRUSION_OF_SIZE * size, LEAST_PROTRUSION), LARGEST_PROTRUSION)
 
 
@@ -111,6 +126,13 @@ def check_cover_settings(protrusion: float | None, most: int) -> None:
         raise InvalidValueError(f"A protrusion of {protrusion:g} m: spheres stick out by a positive length.")
     if not 1 <= most <= _MOST_OF_ALL:
         raise InvalidValueError(f"most={most}: a cover has 1 to {_MOST_OF_ALL} spheres.")
+
+
+def _volume(solids: Sequence[tuple[Solid, Floats]]) -> float:
+    if len(solids) == 1:
+        return solid_volume(solids[0][0])
+    parts = [bound_solid(solid, 0.1 * solid.radius).move(pose) for solid, pose in solids]
+    return CoverRegion(parts).measure_volume()
 
 
 def _make_cover(centres: Floats, radii: Floats, protrusion: float, volume: float) -> SphereCover:
@@ -125,7 +147,8 @@ def _capsule_chain(capsule: Capsule, protrusion: float, most: int) -> tuple[Floa
     With radius r + e they reach beyond both ends by e if the outermost are e inside of the ends of the axis,
     and cover the side as long as neighbours are no further than 2 √((r + e)² - r²) apart.
     """
-    radius, length = float(capsule.radius), float(capsule.length)
+    radius = float(capsule.radius)
+    length = float(capsule.length)
 
     def count_spheres(e: float) -> int:
         span = max(length - 2 * e, 0.0)
