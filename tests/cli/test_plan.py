@@ -135,6 +135,7 @@ def test_requests_and_robots_are_parsed():
         (["--to", "j0=1", "--margin", "-1cm"], "The margin"),
         (["--to", "j0=1", "--move", "j1"], "--move does not say that it moves"),
         (["--to", "j0=1", "--picture", "a.jpg"], "written as .png"),
+        (["--to", "j0=1", "--leave-out", "bax"], "Did you mean 'box'"),
         (["--to", "j0=1", "--save", "a.csv"], "written as .json"),
         (["--to", "j0=1", "--from", "none.json"], "none.json"),
         (["--to", "j0=1", "--from", "wrong.json"], "object of numbers"),

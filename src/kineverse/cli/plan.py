@@ -116,6 +116,14 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--srdf", metavar="FILE", help="SRDF of the robot: pairs that are not checked, states"
     )
+    parser.add_argument(
+        "--leave-out",
+        nargs="+",
+        action="extend",
+        default=[],
+        metavar="BODY",
+        help="bodies or patterns that are no obstacles, such as those whose mesh is missing",
+    )
     parser.add_argument("--margin", metavar="M", default="0", help="least distance from everything (1cm); 0")
     parser.add_argument(
         "--seconds", type=float, default=5.0, metavar="S", help="largest time of the search (5)"
@@ -246,7 +254,7 @@ def _prepare(
     goal_tasks = [make_hold(model, target) for target in goal.targets]
     grips = [make_grip(model, target, start.targets, None) for target in holds]
     with show_activity("covering shapes by spheres and compiling; this is kept for the next time"):
-        planner = Planner(model, move, rules=rules, margin=margin)
+        planner = Planner(model, move, rules=rules, margin=margin, leave_out=arguments.leave_out)
     moving = {*planner.symbols}
     bare = [b for b in model.bodies if b not in planner.scene.bodies and moving & {*model.symbols_of(b)}]
     if bare:

@@ -394,8 +394,10 @@ class Planner:
                 named = ", ".join(f"'{s}'" for s in self.space.unlimited)
                 why += f" Without limits, so searched within 2 m or rad of the start: {named}."
             return why
-        contacts = scene.judge(touching).contacts(rows[0].astype(float), checker.struct.margin)
-        example = f", for example of {describe_contacts(contacts)}" if len(contacts) else ""
+        judge = scene.judge(touching)
+        found = [judge.contacts(row.astype(float), checker.struct.margin) for row in rows[:_TASK_GOALS]]
+        least = max((c for c in found if len(c)), key=lambda c: float(c[0].distance), default=None)
+        example = "" if least is None else f", at least of {describe_contacts(least)}"
         return (
             f"No configuration without collision was found that meets {names}. In reach, but with contacts "
             f"or violated constraints{example}."
