@@ -124,6 +124,9 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         metavar="BODY",
         help="bodies or patterns that are no obstacles, such as those whose mesh is missing",
     )
+    parser.add_argument(
+        "--decomposed", action="store_true", help="use the hulls of kineverse decompose for hollow meshes"
+    )
     parser.add_argument("--margin", metavar="M", default="0", help="least distance from everything (1cm); 0")
     parser.add_argument(
         "--seconds", type=float, default=5.0, metavar="S", help="largest time of the search (5)"
@@ -254,7 +257,14 @@ def _prepare(
     goal_tasks = [make_hold(model, target) for target in goal.targets]
     grips = [make_grip(model, target, start.targets, None) for target in holds]
     with show_activity("covering shapes by spheres and compiling; this is kept for the next time"):
-        planner = Planner(model, move, rules=rules, margin=margin, leave_out=arguments.leave_out)
+        planner = Planner(
+            model,
+            move,
+            rules=rules,
+            margin=margin,
+            decomposed=("*",) if arguments.decomposed else (),
+            leave_out=arguments.leave_out,
+        )
     moving = {*planner.symbols}
     bare = [b for b in model.bodies if b not in planner.scene.bodies and moving & {*model.symbols_of(b)}]
     if bare:
