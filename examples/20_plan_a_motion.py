@@ -5,10 +5,7 @@ The page in the browser plays it; with ``--headless`` the picture plan.png is wr
 
 import sys
 
-import numpy as np
-
 import kineverse as kv
-from kineverse.control import Goal, same_position
 from kineverse.planning import Planner
 from kineverse.view import save_picture
 
@@ -18,12 +15,12 @@ arm = [s for s in model.symbols_of("fetch/gripper_link") if "base" not in str(s)
 planner = Planner(model, arm, protrusion=0.04)  # coarse spheres, which are found sooner
 planner.place({"fetch/base/x": 0.3, "fetch/base/y": -1.3, "kitchen/fridge_door": 1.5})
 
-hand = model.fk("fetch/gripper_link")
 beside, inside = (
-    Goal(same_position(kv.translation(*p), hand), np.zeros(3)) for p in ((0.8, -0.6, 1.1), (1.35, -1.4, 1.2))
+    planner.hold("fetch/gripper_link", "world", mask="xyz", offset=kv.translation(*p))
+    for p in ((0.8, -0.6, 1.1), (1.35, -1.4, 1.2))
 )
 start = planner.solutions(beside, count=1)[0]
-path = planner.plan(start, [inside], seconds=5.0)
+path = planner.plan(start, inside, seconds=5.0)
 if not path:
     sys.exit(path.why)
 trajectory = path.trajectory()

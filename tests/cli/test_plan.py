@@ -26,7 +26,7 @@ def test_path_is_printed_saved_and_drawn(run, tmp_path):
     words = ["--from", "j0=1", "--to", "j0=-1", *ALL, "--save", tmp_path / "a.json"]
     status, out, err = run("plan", ARM, *words, "--picture", tmp_path / "a.png", "--verbose")
     assert status == 0
-    assert out.startswith("j0=-1: found\n  points ")
+    assert out.startswith("j0=-1: found\n  moves      j0, j1, j2\n  points ")
     assert "time [s]" in out
     assert f"trajectory: {tmp_path / 'a.json'}" in out
     assert "picture:" in err
@@ -68,6 +68,10 @@ def test_no_path_ends_with_status_1_and_the_reason(run):
     answer = json.loads(out)
     assert (status, answer["found"], answer["times"]) == (1, False, None)
     assert "its range is -3 to 3" in answer["why"]
+    status, out, _ = run("plan", ARM, "--to", "j0=4")
+    assert (status, out.splitlines()[1].split()[:2]) == (1, ["moves", "j0;"])
+    status, _, err = run("plan", "--to", "j0=1", str(ARM))
+    assert (status, "MODEL comes first" in err) == (2, True)
 
 
 def test_without_a_compiler_it_says_what_works(run, monkeypatch):
@@ -131,6 +135,8 @@ def test_requests_and_robots_are_parsed():
         (["--to", "j0=1", "--margin", "-1cm"], "The margin"),
         (["--to", "j0=1", "--move", "j1"], "--move does not say that it moves"),
         (["--to", "j0=1", "--picture", "a.jpg"], "written as .png"),
+        (["--to", "j0=1", "--leave-out", "bax"], "Did you mean 'box'"),
+        (["--to", "j0=1", "--save", "a.csv"], "written as .json"),
         (["--to", "j0=1", "--from", "none.json"], "none.json"),
         (["--to", "j0=1", "--from", "wrong.json"], "object of numbers"),
         (["--to", "tip@knob+1,0,0", "--along", "tip@knob+1,0,0"], "given there, with --from"),

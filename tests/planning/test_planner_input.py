@@ -58,6 +58,8 @@ def test_nothing_around_is_no_obstacle(ball):
         ([[1, 2, 3]], ShapeError),
         (np.zeros((2, 2, 2)), ShapeError),
         ({"nothing": 1.0}, UnknownNameError),
+        ({"q00": np.inf}, InvalidValueError),
+        ({"q00": -1e9}, InvalidValueError),
     ],
 )
 def test_wrong_configurations_are_refused(ball, given, error):
@@ -121,6 +123,19 @@ def test_wrong_arguments_are_refused(ball):
         ball.place({"nothing": 1.0})
     with pytest.raises(ShapeError, match="differ"):
         ball.edges(np.zeros((2, 2)), np.zeros((3, 2)))
+
+
+def test_goals_out_of_reach_differ_from_blocked_ones():
+    planner = Planner(points(2, 30), margin=0.01)
+    q = planner.symbols[0]
+    why = planner.plan([0, 0], kv.control.Hold(q, 50.0, name="far"), seconds=0.05).why
+    assert why.startswith("Out of reach")
+    assert "'far'" in why
+    assert "searched within 2 m or rad of the start: 'q00', 'q01'" in why
+    blocked = [kv.control.Hold(s, target) for s, target in zip(planner.symbols, (0.0, -10.3), strict=True)]
+    why = planner.plan([0, -9], blocked, seconds=0.05).why
+    assert "In reach" in why
+    assert "'ball' and 'box10' (150.0 mm deep)" in why
 
 
 def test_planners_and_paths_are_pickled():

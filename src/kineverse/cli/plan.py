@@ -72,7 +72,9 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Declare the options."""
     # Options that take several words come last, or they would take MODEL as well.
     parser.usage = "%(prog)s MODEL --to (NAME=VALUE | FRAME@POSE | STATE) ... [options]"
-    parser.add_argument("model", metavar="MODEL", help="name of a shipped model, or path of a file")
+    parser.add_argument(
+        "model", metavar="MODEL", nargs="?", help="name of a shipped model, or path of a file; it comes first"
+    )
     parser.add_argument(
         "--to",
         nargs="+",
@@ -114,9 +116,23 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--srdf", metavar="FILE", help="SRDF of the robot: pairs that are not checked, states"
     )
+    parser.add_argument(
+        "--leave-out",
+        nargs="+",
+        action="extend",
+        default=[],
+        metavar="BODY",
+        help="bodies or patterns that are no obstacles, such as those whose mesh is missing",
+    )
+    parser.add_argument(
+        "--decomposed", action="store_true", help="use the hulls of kineverse decompose for hollow meshes"
+    )
     parser.add_argument("--margin", metavar="M", default="0", help="least distance from everything (1cm); 0")
     parser.add_argument(
         "--seconds", type=float, default=5.0, metavar="S", help="largest time of the search (5)"
+    )
+    parser.add_argument(
+        "--optimize", action="store_true", help="use all of these seconds to shorten the path"
     )
     parser.add_argument("--seed", type=int, default=0, metavar="N", help="seed of the search (0)")
     parser.add_argument("--save", metavar="FILE", help="write the trajectory to a file (.json)")
@@ -166,6 +182,8 @@ class _Problem:
 def run(arguments: argparse.Namespace) -> int:
     """Plan the path, print it, show it if wanted, and return the status."""
     # Parsed before the model is loaded, so that a typing error is reported at once.
+    if arguments.model is None:
+        raise InvalidValueError("MODEL comes first, before options that take several words, such as --to.")
     start = parse_request(arguments.start, "--from", read_files=True)
     goal = parse_request(arguments.to, "--to")
     holds = [parse_frame_target(word, "--along") for word in arguments.along]
@@ -174,6 +192,10 @@ def run(arguments: argparse.Namespace) -> int:
         from kineverse.view.pictures import check_png_name
 
         check_png_name(arguments.picture)
+    if arguments.save is not None:
+        from kineverse.planning.trajectories.trajectory_file import check_trajectory_name
+
+        check_trajectory_name(arguments.save)
     if not arguments.seconds > 0 or math.isinf(arguments.seconds):
         raise InvalidValueError(f"--seconds is a positive number, not {arguments.seconds:g}.")
 
@@ -183,7 +205,7 @@ def run(arguments: argparse.Namespace) -> int:
         planning_functions()  # says at once that there is no compiler
     begin = perf_counter()
     problem = _prepare(arguments, start, goal, holds, margin)
-    path = _plan(problem, arguments.seconds, arguments.seed)
+    path = _plan(problem, arguments.seconds, arguments.seed, arguments.optimize)
     trajectory = path.trajectory() if path.found else None
     preparation = perf_counter() - begin - path.seconds
     if arguments.save is not None and trajectory is not None:
@@ -235,7 +257,14 @@ def _prepare(
     goal_tasks = [make_hold(model, target) for target in goal.targets]
     grips = [make_grip(model, target, start.targets, None) for target in holds]
     with show_activity("covering shapes by spheres and compiling; this is kept for the next time"):
-        planner = Planner(model, move, rules=rules, margin=margin)
+        planner = Planner(
+            model,
+            move,
+            rules=rules,
+            margin=margin,
+            decomposed=("*",) if arguments.decomposed else (),
+            leave_out=arguments.leave_out,
+        )
     moving = {*planner.symbols}
     bare = [b for b in model.bodies if b not in planner.scene.bodies and moving & {*model.symbols_of(b)}]
     if bare:
@@ -253,7 +282,7 @@ def _srdf_prefix(model: kv.Model, robot: str) -> str:
     return robot if any(name.startswith(f"{robot}/") for name in model.frames) else ""
 
 
-def _plan(problem: _Problem, seconds: float, seed: int) -> Path:
+def _plan(problem: _Problem, seconds: float, seed: int, optimize: bool) -> Path:
     """Return the path from the first of some starts from which there is one."""
     from kineverse.control import Hold
 
@@ -291,6 +320,7 @@ def _plan(problem: _Problem, seconds: float, seed: int) -> Path:
                 along=[hold for hold in along if hold],
                 seconds=seconds / len(standing),
                 seed=seed,
+                optimize=optimize,
             )
         if path.found:
             break
@@ -309,11 +339,14 @@ def _print_path(arguments: argparse.Namespace, path: Path, preparation: float) -
     goal = " ".join(arguments.to)
     if not path.found:
         print(f"{goal}: not found. {path.why}")
+        if not arguments.move:
+            print(f"  moves      {_list_moving(path)}; --move names others")
         return
     clearance = path.clearance()
     near = "nothing within 50 cm" if math.isinf(clearance) else f"{format_number(1e3 * clearance, 4)} mm"
     print(f"{goal}: found")
     for name, value in (
+        ("moves", _list_moving(path)),
         ("points", str(len(path))),
         ("length", f"{format_number(path.length, 4)} (rad, m)"),
         ("duration", f"{format_number(float(path.times[-1]), 4)} s"),
@@ -326,6 +359,11 @@ def _print_path(arguments: argparse.Namespace, path: Path, preparation: float) -
         print(_format_way(path))
     if arguments.save is not None:
         print(f"trajectory: {arguments.save}")
+
+
+def _list_moving(path: Path) -> str:
+    more = f" and {len(path.symbols) - 3} more" if len(path.symbols) > 3 else ""
+    return ", ".join(map(str, path.symbols[:3])) + more
 
 
 def _format_time(seconds: float) -> str:

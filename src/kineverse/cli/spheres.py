@@ -75,7 +75,9 @@ class LinkCover:
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Declare the options."""
-    parser.add_argument("model", metavar="MODEL", nargs="?", help="name or path of a model")
+    # An option that takes several words would take MODEL as well.
+    parser.usage = "%(prog)s [MODEL] [options]"
+    parser.add_argument("model", metavar="MODEL", nargs="?", help="name or path of a model; it comes first")
     add_model_options(parser)
     parser.add_argument("--links", metavar="LINK", nargs="+", help="only the shapes of these links")
     parser.add_argument("--protrusion", metavar="M", help="how far spheres may stick out: 0.005, 5mm")
@@ -93,15 +95,21 @@ def run(arguments: argparse.Namespace) -> int:
     if arguments.list or arguments.clear:
         return _manage_cache(arguments)
     if arguments.model is None:
-        raise UnknownNameError("Name a model; see kineverse spheres --help.")
+        raise UnknownNameError("Name a model, before --links; see kineverse spheres --help.")
     from kineverse.planning.spheres.sphere_cover import MOST, check_cover_settings
 
     protrusion = None if arguments.protrusion is None else parse_length(arguments.protrusion)
     most = MOST if arguments.most is None else arguments.most
     check_cover_settings(protrusion, most)
     state = parse_assignments(arguments.assignments)
+    if arguments.picture is not None:
+        from kineverse.view.pictures import check_png_name
+
+        check_png_name(arguments.picture)
     with show_activity(f"reading {arguments.model}"):
         model = load_model(arguments, arguments.model)
+    for name in state:
+        model.symbol(name)  # raises for unknown names, with similar ones
     links = [LinkCover(body, items) for body, items in _objects(model, arguments).items()]
     for link in show_progress(links, "covering", "link"):
         _cover(link, protrusion, most, arguments.force)

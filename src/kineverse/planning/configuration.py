@@ -128,6 +128,12 @@ class PlanningSpace:
         finite = np.isfinite(self.lower), np.isfinite(self.upper)
         return np.where(finite[0], self.lower, low), np.where(finite[1], self.upper, high)
 
+    @property
+    def unlimited(self) -> tuple[Symbol, ...]:
+        """Coordinates without limits that are searched about the start, such as those of a base."""
+        bounded = self.turning | np.isfinite(self.lower) & np.isfinite(self.upper)
+        return tuple(s for s, stays in zip(self.symbols, bounded, strict=True) if not stays)
+
     def equivalents(self, q: Array, start: Array, most: int = 32) -> Array:
         """Return configurations (K, n) within bounds about a start that are q but for full turns of joints.
 
@@ -200,9 +206,9 @@ def read_configurations(space: PlanningSpace, placed: State, Q: Any, name: str) 
         For anything else, and for states in which something stands elsewhere that the planner does not move.
     """
     if isinstance(Q, Mapping):
-        return _read_state(space, placed, Q, name)[None]
+        Q = [Q]
     if isinstance(Q, Sequence) and len(Q) and isinstance(Q[0], Mapping):
-        return np.array([_read_state(space, placed, q, name) for q in Q])
+        Q = np.array([_read_state(space, placed, q, name) for q in Q])
     n = len(space.symbols)
     wanted = f"wanted are configurations of {n} coordinates, in the order of planner.symbols, or states"
     try:
@@ -217,8 +223,8 @@ def read_configurations(space: PlanningSpace, placed: State, Q: Any, name: str) 
         raise InvalidValueError(f"{name} has values that are not finite.")
     if len(points) and np.abs(points).max() > _LARGEST:
         raise InvalidValueError(
-            f"{name} has values beyond {_LARGEST:g}, which have no room in single precision. Choose an "
-            "origin that is nearer."
+            f"{name} has values beyond {_LARGEST:g}, which have no room in single precision: check "
+            "the units, or choose an origin that is nearer."
         )
     return np.ascontiguousarray(points)
 

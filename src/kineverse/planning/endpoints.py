@@ -88,7 +88,7 @@ class Endpoints:
         if len(contacts):
             return Endpoint(q, f"{what} is in collision: {describe_contacts(contacts)}.")
         nearest = self._judge.contacts(q, checker.struct.margin + _ROUNDING)
-        found = [f"'{c.a}' and '{c.b}' are {1e3 * c.distance:.2g} mm apart" for c in [*nearest][:3]]
+        found = [f"'{c.a}' and '{c.b}' are {1e3 * c.distance:.4g} mm apart" for c in [*nearest][:3]]
         return Endpoint(
             q, f"{what} is free, but nearer to a contact than margin= allows: {', '.join(found)}."
         )

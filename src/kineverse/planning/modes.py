@@ -188,8 +188,9 @@ class ModeSearch:
         best = max(nodes, key=lambda node: len(node.segments(self._modes)))
         reached = ", ".join(sorted({self._modes[node.mode].name for node in nodes}))
         problem = (
-            f"No path through the modes was found in {self._seconds:g} s: {len(nodes)} changes of modes were "
-            f"reached, in {reached}. More seconds=, another place of the base, or other holds may help."
+            f"No path through the modes was found in {self._seconds:g} s: {len(nodes) - 1} changes of modes "
+            f"were reached, in {reached}. More seconds=, another place of the base, or other holds may help; "
+            "plan() to the holds of one mode alone says what is in the way."
         )
         return ModePath(best.segments(self._modes), self._searches, problem)
 

@@ -24,9 +24,10 @@ from kineverse.state import State, StateLike
 from kineverse.symbols import Symbol
 
 from .bindings import planning_functions
-from .checker import CollisionChecker
+from .checker import BodyPairs, CollisionChecker
 from .configuration import PlanningSpace, read_configurations, read_state
 from .endpoints import describe_barrier
+from .judge import describe_contacts
 from .manifold import FrameHold, hold_frames
 from .modes import Mode, ModeSearch
 from .path import Path
@@ -36,6 +37,8 @@ from .roadmap import Roadmap
 
 _TASK_GOALS = 32
 """Number of configurations that are looked for where tasks are the goal."""
+_TRIES = 2048
+"""Number of random configurations that say whether tasks are out of reach."""
 _METHODS = ("rrt-connect", "prm")
 
 
@@ -324,7 +327,7 @@ class Planner:
         if tasks:
             ends = scene.solutions([*holds, *tasks], q, _TASK_GOALS, seconds, seed, touching)
             if not len(ends):
-                return scene.no_path(q, self._no_solution([*holds, *tasks]), begin)
+                return scene.no_path(q, self._no_solution([*holds, *tasks], touching), begin)
         else:
             ends = self._configurations(goals, "goals")
             if not len(ends):
@@ -375,11 +378,29 @@ class Planner:
             self.roadmap = Roadmap(symbols, turning)
         return self.roadmap
 
-    def _no_solution(self, tasks: Sequence[Hold]) -> str:
-        names = ", ".join(repr(task) for task in tasks)
+    def _no_solution(self, tasks: Sequence[Hold], touching: BodyPairs) -> str:
+        """Return why no configuration was found that meets tasks: out of reach, or what touches there."""
+        scene, checker = self.planning_scene, self.checker
+        manifold = scene.manifold(tasks)
+        assert manifold is not None
+        tries = np.random.default_rng(0).uniform(checker.lower, checker.upper, (_TRIES, len(self.symbols)))
+        rows = tries.astype(np.float32)
+        rows = rows[manifold.project(rows)]
+        given = (f"'{task.name}'" if task.name else "goals without names" for task in tasks)
+        names = " and ".join(dict.fromkeys(given))
+        if not len(rows):
+            why = f"Out of reach: no configuration within limits was found that meets {names}."
+            if self.space.unlimited:
+                named = ", ".join(f"'{s}'" for s in self.space.unlimited)
+                why += f" Without limits, so searched within 2 m or rad of the start: {named}."
+            return why
+        judge = scene.judge(touching)
+        found = [judge.contacts(row.astype(float), checker.struct.margin) for row in rows[:_TASK_GOALS]]
+        least = max((c for c in found if len(c)), key=lambda c: float(c[0].distance), default=None)
+        example = "" if least is None else f", at least of {describe_contacts(least)}"
         return (
-            f"No configuration without collision was found at which {names} are met. Out of reach, or always "
-            "in contact? kv.control.inverse_kinematics says which; another place of the base may help."
+            f"No configuration without collision was found that meets {names}. In reach, but with contacts "
+            f"or violated constraints{example}."
         )
 
     def __repr__(self) -> str:

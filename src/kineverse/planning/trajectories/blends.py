@@ -123,7 +123,7 @@ def round_corners(
             f"{allowed.shape}."
         )
     if not (allowed >= 0).all():
-        raise InvalidValueError(f"deviation= is a distance from 0, not {deviation!r}.")
+        raise InvalidValueError(f"deviation= is a distance from 0, not {allowed}.")
     steps = np.linalg.norm(np.diff(polyline, axis=0), axis=1)
     # A step below the rounding of the points has no direction.
     keep = np.concatenate(([True], steps > 8 * np.finfo(float).eps * (1 + np.abs(polyline).max())))

@@ -35,14 +35,30 @@ class TrajectoryData(NamedTuple):
     velocities: Array
 
 
+def check_trajectory_name(path: str | os.PathLike[str]) -> None:
+    """Check that the name of a file ends in .json, or has no suffix.
+
+    Raises
+    ------
+    FormatError
+        If it has another suffix.
+    """
+    suffix = Path(path).suffix
+    if suffix.lower() not in ("", ".json"):
+        raise FormatError(
+            f"Trajectories are written as .json, not {suffix}: '{Path(path).with_suffix('.json')}'."
+        )
+
+
 def write_trajectory_file(path: str | os.PathLike[str], data: TrajectoryData) -> None:
     """Write the data of a trajectory to a file.
 
     Raises
     ------
     FormatError
-        If the file cannot be written.
+        If the file cannot be written, or has another suffix than .json.
     """
+    check_trajectory_name(path)
     document = {"format": FORMAT, "version": VERSION, "coordinates": data.names}
     document |= {key: getattr(data, key).tolist() for key in data._fields[1:]}
     replace_file(Path(path), json.dumps(document, allow_nan=False).encode())
