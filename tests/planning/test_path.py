@@ -93,6 +93,9 @@ def test_limits_may_be_given(path):
     slow = path.trajectory(velocity=0.5, acceleration=[1.0, 1.0, 1.0])
     assert np.abs(slow.velocities).max() <= 0.5 * (1 + 1e-9)
     assert slow.duration > path.trajectory(ramp=0.1).duration
+    # A number is no leave to go faster than the model may.
+    assert path.trajectory(velocity=50.0).duration == path.trajectory().duration
+    assert path.trajectory(velocity=[50.0] * 3, acceleration=500.0).duration <= path.trajectory().duration
 
 
 def test_trajectory_is_that_of_the_place_where_it_was_planned(planner, path):

@@ -25,7 +25,9 @@ from .bindings import MOST_COORDINATES
 _WILDCARDS = "*?["
 _LARGEST = 1e6
 """Largest coordinate of a configuration [rad], [m]; edges are computed in single precision."""
-_HALF_TURN, _BEYOND = math.pi + 0.3, 2.0
+_HALF_TURN = math.pi + 0.3
+BEYOND = 2.0
+"""How far coordinates without limits go beyond what is given [m], [rad]."""
 CONDITION_TOLERANCE = 1e-5
 """Largest excess of a constraint that counts as satisfied; float has seven digits."""
 
@@ -115,16 +117,16 @@ class PlanningSpace:
         # An empty range makes every configuration invalid, and messages name it.
         self.upper[:] = np.maximum(self.lower, self.upper)
 
-    def bounds(self, start: Array, points: Array) -> tuple[Array, Array]:
+    def bounds(self, start: Array, points: Array, beyond: float = BEYOND) -> tuple[Array, Array]:
         """Return finite bounds (n,) of a search from a start (n,) to or about configurations (N, n).
 
         A joint that turns fully, without limits, may turn by a little more than half a turn to either side
-        of the start; another coordinate without limits may go beyond the start and the given ones by 2 m or
-        rad.
+        of the start; another coordinate without limits may go beyond the start and the given ones by a length
+        [m], [rad].
         """
         given = np.vstack([start[None], points])
-        low = np.where(self.turning, start - _HALF_TURN, given.min(axis=0) - _BEYOND)
-        high = np.where(self.turning, start + _HALF_TURN, given.max(axis=0) + _BEYOND)
+        low = np.where(self.turning, start - _HALF_TURN, given.min(axis=0) - beyond)
+        high = np.where(self.turning, start + _HALF_TURN, given.max(axis=0) + beyond)
         finite = np.isfinite(self.lower), np.isfinite(self.upper)
         return np.where(finite[0], self.lower, low), np.where(finite[1], self.upper, high)
 

@@ -113,8 +113,8 @@ class Path:
             Time from rest to full speed [s] where the model states no acceleration, see
             :func:`.motion_limits`.
         velocity, acceleration
-            Largest speeds and accelerations (n,), or numbers for all coordinates; None for those of the
-            model.
+            Largest speeds and accelerations (n,), which replace those of the model; a number for all
+            coordinates applies beside them.
 
         Raises
         ------
@@ -157,7 +157,7 @@ class Path:
         given = {"velocity=": velocity, "acceleration=": acceleration}
         limits = MotionLimits(
             *(
-                own if other is None else _as_numbers(name, other)
+                own if other is None else _combine_limits(own, _as_numbers(name, other))
                 for own, (name, other) in zip(stated, given.items(), strict=True)
             )
         )
@@ -215,6 +215,11 @@ class Path:
         if self.found:
             return f"<Path: {len(self.points)} points, length {self.length:.3g}, {1e3 * self.seconds:.3g} ms>"
         return f"<Path: not found. {self.why}>"
+
+
+def _combine_limits(own: Array, given: Array) -> Array:
+    """Return given limits (n,), or those of the model bounded by a number; what is wrong stays so."""
+    return given if given.ndim or not given > 0 else np.minimum(own, given)
 
 
 def _as_numbers(name: str, given: Any) -> Array:

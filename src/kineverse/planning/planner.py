@@ -392,7 +392,7 @@ class Planner:
             why = f"Out of reach: no configuration within limits was found that meets {names}."
             if self.space.unlimited:
                 named = ", ".join(f"'{s}'" for s in self.space.unlimited)
-                why += f" Without limits, so searched within 2 m or rad of the start: {named}."
+                why += f" Without limits, so searched within 32 m or rad of the start: {named}."
             return why
         judge = scene.judge(touching)
         found = [judge.contacts(row.astype(float), checker.struct.margin) for row in rows[:_TASK_GOALS]]

@@ -24,7 +24,7 @@ from kineverse.state import State
 from kineverse.symbols import Symbol
 
 from .checker import BodyPairs, CollisionChecker
-from .configuration import PlanningSpace
+from .configuration import BEYOND, PlanningSpace
 from .connection import MORE_PATIENCE, PATIENCE, connect, connect_on_manifold
 from .endpoints import Endpoint, Endpoints
 from .judge import SceneJudge, describe_contacts
@@ -121,9 +121,11 @@ class PlanningScene:
         """Place the checker again where everything stands."""
         self.checker.place(self.state)
 
-    def set_bounds(self, start: Array, points: Array, still: Flags | None = None) -> None:
+    def set_bounds(
+        self, start: Array, points: Array, still: Flags | None = None, beyond: float = BEYOND
+    ) -> None:
         """Set the bounds of a search from a start (n,) to points (N, n); some coordinates may stand still."""
-        lower, upper = self.space.bounds(start, points)
+        lower, upper = self.space.bounds(start, points, beyond)
         if still is not None:
             lower, upper = np.where(still, start, lower), np.where(still, start, upper)
         self.checker.lower[:], self.checker.upper[:] = lower, upper
@@ -139,12 +141,21 @@ class PlanningScene:
         still: Flags | None = None,
         batches: int = MOST_BATCHES,
     ) -> Array:
-        """Return solutions (K, n), those near to a configuration first; some coordinates have its values."""
-        self.set_bounds(near, near[None], still)
+        """Return solutions (K, n), those near to a configuration first; some coordinates have its values.
+
+        Coordinates without limits are searched further and further away.
+        """
         manifold = self.manifold(holds)
         assert manifold is not None
+        reaches = [BEYOND * k for k in ((1, 4, 16) if self.space.unlimited else (1,))]
         with self.checker.excepting(touching):
-            return find_solutions(self.checker, manifold, near, count, seconds, seed, batches)
+            for beyond in reaches:
+                self.set_bounds(near, near[None], still, beyond)
+                share = seconds / len(reaches)
+                found = find_solutions(self.checker, manifold, near, count, share, seed, batches)
+                if len(found):
+                    break
+        return found
 
     def manifold(self, holds: Sequence[Hold]) -> Manifold | None:
         """Return the manifold of holds and equalities of the model, at the present place."""
