@@ -9,7 +9,7 @@ from planning_models import arm_among_shapes, ball_and_plate, body, contacts, is
 
 import kineverse as kv
 from kineverse.geometry import Scene
-from kineverse.model.body import Box, Mesh, Sphere
+from kineverse.model.body import Box, Cylinder, Mesh, Sphere
 from kineverse.planning import Planner
 
 pytestmark = pytest.mark.compiler
@@ -126,6 +126,23 @@ def test_certificate_finds_a_plate_between_two_samples(plate):
         assert collision[0] == 0
         at = a + collision[1] * (b - a)
         assert abs(at[column]) < 0.05
+
+
+def test_leaning_pole_and_fast_thread_are_not_slipped_through():
+    x, z, lift = (kv.position(name) for name in ("x", "z", "lift"))
+    model = kv.Model()
+    with model.edit() as edit:
+        edit.add_frame("ball", "world", kv.translation(x, 0, z), body(Sphere(0.01)))
+        edit.add_frame("pole", "world", kv.rotation_y(1.3e-3), body(Cylinder(0.02, 8.0)))
+        # A turn for each 1/64 m, the distance of two samples.
+        spindle = kv.translation(5, 0, lift) @ kv.rotation_z(128 * np.pi * lift)
+        edit.add_frame("bar", "world", spindle, body(Box((0.02, 1.0, 0.02)), at=(0, 0.5, 0)))
+        edit.add_frame("post", "world", kv.translation(5.4, 0, 0), body(Box((0.02, 0.02, 3.0))))
+    planner = Planner(model, ["x", "z", "lift"])
+    leaning = np.array([[0.034, 3.9, 0.0], [0.036, 3.9, 0.0]])
+    assert contacts(planner, leaning)[0] < -1e-3
+    assert planner.valid(leaning).tolist() == [False, True]
+    assert not planner.plan([1, 0, 0], [1, 0, 0.5], seconds=0.01).found
 
 
 def test_no_path_crosses_a_plate(plate):
