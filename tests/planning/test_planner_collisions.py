@@ -9,7 +9,7 @@ from planning_models import arm_among_shapes, ball_and_plate, body, contacts, is
 
 import kineverse as kv
 from kineverse.geometry import Scene
-from kineverse.model.body import Box, Cylinder, Mesh, Sphere
+from kineverse.model.body import Body, Box, Cylinder, Mesh, Sphere
 from kineverse.planning import Planner
 
 pytestmark = pytest.mark.compiler
@@ -107,6 +107,25 @@ def test_pair_that_touches_at_the_default_place_only_is_checked_elsewhere():
     assert not planner.valid([[0.0]])[0]
     planner.place({"x": 0.8})
     assert planner.valid([[0.0]])[0]
+
+
+def test_pair_that_is_apart_in_a_small_gap_only_is_checked():
+    x, y = kv.position("x"), kv.position("y")
+    model = kv.Model()
+    with model.edit() as edit:
+        edit.constrain("x", -1, x, 1)
+        edit.constrain("y", -1, y, 1)
+        edit.add_frame("peg", "world", kv.translation(x, y, 0), body(Sphere(0.05)))
+        # Below and above a slot at y = 0.7, and a stop in it.
+        sides = [body(Box(size), at=at) for size, at in (
+            ((9, 2, 1), (0, 1.76, 0)), ((9, 2, 1), (0, -0.36, 0)), ((0.1, 2, 1), (0.5, 0.7, 0)),
+        )]  # fmt: skip
+        edit.add_frame("block", "world", np.eye(4), Body(collisions=sum((s.collisions for s in sides), ())))
+    planner = Planner(model)
+    assert planner.excluded
+    assert "'peg' and 'block'" in planner.plan([0, 0.7], [0.5, 0.7]).why
+    assert not planner.excluded
+    assert planner.valid([[0, 0.7], [0.5, 0.7]]).tolist() == [True, False]
 
 
 def test_certificate_finds_a_plate_between_two_samples(plate):
