@@ -140,8 +140,11 @@ def test_motions_match_a_query_at_each_configuration(rows, monkeypatch, tmp_path
     assert found == {"first", "later", "none"}
     with pytest.raises(kv.errors.InvalidValueError, match="not finite"):
         queries[0].first_within(coordinates, np.full((1, 3), np.nan), -0.0)
-    with pytest.raises(kv.errors.ShapeError, match=r"\(N, 3\)"):
-        queries[0].first_within(coordinates, np.zeros(3))
+    for question in (queries[0].first_within, queries[0].least_distance):
+        with pytest.raises(kv.errors.ShapeError, match=r"\(N, 3\)"):
+            question(coordinates, np.zeros(3))
+        with pytest.raises(kv.errors.InvalidValueError, match="radius"):
+            question(coordinates, np.zeros((0, 3)), -1.0)
 
 
 def test_the_nearest_pairs_of_shapes_are_those_of_the_bodies(model):

@@ -168,8 +168,9 @@ def test_wrong_limits_are_refused(path):
 
 def test_edited_model_needs_another_plan(path, monkeypatch):
     monkeypatch.setattr(path.checks, "_version", -1)
-    with pytest.raises(InvalidValueError, match="Plan it again"):
-        path.trajectory()
+    for question in (path.trajectory, lambda: replace(path).clearance()):
+        with pytest.raises(InvalidValueError, match="Plan it again"):
+            question()
 
 
 def test_start_that_is_its_goal_takes_no_time(planner):

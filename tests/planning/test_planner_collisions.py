@@ -9,7 +9,7 @@ from planning_models import arm_among_shapes, ball_and_plate, body, contacts, is
 
 import kineverse as kv
 from kineverse.geometry import Scene
-from kineverse.model.body import Box, Mesh, Sphere
+from kineverse.model.body import Body, Box, Cylinder, Mesh, Sphere
 from kineverse.planning import Planner
 
 pytestmark = pytest.mark.compiler
@@ -109,6 +109,25 @@ def test_pair_that_touches_at_the_default_place_only_is_checked_elsewhere():
     assert planner.valid([[0.0]])[0]
 
 
+def test_pair_that_is_apart_in_a_small_gap_only_is_checked():
+    x, y = kv.position("x"), kv.position("y")
+    model = kv.Model()
+    with model.edit() as edit:
+        edit.constrain("x", -1, x, 1)
+        edit.constrain("y", -1, y, 1)
+        edit.add_frame("peg", "world", kv.translation(x, y, 0), body(Sphere(0.05)))
+        # Below and above a slot at y = 0.7, and a stop in it.
+        sides = [body(Box(size), at=at) for size, at in (
+            ((9, 2, 1), (0, 1.76, 0)), ((9, 2, 1), (0, -0.36, 0)), ((0.1, 2, 1), (0.5, 0.7, 0)),
+        )]  # fmt: skip
+        edit.add_frame("block", "world", np.eye(4), Body(collisions=sum((s.collisions for s in sides), ())))
+    planner = Planner(model)
+    assert planner.excluded
+    assert "'peg' and 'block'" in planner.plan([0, 0.7], [0.5, 0.7]).why
+    assert not planner.excluded
+    assert planner.valid([[0, 0.7], [0.5, 0.7]]).tolist() == [True, False]
+
+
 def test_certificate_finds_a_plate_between_two_samples(plate):
     rng = np.random.default_rng(0)
     A, B = rng.uniform(0.02, 0.5, (2, 100, 3)).astype(np.float32)
@@ -126,6 +145,23 @@ def test_certificate_finds_a_plate_between_two_samples(plate):
         assert collision[0] == 0
         at = a + collision[1] * (b - a)
         assert abs(at[column]) < 0.05
+
+
+def test_leaning_pole_and_fast_thread_are_not_slipped_through():
+    x, z, lift = (kv.position(name) for name in ("x", "z", "lift"))
+    model = kv.Model()
+    with model.edit() as edit:
+        edit.add_frame("ball", "world", kv.translation(x, 0, z), body(Sphere(0.01)))
+        edit.add_frame("pole", "world", kv.rotation_y(1.3e-3), body(Cylinder(0.02, 8.0)))
+        # A turn for each 1/64 m, the distance of two samples.
+        spindle = kv.translation(5, 0, lift) @ kv.rotation_z(128 * np.pi * lift)
+        edit.add_frame("bar", "world", spindle, body(Box((0.02, 1.0, 0.02)), at=(0, 0.5, 0)))
+        edit.add_frame("post", "world", kv.translation(5.4, 0, 0), body(Box((0.02, 0.02, 3.0))))
+    planner = Planner(model, ["x", "z", "lift"])
+    leaning = np.array([[0.034, 3.9, 0.0], [0.036, 3.9, 0.0]])
+    assert contacts(planner, leaning)[0] < -1e-3
+    assert planner.valid(leaning).tolist() == [False, True]
+    assert not planner.plan([1, 0, 0], [1, 0, 0.5], seconds=0.01).found
 
 
 def test_no_path_crosses_a_plate(plate):

@@ -115,6 +115,16 @@ def test_path_on_a_manifold_from_a_start_that_nearly_touches(globe):
     np.testing.assert_allclose(path.points[0], start, atol=1e-9)
 
 
+def test_hold_with_large_numbers_is_kept_as_well(globe):
+    planner, (x, y, _) = globe[0], globe[0].symbols
+    path = planner.plan(
+        [0, -1.4, 0], [0, 1.4, 0], along=kv.control.Hold(np.sqrt((x + 1000) ** 2 + y * y), 1000.0)
+    )
+    assert path, path.why
+    middle = (path.points[1:] + path.points[:-1]) / 2
+    assert np.abs(np.hypot(middle[:, 0] + 1000, middle[:, 1]) - 1000).max() < 1e-5
+
+
 def test_only_what_both_frames_carry_may_touch(flying):
     hold = flying.hold("hand", "bar", "xyz")
     pairs = {frozenset((hand, "bar")) for hand in ("hand", "finger")}

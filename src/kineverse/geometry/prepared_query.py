@@ -90,6 +90,7 @@ class PreparedQuery:
             If the radius is negative or NaN, or a pose is not finite.
         """
         within = self.radius if radius is None else radius
+        check_radius(within)
         for k in self._move(coordinates).find_rows(_as_rows(Q, len(coordinates)), within, first=True):
             if len(self(within)):
                 return k
@@ -103,6 +104,7 @@ class PreparedQuery:
         Parameters and errors are those of :meth:`first_within`. The scene stays where it is.
         """
         within = self.radius if radius is None else radius
+        check_radius(within)
         motion = self._move(coordinates)
         found = motion.struct
         for _ in motion.find_rows(_as_rows(Q, len(coordinates)), within, first=False):

@@ -70,9 +70,9 @@ class CheckerStruct(ctypes.Structure):
     """Tables of a collision checker as C reads them."""
 
     _fields_ = _fields(
-        "iiiippppiippppppppiippppppppd",
+        "iiiippppiipppppppppiippppppppd",
         "coordinates poses conditions stored compute kept lower upper links bodies link coarse fine planes "
-        "allowed world moving fineness pairs moving_pairs pair moving_pair shape objects object_poses "
+        "allowed world moving fineness turns pairs moving_pairs pair moving_pair shape objects object_poses "
         "object_positions object_centres is_within margin",
     )
 

@@ -103,6 +103,7 @@ class CollisionChecker:
         self._solids = [world.solid(k) for k in range(len(world.objects))]  # C has pointers to them
         self.links.shapes["object"] = [k for b in self.moving for k in world.members[world.body_index(b)]]
         self._build_struct(margin)
+        self._turns[:] = self._find_turns()
         self._placement: tuple[bytes, bytes] | None = None
         self._placed = next(_placements)
         self._excepted: BodyPairs = frozenset()
@@ -189,6 +190,7 @@ class CollisionChecker:
         self.lower, self.upper = np.zeros(n, dtype=np.float32), np.zeros(n, dtype=np.float32)
         switching = {s for e in self._conditions if is_switching(e) for s in e.symbols}
         self._fineness = np.array([FINENESS * (s in switching) for s in self.coordinates], dtype=np.float32)
+        self._turns = np.ones(n, dtype=np.float32)
         self._plane_table = np.concatenate(self._planes or [np.zeros((1, 4))]).astype(np.float32)
         self._set_structs = (ObstacleSetStruct * max(len(self._sets), 1))(*(s.struct for s in self._sets))
         program, links = self.program, self.links
@@ -212,6 +214,7 @@ class CollisionChecker:
             ctypes.addressof(self._world.struct),
             ctypes.addressof(self._set_structs),
             self._fineness.ctypes.data,
+            self._turns.ctypes.data,
             len(self.pairs),
             len(self.moving_pairs),
             self.pairs.ctypes.data,
@@ -359,6 +362,22 @@ class CollisionChecker:
         found = np.zeros(count + self.conditions, dtype=np.float32)
         self._code.kineverse_poses(self.address, q.ctypes.data, found.ctypes.data)
         return found[:count].reshape(-1, 3, 4), found[count:]
+
+    def _find_turns(self) -> Array:
+        """Return by which angle a unit of each coordinate turns a body, the largest one found (n,) [rad].
+
+        Threads and gears turn bodies so fast that two poses do not tell how far they are apart.
+        """
+        generator, found = np.random.default_rng(0), np.zeros(len(self.coordinates))
+        for q in generator.uniform(-1.0, 1.0, (2, len(found))).astype(np.float32):
+            before = self.outputs(q)[0][:, :, :3]
+            for i in range(len(found)):
+                near = q.copy()
+                near[i] += _SAME
+                change = np.linalg.norm(self.outputs(near)[0][:, :, :3] - before, axis=(1, 2))
+                turns = np.nan_to_num(change / math.sqrt(2.0) / float(near[i] - q[i]), nan=0.0)
+                found[i] = max(found[i], turns.max(initial=0.0))
+        return found
 
     def find_periodic(self, candidates: npt.NDArray[np.bool_]) -> npt.NDArray[np.bool_]:
         """Return flags (n,) of those coordinates whose full turns change no pose and no condition."""

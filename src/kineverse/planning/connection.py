@@ -150,7 +150,7 @@ def connect_on_manifold(
             points = search.contract(found.points, left)
         exact = manifold.refine(points)
         if exact is None:
-            problem = "A path was found, but it leaves the limits where the holds are met exactly."
+            problem = "A path was found, but within limits its holds cannot be met exactly all along it."
             continue
         if checker.find_collision(np.ascontiguousarray(exact, dtype=np.float32)) is None:
             return Connected(exact, "", iterations)

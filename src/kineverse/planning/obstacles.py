@@ -17,7 +17,8 @@ from .bindings import BOX, CAPSULE, CYLINDER, HULL, OBSTACLE, SPHERE, ObstacleSe
 
 _SAME_PLANE = 6
 """Digits to which planes of a hull are told apart."""
-_ALIGNED = 1e-6
+_ALIGNED = 1e-5
+"""Largest distance of a shape from the one along the axes that stands for it [m]."""
 _COSTS = np.array([2.0, 3.0, 1.5, 1.0, 0.0])
 _EMPTY = 1e30
 """Coordinate of the boxes that fill the last chunk: nothing meets them."""
@@ -130,13 +131,15 @@ class ObstacleSet:
         extent = np.einsum("kij,kj->ki", np.abs(rotation), self._half[moved])
         centre = np.einsum("kij,kj->ki", rotation, self._centre[moved]) + translation
         # A box along the axes is the same box with its edges in another order.
-        items = self._items[moved]
-        turned = np.all(np.any(np.abs(rotation) > 1 - _ALIGNED, axis=2), axis=1)
-        boxes = turned & (items["kind"] == BOX)
-        round_ = (items["kind"] == CYLINDER) | (items["kind"] == CAPSULE)
-        items["aligned"] = boxes | (round_ & (np.abs(rotation[:, 2, 2]) > 1 - _ALIGNED))
+        items, half = self._items[moved], self._half[moved].max(axis=1)
+        box_slack = 2 * half * np.sort(np.abs(rotation), axis=2)[:, :, 1].max(axis=1)
+        boxes = (box_slack <= _ALIGNED) & (items["kind"] == BOX)
+        slack = 2 * half * np.abs(rotation[:, :2, 2]).max(axis=1)
+        round_ = (slack <= _ALIGNED) & np.isin(items["kind"], (CYLINDER, CAPSULE))
+        items["aligned"] = boxes | round_
         items["rotation"], items["translation"] = rotation.reshape(-1, 9), translation
-        items["size"] = np.where(boxes[:, None], extent, self._sizes[moved])
+        grown = self._sizes[moved] + (slack * round_)[:, None]
+        items["size"] = np.where(boxes[:, None], extent, grown)
         self._items[moved] = items
         # The largest rounding of float at these places.
         extent += 1e-6 * (1.0 + np.abs(centre) + extent)

@@ -84,6 +84,11 @@ class Path:
         """Return the least signed distance of bodies along the path by the scene [m].
 
         It is sampled 32 times a unit. Infinite if no pair is within .5 m.
+
+        Raises
+        ------
+        InvalidValueError
+            If the model has been edited since the path was planned, or the path was pickled.
         """
         return self._clearance
 

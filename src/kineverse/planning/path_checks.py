@@ -61,6 +61,7 @@ class PathChecks:
 
     def clearance(self, points: Array) -> float:
         """Return the least signed distance of bodies along a polyline (N, n) by the scene [m]."""
+        self.ensure_current()
         self._judge.place(self.state)
         return self._judge.clearance(points, 1 / RESOLUTION)
 

@@ -111,13 +111,23 @@ class Planner:
         bodies = as_entries("decomposed=", decomposed, str, "names or patterns of bodies")
         self._options: dict[str, Any] = {"decomposed": bodies, "leave_out": parse_exclusions(leave_out)}
         self.roadmap: Roadmap | None = None
+        self._separate: BodyPairs = frozenset()
         self.planning_scene = self._build(model.default_state())
 
     @no_collection()
     def _build(self, state: State) -> PlanningScene:
         return PlanningScene(
-            self.model, self._move, self._rules, self.margin, self._protrusion, self._options, state
-        )
+            self.model, self._move, self._rules, self.margin, self._protrusion, self._options, state,
+            self._separate,
+        )  # fmt: skip
+
+    def _check_separate_pairs(self, Q: Array) -> PlanningScene:
+        """Return the scene in which pairs are checked that are apart at some of the configurations (N, n)."""
+        found = self.planning_scene.find_separate_pairs(Q)
+        if found:
+            self._separate |= found
+            self.planning_scene = self._build(self.planning_scene.state)
+        return self.planning_scene
 
     def __reduce__(self) -> tuple[Any, ...]:
         """Return how the planner is made again in another process, with everything where it stands."""
@@ -142,7 +152,11 @@ class Planner:
 
     @property
     def excluded(self) -> tuple[Rule, ...]:
-        """Rules for pairs of bodies that touch wherever the coordinates are; these are not checked."""
+        """Rules for pairs of bodies that touch wherever the coordinates are; these are not checked.
+
+        Samples say which. A pair that is apart where things are placed, or at a start or goal, is checked
+        from then on.
+        """
         return self.planning_scene.excluded
 
     @property
@@ -171,6 +185,7 @@ class Planner:
             For unknown names and values that are not finite.
         """
         self._synchronize().place(self._whole(state))
+        self._check_separate_pairs(self.planning_scene.here[None])
 
     def _whole(self, state: StateLike) -> State:
         return self.planning_scene.state | read_state(self.model, state)
@@ -180,7 +195,7 @@ class Planner:
     def valid(self, Q: npt.ArrayLike) -> npt.NDArray[np.bool_]:
         """Return flags (N,) of configurations (N, n) that are within limits and free of collisions.
 
-        Bodies that are nearer than 0.01 mm count as touching.
+        Bodies that are nearer than 0.01 mm may count as touching.
         """
         self._synchronize()
         points = self._configurations(Q, "Q")
@@ -195,7 +210,7 @@ class Planner:
     def edges(self, A: npt.ArrayLike, B: npt.ArrayLike) -> npt.NDArray[np.bool_]:
         """Return flags (N,) of straight ways from A to B, (N, n) each, that are free at 32 samples a unit.
 
-        Starts are not checked.
+        Starts and limits are not checked.
         """
         self._synchronize()
         starts, ends = self._configurations(A, "A"), self._configurations(B, "B")
@@ -314,6 +329,8 @@ class Planner:
         roadmap = self._choose_roadmap(method, holds)
         q = self.planning_scene.here if start is None else self._start(start)
         tasks = () if not _are_tasks(goals) else as_holds("goals", goals)
+        ends = q[None] if tasks else self._configurations(goals, "goals")
+        scene = self._check_separate_pairs(np.vstack([q, ends]))
         touching = scene.touching_pairs([*holds, *tasks])
         if modes is not None:
             if holds:
@@ -322,16 +339,15 @@ class Planner:
                 )
             if optimize:
                 raise InvalidValueError("optimize= is for a path of one mode; leave it out with modes=.")
-            ends = None if tasks else self._configurations(goals, "goals")
-            return self._plan_modes(ModeSearch(scene, modes, tasks, ends, seconds, seed), q, begin)
+            search = ModeSearch(scene, modes, tasks, None if tasks else ends, seconds, seed)
+            return self._plan_modes(search, q, begin)
         if tasks:
             ends = scene.solutions([*holds, *tasks], q, _TASK_GOALS, seconds, seed, touching)
             if not len(ends):
                 return scene.no_path(q, self._no_solution([*holds, *tasks], touching), begin)
-        else:
-            ends = self._configurations(goals, "goals")
-            if not len(ends):
-                raise ShapeError("There is no goal: goals has no rows.")
+            scene = self._check_separate_pairs(ends)
+        elif not len(ends):
+            raise ShapeError("There is no goal: goals has no rows.")
         # What a goal lets touch does not touch on the way, unless there is no other one.
         for allowed in dict.fromkeys((scene.touching_pairs(holds), touching)):
             path = scene.between(q, ends, holds, allowed, seconds, seed, roadmap=roadmap, optimize=optimize)

@@ -29,7 +29,7 @@ from .connection import MORE_PATIENCE, PATIENCE, connect, connect_on_manifold
 from .endpoints import Endpoint, Endpoints
 from .judge import SceneJudge, describe_contacts
 from .manifold import FrameHold, Manifold, hold_targets, manifold_key
-from .overlapping_pairs import find_overlapping_pairs
+from .overlapping_pairs import find_overlapping_pairs, find_separate_pairs
 from .path import Path
 from .path_checks import PathChecks
 from .roadmap import Roadmap
@@ -58,6 +58,8 @@ class PlanningScene:
         Further arguments of the collision scene.
     state
         Where everything stands.
+    separate
+        Pairs of bodies that do not always touch, whatever samples say.
 
     Attributes
     ----------
@@ -87,6 +89,7 @@ class PlanningScene:
         protrusion: float | None,
         options: Mapping[str, Any],
         state: State,
+        separate: BodyPairs = frozenset(),
     ) -> None:
         self.model, self.version = model, model.version
         self.space = space = PlanningSpace(model, move)
@@ -95,7 +98,11 @@ class PlanningScene:
             raise InvalidValueError(
                 "No body of the model has a shape, so nothing can collide: add collision or visual shapes."
             )
-        self.excluded = find_overlapping_pairs(scene, space)
+        self.excluded = tuple(
+            rule
+            for rule in find_overlapping_pairs(scene, space)
+            if frozenset((rule.a, rule.b)) not in separate
+        )
         scene.collision_world.add_rules(self.excluded)
         self.checker = CollisionChecker(scene, space.symbols, space.conditions, margin, protrusion)
         space.turning &= self.checker.find_periodic(space.turning)
@@ -116,6 +123,11 @@ class PlanningScene:
     def here(self) -> Array:
         """Placed values of the coordinates that move, (n,)."""
         return self.state.vector(self.space.symbols)
+
+    def find_separate_pairs(self, Q: Array) -> BodyPairs:
+        """Return the pairs that are not checked, but are apart at some configurations (N, n)."""
+        margin = self.checker.struct.margin
+        return find_separate_pairs(self.scene, self.space, self.excluded, self.state, Q, margin)
 
     def _replace(self) -> None:
         """Place the checker again where everything stands."""

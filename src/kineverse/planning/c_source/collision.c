@@ -66,6 +66,7 @@ typedef struct {
   const ObstacleSet *world;
   const ObstacleSet *moving;
   const float *fineness; /* samples for each unit of a coordinate that conditions switch by; 0 for others */
+  const float *turns;    /* largest angle by which a unit of a coordinate turns a body [rad] */
   long long pairs, moving_pairs;
   const Pair *pair;        /* two links, spheres against spheres */
   const Pair *moving_pair; /* a link, spheres, against a moving set */

@@ -14,6 +14,13 @@ static float distance(const float *a, const float *b, int n) {
   return sqrtf(sum);
 }
 
+/* The number of intervals of the way from a to b, of which each is short and turns no body by more than 1 rad. */
+static float intervals(const Checker *c, const float *a, const float *b, float resolution) {
+  float turn = 0.0f;
+  for (int i = 0; i < c->coordinates; i++) turn += c->turns[i] * fabsf(b[i] - a[i]);
+  return fmaxf(distance(a, b, (int)c->coordinates) * resolution, turn);
+}
+
 INLINE void evaluate(const Checker *c, Work *w) { c->compute(w->x, c->kept, w->store, w->o); }
 
 /* The block at the fractions t of the way from a to b. */
@@ -87,7 +94,7 @@ static int edge_is_certain(const Checker *c, Work *w, const float *a, const floa
   float middle[MOST_INTERVALS];
   *where = 0.0f;
   if (!conditions_hold(c, w, a, b)) return 0;
-  int count = (int)ceilf(fmaxf(distance(a, b, (int)c->coordinates) * resolution, 1.0f));
+  int count = (int)ceilf(fmaxf(intervals(c, a, b, resolution), 1.0f));
   count = (count + W - 1) / W * W;
   if (count > MOST_INTERVALS / 4) count = MOST_INTERVALS / 4;
   float width = 1.0f / count;
@@ -277,7 +284,7 @@ EXPORTED long long kineverse_certify(const Checker *c, const float *points, long
     unsigned char certain[W] = {0};
     int edges = 0;
     while (edges < W && k + edges + 1 < count &&
-           distance(points + (k + edges) * n, points + (k + edges + 1) * n, n) * resolution <= 1.0)
+           intervals(c, points + (k + edges) * n, points + (k + edges + 1) * n, (float)resolution) <= 1.0f)
       edges++;
     if (edges > 1)
       certify_short_edges(c, &w, points + k * n, edges, certain);

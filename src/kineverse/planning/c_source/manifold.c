@@ -171,26 +171,22 @@ typedef long long Mask __attribute__((vector_size(REGISTER)));
 
 INLINE Doubles choose(Mask mask, Doubles a, Doubles b) { return (Doubles)((mask & (Mask)a) | (~mask & (Mask)b)); }
 
-/* Work space of steps in double, and in float. */
+/* Work space of steps in double. */
 typedef struct {
   const Checker *c;
   const Projection *p;
   Doubles *x, *o, *store;
-  V *narrow_x, *narrow_o, *narrow_store;
   void *memory;
 } Polish;
 
 static int polish_begin(Polish *w, const Checker *c, const Projection *p) {
   const size_t n = c->coordinates;
   w->c = c, w->p = p;
-  w->memory = malloc((6 * n + 4 + p->exact_stored + p->stored) * REGISTER + 64);
+  w->memory = malloc((3 * n + 2 + p->exact_stored) * REGISTER + 64);
   if (!w->memory) return 1;
   w->x = (Doubles *)(((size_t)w->memory + 63) & ~(size_t)63);
   w->o = w->x + 2 * n;
   w->store = w->o + n + 1;
-  w->narrow_x = (V *)(w->store + p->exact_stored + 1);
-  w->narrow_o = w->narrow_x + 2 * n;
-  w->narrow_store = w->narrow_o + n + 1;
   return 0;
 }
 
@@ -248,15 +244,16 @@ static long long subdivide(Polish *w, double *points, long long count, long long
   if (!step) return -1;
   int *parts = (int *)(step + edges * n);
   long long total = 1;
-  V *x = w->narrow_x, *o = w->narrow_o;
-  for (int i = 0; i < n; i++) x[n + i] = splat(w->c->lower[i] < w->c->upper[i] ? 1.0f : 0.0f);
-  for (long long first = 0; first + 1 < count; first += W) {
-    for (int j = 0; j < W; j++) {
+  const Doubles zero = {0.0};
+  Doubles *x = w->x, *o = w->o;
+  for (int i = 0; i < n; i++) x[n + i] = zero + (w->c->lower[i] < w->c->upper[i] ? 1.0 : 0.0);
+  for (long long first = 0; first + 1 < count; first += D) {
+    for (int j = 0; j < D; j++) {
       const double *a = points + (first + j + 2 < count ? first + j : count - 2) * n;
-      for (int i = 0; i < n; i++) x[i][j] = (float)(0.5 * (a[i] + a[n + i]));
+      for (int i = 0; i < n; i++) x[i][j] = 0.5 * (a[i] + a[n + i]);
     }
-    w->p->step(x, w->p->kept, w->narrow_store, o);
-    for (long long k = first; k < first + W && k + 1 < count; k++) {
+    w->p->exact(x, w->p->exact_kept, w->store, o);
+    for (long long k = first; k < first + D && k + 1 < count; k++) {
       const double residual = o[n][k - first];
       const double wanted = residual > deviation ? ceil(sqrt(RESERVE * residual / deviation)) : 1.0;
       parts[k] = wanted < MOST_PARTS ? (int)wanted : MOST_PARTS;
