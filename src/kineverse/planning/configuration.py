@@ -27,7 +27,7 @@ _LARGEST = 1e6
 """Largest coordinate of a configuration [rad], [m]; edges are computed in single precision."""
 _HALF_TURN = math.pi + 0.3
 BEYOND = 2.0
-"""How far coordinates without limits go beyond what is given [m], [rad]."""
+"""Length by which coordinates without limits may go beyond what is given [m], [rad]."""
 CONDITION_TOLERANCE = 1e-5
 """Largest excess of a constraint that counts as satisfied; float has seven digits."""
 
