@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import tempfile
 from collections.abc import Sequence
+from statistics import median
 
 from kineverse.errors import UnknownNameError
 
@@ -31,6 +32,9 @@ SEEDS = 5
 
 BUILT = "pr2"
 """Robot whose planner is built in a fresh process, in the shipped kitchen."""
+
+_AGAIN = 5
+"""Number of times that it is built from the cache, of which the median counts."""
 
 FIRST, AGAIN = f"{BUILT}: planner from its file, spheres and compiling", f"{BUILT}: planner from the cache"
 
@@ -93,7 +97,8 @@ def _fresh_builds() -> list[Contender]:
     def build() -> float:
         with tempfile.TemporaryDirectory(prefix="kineverse-bench-") as empty:
             found["first"] = run_program("build_planner", BUILT, cache=empty)["seconds"]
-            found["again"] = run_program("build_planner", BUILT, cache=empty)["seconds"]
+            again = [run_program("build_planner", BUILT, cache=empty)["seconds"] for _ in range(_AGAIN)]
+            found["again"] = median(again)
         return found["first"]
 
     return [Contender(FIRST, build), Contender(AGAIN, lambda: found["again"])]
