@@ -27,8 +27,8 @@ SECONDS, SOON = 10.0, 0.1
 """Largest time of a search, and the time in which nearly all are to be solved [s]."""
 
 MEDIAN, LEAST_SOON, RESIDUAL = 1e-3, 95.0, 1e-5
-"""Targets: median time of the search at the fridge, with its path shortened, polished and certified [s], share
-solved soon of what is solved [%], residual of holds [m], [rad]."""
+"""Targets: median time of the search at the fridge, with its path shortened, polished and certified [s],
+share solved soon of what is solved [%], residual of holds [m], [rad]."""
 
 STARTS = 5
 """Number of starts at each place of the base, each with a goal of its own."""
