@@ -37,7 +37,7 @@ shapes and the settings.
 
 "protrusion" is the largest distance of a sphere's points from the shapes, "excess" the volume of the spheres
 over that of the shapes, minus 1. By default spheres stick out by a tenth of the size of a link, from 5 mm to
-25 mm; by up to 25 mm where more than 48 spheres would be needed; or by more where all would not do.
+25 mm, or by more where 48 spheres are not enough for that.
 
 The exit status is 0 if all went well, 1 if a link could not be covered.
 

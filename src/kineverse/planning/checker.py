@@ -33,6 +33,9 @@ from .obstacles import Floats32, ObstacleSet
 BodyPairs: TypeAlias = frozenset[frozenset[str]]
 """Pairs of bodies, {a, b} each."""
 
+PairTables: TypeAlias = tuple[npt.NDArray[np.uint8], npt.NDArray[np.int32], npt.NDArray[np.int32]]
+"""Checked pairs: flags of links and bodies of the world, rows of two links, and of a link and a set."""
+
 RESOLUTION = 32.0
 """Samples of an edge for each unit of its length, [1/rad] and [1/m]."""
 FINENESS = 2000.0
@@ -107,6 +110,7 @@ class CollisionChecker:
         self._placement: tuple[bytes, bytes] | None = None
         self._placed = next(_placements)
         self._excepted: BodyPairs = frozenset()
+        self._tables = {self._excepted: (self._allowed, self.pairs, self.moving_pairs)}
 
     def _make_program(self, poses: list[Expression], conditions: Sequence[Expression]) -> VectorProgram:
         self._conditions = tuple(conditions)
@@ -260,21 +264,22 @@ class CollisionChecker:
     @contextmanager
     def excepting(self, pairs: BodyPairs) -> Iterator[None]:
         """Leave out pairs of bodies, {a, b} each, while the context lasts."""
-        if not pairs:
-            yield
-            return
-        allowed, spheres, shapes = self._without(pairs)
-        self._use(allowed, spheres, shapes)
-        self._excepted = pairs
+        self._except(pairs)
         try:
             yield
         finally:
-            self._use(self._allowed, self.pairs, self.moving_pairs)
-            self._excepted = frozenset()
+            self._except(frozenset())
 
-    def _without(
-        self, pairs: BodyPairs
-    ) -> tuple[npt.NDArray[np.uint8], npt.NDArray[np.int32], npt.NDArray[np.int32]]:
+    def _except(self, pairs: BodyPairs) -> None:
+        """Make C use the tables without some pairs, which are kept: holds come again."""
+        if pairs not in self._tables:
+            self._tables[pairs] = self._without(pairs)
+        self._excepted, s = pairs, self.struct
+        allowed, spheres, shapes = self._tables[pairs]
+        s.allowed, s.pair, s.moving_pair = allowed.ctypes.data, spheres.ctypes.data, shapes.ctypes.data
+        s.pairs, s.moving_pairs = len(spheres), len(shapes)
+
+    def _without(self, pairs: BodyPairs) -> PairTables:
         """Return the tables of checked pairs without some of them."""
         standing = {body: k for k, body in enumerate(self.standing)}
         numbers = {body: k for k, body in enumerate(self.moving)}
@@ -302,16 +307,6 @@ class CollisionChecker:
             yield
         finally:
             self.struct.margin = margin
-
-    def _use(
-        self,
-        allowed: npt.NDArray[np.uint8],
-        pairs: npt.NDArray[np.int32],
-        moving_pairs: npt.NDArray[np.int32],
-    ) -> None:
-        s = self.struct
-        s.allowed, s.pair, s.moving_pair = allowed.ctypes.data, pairs.ctypes.data, moving_pairs.ctypes.data
-        s.pairs, s.moving_pairs = len(pairs), len(moving_pairs)
 
     # -- configurations ------------------------------------------------------------------------------------
 

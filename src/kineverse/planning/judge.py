@@ -35,10 +35,13 @@ class SceneJudge:
         self._columns = np.array([place.get(s, -1) for s in coordinates], dtype=int)
         self._moved = self._columns >= 0
         self._values = np.zeros(len(scene.inputs))
+        self._state: State | None = None
 
     def place(self, state: State) -> None:
         """Set the values of everything else."""
-        self._values[:] = state.vector(self._scene.inputs)
+        if state is not self._state:
+            self._state = state
+            self._values[:] = state.vector(self._scene.inputs)
 
     def contacts(self, q: Array, radius: float = 0.0) -> DistanceResults:
         """Return the pairs of bodies within a radius [m] at a configuration (n,), deepest first."""

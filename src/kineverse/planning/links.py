@@ -58,8 +58,6 @@ class LinkTable:
             shapes += len(items)
             corners = np.concatenate([_placed_corners(solid, T) for _, solid, T in items])
             link["low"], link["high"] = corners.min(axis=0), corners.max(axis=0)
-            link["ball"] = *(corners.min(axis=0) + corners.max(axis=0)) / 2, 0.0
-            link["ball"][3] = np.linalg.norm(corners - link["ball"][:3], axis=1).max() + 1e-6
             key = cover_key([(solid, T) for _, solid, T in items], protrusion)
             tree = find_or_make_tree(key, partial(_make_tree, items, protrusion))
             link["coarse"] = len(tree.coarse_radii)

@@ -318,7 +318,8 @@ INLINE I link_against_set(const Checker *c, const Work *w, const Link *l, const 
   for (int more = 1; more;) {
     int count = 0, near = 0;
     if (few) {
-      for (; count < s->count; count++) found[count] = s->items + count;
+      for (int k = 0; k < s->count; k++)
+        if (!allowed || allowed[s->items[k].body]) found[count++] = s->items + k;
       more = 0;
     } else {
       count = box_search_next(&search, s, allowed, found);
@@ -326,8 +327,7 @@ INLINE I link_against_set(const Checker *c, const Work *w, const Link *l, const 
     }
     const V reach = splat(l->ball[3] + grown);
     for (int k = 0; k < count; k++)
-      if ((!allowed || allowed[found[k]->body]) && any(touches(found[k], c->planes, centre, reach) & ~hit))
-        found[near++] = found[k];
+      if (any(touches(found[k], c->planes, centre, reach) & ~hit)) found[near++] = found[k];
     if (!near) continue;
     for (int first = 0; first < l->coarse; first += MOST_NEAR) {
       const Coarse *spheres = c->coarse + l->first + first;
