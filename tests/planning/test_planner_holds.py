@@ -184,6 +184,18 @@ def test_door_stops_at_a_pin():
     assert "'leaf' and 'pin'" in planner.plan([0.0], [1.0]).why
 
 
+def test_door_passes_a_gap_that_is_narrower_than_the_margin_of_searches():
+    model = kv.Model()
+    with model.edit() as edit:
+        edit.apply(kv.Revolute(name="door", parent="world", child="door", axis=(0, 0, 1), lower=0, upper=2))
+        edit.add_frame("leaf", "door", kv.translation(0.5, 0, 0), body(Box((0.9, 0.01, 1.5))))
+        place = kv.translation(np.hypot(0.95, 0.005) + 0.1005, 0, 0)
+        edit.add_frame("post", "world", kv.rotation_z(1.0) @ place, body(Cylinder(0.1, 0.2)))
+    path = Planner(model).plan([0.0], [2.0])
+    assert path, path.why
+    assert not Planner(model, margin=1e-3).plan([0.0], [2.0], seconds=0.02)
+
+
 @pytest.fixture(scope="module")
 def four_bar():
     model = kv.Model()

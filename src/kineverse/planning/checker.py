@@ -297,14 +297,18 @@ class CollisionChecker:
         return allowed, keep(self.pairs), keep(self.moving_pairs)
 
     @contextmanager
-    def widened(self, by: float, ends: Floats32) -> Iterator[None]:
-        """Widen the margin [m] while the context lasts, if configurations (N, n) stay valid with it."""
+    def widened(self, by: float, ends: Floats32) -> Iterator[bool]:
+        """Widen the margin [m] while the context lasts, if configurations (N, n) stay valid with it.
+
+        The context is True if it is wider.
+        """
         margin = self.struct.margin
         self.struct.margin = margin + by
-        if not self.valid(np.ascontiguousarray(ends)).all():
+        wider = by > 0.0 and bool(self.valid(np.ascontiguousarray(ends)).all())
+        if not wider:
             self.struct.margin = margin
         try:
-            yield
+            yield wider
         finally:
             self.struct.margin = margin
 

@@ -26,8 +26,9 @@ _FINEST = 4000.0
 _ATTEMPTS, _NEXT_SEED = 16, 7919
 _TELLING = 100
 """Number of samples after which a small tree says that its root cannot be left."""
-_WIDER = 1e-3
-"""Margin beyond the one asked for: edges of a search are mostly free between their samples then [m]."""
+_WIDER, _WIDE_EDGES = 1e-3, 10_000
+"""Margin beyond the one asked for: edges of a search are mostly free between their samples then [m]. A way,
+as of a door, may be too narrow for it: after that many edges, or half of the time, searches go on without."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -71,24 +72,29 @@ def connect(
         Number of shortcuts in a row that may bring nothing.
     """
     begin = perf_counter()
-    search = RrtConnect(checker, edges=edges)
+    search = RrtConnect(checker)
     iterations, points = 0, starts
     for attempt in range(_ATTEMPTS):
         left = seconds - (perf_counter() - begin)
         if attempt and left <= 0.0:
             break
-        with checker.widened(_WIDER, np.vstack([starts, goals])):
-            if roadmap is None:
-                found = search.solve(starts, goals, left, seed + _NEXT_SEED * attempt)
-            else:
-                found = roadmap.solve(checker, starts, goals, left, seed + _NEXT_SEED * attempt)
-        iterations += found.iterations
+        for by in (_WIDER, 0.0):
+            left = seconds - (perf_counter() - begin)
+            with checker.widened(by, np.vstack([starts, goals])) as wider:
+                share, most = (left / 2, min(edges, _WIDE_EDGES)) if wider else (left, edges)
+                if roadmap is None:
+                    found = search.solve(starts, goals, share, seed + _NEXT_SEED * attempt, edges=most)
+                else:
+                    found = roadmap.solve(checker, starts, goals, share, seed + _NEXT_SEED * attempt)
+            iterations += found.iterations
+            if found.found or not wider:
+                break
         if not found.found:
             return Connected(found.points.astype(float), explain_failure(found, seconds), iterations)
         # Parts of a shortcut that just passes would not be certain by themselves.
         with checker.widened(_WIDER / 2, np.vstack([starts, goals])):
             points = search.shorten(found.points, seconds - (perf_counter() - begin), seed, patience)
-        certain = _repair(search, checker, points, begin + seconds, seed)
+        certain = _repair(search, checker, points, begin + seconds, seed, edges)
         if certain is not None:
             return Connected(certain.astype(float), "", iterations)
     problem = (
@@ -99,7 +105,7 @@ def connect(
 
 
 def _repair(
-    search: RrtConnect, checker: CollisionChecker, points: Floats32, end: float, seed: int
+    search: RrtConnect, checker: CollisionChecker, points: Floats32, end: float, seed: int, edges: int
 ) -> Floats32 | None:
     """Return a path that is certainly free: edges that are not are planned anew, with more samples."""
     resolution = RESOLUTION
@@ -110,7 +116,7 @@ def _repair(
         k, _fraction = collision
         resolution = min(_FINER * resolution, _FINEST)
         left = end - perf_counter()
-        detour = search.solve(points[k : k + 1], points[k + 1 : k + 2], left, seed, resolution)
+        detour = search.solve(points[k : k + 1], points[k + 1 : k + 2], left, seed, resolution, edges)
         if not detour.found:
             return None
         points = np.ascontiguousarray(np.vstack([points[:k], detour.points, points[k + 2 :]]))
@@ -133,21 +139,24 @@ def connect_on_manifold(
     more samples.
     """
     begin = perf_counter()
-    search = RrtConnect(checker, manifold, edges)
+    search = RrtConnect(checker, manifold)
     iterations, resolution, problem = 0, RESOLUTION, ""
     points = starts
     for attempt in range(_ATTEMPTS):
         left = seconds - (perf_counter() - begin)
         if attempt and left <= 0.0:
             break
-        with checker.widened(_WIDER, np.vstack([starts, goals])):
-            found = search.solve(starts, goals, left, seed + _NEXT_SEED * attempt, resolution)
-            iterations += found.iterations
-            if not found.found:
-                return Connected(
-                    found.points.astype(float), problem or explain_failure(found, seconds), iterations
-                )
-            points = search.contract(found.points, left)
+        for by in (_WIDER, 0.0):
+            left = seconds - (perf_counter() - begin)
+            with checker.widened(by, np.vstack([starts, goals])) as wider:
+                share, most = (left / 2, min(edges, _WIDE_EDGES)) if wider else (left, edges)
+                found = search.solve(starts, goals, share, seed + _NEXT_SEED * attempt, resolution, most)
+                iterations += found.iterations
+                points = search.contract(found.points, left) if found.found else found.points
+            if found.found or not wider:
+                break
+        if not found.found:
+            return Connected(points.astype(float), problem or explain_failure(found, seconds), iterations)
         exact = manifold.refine(points)
         if exact is None:
             problem = "A path was found, but within limits its holds cannot be met exactly all along it."

@@ -45,14 +45,9 @@ class RrtConnect:
         Collision checker.
     manifold
         The manifold; None for the whole space.
-    edges
-        Largest number of edges that a search tries.
     """
 
-    def __init__(
-        self, checker: CollisionChecker, manifold: Manifold | None = None, edges: int = MOST_EDGES
-    ) -> None:
-        self._edges = edges
+    def __init__(self, checker: CollisionChecker, manifold: Manifold | None = None) -> None:
         self._checker, self._manifold, self._code = checker, manifold, planning_functions()
         self._path = np.empty((PATH_ROOM, len(checker.coordinates)), dtype=np.float32)
         self._struct = SearchStruct()
@@ -64,7 +59,7 @@ class RrtConnect:
         seconds: float,
         seed: int,
         resolution: float = RESOLUTION,
-        nodes: int = _MOST_NODES,
+        edges: int = MOST_EDGES,
     ) -> SearchResult:
         """Search a path from any of (S, n) starts to any of (G, n) goals.
 
@@ -78,10 +73,11 @@ class RrtConnect:
             Seed of the samples.
         resolution
             Samples for each unit of length of an edge.
-        nodes
-            Largest number of nodes of both trees.
+        edges
+            Largest number of edges that are tried.
         """
-        s = self._setup(seconds, seed, resolution, nodes)
+        s = self._setup(seconds, seed, resolution)
+        s.nodes, s.most_edges = _MOST_NODES, edges
         count = self._code.kineverse_rrt_connect(
             ctypes.addressof(s), starts.ctypes.data, len(starts), goals.ctypes.data, len(goals),
             self._path.ctypes.data, PATH_ROOM,
@@ -103,7 +99,7 @@ class RrtConnect:
         patience
             Number of tries in a row that may bring less than a hundredth each.
         """
-        s = self._setup(seconds, seed, RESOLUTION, 0)
+        s = self._setup(seconds, seed, RESOLUTION)
         room = len(points) + 64
         work = np.zeros((room, points.shape[1]), dtype=np.float32)
         work[: len(points)] = points
@@ -119,16 +115,15 @@ class RrtConnect:
 
     def contract(self, points: Floats32, seconds: float) -> Floats32:
         """Return a shorter path on the manifold: it contracts like a band, while its samples are free."""
-        s = self._setup(seconds, 0, RESOLUTION, 0)
+        s = self._setup(seconds, 0, RESOLUTION)
         work = np.zeros((3 * len(points) + 64, points.shape[1]), dtype=np.float32)
         work[: len(points)] = points
         given = ctypes.addressof(s), work.ctypes.data, len(points), len(work)
         return work[: self._code.kineverse_relax(*given)]
 
-    def _setup(self, seconds: float, seed: int, resolution: float, nodes: int) -> SearchStruct:
+    def _setup(self, seconds: float, seed: int, resolution: float) -> SearchStruct:
         s = self._struct
         s.checker = self._checker.address
         s.projection = None if self._manifold is None else self._manifold.address
-        s.range, s.resolution, s.seconds, s.nodes, s.seed = RANGE, resolution, seconds, nodes, seed
-        s.most_edges = self._edges
+        s.range, s.resolution, s.seconds, s.seed = RANGE, resolution, seconds, seed
         return s
