@@ -1,0 +1,41 @@
+"""Results of skills."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from typing import Any
+
+
+@dataclass(frozen=True, slots=True)
+class Outcome:
+    """Result of a skill, true if it was done.
+
+    Attributes
+    ----------
+    done
+        Whether the object is where it was wanted, in the world's truth.
+    value
+        Value of the coordinate at the end, in the world's truth [m], [rad].
+    reason
+        Why it is done, or what prevented it.
+    world
+        Name of the world.
+    seconds
+        Time in the world [s].
+    steps
+        Number of control steps.
+    measures
+        Further figures by name: see the tables of ``kineverse reproduce``.
+    """
+
+    done: bool
+    value: float
+    reason: str
+    world: str
+    seconds: float
+    steps: int
+    measures: Mapping[str, Any] = field(default_factory=dict)
+
+    def __bool__(self) -> bool:
+        return self.done

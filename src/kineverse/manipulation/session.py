@@ -1,0 +1,96 @@
+"""A robot that acts in a world: commands go to the world, the belief comes back, both are measured."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import contextmanager
+from time import perf_counter, thread_time
+
+from kineverse.state import State
+from kineverse.symbols import Symbol
+from kineverse.worlds import World
+
+from .belief import Belief, TrueBelief
+
+Speeds = Mapping[Symbol, float]
+
+
+class Session:
+    """Steps of a skill in a world.
+
+    A skill reads :attr:`state`, computes speeds within :meth:`timed`, and calls :meth:`act`::
+
+        while not done:
+            with session.timed("open"):
+                command = controller.step(session.state)
+            session.act(command.speeds)
+
+    Parameters
+    ----------
+    world
+        The world.
+    dt
+        Time of a step [s].
+    belief
+        Source of the state; the truth by default.
+    on_step
+        Is called with the session after each step, for recordings, measurements and pictures.
+
+    Attributes
+    ----------
+    state
+        The believed state.
+    commands
+        The speeds of the last step.
+    phase
+        Name of the present phase of the skill, for recordings and messages.
+    steps
+        Number of steps.
+    cpu, wall
+        Durations of the computations of each step by the name given to :meth:`timed` [s].
+    """
+
+    def __init__(
+        self,
+        world: World,
+        *,
+        dt: float = 0.02,
+        belief: Belief | None = None,
+        on_step: Callable[[Session], object] | None = None,
+    ) -> None:
+        self.world, self.dt = world, dt
+        self._belief = belief or TrueBelief()
+        self._on_step = on_step
+        self.state: State = self._belief.update(world)
+        self.commands: Speeds = {}
+        self.phase, self.steps = "", 0
+        self.cpu: dict[str, list[float]] = {}
+        self.wall: dict[str, list[float]] = {}
+
+    @contextmanager
+    def timed(self, name: str) -> Iterator[None]:
+        """Measure the time that the computations of a step take."""
+        cpu, wall = thread_time(), perf_counter()
+        yield
+        self.cpu.setdefault(name, []).append(thread_time() - cpu)
+        self.wall.setdefault(name, []).append(perf_counter() - wall)
+
+    def act(self, speeds: Speeds) -> None:
+        """Command speeds for one step, and update the belief. Speeds of objects are not sent.
+
+        Parameters
+        ----------
+        speeds
+            Speeds of the robot, and possibly of objects [m/s], [rad/s]; none to stop.
+        """
+        robot = f"{self.world.robot}/"
+        self.commands = {s: v for s, v in speeds.items() if s.path.startswith(robot)}
+        self.world.apply(self.commands, self.dt, stamp=self.state.stamp)
+        self.state = self._belief.update(self.world, State(self.commands))
+        self.steps += 1
+        if self._on_step is not None:
+            self._on_step(self)
+
+    def stop(self) -> None:
+        """Command zero speeds for one step."""
+        self.act({})
