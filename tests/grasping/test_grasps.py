@@ -14,6 +14,7 @@ import kineverse as kv
 from kineverse import lie
 from kineverse.errors import InvalidValueError
 from kineverse.grasping import Grasp, Handle, find_gripper, find_handle, sample_grasps
+from kineverse.model.body import Body, Box, Pose, Shape
 
 KITCHEN = (
     "fridge_door",
@@ -84,6 +85,29 @@ def test_grasps_differ_in_angle_place_and_half_turn() -> None:
         assert np.allclose(way, 0.1 * gripper.grasp_pose[:3, 0])
 
 
+@pytest.mark.parametrize("robot", ["fetch", "hsr"])
+def test_both_fingers_touch_a_deep_bar_at_any_angle(robot: str) -> None:
+    # A tilted hand meets two edges of it, which are not opposite each other in the middle.
+    panel, bar = Shape(Box((0.02, 0.4, 0.6))), Shape(Box((0.05, 0.015, 0.3)), Pose.from_matrix(place(-0.045)))
+    model, q = kv.load(robot), kv.position("door")
+    with model.edit() as edit:
+        edit.add_frame("case", "world")
+        hinge = kv.translation(0, -0.2, 0) @ kv.rotation_z(q) @ kv.translation(0, 0.2, 0)
+        edit.add_frame("panel", "case", hinge, Body(collisions=(panel, bar)))
+        edit.constrain("range", 0, q, 1.5)
+    gripper, handle = find_gripper(model, robot), find_handle(model, "door")
+    grasps = sample_grasps(model, gripper, handle, count=24)
+    assert max(abs(grasp.tilt) for grasp in grasps) > 0.2
+    assert max(grasp.thickness for grasp in grasps) > 0.016
+    judge = GraspJudge(model, "case", gripper)
+    for grasp in grasps[::3]:
+        check(judge, grasp)
+
+
+def place(x: float) -> np.ndarray:
+    return np.asarray(lie.translation(np.array([x, 0.0, 0.0])))
+
+
 def test_a_bar_that_is_too_thick_or_without_room_is_refused() -> None:
     model = kv.load("kitchen")
     model.include("fetch")
@@ -92,6 +116,6 @@ def test_a_bar_that_is_too_thick_or_without_room_is_refused() -> None:
         InvalidValueError, match="is 200 mm thick, and the gripper of fetch/gripper_link opens 102 mm"
     ):
         sample_grasps(model, gripper, replace(handle, thickness=0.2))
-    inside = handle.pose @ lie.translation(np.array([-0.06, 0.0, 0.0]))  # as if the bar were in the door
+    inside = handle.pose @ place(-0.06)  # as if the bar were in the door
     with pytest.raises(InvalidValueError, match=r"no room at .* collide: .* at kitchen/fridge_door \("):
         sample_grasps(model, gripper, replace(handle, pose=inside))

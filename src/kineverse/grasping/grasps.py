@@ -39,6 +39,8 @@ _NEAR = 0.6
 _REACH = 0.05
 """Distance up to which the clearance of a grasp counts [m]."""
 _CLOSING = 5
+_ADVANCES, _TOUCHING = 20, 1e-4
+"""Most steps in which fingers close, and the distance at which one touches [m]."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -123,11 +125,16 @@ def sample_grasps(
     rng = np.random.default_rng(seed)
     for grasp, cost in _candidates(gripper, handle, surroundings.bar, _CANDIDATES * count, rng):
         pair = surroundings.find_contact(grasp)
-        if pair is not None:
-            hits[pair] += 1
+        closed = None if pair else surroundings.close(grasp)
+        if closed is not None:
+            pair = surroundings.find_contact(closed)
+        if closed is None or pair is not None:
+            hits[pair or (gripper.hand, "the bar, which the fingers miss")] += 1
             continue
-        clearance = surroundings.clearance(grasp)
-        found.append((cost - min(clearance, 0.02) / 0.02, replace(grasp, clearance=clearance)))
+        clearance = surroundings.clearance(closed)
+        # Edges of a bar that is not round spread the fingers, and hold it less well than its sides.
+        cost += closed.thickness / handle.thickness - min(clearance, 0.02) / 0.02
+        found.append((cost, replace(closed, clearance=clearance)))
         if len(found) == count:
             break
     if not found:
@@ -161,11 +168,16 @@ def _candidates(
             continue
         z = np.array([0.0, 0.0, 0.0 if is_knob else place])
         bar_T_grasp = lie.transform(bar_R_grasp, z - depth * bar_R_grasp[:, 0])
-        back = lie.translation(np.array([-_RETREAT, 0.0, 0.0]))
-        grasp_T_hand = lie.inverse(gripper.grasp_pose_at(thickness))
-        pose, approach = (handle.pose @ bar_T_grasp @ T for T in (grasp_T_hand, back @ grasp_T_hand))
+        pose, approach = _place_hand(gripper, handle.pose @ bar_T_grasp, thickness)
         grasp = Grasp(gripper, handle, pose, approach, float(tilt), float(z[2]), thickness, 0.0)
         yield grasp, float(np.abs(part).sum())
+
+
+def _place_hand(gripper: Gripper, frame_T_grasp: Array, gap: float) -> tuple[Array, Array]:
+    """Return frame_T_hand of a hand with a gap of its pads at a grasp pose, and before it approaches."""
+    grasp_T_hand = lie.inverse(gripper.grasp_pose_at(gap))
+    back = lie.translation(np.array([-_RETREAT, 0.0, 0.0]))
+    return frame_T_grasp @ grasp_T_hand, frame_T_grasp @ back @ grasp_T_hand
 
 
 class _Surroundings:
@@ -186,6 +198,8 @@ class _Surroundings:
             if (part.body, part.number) == (handle.frame, handle.shape):
                 pieces.append(part)
         # Of a decomposed handle, the bar is the piece in its middle.
+        if not pieces:
+            raise InvalidValueError(f"The model has no shape {handle.shape} of {handle.frame}: find it anew.")
         bar = min(pieces, key=lambda part: float(np.linalg.norm(part.middle - middle)))
         self.bar = replace(bar, pose=frame_T_world @ bar.pose)
         obstacles = {}
@@ -214,6 +228,30 @@ class _Surroundings:
         pair = self._contacts(_MARGIN)[0]
         hand, other = (pair.b, pair.a) if pair.a.startswith(_OBJECT) else (pair.a, pair.b)
         return hand, "the bar" if other == _BAR else other.removeprefix(_OBJECT)
+
+    def close(self, grasp: Grasp) -> Grasp | None:
+        """Return a grasp moved along the closing motion so that both fingers touch at once, or None.
+
+        Each finger advances by its distance from the bar until both touch (conservative advancement). A bar
+        that is not round is not in the middle, where the hand is tilted. None means that a finger misses it.
+        """
+        gripper = grasp.gripper
+        frame_T_grasp = grasp.pose @ gripper.grasp_pose_at(grasp.thickness)
+        gap = min(grasp.thickness + 2 * _SLACK, gripper.width)
+        for _ in range(_ADVANCES):
+            pose, approach = _place_hand(gripper, frame_T_grasp, gap)
+            self._hand.place(gripper.values_at(gap), pose)
+            one, other = (
+                min(self._hand.scene.distance(body, _BAR).distance for body in finger)
+                for finger in gripper.fingers
+            )
+            if max(abs(one), abs(other)) < _TOUCHING:
+                return replace(grasp, pose=pose, approach=approach, thickness=gap)
+            gap -= one + other
+            frame_T_grasp = frame_T_grasp @ lie.translation(np.array([0.0, (one - other) / 2, 0.0]))
+            if not 0.0 < gap <= gripper.width:
+                return None
+        return None
 
     def clearance(self, grasp: Grasp) -> float:
         """Return the least distance of the hand to everything but the bar [m], at most 50 mm."""
