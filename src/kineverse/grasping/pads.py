@@ -101,11 +101,12 @@ def find_pads(
         Position (3,) of the joint that moves the hand: the fingers point away from it.
     """
     shared = tuple(s for s in a.joints if s in b.joints)
-    pads, why = _find_pads(_Motion(model, alone, a, b, shared), root) if shared else (None, "")
-    if pads is None:  # further joints, such as springs, move only where the fingers have none in common
-        pads, why = _find_pads(
-            _Motion(model, alone, a, b, tuple(dict.fromkeys((*a.joints, *b.joints)))), root
-        )
+    everything = tuple(dict.fromkeys((*a.joints, *b.joints)))
+    # Further joints, such as springs, move only where the fingers have none in common.
+    pads, why = None, ""
+    for joints in dict.fromkeys((shared, everything)):
+        if pads is None and joints:
+            pads, why = _find_pads(_Motion(model, alone, a, b, joints), root)
     return pads, why
 
 
@@ -130,7 +131,10 @@ def _find_pads(motion: _Motion, root: Array) -> tuple[Pads | None, str]:
     speeds = sorted((float(-opening[0] @ y), float(opening[1] @ y)))
     if speeds[0] < _SLOWER * speeds[1]:
         return None, "they do not move against each other"
-    x = _approach(motion, y, moved[0].mean(axis=0) - root)
+    outwards = moved[0].mean(axis=0) - root
+    if np.linalg.norm(np.cross(outwards, y)) < 1e-4:
+        return None, "nothing tells which way they point"
+    x = _approach(motion, y, outwards)
     axes = lie.round_exact(np.stack([x, y, np.cross(x, y)], axis=1))
     return _measure(motion, axes, float(moved[0].mean(axis=0) @ y))
 
