@@ -8,6 +8,7 @@ from __future__ import annotations
 import math
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
+from itertools import product
 
 import numpy as np
 
@@ -32,7 +33,7 @@ _ALIGNED = 0.85
 """Cosine of the angle below which an axis is taken for the approach direction."""
 _SLOWER = 0.4
 """Least motion of one finger against the other's; fingers that mirror each other have 1."""
-_STILL_OPEN, _WIDEST = 0.6, 0.4
+_STILL_OPEN, _WIDEST = 0.45, 0.4
 """Largest gap of closed fingers as a part of that of open ones, and the largest gap at all [m]."""
 _LEAST_STROKE = 5e-3
 """Least change of the gap of a gripper [m]."""
@@ -101,6 +102,8 @@ def find_pads(
         Position (3,) of the joint that moves the hand: the fingers point away from it.
     """
     shared = tuple(s for s in a.joints if s in b.joints)
+    if len(a.joints) != len(b.joints):
+        return None, f"one has {len(a.joints)} joints and the other {len(b.joints)}"
     everything = tuple(dict.fromkeys((*a.joints, *b.joints)))
     # Further joints, such as springs, move only where the fingers have none in common.
     pads, why = None, ""
@@ -174,12 +177,15 @@ def _measure(motion: _Motion, axes: Array, height: float) -> tuple[Pads | None, 
     parts = np.linspace(0.0, 1.0, _SAMPLES)
     tracked = motion.track(frames, points, parts)
     gap = (tracked[:, 1] - tracked[:, 0]) @ y
+    first = int(np.argmax(gap))  # fingers that turn further than to both sides are open before their limits
+    gap, tracked = gap[first:], tracked[first:]
+    opened, closed = motion.values(float(parts[first])), motion.values(1.0)
+    parts = np.linspace(0.0, 1.0, len(gap))
     if (np.diff(gap) > 1e-4).any() or gap[-1] > _STILL_OPEN * gap[0] or gap[0] > _WIDEST:
         return None, f"their gap goes from {gap[0] * 1e3:.0f} to {gap[-1] * 1e3:.0f} mm, as no gripper's does"
     stroke = np.column_stack([parts, gap, tracked.mean(axis=1)])
     length, width = (edges[1] - edges[0]).tolist()
     fingers = (tuple(motion.a), tuple(motion.b))
-    opened, closed = motion.values(0.0), motion.values(1.0)
     return Pads(fingers, frames, np.array(points), axes, (length, width), opened, closed, stroke), ""
 
 
@@ -238,12 +244,14 @@ class _Motion:
 
     def find_closing(self) -> str:
         """Find the values that open and close the fingers; return the reason if they do not."""
-        middle = {s: (low + high) / 2 for s, (low, high) in self.limits.items()}
+        # Closed is the corner of the limits with the least gap: one joint alone may not bring them nearer.
+        corners = [dict(zip(self.joints, corner, strict=True)) for corner in product(*self.limits.values())]
+        self.closed = min(corners, key=self.gap)
+        least = self.gap(self.closed)
         for s, (low, high) in self.limits.items():
-            at_low, at_high = (self.gap({**middle, s: value}) for value in (low, high))
-            self.opened[s], self.closed[s] = (low, high) if at_low > at_high else (high, low)
-            if abs(at_low - at_high) < 1e-6:
-                self.opened[s] = self.closed[s] = middle[s]
+            self.opened[s] = low if self.closed[s] == high else high
+            if abs(self.gap({**self.closed, s: self.opened[s]}) - least) < 1e-6:
+                self.opened[s] = self.closed[s] = (low + high) / 2  # it does not matter to the gap
         parts = np.linspace(0.0, 1.0, _SAMPLES)
         gaps = np.array([self.gap(self.values(part)) for part in parts.tolist()])
         if gaps.max() - gaps.min() < _LEAST_STROKE or gaps.max() <= 0.0:
