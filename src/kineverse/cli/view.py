@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+import math
 import signal
 import sys
 from collections.abc import Iterator
@@ -158,7 +159,17 @@ def run(arguments: argparse.Namespace) -> int:
 
 def _read_recording(arguments: argparse.Namespace) -> RunRecording | None:
     """Return the recording that is to be shown; None for a model."""
-    if not arguments.model.lower().endswith(".mcap"):
+    name = arguments.model.lower()
+    moves = arguments.play is not None or name.endswith(".mcap")
+    if (arguments.time is not None or arguments.speed != 1.0 or arguments.loop) and not moves:
+        raise InvalidValueError("--time, --speed and --loop are for recordings (.mcap) and --play")
+    if arguments.time is not None and not 0.0 <= arguments.time < math.inf:
+        raise InvalidValueError(f"--time is a time from 0 s, not {arguments.time}")
+    if name.endswith(".json") and not name.endswith(".kv.json") and Path(arguments.model).is_file():
+        raise InvalidValueError(
+            f"{arguments.model} is no model; for a trajectory: kineverse view MODEL --play {arguments.model}"
+        )
+    if not name.endswith(".mcap"):
         return None
     from kineverse.worlds import read_run_recording
 
@@ -211,12 +222,14 @@ def _write_picture(
     from kineverse.view.recorded_scene import RecordedScene
     from kineverse.worlds import RunRecording
 
-    options = {"collisions": arguments.collisions, "near": near, "decomposed": arguments.decomposed}
+    options: dict[str, Any] = {"collisions": arguments.collisions, "near": near}
+    options["decomposed"] = arguments.decomposed
     if motion is not None:
         time = motion.duration if arguments.time is None else arguments.time
         if isinstance(motion, RunRecording):
             scene = RecordedScene(motion)
-            state, options["overlay"] = scene.values_at(time), scene.drawables(time)
+            state = scene.values_at(time)
+            options |= {"overlay": scene.draw_ghosts(time), "over": scene.draw_arrows(time)}
         else:
             state = state | {str(s): v for s, v in motion.at(time).items()}
     save_picture(arguments.picture, model, state, **options)

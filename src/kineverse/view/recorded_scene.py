@@ -114,10 +114,10 @@ class RecordedScene:
             lines.append(f"{'done' if outcome.get('done') else 'not done'}: {outcome.get('reason', '')}")
         return lines
 
-    def drawables(self, time: float) -> list[Drawable]:
-        """Return ghost and arrows at a time [s], as parts in the world."""
+    def draw_ghosts(self, time: float) -> list[Drawable]:
+        """Return the bodies where they are believed at a time [s], as parts in the world."""
         ghosts = self.ghost_poses(time)
-        found = [
+        return [
             replace(
                 part,
                 frame=_WORLD,
@@ -127,10 +127,14 @@ class RecordedScene:
             for part in self.parts
             if part.frame in ghosts
         ]
-        for name, ends in self.arrows(time).items():
-            pieces = build_arrow(ends, float(np.linalg.norm(ends[1] - ends[0])))
-            found += [Drawable(_WORLD, piece, self.arrow_color(name), "visual") for piece in pieces]
-        return found
+
+    def draw_arrows(self, time: float) -> list[Drawable]:
+        """Return the arrows of the controller's vectors at a time [s], as parts in the world."""
+        return [
+            Drawable(_WORLD, piece, self.arrow_color(name), "visual")
+            for name, ends in self.arrows(time).items()
+            for piece in build_arrow(ends, float(np.linalg.norm(ends[1] - ends[0])))
+        ]
 
 
 def as_trajectory(recording: RunRecording) -> Trajectory | None:

@@ -70,7 +70,7 @@ class RecordingLayer:
         self._time = 0.0
         self._ghosts: dict[str, Any] = {}
         self._arrows: list[Any] = []
-        self._folder = server.gui.add_folder("run", order=-0.9)
+        self._folder = server.gui.add_folder("recording", order=-0.9)
         with self._folder:
             self._text = HtmlBox(server.gui, element("div"))
             self._ghost_box = server.gui.add_checkbox(

@@ -65,15 +65,19 @@ def _robots(recording: RunRecording) -> list[str]:
 def _draw_values(
     axes: Axes, values: ValuesOverTime, names: list[str], beliefs: ValuesOverTime | None = None
 ) -> None:
-    """Draw those values that change, the ones that change most first."""
-    spans = {name: float(np.ptp(line[np.isfinite(line)])) for name in names if (line := values[name]).size}
-    moving = [name for name in spans if spans[name] > _STILL]
-    shown = sorted(moving, key=lambda name: -spans[name])[:_MOST]
+    """Draw coordinates that change, or speeds that are not zero; the largest ones first."""
+    sizes: dict[str, float] = {}
+    for name in names:
+        known = values[name][np.isfinite(values[name])]
+        if known.size:
+            sizes[name] = float(np.ptp(known) if beliefs is not None else np.abs(known).max())
+    moving = [name for name in sizes if sizes[name] > _STILL]
+    shown = sorted(moving, key=lambda name: -sizes[name])[:_MOST]
     believed = set(map(str, beliefs.symbols)) if beliefs is not None else set()
     for name in shown:
-        (line,) = axes.plot(values.times, values[name], linewidth=1.2, label=name)
+        (drawn,) = axes.plot(values.times, values[name], linewidth=1.2, label=name.removesuffix(":velocity"))
         if beliefs is not None and name in believed:
-            axes.plot(beliefs.times, beliefs[name], "--", linewidth=0.8, color=line.get_color())
+            axes.plot(beliefs.times, beliefs[name], "--", linewidth=0.8, color=drawn.get_color())
     if shown:
         axes.legend(fontsize="x-small", loc="center left", bbox_to_anchor=(1.0, 0.5), frameon=False)
     if len(moving) > _MOST:
@@ -87,13 +91,18 @@ def _draw_contacts(axes: Axes, recording: RunRecording) -> None:
     for time, contacts in zip(recording.contacts.times, recording.contacts.entries, strict=True):
         for label in {f"{one.a} – {one.b}" for one in contacts}:
             pairs.setdefault(label, []).append(float(time))
-    lines = sorted(pairs, key=lambda label: -len(pairs[label]))[:_MOST]
-    for k, label in enumerate(lines):
-        axes.plot(pairs[label], np.full(len(pairs[label]), float(k)), "|", markersize=8)
-    axes.set_yticks(range(len(lines)), lines, fontsize="x-small")
-    axes.set_ylim(max(len(lines), 1) - 0.5, -0.5)
-    if not lines:
-        axes.text(0.5, 0.5, "no contacts", transform=axes.transAxes, ha="center", va="center")
+    longest = sorted(pairs, key=lambda label: (-len(pairs[label]), label))[:_MOST]
+    for k, label in enumerate(longest):
+        axes.plot(pairs[label], np.full(len(pairs[label]), float(k)), "|", markersize=6)
+        axes.text(
+            0.005, k - 0.25, label, transform=axes.get_yaxis_transform(), fontsize="x-small", va="bottom"
+        )
+    axes.set_yticks([])
+    axes.set_ylim(max(len(longest), 1) - 0.5, -1.0)
+    axes.set_ylabel("contacts")
+    if len(pairs) > _MOST:
+        note = f"{_MOST} of {len(pairs)}"
+        axes.text(1.0, 1.0, note, transform=axes.transAxes, fontsize="x-small", ha="right", va="bottom")
 
 
 def _draw_phases(axes: Axes, recording: RunRecording, labels: bool) -> None:
