@@ -22,6 +22,7 @@ from kineverse.cli.arguments import (
 )
 from kineverse.cli.info import is_gallery_list, print_articulations, print_models
 from kineverse.cli.output import show_progress
+from kineverse.cli.plan_arguments import add_robot_option, include_robot
 from kineverse.errors import InvalidValueError
 
 if TYPE_CHECKING:
@@ -43,6 +44,7 @@ examples:
   kineverse view articulations/folding_door      any articulation of the library
   kineverse view                                 list of all models and articulations
   kineverse view my_robot.urdf --set elbow=45deg --port 8090
+  kineverse view kitchen --robot fetch@0.45,0.7,90deg
   kineverse view kitchen --near 5cm              bodies within 5 cm of each other
   kineverse view articulations/ratchet --near 0.1 --collisions --picture ratchet.png
   kineverse view examples/arm.urdf --play arm.json   a trajectory of kineverse plan --save arm.json
@@ -59,6 +61,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         nargs="?",
         help="name of a shipped model, path of a file, or a recording (.mcap); without it, a list is printed",
     )
+    add_robot_option(parser)
     add_set_option(parser)
     parser.add_argument(
         "--near",
@@ -119,7 +122,15 @@ def run(arguments: argparse.Namespace) -> int:
 
     label = read_title(arguments.model)
     recording = _read_recording(arguments)
-    model = load_model(arguments, arguments.model) if recording is None else recording.model
+    model: ModelView
+    if recording is not None:
+        model = recording.model
+    else:
+        model = loaded = load_model(arguments, arguments.model)
+        if arguments.robot is not None:
+            _, standing = include_robot(arguments, loaded)
+            assigned = {str(s): v for s, v in standing.items()} | assigned
+            label = f"{label}, {read_title(arguments.robot.rpartition('@')[0] or arguments.robot)}"
     trajectory = _read_trajectory(arguments, model)
     if arguments.plot is not None:
         return _write_plot(arguments, recording)
@@ -173,7 +184,7 @@ def _read_recording(arguments: argparse.Namespace) -> RunRecording | None:
         return None
     from kineverse.worlds import read_run_recording
 
-    for option in ("play", "assignments"):
+    for option in ("play", "robot", "assignments"):
         if getattr(arguments, option):
             name = "--set" if option == "assignments" else f"--{option}"
             raise InvalidValueError(f"{name} is for a model; a recording has its own motion")
