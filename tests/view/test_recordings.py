@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from types import SimpleNamespace
+
 import numpy as np
 import pytest
 
@@ -11,7 +13,8 @@ from kineverse.cli import main
 from kineverse.errors import UnknownNameError
 from kineverse.planning import Trajectory
 from kineverse.view import view
-from kineverse.view.recorded_scene import LONGEST_ARROW, RecordedScene
+from kineverse.view.recorded_scene import RecordedScene
+from kineverse.view.run_drawing import LONGEST_ARROW
 from kineverse.worlds import Contact, Recorder, read_run_recording
 
 pytest.importorskip("mcap", reason="recordings need the extra 'recording'")
@@ -57,26 +60,26 @@ def test_the_trajectory_has_the_times_and_values_of_the_run(scene):
 
 
 def test_ghosts_are_the_bodies_that_are_believed_elsewhere(scene):
-    assert scene.ghost_poses(0.45) == {}  # nothing was believed yet
-    ghosts = scene.ghost_poses(0.7)
+    assert scene.at(0.45).ghosts == {}  # nothing was believed yet
+    ghosts = scene.at(0.7).ghosts
     assert set(ghosts) == {"cupboard/panel"}
     model = scene.recording.model
     expected = kv.compile(model.fk("cupboard/panel"))(state(model, cupboard__door=0.9))
     np.testing.assert_allclose(ghosts["cupboard/panel"], expected, atol=1e-9)
     # At the end the door is where it is believed; the drawer is drawn as its recorded pose says.
-    (drawer,) = scene.ghost_poses(1.0).items()
+    (drawer,) = scene.at(1.0).ghosts.items()
     assert drawer[0] == "cupboard/drawer"
     np.testing.assert_allclose(drawer[1][:3, 3], [2.3, 0, 1.5])
-    assert len(scene.draw_ghosts(1.0)) == 1
+    assert len(scene.drawing.draw_ghosts(scene.at(1.0))) == 1
 
 
 def test_arrows_have_the_direction_of_vectors_and_a_bounded_length(scene):
-    assert scene.arrows(0.3) == {}
-    arrows = scene.arrows(0.6)
+    assert scene.at(0.3).arrows == {}
+    arrows = scene.at(0.6).arrows
     assert set(arrows) == {"p", "n"}
     np.testing.assert_allclose(arrows["p"], [X, X + 0.5 * UP])
     np.testing.assert_allclose(arrows["n"], [X, X + LONGEST_ARROW * X])
-    assert scene.arrow_color("p") != scene.arrow_color("n")
+    assert scene.drawing.color("p") != scene.drawing.color("n")
 
 
 def test_a_recording_is_played_on_the_page(scene):
@@ -87,7 +90,7 @@ def test_a_recording_is_played_on_the_page(scene):
         play_recording(page, scene.recording, time=0.7)
         assert page.settled()
         assert page.values["cupboard/door"] == pytest.approx(0.7)
-        layer = page._playback._layer
+        layer = page._playback._layer._layer
         (ghost,) = layer._ghosts.values()
         np.testing.assert_allclose(ghost.position, page.pose("cupboard/panel")[:3, 3])
         assert ghost.visible
@@ -104,6 +107,32 @@ def test_a_recording_is_played_on_the_page(scene):
         assert page.settled()
         with pytest.raises(UnknownNameError, match="cupboard/door"):
             page.play(Trajectory((kv.position("cupboard/dor"),), [0], [[0]], [[0]]))
+
+
+def test_a_run_is_shown_while_it_happens(scene):
+    pytest.importorskip("viser", reason="the page needs the extra 'view'")
+    from kineverse.view.live_run import LiveRun
+
+    model = scene.recording.model
+    touch = Contact("robot/neck", "cupboard/panel", X, X, 0.0, np.nan)
+    with view(model, port=0) as page:
+        live = LiveRun(page, speed=0.0)
+        for time in (0.0, 1.0):
+            truth = state(model, cupboard__door=time)
+            world = SimpleNamespace(time=time, state=truth, contacts=lambda: [touch] * 6)
+            believed = truth.updated({"cupboard/door": 0.5})
+            live._drawn = -1.0
+            live(SimpleNamespace(world=world, state=believed, phase="push", vectors={"p": (X, UP)}))
+        assert page.settled()
+        assert page.values["cupboard/door"] == 1.0
+        (ghost,) = live._layer._ghosts.values()
+        expected = kv.compile(model.fk("cupboard/panel"))(state(model, cupboard__door=0.5))
+        assert ghost.visible
+        np.testing.assert_allclose(ghost.position, expected[:3, 3])
+        for line in ("1.0 s", "phase: push", "robot/neck and cupboard/panel", "and 2 more contacts"):
+            assert line in live._layer._text.content
+        assert len(live._layer._arrows) == 2
+        live.remove()
 
 
 def test_commands_draw_a_recording_and_a_trajectory(run, tmp_path, capsys):

@@ -239,8 +239,9 @@ def _write_picture(
         time = motion.duration if arguments.time is None else arguments.time
         if isinstance(motion, RunRecording):
             scene = RecordedScene(motion)
-            state = scene.values_at(time)
-            options |= {"overlay": scene.draw_ghosts(time), "over": scene.draw_arrows(time)}
+            state, moment = scene.values_at(time), scene.at(time)
+            options["overlay"] = scene.drawing.draw_ghosts(moment)
+            options["over"] = scene.drawing.draw_arrows(moment)
         else:
             state = state | {str(s): v for s, v in motion.at(time).items()}
     save_picture(arguments.picture, model, state, **options)
