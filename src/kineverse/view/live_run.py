@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import time
 
-from kineverse.view.run_drawing import RunDrawing, RunMoment, format_contact_lines, find_arrows
+from kineverse.view.run_drawing import RunDrawing, RunMoment, find_arrows, format_contact_lines
 from kineverse.view.run_layer import RunLayer
 from kineverse.view.viewer import PERIOD, Viewer
 from kineverse.worlds.recorder import RecordedStep

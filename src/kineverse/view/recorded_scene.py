@@ -6,7 +6,7 @@ import numpy as np
 
 from kineverse.planning.trajectories.trajectory import Trajectory
 from kineverse.view.poses import complete
-from kineverse.view.run_drawing import RunDrawing, RunMoment, format_contact_lines, find_arrows
+from kineverse.view.run_drawing import RunDrawing, RunMoment, find_arrows, format_contact_lines
 from kineverse.view.triangle_mesh import Floats
 from kineverse.worlds import RunRecording
 
