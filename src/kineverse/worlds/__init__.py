@@ -1,5 +1,6 @@
 """Worlds in which skills are tried: they know nothing of controllers (layer 5)."""
 
+from .judge import Judge
 from .kinematic_world import Event, KinematicWorld
 from .recorder import Recorder
 from .recording import RunRecording, read_run_recording
@@ -10,6 +11,7 @@ from .world import Contact, Observation, World
 __all__ = [
     "Contact",
     "Event",
+    "Judge",
     "KinematicWorld",
     "Observation",
     "Recorder",

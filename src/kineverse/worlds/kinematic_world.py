@@ -1,10 +1,10 @@
 """World without forces: what a robot touches gives way along the normal, and a held body follows the hand.
 
 It takes speeds of the robot alone. An object stands still unless a body of the robot would penetrate it;
-then it moves by the least that its limits, speed limits and locks allow, see :mod:`.object_motion`. So objects
-can be pushed and not dragged, have no inertia, and nothing falls. What cannot give way is penetrated, and
-:meth:`KinematicWorld.contacts` reports it; so are furniture that never moves, and pieces of furniture that run
-into each other. The robot itself goes exactly where its speeds lead, also beyond its limits.
+then it moves by the least that its limits, speed limits and locks allow, see :mod:`.object_motion`. So
+objects can be pushed and not dragged, have no inertia, and nothing falls. What cannot give way is penetrated,
+and :meth:`KinematicWorld.contacts` reports it; so are furniture that never moves, and pieces of furniture
+that run into each other. The robot goes exactly where its speeds lead, also beyond its limits.
 """
 
 from __future__ import annotations
@@ -36,7 +36,8 @@ logger = logging.getLogger(__name__)
 
 _SUBSTEP = 0.002
 """Longest way of a body between two checks of its gaps, while it is near an object [m]."""
-_MOST_SUBSTEPS = 200
+_MOST_SUBSTEPS = 10_000
+_UNKNOWN_WAY = 0.1
 _ROUNDING = 1e-9
 
 
@@ -230,7 +231,7 @@ class KinematicWorld:
             For a symbol that the model does not have.
         """
         values = self.model.default_state().updated(_select(state, self.model))
-        self._motion.place(values.vector(self._motion.symbols))
+        self._motion.reset(values.vector(self._motion.symbols))
         self._time, self.refused = 0.0, 0
         self._events: list[Event] = []
         if self._grip is not None:
@@ -335,23 +336,19 @@ class KinematicWorld:
         motion.place(self._integrate(start, arm, time))
         moved = motion.travel() - before
         # The travel begins anew at some time.
-        moved_most = float(moved.max(initial=0.0)) if (moved >= 0.0).all() else math.inf
-        way = moved_most + reach
+        most = float(moved.max(initial=0.0)) if (moved >= 0.0).all() else _UNKNOWN_WAY
+        way = most + reach
         holds = grip is not None and grip.held is not None
         count = 1
-        if way > _SUBSTEP:
-            _, index = motion.find_near(min(way, 1.0))
-            if len(index):
-                count = math.ceil(min(way / _SUBSTEP, _MOST_SUBSTEPS))
+        if way > _SUBSTEP and len(motion.find_near(way)[1]):
+            count = min(math.ceil(way / _SUBSTEP), _MOST_SUBSTEPS)
         if count == 1:
-            if not math.isfinite(way):
-                way = 1.0
             self._settle(time, way, holds or reach > 0.0)
             return
         motion.place(start)
         for _ in range(count):
             motion.place(self._integrate(motion.q, arm, time / count))
-            self._settle(time / count, min(way, 1.0) / count, grip is not None)
+            self._settle(time / count, way / count, grip is not None)
 
     def _settle(self, time: float, moved: float, grips: bool) -> None:
         """Move fingers and objects after the rest of the robot has moved."""

@@ -48,6 +48,8 @@ _SLACK = 1e-7
 _HELD = 1e-7
 """Weight of least motion beside the error of a hold."""
 _LIGHTEST = 1e-4
+_DEEP = 1e-4
+"""Penetration of what does not yield, from which on its side is remembered [m]."""
 _STEP = Symbol("world/step", 0, "parameter", 0.01)
 
 Residual = Callable[[], tuple[Array, Array]]
@@ -126,6 +128,7 @@ class ObjectMotion:
         motion = FrameDependence(model, speeds)
         self.robot_bodies = tuple(b for b in scene.bodies if is_robot(b))
         self.object_bodies = tuple(b for b in scene.bodies if not is_robot(b) and motion.moves(b))
+        self._penetrated: dict[tuple[int, ...], Array] = {}
         self._query = scene.watch(self.robot_bodies, self.object_bodies, per_shape=True)
         self._ignored = np.zeros((len(scene.bodies),) * 2, dtype=bool)
         self._inputs = self._indices(scene.inputs)
@@ -194,6 +197,12 @@ class ObjectMotion:
             np.maximum(weights, speed**2, out=weights)
         return weights
 
+    def reset(self, q: Array) -> None:
+        """Begin anew at a configuration."""
+        self._penetrated.clear()
+        self.ignore()
+        self.place(q)
+
     def place(self, q: Array) -> None:
         """Set the configuration."""
         self.q[:] = q
@@ -222,8 +231,14 @@ class ObjectMotion:
         return found, np.flatnonzero(~self._ignored[i, j])
 
     def measure_gaps(self, radius: float) -> Gaps:
-        """Return the gaps within a radius [m] with their derivatives."""
+        """Return the gaps within a radius [m] with their derivatives.
+
+        A shape that was penetrated does not separate on its other side: such pairs are left out until they
+        are apart.
+        """
         pairs, index = self.find_near(radius)
+        if self._penetrated:
+            index = self._same_side(pairs, index)
         if not len(index):
             return Gaps(pairs, index, np.zeros(0), np.zeros((0, len(self.columns))))
         self._evaluate_twists()
@@ -233,6 +248,26 @@ class ObjectMotion:
         rows = _project(normals, pairs.points_b[index], twists[b])
         rows -= _project(normals, pairs.points_a[index], twists[a])
         return Gaps(pairs, index, pairs.distances[index], rows)
+
+    def _same_side(self, pairs: DistanceResults, index: npt.NDArray[np.intp]) -> npt.NDArray[np.intp]:
+        """Return the indices of pairs without those that are penetrated beyond their middle."""
+        keys = _pair_keys(pairs)
+        inside = {keys[k] for k in index.tolist() if pairs.distances[k] < 0.0}
+        self._penetrated = {key: n for key, n in self._penetrated.items() if key in inside}
+        kept = [
+            k
+            for k in index.tolist()
+            if keys[k] not in self._penetrated or pairs.normals[k] @ self._penetrated[keys[k]] > 0.0
+        ]
+        return np.array(kept, dtype=np.intp)
+
+    def _note_penetrated(self, gaps: Gaps) -> None:
+        """Remember the sides from which shapes are penetrated because nothing yields."""
+        deep = gaps.index[gaps.distances < -_DEEP]
+        if len(deep):
+            keys = _pair_keys(gaps.pairs)
+            for k in deep.tolist():
+                self._penetrated.setdefault(keys[k], gaps.pairs.normals[k].copy())
 
     def twist(self, body: str) -> Array:
         """Return the spatial twist of a body by the speeds of objects, (6, n)."""
@@ -269,6 +304,7 @@ class ObjectMotion:
             v = found
             self.place(self._integrate(start, v, h))
             if change <= _STEADY:
+                self._note_penetrated(gaps)
                 break
         return v
 
@@ -362,6 +398,11 @@ class _CompiledRows:
         self._evaluator()
         matrix, lower, upper = (out.copy() for out in self._evaluator.outputs)
         return matrix, lower, upper
+
+
+def _pair_keys(pairs: DistanceResults) -> list[tuple[int, ...]]:
+    """Return the numbers of bodies and shapes of pairs."""
+    return [tuple(row) for row in np.hstack([pairs.body_indices, pairs.shape_indices]).tolist()]
 
 
 def _link_columns(count: int, patterns: Iterable[npt.NDArray[np.bool_]]) -> npt.NDArray[np.bool_]:
