@@ -336,12 +336,14 @@ class KinematicWorld:
         motion.place(self._integrate(start, arm, time))
         moved = motion.travel() - before
         # The travel begins anew at some time.
-        most = float(moved.max(initial=0.0)) if (moved >= 0.0).all() else _UNKNOWN_WAY
-        way = most + reach
+        moved[moved < 0.0] = _UNKNOWN_WAY
+        way = float(moved.max(initial=0.0)) + reach
         holds = grip is not None and grip.held is not None
         count = 1
-        if way > _SUBSTEP and len(motion.find_near(way)[1]):
-            count = min(math.ceil(way / _SUBSTEP), _MOST_SUBSTEPS)
+        if way > _SUBSTEP:
+            near = motion.near_bodies(way)
+            longest = float(moved[near].max(initial=-reach)) + reach
+            count = max(1, min(math.ceil(longest / _SUBSTEP), _MOST_SUBSTEPS))
         if count == 1:
             self._settle(time, way, holds or reach > 0.0)
             return

@@ -14,6 +14,7 @@ solved again where it led, until nothing changes (sequential quadratic programmi
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Collection, Iterable, Sequence
 from dataclasses import dataclass
 from typing import Any
@@ -40,8 +41,8 @@ SKIN = 1e-6
 
 _REACH = 0.005
 """Distance beyond the robot's motion up to which gaps are rows [m]."""
-_ROUNDS = 8
-_STEADY = 1e-8
+_ROUNDS = 10
+_STEADY = 2e-7
 """Change of displacements below which a solution is final [m]."""
 _SLACK = 1e-7
 """Reciprocal ρ of the weight of slacks, beside weights near 1 kg of least motion."""
@@ -135,6 +136,7 @@ class ObjectMotion:
         owners = scene.collision_world.table.body
         moving = np.array([is_robot(b) for b in scene.bodies], dtype=bool)
         self._robot_objects = np.flatnonzero(moving[owners[: scene.collision_world.table.moving]])
+        self._robot_owners = owners[self._robot_objects]
         self._compile_twists(model)
         self._integrate = model.integrator(speeds, self.symbols)
         self.skipped: tuple[tuple[str, str], ...] = ()
@@ -209,9 +211,16 @@ class ObjectMotion:
         self.scene.update(self.q[self._inputs])
 
     def travel(self) -> Array:
-        """Return the way that each shape of the robot has gone so far, at most [m]."""
-        found: Array = self.scene.collision_world.table.travel[self._robot_objects]
+        """Return the ways that bodies of the robot have gone so far, at most (B,) [m]; 0 for other bodies."""
+        found = np.zeros(len(self.scene.bodies))
+        table = self.scene.collision_world.table
+        np.maximum.at(found, self._robot_owners, table.travel[self._robot_objects])
         return found
+
+    def near_bodies(self, radius: float) -> npt.NDArray[np.intp]:
+        """Return the indices of bodies in pairs within a radius [m] that are not ignored."""
+        pairs, index = self.find_near(radius)
+        return np.unique(pairs.body_indices[index]).astype(np.intp)
 
     def ignore(self, ones: Iterable[str] = (), others: Iterable[str] = ()) -> None:
         """Ignore pairs of one body each, in place of those that were ignored before."""
@@ -291,22 +300,40 @@ class ObjectMotion:
         residual
             Error of a hold, which the objects that reduce it follow.
         """
-        n, start = self.count, self.q.copy()
-        v, radius = np.zeros(n), moved + _REACH
+        start, radius = self.q.copy(), moved + _REACH
         limits = self._rates.evaluate(start, h)
-        for _ in range(_ROUNDS):
+        v = best = np.zeros(self.count)
+        least = math.inf
+        for k in range(_ROUNDS):
             gaps = self.measure_gaps(radius)
-            if residual is None and not v.any() and gaps.least >= 0.0:
-                break
+            if residual is None and not k and gaps.least >= 0.0:
+                return v
             pulled = None if residual is None else residual()
-            found = self._solve(h, v, gaps, limits, pulled)
-            change = float(np.max(np.abs(found - v) * np.sqrt(self.weights[:n]), initial=0.0)) * h
+            cost = self._cost(h * v, gaps, pulled)
+            if cost <= least * (1.0 + 1e-9):
+                least, best = cost, v
+                self._note_penetrated(gaps)
+                found = self._solve(h, v, gaps, limits, pulled)
+            else:
+                # The gaps bend too much, as of bodies that are jammed: half of the way.
+                found = 0.5 * (best + v)
+            change = float(np.max(np.abs(found - v) * np.sqrt(self.weights[: self.count]), initial=0.0)) * h
             v = found
             self.place(self._integrate(start, v, h))
             if change <= _STEADY:
-                self._note_penetrated(gaps)
-                break
+                return v
+        if self._cost(h * v, self.measure_gaps(radius), None if residual is None else residual()) > least:
+            v = best
+            self.place(self._integrate(start, v, h))
         return v
+
+    def _cost(self, way: Array, gaps: Gaps, pulled: tuple[Array, Array] | None) -> float:
+        """Return twice the cost of a motion by some way of the objects (n,)."""
+        depths = np.minimum(gaps.distances, 0.0)
+        moved = float(self.weights[: self.count] @ way**2)
+        if pulled is not None:
+            moved = _HELD * moved + float(pulled[0] @ pulled[0])
+        return moved + float(depths @ depths) / _SLACK
 
     def _solve(
         self,
@@ -418,8 +445,13 @@ def _link_columns(count: int, patterns: Iterable[npt.NDArray[np.bool_]]) -> npt.
 
 def _project(normals: Array, points: Array, twists: Array) -> Array:
     """Return n·(v + ω × p) for each of K points and each column: (K, 3), (K, 3), (K, 6, n) -> (K, n)."""
-    wrenches = np.concatenate([normals, np.cross(points, normals)], axis=1)
-    return np.asarray(np.einsum("ki,kij->kj", wrenches, twists))
+    (nx, ny, nz), (px, py, pz) = normals.T, points.T
+    wrench = np.empty((len(normals), 1, 6))
+    wrench[:, 0, :3] = normals
+    wrench[:, 0, 3] = py * nz - pz * ny
+    wrench[:, 0, 4] = pz * nx - px * nz
+    wrench[:, 0, 5] = px * ny - py * nx
+    return np.asarray((wrench @ twists)[:, 0])
 
 
 def _import_daqp() -> Any:
