@@ -179,6 +179,17 @@ def test_a_finger_pushes_what_yields_and_stops_at_what_does_not(world):
     assert gap(world) > -2e-6
 
 
+def test_fingers_side_by_side_push_and_do_not_hold(world):
+    start(world, x=0.85, y=0.3, z=0.5, finger=0.03)
+    move(world, 0.6, x=0.15, finger=-0.01)
+    pushed = world.state["room/door"]
+    assert pushed > 0.05
+    assert {c.a for c in world.contacts()} & {"robot/left_finger", "robot/right_finger"}
+    move(world, 0.4, x=-0.1, finger=-0.01)
+    assert world.held is None
+    assert world.state["room/door"] == pushed
+
+
 def world_gap(tolerance: float) -> float:
     """Return the largest offset of a held body from the middle of the fingers."""
     return tolerance / 2 + 1e-5

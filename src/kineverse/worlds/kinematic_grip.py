@@ -1,8 +1,8 @@
 """Grip of a robot's fingers in a world without forces.
 
 Closing fingers stop at a body of an object, unless it yields to the motion. The hold begins when bodies of
-both fingers touch the same object, or one touches and the other is near. From then on the fingers stay, and
-the object follows the hand: its coordinates minimise
+both fingers touch the same object from opposite sides, or one touches and the other is near. From then on
+the fingers stay, and the object follows the hand: its coordinates minimise
 
     |c_object - c_hand|² + (0.1 m)² |log(R_object R_handᵀ)|²,
 
@@ -30,6 +30,12 @@ TOUCH = 1e-4
 
 ROTATION_ARM = 0.1
 """Length that makes rotations comparable to distances [m]."""
+
+_OPPOSED = 0.5
+"""Least cosine of the angle between the normal of a contact that holds and the closing motion."""
+
+_ASLANT = 0.2
+"""Least part of a finger's motion along the normal of a contact that stops it."""
 
 _ROUNDS = 6
 
@@ -164,9 +170,10 @@ class KinematicGrip:
         """Return the part of the fingers' motion that objects do not yield to (k,)."""
         back = np.zeros(len(step))
         columns = gaps.rows[:, self._motion.count :]
+        lever = np.sqrt(self._motion.weights[self._motion.count :])
         for depth, row in zip(-gaps.distances, columns, strict=True):
             # A finger goes back as far as the gap shrinks by its motion.
-            into = np.where(row * step < 0.0, np.abs(row), 0.0)
+            into = np.where(row * np.sign(step) < -_ASLANT * lever, np.abs(row), 0.0)
             if depth > SKIN and into.any():
                 k = int(np.argmax(into * np.abs(step)))
                 back[k] = max(back[k], (depth + SKIN) / into[k])
@@ -177,10 +184,13 @@ class KinematicGrip:
         motion = self._motion
         pairs, index = motion.find_near(max(self._near, TOUCH))
         touched: list[dict[int, tuple[float, int]]] = [{}, {}]
+        along = self._hand()[:3, :3] @ self.gripper.grasp_pose[:3, 1]
         for k in index.tolist():
-            for one, other in (pairs.body_indices[k], pairs.body_indices[k][::-1]):
-                for finger, near in zip(self._fingers, touched, strict=True):
-                    if one in finger:
+            (a, b), normal = pairs.body_indices[k].tolist(), pairs.normals[k]
+            for one, other, outwards in ((a, b, normal @ along), (b, a, -(normal @ along))):
+                for finger, near, side in zip(self._fingers, touched, (1.0, -1.0), strict=True):
+                    # Fingers that press against a front side by side do not hold it.
+                    if one in finger and side * outwards >= _OPPOSED:
                         near.setdefault(int(motion.group[other]), (float(pairs.distances[k]), int(other)))
         common = touched[0].keys() & touched[1].keys()
         best = min(common, key=lambda g: min(touched[0][g], touched[1][g]), default=None)

@@ -123,7 +123,7 @@ class KinematicWorld:
             number = finite_number(value)
             if number is None or number < 0 or (field == "timeout" and not number):
                 raise InvalidValueError(f"'{field}' of a world is a number from 0 on, not {value!r}.")
-        self.model, self.robot = model, robot
+        self.model, self.robot, self._version = model, robot, model.version
         self._timeout, self._delay = float(timeout), float(delay)
         if not any(self._is_robot(s.path) for s in model.degrees_of_freedom):
             prefixes = sorted({s.path.partition("/")[0] for s in model.degrees_of_freedom})
@@ -230,6 +230,7 @@ class KinematicWorld:
         UnknownNameError
             For a symbol that the model does not have.
         """
+        self._check_version()
         values = self.model.default_state().updated(_select(state, self.model))
         self._motion.reset(values.vector(self._motion.symbols))
         self._time, self.refused = 0.0, 0
@@ -266,6 +267,7 @@ class KinematicWorld:
         UnknownNameError
             For speeds that the model does not have.
         """
+        self._check_version()
         length = finite_number(duration)
         if length is None or length <= 0:
             raise InvalidValueError(f"A duration is a positive number of seconds, not {duration!r}.")
@@ -374,6 +376,13 @@ class KinematicWorld:
             scene.watch(motion.robot_bodies, others, TOUCH),
             scene.watch(others, others, 0.0, moving=objects, rules=rules),
         )
+
+    def _check_version(self) -> None:
+        """Raise InvalidValueError after an edit of the model."""
+        if self.model.version != self._version:
+            raise InvalidValueError(
+                "The model of this world was edited. Make another world, or this one of model.snapshot()."
+            )
 
     def _forget(self) -> None:
         self._state = self._contacts = None
