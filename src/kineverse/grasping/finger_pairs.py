@@ -118,7 +118,7 @@ def _why_no_finger(model: ModelView, branch: Branch) -> str:
     names = ", ".join(map(str, branch.joints[: MOST_JOINTS + 1]))
     if len(branch.joints) > MOST_JOINTS:
         return f"{branch.root} has more joints than a finger's {MOST_JOINTS} ({names} ...)"
-    if not all(math.isfinite(bound) for s in branch.joints for bound in model.limits(s)):
+    if not all(high - low <= 2 * math.pi for low, high in map(model.limits, branch.joints)):
         return f"{branch.root} has no limits ({names})"
     if not bodies_with_shapes(model, branch.frames):
         return f"{branch.root} has no shapes ({names})"

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections import Counter
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -12,7 +12,7 @@ import numpy as np
 from kineverse import lie
 from kineverse.errors import InvalidValueError
 from kineverse.geometry import Scene
-from kineverse.geometry.objects import collision_shapes
+from kineverse.geometry.objects import collision_shapes, matches_pattern
 from kineverse.lie import Array
 from kineverse.model.body import Body
 from kineverse.model.model_view import ModelView
@@ -39,6 +39,8 @@ _NEAR = 0.6
 _REACH = 0.05
 """Distance up to which the clearance of a grasp counts [m]."""
 _CLOSING = 5
+_ADVANCES, _TOUCHING = 20, 1e-4
+"""Most steps in which fingers close, and the distance at which one touches [m]."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -79,7 +81,13 @@ class Grasp:
 
 
 def sample_grasps(
-    model: ModelView, gripper: Gripper, handle: Handle, count: int = 64, seed: int = 0
+    model: ModelView,
+    gripper: Gripper,
+    handle: Handle,
+    count: int = 64,
+    seed: int = 0,
+    *,
+    decomposed: Iterable[str] = (),
 ) -> tuple[Grasp, ...]:
     """Return grasps across a bar, without contact of the gripper with the object, the best first.
 
@@ -88,6 +96,19 @@ def sample_grasps(
     closing fingers are free of collisions with everything that is not the robot's, at its default values.
     Upright grasps at the middle of the bar and of the pads come first, of similar ones the clearer.
 
+    Parameters
+    ----------
+    model
+        Model of the robot and of the object.
+    gripper, handle
+        What holds what.
+    count
+        Most grasps that are returned.
+    seed
+        Seed of the samples: equal arguments give equal grasps.
+    decomposed
+        Bodies, or patterns, as for :class:`kineverse.geometry.Scene`: without them a mesh is its convex hull.
+
     Raises
     ------
     InvalidValueError
@@ -95,19 +116,25 @@ def sample_grasps(
     """
     if handle.thickness + _SLACK > gripper.width:
         raise InvalidValueError(
-            f"The {handle} is too thick for the {gripper}. find_handles and find_grippers list others."
+            f"The handle {handle.frame} is {handle.thickness * 1e3:.0f} mm thick, and the gripper of "
+            f"{gripper.hand} opens {gripper.width * 1e3:.0f} mm. find_handles and find_grippers list others."
         )
-    surroundings = _Surroundings(model, gripper, handle)
+    surroundings = _Surroundings(model, gripper, handle, tuple(decomposed))
     found: list[tuple[float, Grasp]] = []
     hits: Counter[tuple[str, str]] = Counter()
     rng = np.random.default_rng(seed)
     for grasp, cost in _candidates(gripper, handle, surroundings.bar, _CANDIDATES * count, rng):
         pair = surroundings.find_contact(grasp)
-        if pair is not None:
-            hits[pair] += 1
+        closed = None if pair else surroundings.close(grasp)
+        if closed is not None:
+            pair = surroundings.find_contact(closed)
+        if closed is None or pair is not None:
+            hits[pair or (gripper.hand, "the bar, which the fingers miss")] += 1
             continue
-        clearance = surroundings.clearance(grasp)
-        found.append((cost - min(clearance, 0.02) / 0.02, replace(grasp, clearance=clearance)))
+        clearance = surroundings.clearance(closed)
+        # Edges of a bar that is not round spread the fingers, and hold it less well than its sides.
+        cost += closed.thickness / handle.thickness - min(clearance, 0.02) / 0.02
+        found.append((cost, replace(closed, clearance=clearance)))
         if len(found) == count:
             break
     if not found:
@@ -130,6 +157,7 @@ def _candidates(
         # First both half turns at some depths, upright at the middle: knobs leave little more.
         part = np.array([0.0, 0.0, _DEPTHS[k // 2]]) if k < 2 * len(_DEPTHS) else rng.uniform(-1.0, 1.0, 3)
         spin = rng.uniform(-math.pi / 2, math.pi / 2) if is_knob and k > 1 else 0.0
+        part[0] *= abs(part[0])  # many are nearly upright, which fits where there is little room
         tilt, place, depth = part * (_MOST_TILT_OF_KNOB if is_knob else _MOST_TILT, along, deep)
         bar_R_grasp = lie.rotation_x(np.array(spin)) @ lie.rotation_z(np.array(tilt + math.pi))
         if k % 2:
@@ -140,39 +168,53 @@ def _candidates(
             continue
         z = np.array([0.0, 0.0, 0.0 if is_knob else place])
         bar_T_grasp = lie.transform(bar_R_grasp, z - depth * bar_R_grasp[:, 0])
-        back = lie.translation(np.array([-_RETREAT, 0.0, 0.0]))
-        grasp_T_hand = lie.inverse(gripper.grasp_pose_at(thickness))
-        pose, approach = (handle.pose @ bar_T_grasp @ T for T in (grasp_T_hand, back @ grasp_T_hand))
+        pose, approach = _place_hand(gripper, handle.pose @ bar_T_grasp, thickness)
         grasp = Grasp(gripper, handle, pose, approach, float(tilt), float(z[2]), thickness, 0.0)
         yield grasp, float(np.abs(part).sum())
+
+
+def _place_hand(gripper: Gripper, frame_T_grasp: Array, gap: float) -> tuple[Array, Array]:
+    """Return frame_T_hand of a hand with a gap of its pads at a grasp pose, and before it approaches."""
+    grasp_T_hand = lie.inverse(gripper.grasp_pose_at(gap))
+    back = lie.translation(np.array([-_RETREAT, 0.0, 0.0]))
+    return frame_T_grasp @ grasp_T_hand, frame_T_grasp @ back @ grasp_T_hand
 
 
 class _Surroundings:
     """Bodies around a handle, and a hand that is tried there, all in the frame of the handle."""
 
-    def __init__(self, model: ModelView, gripper: Gripper, handle: Handle) -> None:
+    def __init__(
+        self, model: ModelView, gripper: Gripper, handle: Handle, decomposed: tuple[str, ...]
+    ) -> None:
         robot = _frames_of_robot(model, gripper)
-        scene = Scene(model, leave_out=[f for f in model.bodies if f in robot])
+        scene = Scene(model, leave_out=[f for f in model.bodies if f in robot], decomposed=decomposed)
         scene.update(model.default_state())
         frame_T_world = lie.inverse(scene.pose(handle.frame))
         middle = (scene.pose(handle.frame) @ handle.pose)[:3, 3]
         near: dict[str, list[int]] = {}
-        for part in find_parts(scene):
-            if np.linalg.norm(part.middle - middle) - np.linalg.norm(part.size) / 2 < _NEAR:
-                near.setdefault(part.body, []).append(part.number)
+        pieces: list[Part] = []
+        for part in find_parts(scene, middle, _NEAR):
+            near.setdefault(part.body, []).append(part.number)
             if (part.body, part.number) == (handle.frame, handle.shape):
-                self.bar = replace(part, pose=frame_T_world @ part.pose)
+                pieces.append(part)
+        # Of a decomposed handle, the bar is the piece in its middle.
+        if not pieces:
+            raise InvalidValueError(f"The model has no shape {handle.shape} of {handle.frame}: find it anew.")
+        bar = min(pieces, key=lambda part: float(np.linalg.norm(part.middle - middle)))
+        self.bar = replace(bar, pose=frame_T_world @ bar.pose)
         obstacles = {}
         for name, numbers in near.items():
             shapes, pose = collision_shapes(model.bodies[name]), frame_T_world @ scene.pose(name)
             kept = [shapes[k] for k in dict.fromkeys(numbers) if (name, k) != (handle.frame, handle.shape)]
             if kept:
                 obstacles[f"{_OBJECT}{name}"] = (pose, Body(collisions=tuple(kept)))
-        bar = collision_shapes(model.bodies[handle.frame])[handle.shape]
-        obstacles[_BAR] = (np.eye(4), Body(collisions=(bar,)))
+        shape = collision_shapes(model.bodies[handle.frame])[handle.shape]
+        obstacles[_BAR] = (np.eye(4), Body(collisions=(shape,)))
+        whole = [_BAR] if matches_pattern(handle.frame, decomposed) else []
+        whole += [name for name in obstacles if matches_pattern(name.removeprefix(_OBJECT), decomposed)]
         rigid = [f for f in robot if not model.speeds_of(f, gripper.hand)]
         bodies = bodies_with_shapes(model, dict.fromkeys((*rigid, *gripper.bodies)))
-        self._hand = HandModel(model, gripper.hand, bodies, gripper.joints, obstacles)
+        self._hand = HandModel(model, gripper.hand, bodies, gripper.joints, obstacles, whole)
         watch = self._hand.scene.watch
         self._contacts = watch(self._hand.bodies, list(obstacles), _REACH)
         others = [name for name in obstacles if name != _BAR]
@@ -186,6 +228,30 @@ class _Surroundings:
         pair = self._contacts(_MARGIN)[0]
         hand, other = (pair.b, pair.a) if pair.a.startswith(_OBJECT) else (pair.a, pair.b)
         return hand, "the bar" if other == _BAR else other.removeprefix(_OBJECT)
+
+    def close(self, grasp: Grasp) -> Grasp | None:
+        """Return a grasp moved along the closing motion so that both fingers touch at once, or None.
+
+        Each finger advances by its distance from the bar until both touch (conservative advancement). A bar
+        that is not round is not in the middle, where the hand is tilted. None means that a finger misses it.
+        """
+        gripper = grasp.gripper
+        frame_T_grasp = grasp.pose @ gripper.grasp_pose_at(grasp.thickness)
+        gap = min(grasp.thickness + 2 * _SLACK, gripper.width)
+        for _ in range(_ADVANCES):
+            pose, approach = _place_hand(gripper, frame_T_grasp, gap)
+            self._hand.place(gripper.values_at(gap), pose)
+            one, other = (
+                min(self._hand.scene.distance(body, _BAR).distance for body in finger)
+                for finger in gripper.fingers
+            )
+            if max(abs(one), abs(other)) < _TOUCHING:
+                return replace(grasp, pose=pose, approach=approach, thickness=gap)
+            gap -= one + other
+            frame_T_grasp = frame_T_grasp @ lie.translation(np.array([0.0, (one - other) / 2, 0.0]))
+            if not 0.0 < gap <= gripper.width:
+                return None
+        return None
 
     def clearance(self, grasp: Grasp) -> float:
         """Return the least distance of the hand to everything but the bar [m], at most 50 mm."""
@@ -217,10 +283,13 @@ def _frames_of_robot(model: ModelView, gripper: Gripper) -> dict[str, None]:
 
 
 def _explain(gripper: Gripper, handle: Handle, hits: Counter[tuple[str, str]]) -> str:
+    others = "find_handles and find_grippers list others."
     if not hits:
-        return f"The {gripper} does not open wide enough for the {handle} from any side."
+        return f"The gripper of {gripper.hand} opens too little for {handle.frame} from any side. {others}"
     listed = ", ".join(f"{a} at {b} ({n}×)" for (a, b), n in hits.most_common(4))
     return (
-        f"The {gripper} has no room at the {handle}: all {sum(hits.values())} tries collide, {listed}. "
-        "find_handles and find_grippers list others."
+        f"The gripper of {gripper.hand} has no room at the handle {handle.frame}, which is "
+        f"{handle.thickness * 1e3:.0f} mm thick and has {handle.clearance * 1e3:.0f} mm free behind it. All "
+        f"{sum(hits.values())} grasps that were tried collide: {listed}. {others} Meshes are convex hulls: "
+        "decomposed= takes the bodies of which kineverse decompose has made several."
     )

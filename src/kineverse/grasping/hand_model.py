@@ -34,9 +34,11 @@ class HandModel:
     bodies
         Bodies with shapes by their frame, which move with respect to the hand by the joints alone.
     joints
-        Free coordinates of the fingers.
+        Free coordinates of the fingers; others that move the bodies are held at their default values.
     obstacles
         Poses (4, 4) [m] and bodies of what stands still, by name.
+    decomposed
+        Bodies, or patterns, as for :class:`kineverse.geometry.Scene`.
 
     Attributes
     ----------
@@ -53,6 +55,7 @@ class HandModel:
         bodies: Mapping[str, Body],
         joints: Iterable[Symbol],
         obstacles: Mapping[str, tuple[Array, Body]] | None = None,
+        decomposed: Iterable[str] = (),
     ) -> None:
         self.bodies = tuple(bodies)
         alone = Model()
@@ -66,7 +69,9 @@ class HandModel:
                 edit.add_frame(name, WORLD, Pose.from_matrix(lie.orthonormalize(pose)), body)
         self.joints = tuple(s for s in joints if s in alone.symbols)
         self.model = alone
-        self.scene = Scene(alone)
+        defaults = model.default_state()
+        self._held = {s: defaults[s] for s in alone.symbols if s not in self.coordinates}
+        self.scene = Scene(alone, decomposed=decomposed)
         self.place({})
 
     @property
@@ -81,7 +86,8 @@ class HandModel:
 
     def place(self, values: Mapping[Symbol, float], pose: Array | None = None) -> None:
         """Place the scene at values of the joints, with the hand at a pose (4, 4) [m]."""
-        self.scene.update(dict(zip(self.coordinates, self.row(values, pose).tolist(), strict=True)))
+        moved = dict(zip(self.coordinates, self.row(values, pose).tolist(), strict=True))
+        self.scene.update({**self._held, **moved})
 
     def box_corners(self, frames: Iterable[str]) -> Array:
         """Return the corners (n, 3) of the boxes around the shapes of placed bodies, in the world [m]."""

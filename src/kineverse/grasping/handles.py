@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -20,7 +20,7 @@ from kineverse.symbols import Symbol
 from .bars import Part, ProtrudingBar, find_bars, find_parts, free_length
 from .finger_pairs import path_to_root
 
-_FREE = 0.08
+_FREE = 0.15
 """Free space in front of a bar that a hand needs [m]."""
 _PART_OF_RANGE = 0.05
 _WITHIN = 0.5
@@ -65,7 +65,9 @@ class Handle:
         return f"handle {self.frame}: {sizes}, {self.clearance * 1e3:.0f} mm free behind it{kind}"
 
 
-def find_handles(model: ModelView, coordinate: Symbol | str) -> tuple[Handle, ...]:
+def find_handles(
+    model: ModelView, coordinate: Symbol | str, *, decomposed: Iterable[str] = ()
+) -> tuple[Handle, ...]:
     """Return the handles that a coordinate moves, the best first; empty if there is none.
 
     A handle is a bar or a knob: a slim convex shape that stands out from the rest of its rigid link, with
@@ -80,16 +82,24 @@ def find_handles(model: ModelView, coordinate: Symbol | str) -> tuple[Handle, ..
         Model of the object.
     coordinate
         Coordinate of a door, a drawer or any other mechanism.
+    decomposed
+        Bodies, or patterns, as for :class:`kineverse.geometry.Scene`: without them a mesh is its convex hull.
 
     Raises
     ------
     UnknownNameError
         If the model has no such coordinate.
     """
-    return _search(model, coordinate)[0]
+    return _search(model, coordinate, decomposed)[0]
 
 
-def find_handle(model: ModelView, coordinate: Symbol | str, frame: str | None = None) -> Handle:
+def find_handle(
+    model: ModelView,
+    coordinate: Symbol | str,
+    frame: str | None = None,
+    *,
+    decomposed: Iterable[str] = (),
+) -> Handle:
     """Return the best handle that a coordinate moves, or the one at a frame.
 
     Raises
@@ -97,7 +107,7 @@ def find_handle(model: ModelView, coordinate: Symbol | str, frame: str | None = 
     UnknownNameError
         If there is none; the message says which bodies the coordinate moves and why none is a handle.
     """
-    found, why = _search(model, coordinate)
+    found, why = _search(model, coordinate, decomposed)
     if frame is not None:
         model.fk(frame)  # raises for an unknown frame
         at = [handle for handle in found if handle.frame == frame]
@@ -110,7 +120,9 @@ def find_handle(model: ModelView, coordinate: Symbol | str, frame: str | None = 
     return found[0]
 
 
-def _search(model: ModelView, coordinate: Symbol | str) -> tuple[tuple[Handle, ...], str]:
+def _search(
+    model: ModelView, coordinate: Symbol | str, decomposed: Iterable[str]
+) -> tuple[tuple[Handle, ...], str]:
     """Return the handles, and a sentence on why there is none."""
     symbol = coordinate if isinstance(coordinate, Symbol) else model.symbol(coordinate)
     motion = FrameDependence(model, [symbol])
@@ -118,7 +130,8 @@ def _search(model: ModelView, coordinate: Symbol | str) -> tuple[tuple[Handle, .
     if not moved:
         return (), "It moves no frame."
     tops = {path_to_root(model, name)[-1] for name in moved}
-    scene = Scene(model, leave_out=[f for f in model.bodies if path_to_root(model, f)[-1] not in tops])
+    others = [f for f in model.bodies if path_to_root(model, f)[-1] not in tops]
+    scene = Scene(model, leave_out=others, decomposed=decomposed)
     if not any(f in scene.bodies for f in moved):
         return (), f"It moves {_listed(moved)}, without shapes."
     state, opening, is_known = _open_a_little(model, symbol)

@@ -5,13 +5,15 @@ All poses and points are in the frame of the hand [m].
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
+from itertools import product
 
 import numpy as np
 
 from kineverse import lie
-from kineverse.geometry import DistanceResult
+from kineverse.geometry import DistanceResult, RayHit
 from kineverse.lie import Array
 from kineverse.model.model_view import ModelView
 from kineverse.symbols import Symbol
@@ -24,14 +26,14 @@ _NEAR = 4e-3
 """Opening at which fingers count as nearly closed: their pads face each other there [m]."""
 _FLAT = 2e-3
 """Unevenness of a pad [m]."""
-_CELLS = 20
+_CELLS = 14
 _REACH = 0.3
 """Length of the rays from the middle to the pads [m]."""
 _ALIGNED = 0.85
 """Cosine of the angle below which an axis is taken for the approach direction."""
 _SLOWER = 0.4
 """Least motion of one finger against the other's; fingers that mirror each other have 1."""
-_STILL_OPEN, _WIDEST = 0.6, 0.4
+_STILL_OPEN, _WIDEST = 0.45, 0.4
 """Largest gap of closed fingers as a part of that of open ones, and the largest gap at all [m]."""
 _LEAST_STROKE = 5e-3
 """Least change of the gap of a gripper [m]."""
@@ -100,11 +102,14 @@ def find_pads(
         Position (3,) of the joint that moves the hand: the fingers point away from it.
     """
     shared = tuple(s for s in a.joints if s in b.joints)
-    pads, why = _find_pads(_Motion(model, alone, a, b, shared), root) if shared else (None, "")
-    if pads is None:  # further joints, such as springs, move only where the fingers have none in common
-        pads, why = _find_pads(
-            _Motion(model, alone, a, b, tuple(dict.fromkeys((*a.joints, *b.joints)))), root
-        )
+    if len(a.joints) != len(b.joints):
+        return None, f"one has {len(a.joints)} joints and the other {len(b.joints)}"
+    everything = tuple(dict.fromkeys((*a.joints, *b.joints)))
+    # Further joints, such as springs, move only where the fingers have none in common.
+    pads, why = None, ""
+    for joints in dict.fromkeys((shared, everything)):
+        if pads is None and joints:
+            pads, why = _find_pads(_Motion(model, alone, a, b, joints), root)
     return pads, why
 
 
@@ -129,7 +134,10 @@ def _find_pads(motion: _Motion, root: Array) -> tuple[Pads | None, str]:
     speeds = sorted((float(-opening[0] @ y), float(opening[1] @ y)))
     if speeds[0] < _SLOWER * speeds[1]:
         return None, "they do not move against each other"
-    x = _approach(motion, y, moved[0].mean(axis=0) - root)
+    outwards = moved[0].mean(axis=0) - root
+    if np.linalg.norm(np.cross(outwards, y)) < 1e-4:
+        return None, "nothing tells which way they point"
+    x = _approach(motion, y, outwards)
     axes = lie.round_exact(np.stack([x, y, np.cross(x, y)], axis=1))
     return _measure(motion, axes, float(moved[0].mean(axis=0) @ y))
 
@@ -158,41 +166,62 @@ def _approach(motion: _Motion, y: Array, outwards: Array) -> Array:
 
 
 def _measure(motion: _Motion, axes: Array, height: float) -> tuple[Pads | None, str]:
-    x, y, z = axes.T
     motion.place(motion.nearly_closed)
-    corners = [motion.alone.box_corners(frames) for frames in (motion.a, motion.b)]
-    low = np.max([c.min(axis=0) for c in (corner @ axes for corner in corners)], axis=0)
-    high = np.min([c.max(axis=0) for c in (corner @ axes for corner in corners)], axis=0)
-    for _ in range(2):  # the pads, and then these alone, finer
-        if (low >= high)[[0, 2]].any():
-            return None, "they do not face each other"
-        cells = motion.scan(axes, height, (np.array([low[0], high[0]]), np.array([low[2], high[2]])))
-        if not len(cells):
-            return None, "they do not face each other"
-        gaps = cells[:, 2] + cells[:, 3]
-        pad = cells[gaps <= gaps.min() + _FLAT]
-        step = (high - low)[[0, 2]] / _CELLS
-        low[[0, 2]] = np.maximum(low[[0, 2]], pad[:, :2].min(axis=0) - step)
-        high[[0, 2]] = np.minimum(high[[0, 2]], pad[:, :2].max(axis=0) + step)
-    middle = pad[np.argmin(np.linalg.norm(pad[:, :2] - pad[:, :2].mean(axis=0), axis=1))]
-    origin = middle[0] * x + height * y + middle[1] * z
-    hits = [motion.scene.ray(origin, -y, _REACH), motion.scene.ray(origin, y, _REACH)]
-    if hits[0] is None or hits[1] is None:
+    edges = _find_edges(motion, axes, height)
+    hits = None if edges is None else motion.face(axes, height, edges.mean(axis=0))
+    if edges is None or hits is None:
         return None, "they do not face each other"
-    centre = pad[:, :2].mean(axis=0) - middle[:2]
-    shift = centre[0] * x + centre[1] * z
-    points = [_in_frame(motion.scene.pose(hit.body), hit.point + shift) for hit in hits if hit]
+    y = axes[:, 1]
     frames = (hits[0].body, hits[1].body)
+    points = [_in_frame(motion.scene.pose(hit.body), hit.point) for hit in hits]
     parts = np.linspace(0.0, 1.0, _SAMPLES)
     tracked = motion.track(frames, points, parts)
     gap = (tracked[:, 1] - tracked[:, 0]) @ y
+    first = int(np.argmax(gap))  # fingers that turn further than to both sides are open before their limits
+    gap, tracked = gap[first:], tracked[first:]
+    opened, closed = motion.values(float(parts[first])), motion.values(1.0)
+    parts = np.linspace(0.0, 1.0, len(gap))
     if (np.diff(gap) > 1e-4).any() or gap[-1] > _STILL_OPEN * gap[0] or gap[0] > _WIDEST:
         return None, f"their gap goes from {gap[0] * 1e3:.0f} to {gap[-1] * 1e3:.0f} mm, as no gripper's does"
     stroke = np.column_stack([parts, gap, tracked.mean(axis=1)])
-    length, width = (np.ptp(pad[:, :2], axis=0) + step).tolist()
+    length, width = (edges[1] - edges[0]).tolist()
     fingers = (tuple(motion.a), tuple(motion.b))
-    opened, closed = motion.values(0.0), motion.values(1.0)
     return Pads(fingers, frames, np.array(points), axes, (length, width), opened, closed, stroke), ""
+
+
+def _find_edges(motion: _Motion, axes: Array, height: float) -> Array | None:
+    """Return the least and largest x and z (2, 2) of the facing surfaces; None if there are none.
+
+    They are where the gap is nearly the least one: cells of a grid, whose borders are then bisected.
+    """
+    corners = [motion.alone.box_corners(frames) @ axes[:, [0, 2]] for frames in motion.tips]
+    low, high = (
+        np.max([c.min(axis=0) for c in corners], axis=0),
+        np.min([c.max(axis=0) for c in corners], axis=0),
+    )
+    if (low >= high).any():
+        return None
+    step = (high - low) / _CELLS
+    cells = [low + step * (np.array(k) + 0.5) for k in np.ndindex(_CELLS, _CELLS)]
+    gaps = np.array([motion.gap_at(axes, height, cell) for cell in cells])
+    if not np.isfinite(gaps).any():
+        return None
+    pad = np.array(cells)[gaps <= gaps.min() + _FLAT]
+    middle = pad[np.argmin(np.linalg.norm(pad - pad.mean(axis=0), axis=1))]
+    edges = np.stack([pad.min(axis=0), pad.max(axis=0)])
+    for side, sign in ((0, -1.0), (1, 1.0)):
+        for axis in (0, 1):
+            inside, outside = middle.copy(), middle.copy()
+            inside[axis] = edges[side, axis]
+            outside[axis] = edges[side, axis] + sign * step[axis]
+            if motion.gap_at(axes, height, inside) > gaps.min() + _FLAT:
+                continue  # not a rectangle: the cells are all that is known
+            for _ in range(8):
+                between = (inside + outside) / 2
+                is_pad = motion.gap_at(axes, height, between) <= gaps.min() + _FLAT
+                inside, outside = (between, outside) if is_pad else (inside, between)
+            edges[side, axis] = inside[axis]
+    return edges
 
 
 class _Motion:
@@ -215,12 +244,14 @@ class _Motion:
 
     def find_closing(self) -> str:
         """Find the values that open and close the fingers; return the reason if they do not."""
-        middle = {s: (low + high) / 2 for s, (low, high) in self.limits.items()}
+        # Closed is the corner of the limits with the least gap: one joint alone may not bring them nearer.
+        corners = [dict(zip(self.joints, corner, strict=True)) for corner in product(*self.limits.values())]
+        self.closed = min(corners, key=self.gap)
+        least = self.gap(self.closed)
         for s, (low, high) in self.limits.items():
-            at_low, at_high = (self.gap({**middle, s: value}) for value in (low, high))
-            self.opened[s], self.closed[s] = (low, high) if at_low > at_high else (high, low)
-            if abs(at_low - at_high) < 1e-6:
-                self.opened[s] = self.closed[s] = middle[s]
+            self.opened[s] = low if self.closed[s] == high else high
+            if abs(self.gap({**self.closed, s: self.opened[s]}) - least) < 1e-6:
+                self.opened[s] = self.closed[s] = (low + high) / 2  # it does not matter to the gap
         parts = np.linspace(0.0, 1.0, _SAMPLES)
         gaps = np.array([self.gap(self.values(part)) for part in parts.tolist()])
         if gaps.max() - gaps.min() < _LEAST_STROKE or gaps.max() <= 0.0:
@@ -273,21 +304,23 @@ class _Motion:
             rows.append([_at(self.scene.pose(f), p) for f, p in zip(frames, points, strict=True)])
         return np.array(rows)
 
-    def scan(self, axes: Array, height: float, spans: tuple[Array, Array]) -> Array:
-        """Return the cells (n, 4) where both fingers face the plane between them: x, z, both distances.
+    def face(self, axes: Array, height: float, place: Array) -> tuple[RayHit, RayHit] | None:
+        """Return where rays along -y and y hit the tips of the first and second finger, or None.
 
-        The plane is normal to y at a height. Rays are cast from it along -y to the first finger and along y
-        to the second.
+        They start at a place (x, z) in the plane normal to y at a height.
         """
         x, y, z = axes.T
-        cells = []
-        for u in _centres(spans[0]):
-            for w in _centres(spans[1]):
-                origin = u * x + height * y + w * z
-                hits = self.scene.ray(origin, -y, _REACH), self.scene.ray(origin, y, _REACH)
-                if hits[0] and hits[1] and hits[0].body in self.tips[0] and hits[1].body in self.tips[1]:
-                    cells.append((u, w, hits[0].distance, hits[1].distance))
-        return np.array(cells).reshape(-1, 4)
+        origin = place[0] * x + height * y + place[1] * z
+        first, second = self.scene.ray(origin, -y, _REACH), self.scene.ray(origin, y, _REACH)
+        if first is None or second is None:
+            return None
+        faces = first.body in self.tips[0] and second.body in self.tips[1]
+        return (first, second) if faces else None
+
+    def gap_at(self, axes: Array, height: float, place: Array) -> float:
+        """Return the length between these hits, infinite if there are none."""
+        hits = self.face(axes, height, place)
+        return math.inf if hits is None else hits[0].distance + hits[1].distance
 
     def turn(self, frame: str) -> Array:
         """Return the rotation vector (3,) of a frame from open to closed [rad]."""
@@ -301,11 +334,6 @@ def _tips(model: ModelView, frames: Sequence[str]) -> list[str]:
     """Return the frames on which none of the others moves."""
     inner = {f for g in frames for f in path_to_root(model, g) if f in frames and model.speeds_of(g, f)}
     return [f for f in frames if f not in inner]
-
-
-def _centres(span: Array) -> Array:
-    edges = np.linspace(span[0], span[1], _CELLS + 1)
-    return (edges[1:] + edges[:-1]) / 2
 
 
 def _at(pose: Array, point: Array) -> Array:
