@@ -55,12 +55,14 @@ def test_limits_of_positions_and_of_true_speeds(judge):
     assert fast["limit_violation"] == pytest.approx(0.1)
 
 
-def test_locks_hold_for_the_speeds_from_the_begin_of_a_step():
+def test_locks_hold_if_they_are_closed_during_a_step():
     model = pusher(locked=True)
     judge = Judge(model, "robot")
     opens = run(judge, [{"room/bolt": 0.6}, {"room/bolt": 0.4, "room/drawer": 0.002}])
     assert opens["limit_violation"] == 0.0
-    locked = run(judge, [{"room/bolt": 0.4}, {"room/bolt": 0.6, "room/drawer": 0.002}])
+    shuts = run(judge, [{"room/bolt": 0.4}, {"room/bolt": 0.6, "room/drawer": 0.002}])
+    assert shuts["limit_violation"] == 0.0
+    locked = run(judge, [{"room/bolt": 0.4}, {"room/bolt": 0.45, "room/drawer": 0.002}])
     assert locked["limit"] == "room/drawer/lock"
     assert locked["limit_violation"] == pytest.approx(0.1)
 

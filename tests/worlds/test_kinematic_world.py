@@ -6,11 +6,14 @@ import math
 
 import numpy as np
 import pytest
-from pusher import BALL, angle_of_door, gripper, pusher
+from pusher import BALL, angle_of_door, gripper, pusher, solid
 
+import kineverse as kv
+from kineverse import gallery
 from kineverse.errors import InvalidValueError, UnknownNameError
 from kineverse.formats import load
 from kineverse.grasping import Gripper
+from kineverse.model.body import Sphere
 from kineverse.model.model import Model
 from kineverse.worlds import Judge, KinematicWorld, Sensors
 
@@ -326,3 +329,38 @@ def test_fetch_drives_by_its_wheels_and_closes_a_door():
     assert judge.measures["penetration"] < 1e-6
     assert judge.measures["limit_violation"] < 1e-9
     assert judge.measures["distance"] == pytest.approx(4.95 * 0.06 * 1.6, rel=1e-3)
+
+
+@pytest.mark.parametrize("scene", ["ball", "folding_door", "four_bar", "ratchet"])
+def test_mechanisms_of_all_kinds_keep_their_limits(scene):
+    """A ball flies at each body: quaternions within a cone, a four-bar in closed form, a loop, a lock."""
+    model = kv.Model()
+    x, y, z = (kv.position(f"robot/{name}") for name in "xyz")
+    with model.edit() as edit:
+        edit.add_frame("robot/ball", "world", kv.translation(x, y, z), solid(Sphere(BALL)))
+        for operation in gallery.operations(scene, "thing"):
+            edit.apply(operation)
+    world, judge = KinematicWorld(model, "robot"), Judge(model, "robot")
+    rng, moved = np.random.default_rng(0), 0
+    objects = [s for s in model.symbols if s.path.startswith("thing")]
+    ranges = {s: np.array(model.limits(s)) for s in objects}
+    home = model.default_state().updated(
+        {s: float(r.mean()) for s, r in ranges.items() if np.isfinite(r).all()}
+    )
+    for body in [name for name in model.bodies if name.startswith("thing")][-3:]:
+        middle = model.fk(body)(home)[:3, 3]
+        way = rng.normal(size=3)
+        way *= 0.25 / np.linalg.norm(way)
+        world.reset(home.updated(dict(zip((x, y, z), middle - way, strict=True))))
+        judge.reset()
+        judge.update(world.state)
+        speeds = dict(zip((x.derivative(), y.derivative(), z.derivative()), way, strict=True))
+        for _ in range(60):
+            before, near = world.state.vector(objects), bool(world.contacts())
+            world.apply(speeds, 0.02)
+            judge.update(world.state, speeds)
+            still = np.allclose(world.state.vector(objects), before, atol=1e-12)
+            assert still or near or world.contacts()
+            moved += not still
+        assert judge.measures["limit_violation"] < 1e-7
+    assert moved

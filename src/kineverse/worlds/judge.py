@@ -2,7 +2,8 @@
 
 - *limit violation*: largest excess of any constraint of the model. Positions are those of the states, speeds
   are differences of successive states by time; commanded speeds stand in where no coordinate is the integral
-  of a speed.
+  of a speed. A limit of a speed that depends on the state, such as a lock, is violated if it was at the
+  begin and at the end of a step.
 - *penetration*: largest depth of any pair of bodies, but for the excepted pairs, which are listed.
 - *contact losses*: number of times that the robot touched the object and then did not, while pushing.
 - *grasp error*: largest motion of the held body in the hand since the hold began, in the middle between the
@@ -273,28 +274,30 @@ class Judge:
 
     def _measure_limits(self, values: Array, stamp: float, commanded: Array | None) -> None:
         vector, count = self._vector, len(self._symbols)
+        rates = vector[count:]
+        rates[:] = 0.0
+        before = np.full(len(self._about_speeds), -np.inf)
         if self._stamp is not None:
-            # Locks hold for the speeds of a step from its begin.
-            vector[:count], rates = self._values, vector[count:]
-            rates[:] = 0.0
             if commanded is not None:
                 rates[self._robot_columns] = commanded
             moved = values[self._coordinate] - self._values[self._coordinate]
             rates[self._differed] = moved / (stamp - self._stamp)
-            self._note_excess(vector, self._about_speeds)
+            vector[:count] = self._values
+            before = self._excesses(vector)
         vector[:count] = values
-        self._note_excess(vector, ~self._about_speeds)
-
-    def _note_excess(self, vector: Array, which: npt.NDArray[np.bool_]) -> None:
-        self._checker(vector)
-        if not which.any():
+        excess = self._excesses(vector)
+        # A lock that closes or opens within the step may have been open while it moved.
+        excess[self._about_speeds] = np.minimum(excess, before)[self._about_speeds]
+        if not len(excess):
             return
-        # A constraint without a value is violated beyond measure.
-        excess = np.where(np.isnan(self._checker.excess), np.inf, self._checker.excess)
-        excess[~which] = -np.inf
         worst = int(np.argmax(excess))
         if excess[worst] > self._excess:
             self._excess, self._limit = float(excess[worst]), self._checker.names[worst]
+
+    def _excesses(self, vector: Array) -> Array:
+        """Return the excess of each constraint: a constraint without a value is violated beyond measure."""
+        self._checker(vector)
+        return np.where(np.isnan(self._checker.excess), np.inf, self._checker.excess)
 
     def _measure_jitter(self, commanded: Array) -> None:
         self._commanded = [*self._commanded[-2:], commanded]

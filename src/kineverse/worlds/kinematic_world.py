@@ -13,6 +13,7 @@ import logging
 import math
 from collections import deque
 from collections.abc import Iterable, Mapping
+from functools import partial
 from typing import NamedTuple
 
 import numpy as np
@@ -124,6 +125,7 @@ class KinematicWorld:
             if number is None or number < 0 or (field == "timeout" and not number):
                 raise InvalidValueError(f"'{field}' of a world is a number from 0 on, not {value!r}.")
         self.model, self.robot, self._version = model, robot, model.version
+        self._is_robot = partial(is_of_robot, robot=robot)
         self._timeout, self._delay = float(timeout), float(delay)
         if not any(self._is_robot(s.path) for s in model.degrees_of_freedom):
             prefixes = sorted({s.path.partition("/")[0] for s in model.degrees_of_freedom})
@@ -240,7 +242,7 @@ class KinematicWorld:
         self._last: Array = np.zeros(len(self._column))
         self._commands: deque[_Command] = deque()
         self._active = _Command(self._last, 0.0, 0.0)
-        self._forget()
+        self._state = self._contacts = None
         self._sampler.reset()
 
     def apply(self, speeds: StateLike, duration: float, *, stamp: float | None = None) -> None:
@@ -285,7 +287,7 @@ class KinematicWorld:
                 vector = self._stopped(self._last)
         self._last = vector
         self._commands.append(_Command(vector, now + self._delay, until + self._delay))
-        self._forget()
+        self._state = self._contacts = None
         end = now + length
         while self._time < end - _ROUNDING:
             while self._commands and self._commands[0].start <= self._time + _ROUNDING:
@@ -328,9 +330,8 @@ class KinematicWorld:
     def _move(self, speeds: Array, time: float) -> None:
         """Move robot and objects with constant speeds of the robot."""
         motion, grip = self._motion, self._grip
-        arm, start = speeds.copy(), motion.q.copy()
+        arm, start, reach = speeds.copy(), motion.q.copy(), 0.0
         arm[self._finger] = 0.0
-        reach = 0.0
         if grip is not None:
             grip.command(speeds[self._finger])
             reach = float(np.abs(grip.steps(time)) @ np.sqrt(motion.weights[motion.count :]))
@@ -340,19 +341,18 @@ class KinematicWorld:
         # The travel begins anew at some time.
         moved[moved < 0.0] = _UNKNOWN_WAY
         way = float(moved.max(initial=0.0)) + reach
-        holds = grip is not None and grip.held is not None
-        count = 1
-        if way > _SUBSTEP:
-            near = motion.near_bodies(way)
-            longest = float(moved[near].max(initial=-reach)) + reach
-            count = max(1, min(math.ceil(longest / _SUBSTEP), _MOST_SUBSTEPS))
-        if count == 1:
-            self._settle(time, way, holds or reach > 0.0)
-            return
-        motion.place(start)
-        for _ in range(count):
-            motion.place(self._integrate(motion.q, arm, time / count))
-            self._settle(time / count, way / count, grip is not None)
+        grips = grip is not None and (grip.held is not None or reach > 0.0)
+        # What is not near now has not been touched on the way.
+        near = motion.near_bodies(way)
+        longest = float(moved[near].max(initial=0.0)) + reach if len(near) else 0.0
+        count = min(math.ceil(longest / _SUBSTEP), _MOST_SUBSTEPS)
+        if count > 1:
+            motion.place(start)
+            for _ in range(count):
+                motion.place(self._integrate(motion.q, arm, time / count))
+                self._settle(time / count, way / count, grips)
+        elif len(near) or grips:
+            self._settle(time, way, grips)
 
     def _settle(self, time: float, moved: float, grips: bool) -> None:
         """Move fingers and objects after the rest of the robot has moved."""
@@ -383,12 +383,6 @@ class KinematicWorld:
             raise InvalidValueError(
                 "The model of this world was edited. Make another world, or this one of model.snapshot()."
             )
-
-    def _forget(self) -> None:
-        self._state = self._contacts = None
-
-    def _is_robot(self, name: str) -> bool:
-        return is_of_robot(name, self.robot)
 
     def _report(self, text: str) -> None:
         logger.info("%g s: %s", self._time, text)

@@ -17,7 +17,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Collection, Iterable, Sequence
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, TypeAlias
 
 import numpy as np
 import numpy.typing as npt
@@ -29,12 +29,11 @@ from kineverse.expressions.expression import Expression, array, as_expression
 from kineverse.geometry import Scene
 from kineverse.geometry.results import DistanceResults
 from kineverse.lie import Array
-from kineverse.model.constraint import Constraint
 from kineverse.model.frame_dependence import FrameDependence
 from kineverse.model.model_view import ModelView
-from kineverse.model.projection import is_equality
-from kineverse.model.velocity_rows import Recovery, VelocityRows, velocity_rows
 from kineverse.symbols import Symbol
+
+from .object_limits import ObjectLimits, Rows
 
 SKIN = 1e-6
 """Gap to which objects are pushed [m]: below, normals of nearest points are not determined."""
@@ -46,14 +45,15 @@ _STEADY = 2e-7
 """Change of displacements below which a solution is final [m]."""
 _SLACK = 1e-7
 """Reciprocal ρ of the weight of slacks, beside weights near 1 kg of least motion."""
+_HARD = 1e-10
+"""Reciprocal weight of exceeded limits, where solutions of curved problems are compared."""
 _HELD = 1e-7
 """Weight of least motion beside the error of a hold."""
 _LIGHTEST = 1e-4
 _DEEP = 1e-4
 """Penetration of what does not yield, from which on its side is remembered [m]."""
-_STEP = Symbol("world/step", 0, "parameter", 0.01)
 
-Residual = Callable[[], tuple[Array, Array]]
+Residual: TypeAlias = Callable[[], tuple[Array, Array]]
 """Function that returns the error of a hold at the present configuration, (6,), and its Jacobian (6, n)."""
 
 
@@ -77,11 +77,6 @@ class Gaps:
     index: npt.NDArray[np.intp]
     distances: Array
     rows: Array
-
-    @property
-    def least(self) -> float:
-        """Least gap [m]; infinite without any."""
-        return float(self.distances.min(initial=np.inf))
 
 
 class ObjectMotion:
@@ -139,8 +134,8 @@ class ObjectMotion:
         self._robot_owners = owners[self._robot_objects]
         self._compile_twists(model)
         self._integrate = model.integrator(speeds, self.symbols)
-        self.skipped: tuple[tuple[str, str], ...] = ()
-        self._compile_rows(model, speeds, frozenset(leave_out))
+        self._limits = ObjectLimits(model, speeds, is_robot, leave_out)
+        self.skipped = self._limits.skipped
         self.place(self.q)
         self.weights = self._weigh()
 
@@ -158,28 +153,6 @@ class ObjectMotion:
         stacked = array([e for t in twists for e in t.ravel()]).reshape(len(twists), 6, n)
         function = compile([stacked])
         self._twist_inputs, self._twists = self._indices(function.inputs), function.bind()
-
-    def _compile_rows(self, model: ModelView, speeds: Sequence[Symbol], leave_out: frozenset[str]) -> None:
-        """Compile the rows of positions, and those of speeds."""
-        found = model.constraints_for(speeds) if speeds else {}
-        kept = {n: c for n, c in found.items() if n not in leave_out}
-        closures = {n: c for n, c in kept.items() if is_equality(c)}
-        limits = {n: c for n, c in kept.items() if c.order == 0 and n not in closures}
-        rates = {n: c for n, c in kept.items() if c.order == 1}
-        # A limit that is exceeded already moves nothing by itself. A closure has to close.
-        sets: list[tuple[dict[str, Constraint], Recovery]] = [
-            (closures, "required"), (limits, "allowed"), (rates, "allowed")
-        ]  # fmt: skip
-        rows = [
-            velocity_rows(these, _STEP, rates=model.rates, speeds=speeds, recovery=recovery)
-            for these, recovery in sets
-        ]
-        self.skipped = tuple((n, "accelerations are not limited") for n, c in kept.items() if c.order > 1)
-        self.skipped += tuple(pair for each in rows for pair in each.skipped)
-        self._positions, self._rates = (
-            _CompiledRows(parts, len(speeds), self._indices) for parts in (rows[:2], rows[2:])
-        )
-        self._linked = _link_columns(len(speeds), (self._positions.pattern, self._rates.pattern))
 
     def _indices(self, symbols: Iterable[Symbol]) -> npt.NDArray[np.intp]:
         return np.array([self._place[s] for s in symbols], dtype=np.intp)
@@ -202,6 +175,7 @@ class ObjectMotion:
     def reset(self, q: Array) -> None:
         """Begin anew at a configuration."""
         self._penetrated.clear()
+        self._limits.reset()
         self.ignore()
         self.place(q)
 
@@ -300,20 +274,23 @@ class ObjectMotion:
         residual
             Error of a hold, which the objects that reduce it follow.
         """
-        start, radius = self.q.copy(), moved + _REACH
-        limits = self._rates.evaluate(start, h)
         v = best = np.zeros(self.count)
-        least = math.inf
-        for k in range(_ROUNDS):
+        start, radius, least = self.q.copy(), moved + _REACH, math.inf
+        if residual is None and not len(self.find_near(0.0)[1]):
+            return v
+        rates = self._limits.begin(start, h)
+        for k in range(_ROUNDS + 1):
             gaps = self.measure_gaps(radius)
-            if residual is None and not k and gaps.least >= 0.0:
-                return v
             pulled = None if residual is None else residual()
-            cost = self._cost(h * v, gaps, pulled)
-            if cost <= least * (1.0 + 1e-9):
+            limits, beyond = self._limits.position_rows(self.q, h, v)
+            cost = self._cost(h * v, gaps, pulled) + beyond / _HARD
+            better = cost <= least * (1.0 + 1e-9)
+            if k == _ROUNDS:
+                break
+            if better:
                 least, best = cost, v
                 self._note_penetrated(gaps)
-                found = self._solve(h, v, gaps, limits, pulled)
+                found = self._solve(h, v, gaps, rates, limits, pulled)
             else:
                 # The gaps bend too much, as of bodies that are jammed: half of the way.
                 found = 0.5 * (best + v)
@@ -321,10 +298,11 @@ class ObjectMotion:
             v = found
             self.place(self._integrate(start, v, h))
             if change <= _STEADY:
-                return v
-        if self._cost(h * v, self.measure_gaps(radius), None if residual is None else residual()) > least:
+                break
+        if not better:
             v = best
             self.place(self._integrate(start, v, h))
+        self._limits.finish(self.q, h)
         return v
 
     def _cost(self, way: Array, gaps: Gaps, pulled: tuple[Array, Array] | None) -> float:
@@ -340,7 +318,8 @@ class ObjectMotion:
         h: float,
         v: Array,
         gaps: Gaps,
-        limits: tuple[Array, Array, Array],
+        rates: Rows,
+        limits: Rows,
         pulled: tuple[Array, Array] | None,
     ) -> Array:
         """Return the speeds of one linearisation at speeds v."""
@@ -349,34 +328,26 @@ class ObjectMotion:
         active = (G != 0.0).any(axis=0) | (v != 0.0)
         if pulled is not None:
             active |= (pulled[1] != 0.0).any(axis=0)
-        active = self._linked[active].any(axis=0)
+        active = self._limits.linked[active].any(axis=0)
         use = np.flatnonzero(active)
         if not len(use):
             return v
-        weight = self.weights[use]
-        H, f = np.diag(weight), np.zeros(len(use))
+        H, f = np.diag(self.weights[use]), np.zeros(len(use))
         if pulled is not None:
             error, J = pulled[0] / h, pulled[1][:, use]
             mine = (J != 0.0).any(axis=0)
             H[mine, mine] *= _HELD
             H += J.T @ J
             f += J.T @ (error - J @ v[use])
-        A, low, high = self._positions.evaluate(self.q, h)
-        shift = A @ v
-        B, slow, fast = limits
-        matrix, lower, upper = (
-            np.concatenate(parts) for parts in ((A, B), (low + shift, slow), (high + shift, fast))
-        )
-        concerned = (matrix[:, use] != 0.0).any(axis=1)
-        touching = (G != 0.0).any(axis=1)
+        matrix, lower, upper = (np.concatenate(both) for both in zip(limits[:3], rates[:3], strict=True))
+        concerned, touching = ((M[:, use] != 0.0).any(axis=1) for M in (matrix, G))
         G, d = G[touching], d[touching]
         # Shapes that nearly touch stay as they are: what is not penetrated does not move by itself.
         aim = np.where(d < 0.0, SKIN, np.minimum(d, SKIN))
         rows = np.concatenate([matrix[concerned][:, use], G[:, use]])
         least = np.concatenate([lower[concerned], (aim - d) / h + G @ v])
         most = np.concatenate([upper[concerned], np.full(len(d), _UNBOUNDED)])
-        sense = np.zeros(len(rows), dtype=np.intc)
-        sense[len(rows) - len(d) :] = _SOFT
+        sense = np.repeat(np.array([0, _SOFT], dtype=np.intc), [len(rows) - len(d), len(d)])
         np.clip(least, -_UNBOUNDED, _UNBOUNDED, out=least)
         np.clip(most, -_UNBOUNDED, _UNBOUNDED, out=most)
         x, _, flag, _ = self._daqp.solve(
@@ -385,6 +356,9 @@ class ObjectMotion:
         )  # fmt: skip
         found = np.zeros(n)
         if flag >= 1 and np.isfinite(x).all():
+            hard = rows[: len(rows) - len(d)]
+            single = np.count_nonzero(hard, axis=1) == 1
+            _clip_to_bounds(x, hard[single], least[: len(hard)][single], most[: len(hard)][single])
             found[use] = x
         return found
 
@@ -392,55 +366,18 @@ class ObjectMotion:
 _SOFT, _UNBOUNDED = 8, 1e9
 
 
-class _CompiledRows:
-    """Rows as a function of the model's symbols and the time of a step."""
-
-    def __init__(
-        self,
-        parts: Sequence[VelocityRows],
-        count: int,
-        indices: Callable[[Iterable[Symbol]], npt.NDArray[np.intp]],
-    ) -> None:
-        rows = [row for part in parts for row in part.rows]
-        columns = parts[0].speeds
-        self.pattern = np.array([[s in row.weights for s in columns] for row in rows], dtype=bool)
-        self.pattern = self.pattern.reshape(len(rows), count)
-        self._values = np.zeros((0, count)), np.zeros(0), np.zeros(0)
-        self._evaluator: Any = None
-        if not rows:
-            return
-        matrix = array([row.weights.get(s, 0.0) for row in rows for s in columns])
-        ends = (array([row.lower for row in rows]), array([row.upper for row in rows]))
-        function = compile([matrix.reshape(len(rows), count), *ends])
-        self._step = np.array([s == _STEP for s in function.inputs], dtype=bool)
-        self._source = indices(s for s in function.inputs if s != _STEP)
-        self._evaluator = function.bind()
-
-    def evaluate(self, q: Array, h: float) -> tuple[Array, Array, Array]:
-        """Return matrix, lower and upper bounds at values of the model's symbols for a step of h [s]."""
-        if self._evaluator is None:
-            return self._values
-        self._evaluator.input[~self._step] = q[self._source]
-        self._evaluator.input[self._step] = h
-        self._evaluator()
-        matrix, lower, upper = (out.copy() for out in self._evaluator.outputs)
-        return matrix, lower, upper
+def _clip_to_bounds(x: Array, rows: Array, lower: Array, upper: Array) -> None:
+    """Clip values to the bounds of rows with one entry each, in place: solvers satisfy them nearly."""
+    for row, low, high in zip(rows, lower, upper, strict=True):
+        k = int(np.argmax(np.abs(row)))
+        ends = (low / row[k], high / row[k])
+        if min(ends) <= max(ends):
+            x[k] = min(max(x[k], min(ends)), max(ends))
 
 
 def _pair_keys(pairs: DistanceResults) -> list[tuple[int, ...]]:
     """Return the numbers of bodies and shapes of pairs."""
     return [tuple(row) for row in np.hstack([pairs.body_indices, pairs.shape_indices]).tolist()]
-
-
-def _link_columns(count: int, patterns: Iterable[npt.NDArray[np.bool_]]) -> npt.NDArray[np.bool_]:
-    """Return (n, n) flags of columns that share a row, directly or by others."""
-    linked = np.eye(count, dtype=bool)
-    for pattern in patterns:
-        for row in pattern:
-            linked[np.ix_(row, row)] = True
-    for k in range(count):  # transitive closure (Warshall)
-        linked |= np.outer(linked[:, k], linked[k])
-    return linked
 
 
 def _project(normals: Array, points: Array, twists: Array) -> Array:
@@ -458,7 +395,5 @@ def _import_daqp() -> Any:
     try:
         import daqp
     except ImportError as error:
-        raise MissingDependencyError(
-            f"The kinematic world needs daqp: {install_command('control')}"
-        ) from error
+        raise MissingDependencyError(f"This world needs daqp: {install_command('control')}") from error
     return daqp
