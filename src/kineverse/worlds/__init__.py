@@ -1,5 +1,7 @@
 """Worlds in which skills are tried: they know nothing of controllers (layer 5)."""
 
+from .judge import Judge
+from .kinematic_world import Event, KinematicWorld
 from .recorder import Recorder
 from .recording import RunRecording, read_run_recording
 from .sensor_sampler import SensorSampler
@@ -8,6 +10,9 @@ from .world import Contact, Observation, World
 
 __all__ = [
     "Contact",
+    "Event",
+    "Judge",
+    "KinematicWorld",
     "Observation",
     "Recorder",
     "RunRecording",

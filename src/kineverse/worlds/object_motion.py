@@ -1,0 +1,399 @@
+"""Least motion of objects that keeps a robot out of them, in a world without forces.
+
+Let g be the gaps between bodies of the robot and bodies of objects after the robot has moved for a time h,
+and G their derivative by the displacement of the objects. The speeds v of the objects solve
+
+    min  1/2 Σ w_i v_i² + 1/(2ρ) Σ s_k²    subject to    g + h G v + s >= 0,    l <= A v <= u
+
+with the rows A of the model's limits, locks and closures. There is no friction: an object is pushed along the
+normal, and stays where nothing touches it. The slacks s are zero unless the object is blocked; then the
+penetration remains. The weights w are the squares of the speeds that coordinates give to points of bodies, so
+rotations and translations compare. The problem is linear in the neighbourhood of a configuration, and it is
+solved again where it led, until nothing changes (sequential quadratic programming).
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Collection, Iterable, Sequence
+from dataclasses import dataclass
+from typing import Any, TypeAlias
+
+import numpy as np
+import numpy.typing as npt
+
+from kineverse._extras import install_command
+from kineverse.compile import compile  # noqa: A004
+from kineverse.errors import MissingDependencyError
+from kineverse.expressions.expression import Expression, array, as_expression
+from kineverse.geometry import Scene
+from kineverse.geometry.results import DistanceResults
+from kineverse.lie import Array
+from kineverse.model.frame_dependence import FrameDependence
+from kineverse.model.model_view import ModelView
+from kineverse.symbols import Symbol
+
+from .object_limits import ObjectLimits, Rows
+
+SKIN = 1e-6
+"""Gap to which objects are pushed [m]: below, normals of nearest points are not determined."""
+
+_REACH = 0.005
+"""Distance beyond the robot's motion up to which gaps are rows [m]."""
+_ROUNDS = 10
+_STEADY = 2e-7
+"""Change of displacements below which a solution is final [m]."""
+_SLACK = 1e-7
+"""Reciprocal ρ of the weight of slacks, beside weights near 1 kg of least motion."""
+_HARD = 1e-10
+"""Reciprocal weight of exceeded limits, where solutions of curved problems are compared."""
+_HELD = 1e-7
+"""Weight of least motion beside the error of a hold."""
+_LIGHTEST = 1e-4
+_DEEP = 1e-4
+"""Penetration of what does not yield, from which on its side is remembered [m]."""
+
+Residual: TypeAlias = Callable[[], tuple[Array, Array]]
+"""Function that returns the error of a hold at the present configuration, (6,), and its Jacobian (6, n)."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Gaps:
+    """Gaps of near pairs of shapes and their derivatives.
+
+    Attributes
+    ----------
+    pairs
+        The pairs as the scene found them, nearest first.
+    index
+        (K,) indices of the gaps among these pairs.
+    distances
+        (K,) gaps [m].
+    rows
+        (K, n) derivatives by the displacement of all columns.
+    """
+
+    pairs: DistanceResults
+    index: npt.NDArray[np.intp]
+    distances: Array
+    rows: Array
+
+
+class ObjectMotion:
+    """Bodies of a robot and of objects at a configuration, and the motion of the objects.
+
+    Parameters
+    ----------
+    scene
+        Collision scene of the model; its poses are those of the last configuration.
+    speeds
+        Speeds of objects.
+    fingers
+        Speeds of the robot's fingers, columns after those of the objects.
+    is_robot
+        Function that tells frames of the robot.
+    leave_out
+        Names of constraints that do not hold here.
+
+    Attributes
+    ----------
+    q
+        Values of the model's symbols, in their order; changed in place.
+    columns
+        Speeds of objects, then those of fingers.
+    robot_bodies, object_bodies
+        Bodies with shapes: those of the robot, and those that objects move.
+    skipped
+        Constraints of objects that cannot be enforced, as pairs (name, reason).
+    """
+
+    def __init__(
+        self,
+        scene: Scene,
+        speeds: Sequence[Symbol],
+        fingers: Sequence[Symbol],
+        is_robot: Callable[[str], bool],
+        leave_out: Collection[str] = (),
+    ) -> None:
+        self.scene, self._daqp = scene, _import_daqp()
+        model: ModelView = scene.model
+        self.symbols, self.count = model.symbols, len(speeds)
+        self.columns = (*speeds, *fingers)
+        self._place = {s: k for k, s in enumerate(self.symbols)}
+        self.q: Array = model.default_state().vector(self.symbols)
+        motion = FrameDependence(model, speeds)
+        self.robot_bodies = tuple(b for b in scene.bodies if is_robot(b))
+        self.object_bodies = tuple(b for b in scene.bodies if not is_robot(b) and motion.moves(b))
+        self._penetrated: dict[tuple[int, ...], Array] = {}
+        self._query = scene.watch(self.robot_bodies, self.object_bodies, per_shape=True)
+        self._ignored = np.zeros((len(scene.bodies),) * 2, dtype=bool)
+        self._inputs = self._indices(scene.inputs)
+        owners = scene.collision_world.table.body
+        moving = np.array([is_robot(b) for b in scene.bodies], dtype=bool)
+        self._robot_objects = np.flatnonzero(moving[owners[: scene.collision_world.table.moving]])
+        self._robot_owners = owners[self._robot_objects]
+        self._compile_twists(model)
+        self._integrate = model.integrator(speeds, self.symbols)
+        self._limits = ObjectLimits(model, speeds, is_robot, leave_out)
+        self.skipped = self._limits.skipped
+        self.place(self.q)
+        self.weights = self._weigh()
+
+    def _compile_twists(self, model: ModelView) -> None:
+        """Compile the spatial twists of groups of bodies that move together, over all columns."""
+        motion, bodies = FrameDependence(model, self.columns), self.scene.bodies
+        concerned = {*self.robot_bodies, *self.object_bodies}
+        moved = [motion.moving_ancestors(b) if b in concerned else () for b in bodies]
+        groups = {group: k for k, group in enumerate(dict.fromkeys(((), *moved)))}
+        self.group = np.array([groups[group] for group in moved], dtype=np.intp)
+        members = dict(zip(moved, bodies, strict=True))
+        n = len(self.columns)
+        twists: list[Expression] = [as_expression(np.zeros((6, n)))]
+        twists += [model.jacobian(members[g], form="world", symbols=self.columns) for g in groups if g]
+        stacked = array([e for t in twists for e in t.ravel()]).reshape(len(twists), 6, n)
+        function = compile([stacked])
+        self._twist_inputs, self._twists = self._indices(function.inputs), function.bind()
+
+    def _indices(self, symbols: Iterable[Symbol]) -> npt.NDArray[np.intp]:
+        return np.array([self._place[s] for s in symbols], dtype=np.intp)
+
+    def _weigh(self) -> Array:
+        """Return the squares of the largest speeds that columns give to points of bodies, at this place."""
+        self._evaluate_twists()
+        twists, table = self._twists.outputs[0], self.scene.collision_world.table
+        weights = np.full(len(self.columns), _LIGHTEST)
+        self._query(0.0)  # Sizes are known from the first query on.
+        for k, body in enumerate(table.body.tolist()):
+            v, w = twists[self.group[body], :3], twists[self.group[body], 3:]
+            at = table.position[k]
+            speed = (
+                np.linalg.norm(v + np.cross(w.T, at).T, axis=0) + np.linalg.norm(w, axis=0) * table.radius[k]
+            )
+            np.maximum(weights, speed**2, out=weights)
+        return weights
+
+    def reset(self, q: Array) -> None:
+        """Begin anew at a configuration."""
+        self._penetrated.clear()
+        self._limits.reset()
+        self.ignore()
+        self.place(q)
+
+    def place(self, q: Array) -> None:
+        """Set the configuration."""
+        self.q[:] = q
+        self.scene.update(self.q[self._inputs])
+
+    def travel(self) -> Array:
+        """Return the ways that bodies of the robot have gone so far, at most (B,) [m]; 0 for other bodies."""
+        found = np.zeros(len(self.scene.bodies))
+        table = self.scene.collision_world.table
+        np.maximum.at(found, self._robot_owners, table.travel[self._robot_objects])
+        return found
+
+    def near_bodies(self, radius: float) -> npt.NDArray[np.intp]:
+        """Return the indices of bodies in pairs within a radius [m] that are not ignored."""
+        pairs, index = self.find_near(radius)
+        return np.unique(pairs.body_indices[index]).astype(np.intp)
+
+    def ignore(self, ones: Iterable[str] = (), others: Iterable[str] = ()) -> None:
+        """Ignore pairs of one body each, in place of those that were ignored before."""
+        self._ignored[:] = False
+        number = {b: k for k, b in enumerate(self.scene.bodies)}
+        for a in ones:
+            for b in others:
+                if a in number and b in number:
+                    self._ignored[number[a], number[b]] = self._ignored[number[b], number[a]] = True
+
+    def find_near(self, radius: float) -> tuple[DistanceResults, npt.NDArray[np.intp]]:
+        """Return the pairs within a radius [m], and the indices of those that are not ignored."""
+        found = self._query(radius)
+        if not len(found):
+            return found, np.zeros(0, dtype=np.intp)
+        i, j = found.body_indices.T
+        return found, np.flatnonzero(~self._ignored[i, j])
+
+    def measure_gaps(self, radius: float) -> Gaps:
+        """Return the gaps within a radius [m] with their derivatives.
+
+        A shape that was penetrated does not separate on its other side: such pairs are left out until they
+        are apart.
+        """
+        pairs, index = self.find_near(radius)
+        if self._penetrated:
+            index = self._same_side(pairs, index)
+        if not len(index):
+            return Gaps(pairs, index, np.zeros(0), np.zeros((0, len(self.columns))))
+        self._evaluate_twists()
+        twists = self._twists.outputs[0]
+        a, b = self.group[pairs.body_indices[index]].T
+        normals = pairs.normals[index]
+        rows = _project(normals, pairs.points_b[index], twists[b])
+        rows -= _project(normals, pairs.points_a[index], twists[a])
+        return Gaps(pairs, index, pairs.distances[index], rows)
+
+    def _same_side(self, pairs: DistanceResults, index: npt.NDArray[np.intp]) -> npt.NDArray[np.intp]:
+        """Return the indices of pairs without those that are penetrated beyond their middle."""
+        keys = _pair_keys(pairs)
+        inside = {keys[k] for k in index.tolist() if pairs.distances[k] < 0.0}
+        self._penetrated = {key: n for key, n in self._penetrated.items() if key in inside}
+        kept = [
+            k
+            for k in index.tolist()
+            if keys[k] not in self._penetrated or pairs.normals[k] @ self._penetrated[keys[k]] > 0.0
+        ]
+        return np.array(kept, dtype=np.intp)
+
+    def _note_penetrated(self, gaps: Gaps) -> None:
+        """Remember the sides from which shapes are penetrated because nothing yields."""
+        deep = gaps.index[gaps.distances < -_DEEP]
+        if len(deep):
+            keys = _pair_keys(gaps.pairs)
+            for k in deep.tolist():
+                self._penetrated.setdefault(keys[k], gaps.pairs.normals[k].copy())
+
+    def twist(self, body: str) -> Array:
+        """Return the spatial twist of a body by the speeds of objects, (6, n)."""
+        self._evaluate_twists()
+        found: Array = self._twists.outputs[0][self.group[self.scene.bodies.index(body)], :, : self.count]
+        return found
+
+    def _evaluate_twists(self) -> None:
+        self._twists.input[:] = self.q[self._twist_inputs]
+        self._twists()
+
+    def resolve(self, h: float, moved: float, residual: Residual | None = None) -> Array:
+        """Move the objects after the robot has moved, and return their speeds (n,).
+
+        Parameters
+        ----------
+        h
+            Time of the motion [s].
+        moved
+            Largest way of a shape of the robot [m].
+        residual
+            Error of a hold, which the objects that reduce it follow.
+        """
+        v = best = np.zeros(self.count)
+        start, radius, least = self.q.copy(), moved + _REACH, math.inf
+        if residual is None and not len(self.find_near(0.0)[1]):
+            return v
+        rates = self._limits.begin(start, h)
+        for k in range(_ROUNDS + 1):
+            gaps = self.measure_gaps(radius)
+            pulled = None if residual is None else residual()
+            limits, beyond = self._limits.position_rows(self.q, h, v)
+            cost = self._cost(h * v, gaps, pulled) + beyond / _HARD
+            better = cost <= least * (1.0 + 1e-9)
+            if k == _ROUNDS:
+                break
+            if better:
+                least, best = cost, v
+                self._note_penetrated(gaps)
+                found = self._solve(h, v, gaps, rates, limits, pulled)
+            else:
+                # The gaps bend too much, as of bodies that are jammed: half of the way.
+                found = 0.5 * (best + v)
+            change = float(np.max(np.abs(found - v) * np.sqrt(self.weights[: self.count]), initial=0.0)) * h
+            v = found
+            self.place(self._integrate(start, v, h))
+            if change <= _STEADY:
+                break
+        if not better:
+            v = best
+            self.place(self._integrate(start, v, h))
+        self._limits.finish(self.q, h)
+        return v
+
+    def _cost(self, way: Array, gaps: Gaps, pulled: tuple[Array, Array] | None) -> float:
+        """Return twice the cost of a motion by some way of the objects (n,)."""
+        depths = np.minimum(gaps.distances, 0.0)
+        moved = float(self.weights[: self.count] @ way**2)
+        if pulled is not None:
+            moved = _HELD * moved + float(pulled[0] @ pulled[0])
+        return moved + float(depths @ depths) / _SLACK
+
+    def _solve(
+        self,
+        h: float,
+        v: Array,
+        gaps: Gaps,
+        rates: Rows,
+        limits: Rows,
+        pulled: tuple[Array, Array] | None,
+    ) -> Array:
+        """Return the speeds of one linearisation at speeds v."""
+        n = self.count
+        G, d = gaps.rows[:, :n], gaps.distances
+        active = (G != 0.0).any(axis=0) | (v != 0.0)
+        if pulled is not None:
+            active |= (pulled[1] != 0.0).any(axis=0)
+        active = self._limits.linked[active].any(axis=0)
+        use = np.flatnonzero(active)
+        if not len(use):
+            return v
+        H, f = np.diag(self.weights[use]), np.zeros(len(use))
+        if pulled is not None:
+            error, J = pulled[0] / h, pulled[1][:, use]
+            mine = (J != 0.0).any(axis=0)
+            H[mine, mine] *= _HELD
+            H += J.T @ J
+            f += J.T @ (error - J @ v[use])
+        matrix, lower, upper = (np.concatenate(both) for both in zip(limits[:3], rates[:3], strict=True))
+        concerned, touching = ((M[:, use] != 0.0).any(axis=1) for M in (matrix, G))
+        G, d = G[touching], d[touching]
+        # Shapes that nearly touch stay as they are: what is not penetrated does not move by itself.
+        aim = np.where(d < 0.0, SKIN, np.minimum(d, SKIN))
+        rows = np.concatenate([matrix[concerned][:, use], G[:, use]])
+        least = np.concatenate([lower[concerned], (aim - d) / h + G @ v])
+        most = np.concatenate([upper[concerned], np.full(len(d), _UNBOUNDED)])
+        sense = np.repeat(np.array([0, _SOFT], dtype=np.intc), [len(rows) - len(d), len(d)])
+        np.clip(least, -_UNBOUNDED, _UNBOUNDED, out=least)
+        np.clip(most, -_UNBOUNDED, _UNBOUNDED, out=most)
+        x, _, flag, _ = self._daqp.solve(
+            H, f, np.ascontiguousarray(rows), most, least, sense,
+            rho_soft=_SLACK, primal_tol=1e-10, sing_tol=1e-14,
+        )  # fmt: skip
+        found = np.zeros(n)
+        if flag >= 1 and np.isfinite(x).all():
+            hard = rows[: len(rows) - len(d)]
+            single = np.count_nonzero(hard, axis=1) == 1
+            _clip_to_bounds(x, hard[single], least[: len(hard)][single], most[: len(hard)][single])
+            found[use] = x
+        return found
+
+
+_SOFT, _UNBOUNDED = 8, 1e9
+
+
+def _clip_to_bounds(x: Array, rows: Array, lower: Array, upper: Array) -> None:
+    """Clip values to the bounds of rows with one entry each, in place: solvers satisfy them nearly."""
+    for row, low, high in zip(rows, lower, upper, strict=True):
+        k = int(np.argmax(np.abs(row)))
+        ends = (low / row[k], high / row[k])
+        if min(ends) <= max(ends):
+            x[k] = min(max(x[k], min(ends)), max(ends))
+
+
+def _pair_keys(pairs: DistanceResults) -> list[tuple[int, ...]]:
+    """Return the numbers of bodies and shapes of pairs."""
+    return [tuple(row) for row in np.hstack([pairs.body_indices, pairs.shape_indices]).tolist()]
+
+
+def _project(normals: Array, points: Array, twists: Array) -> Array:
+    """Return n·(v + ω × p) for each of K points and each column: (K, 3), (K, 3), (K, 6, n) -> (K, n)."""
+    (nx, ny, nz), (px, py, pz) = normals.T, points.T
+    wrench = np.empty((len(normals), 1, 6))
+    wrench[:, 0, :3] = normals
+    wrench[:, 0, 3] = py * nz - pz * ny
+    wrench[:, 0, 4] = pz * nx - px * nz
+    wrench[:, 0, 5] = px * ny - py * nx
+    return np.asarray((wrench @ twists)[:, 0])
+
+
+def _import_daqp() -> Any:
+    try:
+        import daqp
+    except ImportError as error:
+        raise MissingDependencyError(f"This world needs daqp: {install_command('control')}") from error
+    return daqp

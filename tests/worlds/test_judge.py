@@ -1,0 +1,135 @@
+"""Law: the judge measures what a state shows, whatever the world says about it."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import pytest
+from pusher import BALL, gripper, pusher
+
+from kineverse.errors import InvalidValueError, UnknownNameError
+from kineverse.grasping import Gripper
+from kineverse.model.model import Model
+from kineverse.state import State
+from kineverse.worlds import Judge
+
+DT = 0.02
+
+
+@pytest.fixture(scope="module")
+def model() -> Model:
+    return pusher()
+
+
+@pytest.fixture(scope="module")
+def hand(model: Model) -> Gripper:
+    return gripper(model)
+
+
+@pytest.fixture(scope="module")
+def judge(model: Model, hand: Gripper) -> Judge:
+    return Judge(model, "robot", hand, "room/door_handle")
+
+
+def run(judge: Judge, rows: list[dict[str, float]], speeds=None, **given) -> dict:
+    """Return the measures of states, one each 20 ms, with commanded speeds by state from the second on."""
+    home = judge.model.default_state().updated({"robot/finger": 0.05})
+    judge.reset()
+    for k, row in enumerate(rows):
+        commanded = None if speeds is None or k == 0 else speeds[k - 1]
+        options = {name: value[k] for name, value in given.items()}
+        judge.update(home.updated(row, stamp=k * DT), commanded, **options)
+    return judge.measures
+
+
+def test_limits_of_positions_and_of_true_speeds(judge):
+    fine = run(judge, [{"room/drawer": 0.0}, {"room/drawer": 0.004}, {"room/drawer": 0.4}][:2])
+    assert (fine["limit_violation"], fine["limit"]) == (0.0, "")
+    beyond = run(judge, [{"room/drawer": 0.402}, {"room/drawer": 0.4}])
+    assert beyond["limit"] == "room/drawer/range"
+    assert beyond["limit_violation"] == pytest.approx(0.002)
+    # 0.006 m in 20 ms are 0.3 m/s, beyond 0.2 m/s, though nobody commanded it.
+    fast = run(judge, [{"room/drawer": 0.1}, {"room/drawer": 0.106}])
+    assert fast["limit"] == "room/drawer/speed"
+    assert fast["limit_violation"] == pytest.approx(0.1)
+
+
+def test_locks_hold_if_they_are_closed_during_a_step():
+    model = pusher(locked=True)
+    judge = Judge(model, "robot")
+    opens = run(judge, [{"room/bolt": 0.6}, {"room/bolt": 0.4, "room/drawer": 0.002}])
+    assert opens["limit_violation"] == 0.0
+    shuts = run(judge, [{"room/bolt": 0.4}, {"room/bolt": 0.6, "room/drawer": 0.002}])
+    assert shuts["limit_violation"] == 0.0
+    locked = run(judge, [{"room/bolt": 0.4}, {"room/bolt": 0.45, "room/drawer": 0.002}])
+    assert locked["limit"] == "room/drawer/lock"
+    assert locked["limit_violation"] == pytest.approx(0.1)
+
+
+def test_penetration_of_all_pairs_but_the_excepted_ones(judge):
+    ball = 1.0 - 0.01 - BALL
+    assert run(judge, [{"robot/x": ball - 0.001, "robot/y": 0.3, "robot/z": -0.2}])["penetration"] == 0.0
+    deep = run(judge, [{"robot/x": ball + d, "robot/y": 0.3, "robot/z": -0.2} for d in (0.0, 0.004, 0.002)])
+    assert deep["penetration"] == pytest.approx(0.004, abs=1e-6)
+    assert set(deep["penetrating"]) == {"robot/ball", "room/panel"}
+    # The palm in the handle does not count, and the list says so. In the bar of the drawer it does.
+    inside = run(judge, [{"robot/x": 0.915, "robot/y": 0.7, "robot/finger": 0.05}])
+    assert ("robot/palm", "room/door_handle") in inside["excepted"]
+    assert inside["penetration"] == 0.0
+    other = run(judge, [{"robot/x": 0.875, "robot/z": 2.0, "robot/turn": math.pi / 2}])
+    assert other["penetrating"] == ("robot/palm", "room/drawer_handle")
+    assert other["penetration"] == pytest.approx(0.005, abs=1e-5)
+
+
+def test_contacts_that_end_while_pushing_are_losses(judge):
+    gaps = (0.0005, 0.002, 0.0005, 0.0, 0.003, 0.0005)
+    rows = [{"robot/x": 1.0 - 0.01 - BALL - gap, "robot/y": 0.3} for gap in gaps]
+    pushing = [True, True, True, True, False, True]
+    assert run(judge, rows, pushing=pushing)["contact_losses"] == 1
+    assert run(judge, rows, pushing=[True] * 6)["contact_losses"] == 2
+    assert run(judge, rows)["contact_losses"] == 0
+
+
+def test_grasp_error_is_the_motion_in_the_hand_since_the_hold_began(judge):
+    held = [None, "room/door_handle", "room/door_handle", None, "room/door_handle", "room/door_handle"]
+    rows = [
+        {"robot/x": x, "robot/y": 0.7, "robot/turn": turn}
+        for x, turn in ((0.7, 0), (0.88, 0), (0.882, 0.03), (0.5, 0), (0.881, 0), (0.8805, 0))
+    ]
+    found = run(judge, rows, held=held)
+    middle = 0.06  # from the base to between the fingers
+    # The middle is fixed in the handle: the hand is 2 mm further, and turned about its base.
+    moved = np.array([0.94, 0.7]) - np.array([0.882, 0.7])
+    back = np.array([[math.cos(0.03), math.sin(0.03)], [-math.sin(0.03), math.cos(0.03)]]) @ moved
+    assert found["grasp_error"] == pytest.approx(float(np.hypot(back[0] - middle, back[1])), abs=1e-9)
+    assert found["grasp_rotation"] == pytest.approx(0.03)
+    assert math.isnan(run(judge, rows)["grasp_error"])
+
+
+def test_jitter_reversals_and_ways(judge):
+    signs = [1.0, -1.0, 1.0, -1.0, 1.0]
+    rows = [{"robot/x": 0.1 * k, "robot/y": -0.1 * (k % 2)} for k in range(6)]
+    found = run(judge, rows, [{"robot/x:velocity": 0.1, "robot/y:velocity": 0.02 * s} for s in signs])
+    assert found["jitter"] == pytest.approx(0.08)
+    assert found["reversals"] == pytest.approx(4 / (5 * DT))
+    assert found["distance"] == pytest.approx(5 * math.hypot(0.1, 0.1))
+    assert found["hand_distance"] == pytest.approx(found["distance"])
+    ramp = run(
+        judge, rows, [{"robot/x:velocity": 0.1 * k, "room/door:velocity": (-1.0) ** k} for k in range(5)]
+    )
+    assert ramp["jitter"] == pytest.approx(0.0, abs=1e-12)
+    assert ramp["reversals"] == 0.0
+
+
+def test_bad_input_is_refused(judge, model):
+    judge.reset()
+    with pytest.raises(InvalidValueError, match="stamps"):
+        judge.update(model.default_state())
+    judge.update(State(model.default_state(), stamp=1.0))
+    with pytest.raises(InvalidValueError, match="reset"):
+        judge.update(State(model.default_state(), stamp=1.0))
+    with pytest.raises(UnknownNameError, match="room/door_handle"):
+        Judge(model, "robot", handle="room/door_handel")
+    with pytest.raises(UnknownNameError, match="robot"):
+        Judge(model, "robto")
