@@ -82,7 +82,7 @@ class MujocoCoordinates:
                 self.followers[dof, dof] = 0.0
             elif name in dependent:
                 self._dependent.append((at, dependent[name]))
-        known = {s for s in self.address}
+        known = set(self.address)
         known.update(s for _, symbols in self._balls for s in symbols)
         known.update(s for _, symbols, _ in self._free for s in symbols)
         self._others = {s: self.default[s] for s in self._symbols if s not in known}

@@ -77,8 +77,8 @@ class GripperDrive:
         missing = [str(s) for s in self.coordinates if s not in coordinates.address]
         if missing or not self.coordinates:
             raise InvalidValueError(
-                f"The gripper at '{gripper.hand}' moves by {', '.join(missing) or 'nothing'}, which is no free "
-                "coordinate of one joint; give a Gripper with those that open and close the fingers."
+                f"The gripper at '{gripper.hand}' moves by {', '.join(missing) or 'nothing'}, which is no "
+                "free coordinate of one joint; give a Gripper with those that open and close the fingers."
             )
         self._gripper, self._force, self._step = gripper, force, step
         self._map, self._closing = coordinates, np.array([_direction(gripper, s) for s in self.coordinates])

@@ -105,8 +105,8 @@ def add_masses(spec: Any, remark: Callable[[str], None]) -> None:
             assumed.append(body.name)
     if assumed:
         remark(
-            f"{', '.join(assumed)} {'has' if len(assumed) == 1 else 'have'} no inertia: that of the collision "
-            f"shapes is taken, of {_DENSITY:g} kg/m³, and {_MESH_MASS:g} kg for a mesh"
+            f"{', '.join(assumed)} {'has' if len(assumed) == 1 else 'have'} no inertia: that of the "
+            f"collision shapes is taken, of {_DENSITY:g} kg/m³, and {_MESH_MASS:g} kg for a mesh"
         )
 
 

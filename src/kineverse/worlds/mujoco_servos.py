@@ -4,9 +4,9 @@ A servo is a spring and a damper on a set point q_s that moves with the speed v,
 
     τ = I w² (q_s - q) + 2 I w (v - q̇),    |τ| <= effort,
 
-critically damped with the bandwidth w. I is the largest inertia about the joint in sampled configurations: with
-that of one configuration, such as a stretched arm, a joint would be too soft in others. The set point stays near
-the joint, so that a servo that something stops does not wind up.
+critically damped with the bandwidth w. I is the largest inertia about the joint in sampled configurations:
+with that of one configuration, such as a stretched arm, a joint would be too soft in others. The set point
+stays near the joint, so that a servo that something stops does not wind up.
 """
 
 from __future__ import annotations
@@ -82,8 +82,8 @@ class SpeedMap:
         missing = [str(s) for s in inputs if s not in address]
         if missing:
             raise InvalidValueError(
-                f"The speeds of {', '.join(map(str, coordinates))} depend on {', '.join(missing)}, which MuJoCo "
-                "has not as the position of one joint. Replace that part of the robot."
+                f"The speeds of {', '.join(map(str, coordinates))} depend on {', '.join(missing)}, which "
+                "MuJoCo has not as the position of one joint. Replace that part of the robot."
             )
         self._at = np.array([address[s] for s in inputs], dtype=int)
 
@@ -191,9 +191,9 @@ class JointServos:
             servo.forcelimited, servo.forcerange = True, (-force, force)
         largest, smallest = (f(inertia) if len(inertia) else 0.0 for f in (np.max, np.min))
         remark(
-            f"servos of bandwidth {bandwidth:g}/s drive {len(driven)} coordinates, with the largest inertia of "
-            f"{_CONFIGURATIONS} configurations ({smallest:.2g} to {largest:.3g} kg m² or kg) and the effort of "
-            f"the model; joints have {_ARMATURE:g} of it as armature"
+            f"servos of bandwidth {bandwidth:g}/s drive {len(driven)} coordinates, with the largest "
+            f"inertia of {_CONFIGURATIONS} configurations ({smallest:.2g} to {largest:.3g} kg m² or kg) and "
+            f"the effort of the model; joints have {_ARMATURE:g} of it as armature"
         )
         if assumed:
             remark(f"no effort is stated; servos have [N], [N m]: {', '.join(assumed)}")

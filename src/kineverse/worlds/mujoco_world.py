@@ -23,6 +23,8 @@ from .mujoco_contacts import MujocoContacts
 from .mujoco_coordinates import MujocoCoordinates
 from .mujoco_gripper import GripperDrive
 from .mujoco_servos import BANDWIDTH, JointServos, SpeedMap
+from .sensor_sampler import SensorSampler, is_of_robot
+from .sensors import Sensors
 from .world import Contact, Observation
 
 logger = logging.getLogger(__name__)
@@ -66,7 +68,7 @@ class MujocoWorld:
     delay
         Time [s] from a command to its effect.
     sensors
-        Sensors whose readings :meth:`observe` returns; None for exact encoders and touch, and no poses.
+        Settings of the sensors whose readings :meth:`observe` returns; None for exact ones.
     leave_out
         Names of constraints that are left out without another remark, as of :meth:`kineverse.Model.save`.
     door_friction
@@ -102,7 +104,7 @@ class MujocoWorld:
         grasp: Literal["friction", "tie"] = "friction",
         timeout: float = 0.04,
         delay: float = 0.0,
-        sensors: Any = None,
+        sensors: Sensors | None = None,
         leave_out: Iterable[str] = (),
         door_friction: Mapping[Symbol, float] | Mapping[str, float] | None = None,
         bandwidth: float = BANDWIDTH,
@@ -165,6 +167,7 @@ class MujocoWorld:
         self._map = SpeedMap(model, [*driven, *held], self._coordinates.address)
         self._is_finger = self._map.columns_of(held)
         self._count = len(driven)
+        self._sampler = SensorSampler(sensors or Sensors(), model, robot, seed)
         self.remarks = tuple(self._remarks)
         self.reset(model.default_state())
 
@@ -208,6 +211,7 @@ class MujocoWorld:
         if self._drive is not None:
             self._drive.reset(data)
         engine.mj_forward(self._compiled, data)
+        self._sampler.reset()
 
     def apply(self, speeds: StateLike, duration: float, *, stamp: float | None = None) -> None:
         """Advance by a duration with speeds of the robot.
@@ -261,10 +265,7 @@ class MujocoWorld:
 
     def observe(self) -> Observation:
         """Return the latest sensor readings that have arrived."""
-        touching = frozenset(c.a for c in self.contacts() if self._is_robot(c.a))
-        state = self.state
-        joints = {s: state[s] for s in state if self._is_robot(s.path)}
-        return Observation(self.time, joints, touching=touching)
+        return self._sampler.observe(self.time, self.state, self.contacts())
 
     def _advance(self) -> None:
         """Simulate one time step."""
@@ -287,7 +288,7 @@ class MujocoWorld:
 
     def _is_robot(self, name: str) -> bool:
         """Return whether a frame or coordinate is the robot's."""
-        return not self.robot or name == self.robot or name.startswith(f"{self.robot}/")
+        return is_of_robot(name, self.robot)
 
     def _remark(self, text: str) -> None:
         """Add a remark once."""

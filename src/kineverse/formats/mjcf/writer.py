@@ -51,7 +51,7 @@ _MAX_BODY_DOFS = 6
 _ARMATURE = 1e-3
 """Armature [kg m²] or [kg] of dependent joints in links with many joints; avoids singular inertia."""
 _TIE_SOLREF, _TIE_SOLIMP = (0.004, 1.0), (0.99, 0.999, 0.001)
-"""Stiffness of the equalities of dependent joints: with MuJoCo's default, a mimic joint gives way under load."""
+"""Equalities of dependent joints: with MuJoCo's default, a mimic joint gives way under load."""
 _QUATERNION = ("qx", "qy", "qz", "qw")
 _DYNAMICS = {
     "damping": "damping",
