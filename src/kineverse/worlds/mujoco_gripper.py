@@ -23,7 +23,8 @@ _FINGER_MASS = 2.0
 """Mass of a finger with its motor [kg]: with some grams, what ties fingers together does not carry force."""
 _STIFFNESS = 10.0
 """Speed by the distance of a finger from its set point [1/s]."""
-_LEAD = 0.05
+_LEAD = 0.01
+"""Largest distance of the gap between the fingers from that of the set point [m]."""
 _STILL = 1e-6
 
 
@@ -92,6 +93,7 @@ class GripperDrive:
         engine.mj_kinematics(compiled, data)
         engine.mj_comPos(compiled, data)
         leverage = self._leverage(compiled, data)
+        self._lead = _LEAD / np.maximum(leverage, 1e-3)
         own = np.abs(self._rows(compiled, data)).max(axis=0)
         for k in range(compiled.njnt):
             dof = int(compiled.jnt_dofadr[k])
@@ -156,7 +158,7 @@ class GripperDrive:
             return
         q = data.qpos[self._at]
         self._target += self._step * rates
-        np.clip(self._target, q - _LEAD, q + _LEAD, out=self._target)
+        np.clip(self._target, q - self._lead, q + self._lead, out=self._target)
         data.ctrl[self._actuators] = self._damping * (rates + _STIFFNESS * (self._target - q))
 
     def pressed(self, data: Any) -> str | None:

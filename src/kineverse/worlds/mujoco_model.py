@@ -28,6 +28,7 @@ _KNOB_MASS = 1.0
 _DENSITY, _MESH_MASS = 500.0, 0.5
 """Assumed density of bodies without inertia [kg/m³], and mass of a mesh [kg], whose volume is not known."""
 _CONDIM = 6
+_STIFF_SOLREF, _STIFF_SOLIMP = (0.004, 1.0), (0.99, 0.999, 0.001)
 _FOLDER = Path("/kineverse")
 
 
@@ -146,6 +147,8 @@ def add_joint_friction(
             units = ("N", "N s/m") if slides else ("N m", "N m s")
             what = f"friction {given[0]:g} {units[0]} and damping {given[1]:g} {units[1]}"
             assumed.setdefault(what, []).append(name)
+        # With MuJoCo's default a door creeps although friction holds it.
+        joint.solref_friction[:2], joint.solimp_friction[:3] = _STIFF_SOLREF, _STIFF_SOLIMP
         if name in friction:
             joint.frictionloss = friction[name]
             remark(f"'{name}' has the friction {friction[name]:g}, as asked for")
