@@ -29,7 +29,7 @@ _DENSITY, _MESH_MASS = 500.0, 0.5
 """Assumed density of bodies without inertia [kg/m³], and mass of a mesh [kg], whose volume is not known."""
 _CONDIM = 6
 _STIFF_SOLREF, _STIFF_SOLIMP = (0.004, 1.0), (0.99, 0.999, 0.001)
-_FOLDER = Path("/kineverse")
+_FOLDER = Path("/")
 
 
 def export_spec(model: ModelView, leave_out: Iterable[str], remark: Callable[[str], None]) -> Any:
@@ -143,7 +143,7 @@ def add_joint_friction(
             light = compiled.body_subtreemass[body] < _KNOB_MASS
             given = _DRAWER if slides else _KNOB if light else _DOOR
             joint.frictionloss = given[0]
-            joint.damping = np.eye(1, 3)[0] * given[1] if np.ndim(joint.damping) else given[1]
+            joint.damping = _like(joint.damping, given[1])
             units = ("N", "N s/m") if slides else ("N m", "N m s")
             what = f"friction {given[0]:g} {units[0]} and damping {given[1]:g} {units[1]}"
             assumed.setdefault(what, []).append(name)
@@ -154,6 +154,24 @@ def add_joint_friction(
             remark(f"'{name}' has the friction {friction[name]:g}, as asked for")
     for what, names in assumed.items():
         remark(f"{what} are assumed, as the model states none: {', '.join(names)}")
+
+
+def add_tipping_springs(spec: Any, model: ModelView, remark: Callable[[str], None]) -> None:
+    """Give a mechanism the spring that tips at an angle: τ = stiffness (q - tipping), weight included.
+
+    The parts that it moves have no weight of their own then.
+    """
+    for name, record in model.articulations.items():
+        known = dict(record.dynamics)
+        stiffness, tipping = known.get("spring/stiffness"), known.get("spring/tipping")
+        joint = spec.joint(record.coordinates[0].path) if len(record.coordinates) == 1 else None
+        if joint is None or not isinstance(stiffness, (int, float)) or not isinstance(tipping, (int, float)):
+            continue
+        joint.stiffness, joint.springref = _like(joint.stiffness, -float(stiffness)), float(tipping)
+        for frame in model.frames:
+            if record.coordinates[0] in model.symbols_of(frame):
+                spec.body(frame).gravcomp = 1.0
+        remark(f"'{name}' has its spring, which includes the weight of what it moves: gravity does not act")
 
 
 def add_contact_rules(
@@ -228,3 +246,8 @@ def overlapping_pairs(
         if not always:
             break
     return [(compiled.body(a).name, compiled.body(b).name) for a, b in sorted(at_home | (always or set()))]
+
+
+def _like(present: Any, value: float) -> Any:
+    """Return a coefficient in the form of the present one: in newer MuJoCo, the first of a polynomial."""
+    return np.array([value, *[0.0] * (np.size(present) - 1)]) if np.ndim(present) else value

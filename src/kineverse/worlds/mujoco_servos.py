@@ -40,6 +40,7 @@ _ACCELERATION = 20.0
 """Acceleration [m/s²], [rad/s²] that a servo without a stated effort can give to the largest inertia."""
 _BASE_FORCE = 1500.0
 _CONFIGURATIONS = 40
+_PLANAR = 3
 
 
 class SpeedMap:
@@ -143,8 +144,7 @@ class JointServos:
     driven
         Coordinates with a servo.
     model
-        The model, which states the effort of its joints. A joint of several coordinates is taken for a mobile
-        base.
+        The model, which states the effort of its joints.
     step
         Time step of the simulation [s].
     bandwidth
@@ -174,8 +174,7 @@ class JointServos:
         self._step, self._ahead = step, 2 / bandwidth
         inertia = sampled_inertia(compiled, coordinates, self._dof, seed)
         assumed, effort = [], stated_effort(model)
-        records = [r for r in model.articulations.values() if len(r.coordinates) > 1]
-        base = {s for record in records for s in record.coordinates}
+        base = base_coordinates(model)
         for symbol, i in zip(driven, inertia.tolist(), strict=True):
             joint, armature = spec.joint(symbol.path), 0.0 if symbol in base else _ARMATURE * i
             joint.armature += armature
@@ -236,6 +235,12 @@ def sampled_inertia(compiled: Any, coordinates: MujocoCoordinates, dofs: Array, 
             engine.mj_mulM(compiled, data, product, column)
             largest[k] = max(largest[k], float(column @ product))
     return largest
+
+
+def base_coordinates(model: ModelView) -> set[Symbol]:
+    """Return the coordinates of bodies that move in the plane or in space: mobile bases."""
+    records = model.articulations.values()
+    return {s for r in records if len(r.coordinates) >= _PLANAR for s in r.coordinates}
 
 
 def stated_effort(model: ModelView) -> dict[Symbol, float]:

@@ -136,6 +136,7 @@ class MujocoWorld:
         mujoco_model.add_masses(spec, self._remark)
         compiled = mujoco_model.compile_world(spec)
         mujoco_model.add_joint_friction(spec, compiled, furniture, frictions, self._remark)
+        mujoco_model.add_tipping_springs(spec, model, self._remark)
         mujoco_model.add_contact_rules(spec, model, fingers, friction, self._remark)
         self._float_robot(spec)
         compiled = mujoco_model.compile_world(spec)

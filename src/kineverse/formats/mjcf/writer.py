@@ -59,6 +59,8 @@ _DYNAMICS = {
     "armature": "armature",
     "spring_stiffness": "stiffness",
     "spring_reference": "springref",
+    "stiffness": "stiffness",
+    "rest": "springref",
 }
 
 
