@@ -28,7 +28,8 @@ _KNOB_MASS = 1.0
 _DENSITY, _MESH_MASS = 500.0, 0.5
 """Assumed density of bodies without inertia [kg/m³], and mass of a mesh [kg], whose volume is not known."""
 _CONDIM = 6
-_STIFF_SOLREF, _STIFF_SOLIMP = (0.004, 1.0), (0.99, 0.999, 0.001)
+_STIFF_SOLIMP = (0.99, 0.999, 0.001)
+"""Impedance of limits, ties and friction in joints; MuJoCo's default gives way by some 10 %."""
 _FOLDER = Path("/")
 
 
@@ -148,7 +149,8 @@ def add_joint_friction(
             what = f"friction {given[0]:g} {units[0]} and damping {given[1]:g} {units[1]}"
             assumed.setdefault(what, []).append(name)
         # With MuJoCo's default a door creeps although friction holds it.
-        joint.solref_friction[:2], joint.solimp_friction[:3] = _STIFF_SOLREF, _STIFF_SOLIMP
+        stiff = _solref(spec), _STIFF_SOLIMP
+        joint.solref_friction[:2], joint.solimp_friction[:3] = stiff
         if name in friction:
             joint.frictionloss = friction[name]
             remark(f"'{name}' has the friction {friction[name]:g}, as asked for")
@@ -181,7 +183,7 @@ def add_contact_rules(
     friction: float,
     remark: Callable[[str], None],
 ) -> None:
-    """Set friction of contacts and exclude the pairs of bodies that a scene of the model does not check.
+    """Set the stiffness of constraints and exclude the pairs of bodies that a scene does not check.
 
     Parameters
     ----------
@@ -209,6 +211,11 @@ def add_contact_rules(
     checked = allowed_pairs(model, bodies, read_rules(model))
     for i, k in zip(*np.nonzero(np.triu(1 - checked, 1)), strict=True):
         spec.add_exclude(bodyname1=bodies[i], bodyname2=bodies[k])
+    solref = _solref(spec)
+    for joint in spec.joints:
+        joint.solref_limit[:2], joint.solimp_limit[:3] = solref, _STIFF_SOLIMP
+    for tie in spec.equalities:
+        tie.solref[:2], tie.solimp[:3] = solref, _STIFF_SOLIMP
     remark(f"contacts have friction {friction:g}, elliptic cones and impratio {option.impratio:g}")
 
 
@@ -251,3 +258,8 @@ def overlapping_pairs(
 def _like(present: Any, value: float) -> Any:
     """Return a coefficient in the form of the present one: in newer MuJoCo, the first of a polynomial."""
     return np.array([value, *[0.0] * (np.size(present) - 1)]) if np.ndim(present) else value
+
+
+def _solref(spec: Any) -> tuple[float, float]:
+    """Return the time constant [s] and the damping ratio of stiff constraints: two steps are the least."""
+    return 2.0 * float(spec.option.timestep), 1.0
