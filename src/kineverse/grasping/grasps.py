@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections import Counter
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -12,7 +12,7 @@ import numpy as np
 from kineverse import lie
 from kineverse.errors import InvalidValueError
 from kineverse.geometry import Scene
-from kineverse.geometry.objects import collision_shapes
+from kineverse.geometry.objects import collision_shapes, matches_pattern
 from kineverse.lie import Array
 from kineverse.model.body import Body
 from kineverse.model.model_view import ModelView
@@ -20,7 +20,7 @@ from kineverse.model.model_view import ModelView
 from .bars import Part, find_parts
 from .finger_pairs import path_to_root
 from .gripper import Gripper
-from .hand_model import HandModel
+from .hand_model import HandModel, bodies_with_shapes
 from .handles import Handle
 
 _RETREAT = 0.1
@@ -79,7 +79,13 @@ class Grasp:
 
 
 def sample_grasps(
-    model: ModelView, gripper: Gripper, handle: Handle, count: int = 64, seed: int = 0
+    model: ModelView,
+    gripper: Gripper,
+    handle: Handle,
+    count: int = 64,
+    seed: int = 0,
+    *,
+    decomposed: Iterable[str] = (),
 ) -> tuple[Grasp, ...]:
     """Return grasps across a bar, without contact of the gripper with the object, the best first.
 
@@ -87,6 +93,19 @@ def sample_grasps(
     approach; around a knob also in the angle about its axis. The way from ``approach`` to ``pose`` and the
     closing fingers are free of collisions with everything that is not the robot's, at its default values.
     Upright grasps at the middle of the bar and of the pads come first, of similar ones the clearer.
+
+    Parameters
+    ----------
+    model
+        Model of the robot and of the object.
+    gripper, handle
+        What holds what.
+    count
+        Most grasps that are returned.
+    seed
+        Seed of the samples: equal arguments give equal grasps.
+    decomposed
+        Bodies, or patterns, as for :class:`kineverse.geometry.Scene`: without them a mesh is its convex hull.
 
     Raises
     ------
@@ -97,7 +116,7 @@ def sample_grasps(
         raise InvalidValueError(
             f"The {handle} is too thick for the {gripper}. find_handles and find_grippers list others."
         )
-    surroundings = _Surroundings(model, gripper, handle)
+    surroundings = _Surroundings(model, gripper, handle, tuple(decomposed))
     found: list[tuple[float, Grasp]] = []
     hits: Counter[tuple[str, str]] = Counter()
     rng = np.random.default_rng(seed)
@@ -130,6 +149,7 @@ def _candidates(
         # First both half turns at some depths, upright at the middle: knobs leave little more.
         part = np.array([0.0, 0.0, _DEPTHS[k // 2]]) if k < 2 * len(_DEPTHS) else rng.uniform(-1.0, 1.0, 3)
         spin = rng.uniform(-math.pi / 2, math.pi / 2) if is_knob and k > 1 else 0.0
+        part[0] *= abs(part[0])  # many are nearly upright, which fits where there is little room
         tilt, place, depth = part * (_MOST_TILT_OF_KNOB if is_knob else _MOST_TILT, along, deep)
         bar_R_grasp = lie.rotation_x(np.array(spin)) @ lie.rotation_z(np.array(tilt + math.pi))
         if k % 2:
@@ -150,33 +170,41 @@ def _candidates(
 class _Surroundings:
     """Bodies around a handle, and a hand that is tried there, all in the frame of the handle."""
 
-    def __init__(self, model: ModelView, gripper: Gripper, handle: Handle) -> None:
+    def __init__(
+        self, model: ModelView, gripper: Gripper, handle: Handle, decomposed: tuple[str, ...]
+    ) -> None:
         robot = _frames_of_robot(model, gripper)
-        scene = Scene(model, leave_out=[f for f in model.bodies if f in robot])
+        scene = Scene(model, leave_out=[f for f in model.bodies if f in robot], decomposed=decomposed)
         scene.update(model.default_state())
         frame_T_world = lie.inverse(scene.pose(handle.frame))
         middle = (scene.pose(handle.frame) @ handle.pose)[:3, 3]
         near: dict[str, list[int]] = {}
+        pieces: list[Part] = []
         for part in find_parts(scene):
             if np.linalg.norm(part.middle - middle) - np.linalg.norm(part.size) / 2 < _NEAR:
                 near.setdefault(part.body, []).append(part.number)
             if (part.body, part.number) == (handle.frame, handle.shape):
-                self.bar = replace(part, pose=frame_T_world @ part.pose)
+                pieces.append(part)
+        # Of a decomposed handle, the bar is the piece in its middle.
+        bar = min(pieces, key=lambda part: float(np.linalg.norm(part.middle - middle)))
+        self.bar = replace(bar, pose=frame_T_world @ bar.pose)
         obstacles = {}
         for name, numbers in near.items():
             shapes, pose = collision_shapes(model.bodies[name]), frame_T_world @ scene.pose(name)
             kept = [shapes[k] for k in dict.fromkeys(numbers) if (name, k) != (handle.frame, handle.shape)]
             if kept:
                 obstacles[f"{_OBJECT}{name}"] = (pose, Body(collisions=tuple(kept)))
-        bar = collision_shapes(model.bodies[handle.frame])[handle.shape]
-        obstacles[_BAR] = (np.eye(4), Body(collisions=(bar,)))
+        shape = collision_shapes(model.bodies[handle.frame])[handle.shape]
+        obstacles[_BAR] = (np.eye(4), Body(collisions=(shape,)))
+        whole = [_BAR] if matches_pattern(handle.frame, decomposed) else []
+        whole += [name for name in obstacles if matches_pattern(name.removeprefix(_OBJECT), decomposed)]
         rigid = [f for f in robot if not model.speeds_of(f, gripper.hand)]
-        frames = dict.fromkeys((*rigid, *gripper.bodies))
-        self._hand = HandModel(model, gripper.hand, frames, gripper.joints, obstacles)
-        watch, bodies = self._hand.scene.watch, self._hand.bodies
-        self._contacts = watch(bodies, list(obstacles), _REACH)
+        bodies = bodies_with_shapes(model, dict.fromkeys((*rigid, *gripper.bodies)))
+        self._hand = HandModel(model, gripper.hand, bodies, gripper.joints, obstacles, whole)
+        watch = self._hand.scene.watch
+        self._contacts = watch(self._hand.bodies, list(obstacles), _REACH)
         others = [name for name in obstacles if name != _BAR]
-        self._others = watch(bodies, others, _REACH) if others else None
+        self._others = watch(self._hand.bodies, others, _REACH) if others else None
 
     def find_contact(self, grasp: Grasp) -> tuple[str, str] | None:
         """Return the bodies of hand and object that come too near to each other, or None."""
