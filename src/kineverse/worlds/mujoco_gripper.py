@@ -202,7 +202,7 @@ class GripperDrive:
         engine.mju_rotVecQuat(position, data.xpos[body] - data.xpos[hand], inverse)
         engine.mju_mulQuat(quaternion, inverse, data.xquat[body])
         self._compiled.eq_obj2id[self._tie] = body
-        self._compiled.eq_data[self._tie] = [0, 0, 0, *position, *quaternion, 1]
+        self._compiled.eq_data[self._tie, :11] = [0, 0, 0, *position, *quaternion, 1]
         data.eq_active[self._tie] = 1
         self._tied = name
 

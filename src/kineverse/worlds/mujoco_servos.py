@@ -4,9 +4,10 @@ A servo is a spring and a damper on a set point q_s that moves with the speed v,
 
     τ = I w² (q_s - q) + 2 I w (v - q̇),    |τ| <= effort,
 
-critically damped with the bandwidth w. I is the largest inertia about the joint in sampled configurations:
-with that of one configuration, such as a stretched arm, a joint would be too soft in others. The set point
-stays near the joint, so that a servo that something stops does not wind up.
+with the inertial forces of the acceleration of v. It is critically damped with the bandwidth w. I is the
+largest inertia about the joint in sampled configurations: with that of one configuration, such as a stretched
+arm, a joint would be too soft in others. The set point stays near the joint, so that a servo that something
+stops does not wind up. v reaches the commanded speed with an acceleration that the effort allows.
 """
 
 from __future__ import annotations
@@ -36,9 +37,11 @@ _LEAD = 0.05
 """Largest distance of a set point from its joint [m], [rad]."""
 _ARMATURE = 0.1
 """Part of the largest inertia that is added to a joint as that of its motor."""
-_ACCELERATION = 20.0
-"""Acceleration [m/s²], [rad/s²] that a servo without a stated effort can give to the largest inertia."""
-_BASE_FORCE = 1500.0
+_ACCELERATION, _TRACTION = 20.0, 6.0
+"""Acceleration that a servo without a stated effort can give to the largest inertia [m/s²], [rad/s²], and
+that of a base that slides along the floor: its wheels have some friction of 0.6."""
+_RAMP, _RESERVE = 0.05, 0.8
+"""Time from rest to the limit of a speed [s], and the part of the effort that an acceleration may take."""
 _CONFIGURATIONS = 40
 _PLANAR = 3
 
@@ -171,29 +174,44 @@ class JointServos:
         self.coordinates = tuple(driven)
         self._at = np.array([coordinates.address[s] for s in driven], dtype=int)
         self._dof = np.array([coordinates.dof[s] for s in driven], dtype=int)
+        self._ties = np.ascontiguousarray(coordinates.followers[:, self._dof])
         self._step, self._ahead = step, 2 / bandwidth
         inertia = sampled_inertia(compiled, coordinates, self._dof, seed)
+        accelerations: list[float] = []
+        weight = _sampled_weight(compiled, coordinates, self._dof, seed)
+        raised: list[str] = []
         assumed, effort = [], stated_effort(model)
         base = base_coordinates(model)
         for symbol, i in zip(driven, inertia.tolist(), strict=True):
             joint, armature = spec.joint(symbol.path), 0.0 if symbol in base else _ARMATURE * i
             joint.armature += armature
+            joint.actfrclimited = False  # the servo has the limit
             i += armature
             force = effort.get(symbol, 0.0)
             if not force > 0:
-                force = max(_ACCELERATION * i, _BASE_FORCE if symbol in base else 0.0)
+                slides = joint.type == engine.mjtJoint.mjJNT_SLIDE
+                force = i * (_TRACTION if symbol in base and slides else _ACCELERATION)
                 assumed.append(f"{symbol} {force:.3g}")
+            elif force < (load := float(weight[len(accelerations)])):
+                raised.append(f"{symbol} {force:g} to {load:.3g}")
+                force = load
+            fastest = float(np.abs(model.limits(symbol.derivative())).min())
+            ramp = (fastest if 0 < fastest < math.inf else 1.0) / _RAMP
+            accelerations.append(min(_RESERVE * force / i, ramp))
             kp, kv = i * bandwidth**2, 2 * i * bandwidth
             servo = spec.add_actuator(name=f"{symbol.path}/servo", target=symbol.path)
             servo.trntype, servo.biastype = engine.mjtTrn.mjTRN_JOINT, engine.mjtBias.mjBIAS_AFFINE
             servo.gainprm[0], servo.biasprm[:3] = kp, (0, -kp, -kv)
             servo.forcelimited, servo.forcerange = True, (-force, force)
+        self._acceleration: Array = np.array(accelerations)
         largest, smallest = (f(inertia) if len(inertia) else 0.0 for f in (np.max, np.min))
         remark(
             f"servos of bandwidth {bandwidth:g}/s drive {len(driven)} coordinates, with the largest "
             f"inertia of {_CONFIGURATIONS} configurations ({smallest:.2g} to {largest:.3g} kg m² or kg) and "
             f"the effort of the model; joints have {_ARMATURE:g} of it as armature"
         )
+        if raised:
+            remark(f"the effort is raised where it is less than the weight, [N], [N m]: {', '.join(raised)}")
         if assumed:
             remark(f"no effort is stated; servos have [N], [N m]: {', '.join(assumed)}")
 
@@ -201,23 +219,28 @@ class JointServos:
         """Find the servos in the final ``MjModel``."""
         names = [f"{s.path}/servo" for s in self.coordinates]
         self._actuators = np.array([compiled.actuator(name).id for name in names], dtype=int)
+        self._compiled, self._product = compiled, np.zeros(compiled.nv)
+        self._stiffness: Array = compiled.actuator_gainprm[self._actuators, 0].copy()
 
     def reset(self, data: Any) -> None:
         """Set all set points to the present positions."""
         self._target: Array = data.qpos[self._at].copy()
+        self._rates = np.zeros(len(self._at))
         data.ctrl[self._actuators] = self._target
-
-    def stop(self, data: Any) -> None:
-        """Move all set points to the present positions."""
-        self._target = data.qpos[self._at].copy()
 
     def drive(self, data: Any, rates: Array) -> None:
         """Move the set points by one time step at speeds (n,), and set the controls."""
-        q = data.qpos[self._at]
-        self._target += self._step * rates
+        q, most = data.qpos[self._at], self._step * self._acceleration
+        change = np.clip(rates - self._rates, -most, most)
+        self._rates = self._rates + change
+        self._target += self._step * self._rates
         np.clip(self._target, q - _LEAD, q + _LEAD, out=self._target)
+        control = self._target + self._ahead * self._rates
+        if change.any():
+            mujoco().mj_mulM(self._compiled, data, self._product, self._ties @ (change / self._step))
+            control += (self._ties.T @ self._product) / self._stiffness
         # The servo is τ = kp (u - q) - kv q̇, and 2/w = kv/kp.
-        data.ctrl[self._actuators] = self._target + self._ahead * rates
+        data.ctrl[self._actuators] = control
 
 
 def sampled_inertia(compiled: Any, coordinates: MujocoCoordinates, dofs: Array, seed: int) -> Array:
@@ -234,6 +257,17 @@ def sampled_inertia(compiled: Any, coordinates: MujocoCoordinates, dofs: Array, 
         for k, column in enumerate(columns):
             engine.mj_mulM(compiled, data, product, column)
             largest[k] = max(largest[k], float(column @ product))
+    return largest
+
+
+def _sampled_weight(compiled: Any, coordinates: MujocoCoordinates, dofs: Array, seed: int) -> Array:
+    """Return the largest force of gravity on each joint in sampled configurations (n,) [N], [N m]."""
+    engine, data, random = mujoco(), mujoco().MjData(compiled), np.random.default_rng(seed)
+    move, largest = coordinates.sampler(), np.zeros(len(dofs))
+    for _ in range(_CONFIGURATIONS):
+        move(data, random)
+        engine.mj_forward(compiled, data)
+        np.maximum(largest, np.abs(data.qfrc_gravcomp @ coordinates.followers[:, dofs]), out=largest)
     return largest
 
 
