@@ -132,7 +132,7 @@ def test_robot_moves_as_the_model_integrates(robot: str) -> None:
 @pytest.mark.parametrize(
     ("base", "speeds", "seconds", "least", "most"),
     [
-        ((-0.6, -1.6), {v: 0.3 * x for v, x in FORWARD["fetch"].items()}, 2.1, -1e-3, 0.1),
+        ((-0.6, -1.6), {v: 0.15 * x for v, x in FORWARD["fetch"].items()}, 4.5, -1e-3, 0.1),
         ((-0.1, -1.25), {"fetch/shoulder_pan_joint:velocity": -0.4}, 1.5, 1.2, math.pi / 2),
     ],
 )
@@ -152,7 +152,7 @@ def test_arm_that_sweeps_past_a_door_shuts_or_opens_it(
     assert touched
     assert all(c.a.startswith("fetch/") and "fridge_door" in c.b for c in touched)
     assert all(c.distance < 5e-3 and abs(np.linalg.norm(c.normal) - 1) < 1e-9 for c in touched)
-    assert 0 < max(c.force for c in touched) < 300
+    assert 0 < max(c.force for c in touched) < 500
     others = [s for s in before if s.path.startswith("kitchen/") and str(s) != FRIDGE]
     assert np.abs(world.state.vector(others) - before.vector(others)).max() < 1e-3
 
@@ -277,7 +277,7 @@ def test_loops_move_as_the_model_says() -> None:
             for frame in (f for f in model.frames if f.startswith(name)):
                 expected = np.asarray(model.fk(frame)(state))
                 assert np.abs(expected - simulated_pose(world, frame)).max() < tolerance
-        assert state[coordinate] == pytest.approx(0.5, abs=0.02)
+        assert state[coordinate] == pytest.approx(0.5, abs=0.05)
 
 
 def simulated_pose(world: MujocoWorld, frame: str) -> Array:
