@@ -307,6 +307,7 @@ def test_free_and_turned_bodies_keep_their_state() -> None:
         edit.apply(kv.Floating(name="ball", parent="world", child="ball", origin=place))
         edit.apply(SetBody("ball", cube(1.0, (0.1, 0.1, 0.1))))
         edit.apply(kv.articulations.Ball(name="globe", parent="world", child="globe", origin=place))
+        edit.apply(kv.Prismatic(name="ghost", parent="world", child="ghost", lower=0, upper=1))
         edit.apply(SetBody("globe", Body(collisions=cube(1.0, (0.1, 0.2, 0.1)).collisions)))
     world = MujocoWorld(model, "hsr", gripper("hsr"))
     state = model.default_state() | {"ball/x": 0.4, "ball/qx": 0.6, "ball/qw": 0.8}
@@ -320,6 +321,7 @@ def test_free_and_turned_bodies_keep_their_state() -> None:
     world.apply({}, 0.1)
     fall = model.fk("ball")(state)[2, 3] - model.fk("ball")(world.state)[2, 3]
     assert fall == pytest.approx(9.81 * 0.1**2 / 2, rel=0.05)
+    assert "nothing can touch ghost: without collision shapes" in world.remarks
     assert any("globe" in remark and "no inertia" in remark for remark in world.remarks)
 
 

@@ -112,6 +112,16 @@ def add_masses(spec: Any, remark: Callable[[str], None]) -> None:
         )
 
 
+def remark_missing_shapes(spec: Any, robot: Callable[[str], bool], remark: Callable[[str], None]) -> None:
+    """Remark on moving furniture without collision shapes, which nothing can touch."""
+    names = []
+    for body in spec.bodies:
+        if body.joints and not robot(body.name) and not any(part.geoms for part in rigid_parts(body)):
+            names.append(body.name)
+    if names:
+        remark(f"nothing can touch {', '.join(names)}: without collision shapes")
+
+
 def add_joint_friction(
     spec: Any,
     compiled: Any,

@@ -134,6 +134,7 @@ class MujocoWorld:
         spec = mujoco_model.export_spec(model, leave_out, self._remark)
         spec.option.timestep = self._step
         mujoco_model.add_masses(spec, self._remark)
+        mujoco_model.remark_missing_shapes(spec, self._is_robot, self._remark)
         compiled = mujoco_model.compile_world(spec)
         mujoco_model.add_joint_friction(spec, compiled, furniture, frictions, self._remark)
         mujoco_model.add_tipping_springs(spec, model, self._remark)
