@@ -27,6 +27,8 @@ FORWARD = {
     "hsr": {"hsr/base/x:velocity": 1.0},
     "fetch": {"fetch/l_wheel_joint:velocity": 1 / 0.06, "fetch/r_wheel_joint:velocity": 1 / 0.06},
 }
+FLAT = {"hsr/arm_flex_joint": -math.pi / 2, "hsr/arm_lift_joint": 0.3}
+"""The hand of the HSR points forwards."""
 OVEN, DISHWASHER, FRIDGE = (f"kitchen/{name}_door" for name in ("oven", "dishwasher", "fridge"))
 
 
@@ -50,13 +52,14 @@ def cube(mass: float, size: tuple[float, float, float]) -> Body:
 def world_with_bar(robot: str = "fetch", **options: Any) -> MujocoWorld:
     """Return a world with a bar in the open hand, which slides to and from it."""
     model, hand = kv.load(robot), gripper(robot)
-    place = np.asarray(model.fk(hand.hand)(model.default_state())) @ hand.grasp_pose
+    start = model.default_state() | hand.opened | (FLAT if robot == "hsr" else {})
+    place = np.asarray(model.fk(hand.hand)(start)) @ hand.grasp_pose
     with model.edit() as edit:
         edit.add_frame("thing", parent="world", transform=place)
         edit.apply(kv.Prismatic(name="thing/way", parent="thing", child="thing/bar", lower=-0.5, upper=0.5))
         edit.apply(SetBody("thing/bar", cube(1.0, (0.02, 0.02, 0.2))))
     world = MujocoWorld(model, robot, hand, **options)
-    world.reset(model.default_state() | hand.opened)
+    world.reset(start)
     return world
 
 
@@ -157,18 +160,19 @@ def test_arm_that_sweeps_past_a_door_shuts_or_opens_it(
     assert np.abs(world.state.vector(others) - before.vector(others)).max() < 1e-3
 
 
-@pytest.mark.parametrize("robot", ["pr2", "fetch"])
+@pytest.mark.parametrize("robot", ROBOTS)
 def test_fingers_hold_a_bar_with_the_stated_force_until_they_open(robot: str) -> None:
     world = world_with_bar(robot, grip=40.0)
     forward = {v: -0.1 * x for v, x in FORWARD[robot].items()}
-    for _ in range(200):
-        world.apply(closing(robot), 0.01)
+    close = closing(robot, 0.5 if robot == "hsr" else 0.05)
+    for _ in range(300):
+        world.apply(close, 0.01)
         if world.held is not None:
             break
     assert world.held == "thing/bar"
-    world.apply(closing(robot), 0.3)
+    world.apply(close, 0.3)
     assert finger_forces(world) == pytest.approx([40.0, 40.0], rel=0.02)
-    for quiet in ({}, dict.fromkeys(closing(robot), 0.0)):  # neither silence nor a speed of zero lets go
+    for quiet in ({}, dict.fromkeys(close, 0.0)):  # neither silence nor a speed of zero lets go
         world.apply(quiet, 0.3)
         assert finger_forces(world) == pytest.approx([40.0, 40.0], rel=0.02)
     before = world.state
@@ -177,7 +181,7 @@ def test_fingers_hold_a_bar_with_the_stated_force_until_they_open(robot: str) ->
     way = world.state["thing/way"] - before["thing/way"]
     assert way == pytest.approx(-0.05, abs=2e-3)
     assert world.held == "thing/bar"
-    world.apply({v: -x for v, x in closing(robot).items()}, 0.2)
+    world.apply({v: -x for v, x in close.items()}, 0.2)
     assert world.held is None
     assert finger_forces(world) == []
     assert sum(world.state[q] for q in gripper(robot).joints) > sum(before[q] for q in gripper(robot).joints)

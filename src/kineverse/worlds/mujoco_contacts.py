@@ -70,7 +70,10 @@ class MujocoContacts:
         )
 
     def grip(self, data: Any) -> dict[str, tuple[float, float]]:
-        """Return the normal forces of both fingers by the body that they touch [N]."""
+        """Return the normal forces of both fingers by what they touch [N].
+
+        Bodies that are rigidly connected and move count as one; its name is that of the one pressed most.
+        """
         if not data.ncon:
             return {}
         contact = data.contact
@@ -78,10 +81,16 @@ class MujocoContacts:
         sides = self._side[bodies]
         # Fingers with something that is not the robot's, in contacts that the solver has rows for.
         wanted = (sides.max(axis=1) > 0) & ~self._is_robot[bodies].all(axis=1) & (contact.efc_address >= 0)
-        found: dict[str, tuple[float, float]] = {}
+        pressed: dict[tuple[bool, int], dict[int, Array]] = {}
         for k in np.flatnonzero(wanted).tolist():
             finger = int(sides[k, 1] > 0)
-            name, force = self._names[bodies[k, 1 - finger]], float(data.efc_force[contact.efc_address[k]])
-            left, right = found.get(name, (0.0, 0.0))
-            found[name] = (left + force, right) if sides[k, finger] == 1 else (left, right + force)
+            body = int(bodies[k, 1 - finger])
+            root = int(self._compiled.body_weldid[body])
+            forces = pressed.setdefault((root > 0, root or body), {}).setdefault(body, np.zeros(2))
+            forces[sides[k, finger] - 1] += data.efc_force[contact.efc_address[k]]
+        found = {}
+        for parts in pressed.values():
+            most = max(parts, key=lambda body: float(parts[body].sum()))
+            one, other = sum(parts.values(), np.zeros(2)).tolist()
+            found[self._names[most]] = one, other
         return found

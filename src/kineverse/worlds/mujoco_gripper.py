@@ -21,6 +21,7 @@ TOUCH_FORCE = 1.0
 """Normal force of each finger [N] above which a body between them is held."""
 _FINGER_MASS = 2.0
 """Mass of a finger with its motor [kg]: with some grams, what ties fingers together does not carry force."""
+_SMALLEST_LEVER = 0.02
 _STIFFNESS = 10.0
 """Speed by the distance of a finger from its set point [1/s]."""
 _LEAD = 0.01
@@ -94,13 +95,16 @@ class GripperDrive:
         engine.mj_comPos(compiled, data)
         leverage = self._leverage(compiled, data)
         self._lead = _LEAD / np.maximum(leverage, 1e-3)
-        own = np.abs(self._rows(compiled, data)).max(axis=0)
+        levers = np.abs(self._rows(compiled, data)).max(axis=0)
+        levers[self._dof] = leverage
+        hand = compiled.body(gripper.hand).id
         for k in range(compiled.njnt):
             dof = int(compiled.jnt_dofadr[k])
-            if dof not in self._dof and not coordinates.followers[dof, self._dof].any():
-                continue
-            lever = leverage[list(self._dof).index(dof)] if dof in self._dof else own[dof]
-            spec.joint(compiled.joint(k).name).armature += _FINGER_MASS * float(lever) ** 2
+            # Also joints of fingers that nothing drives, such as springs in series.
+            parent = compiled.body_parentid[compiled.jnt_bodyid[k]]
+            if coordinates.followers[dof, self._dof].any() or _is_below(compiled, parent, hand):
+                lever = max(float(levers[dof]), _SMALLEST_LEVER)
+                spec.joint(compiled.joint(k).name).armature += _FINGER_MASS * lever**2
         for symbol in self.coordinates:
             drive = spec.add_actuator(name=f"{symbol.path}/grip", target=symbol.path)
             drive.trntype, drive.biastype = engine.mjtTrn.mjTRN_JOINT, engine.mjtBias.mjBIAS_AFFINE
@@ -216,6 +220,13 @@ class GripperDrive:
 def _direction(gripper: Gripper, symbol: Symbol) -> float:
     """Return the sign of the speed with which a coordinate closes the fingers."""
     return float(np.sign(gripper.closed[symbol] - gripper.opened[symbol]))
+
+
+def _is_below(compiled: Any, body: int, root: int) -> bool:
+    """Return whether a body is below another one in the tree."""
+    while body not in (0, root):
+        body = int(compiled.body_parentid[body])
+    return bool(body == root)
 
 
 def _deepest(compiled: Any, names: Sequence[str]) -> int:

@@ -114,10 +114,8 @@ def add_masses(spec: Any, remark: Callable[[str], None]) -> None:
 
 def remark_missing_shapes(spec: Any, robot: Callable[[str], bool], remark: Callable[[str], None]) -> None:
     """Remark on moving furniture without collision shapes, which nothing can touch."""
-    names = []
-    for body in spec.bodies:
-        if body.joints and not robot(body.name) and not any(part.geoms for part in rigid_parts(body)):
-            names.append(body.name)
+    moving = [body for body in spec.bodies if body.joints and not robot(body.name)]
+    names = [body.name for body in moving if not any(part.geoms for part in rigid_parts(body))]
     if names:
         remark(f"nothing can touch {', '.join(names)}: without collision shapes")
 

@@ -219,6 +219,10 @@ class JointServos:
         """Find the servos in the final ``MjModel``."""
         names = [f"{s.path}/servo" for s in self.coordinates]
         self._actuators = np.array([compiled.actuator(name).id for name in names], dtype=int)
+        joints = [compiled.joint(s.path).id for s in self.coordinates]
+        limited = compiled.jnt_limited[joints].astype(bool)
+        self._lower: Array = np.where(limited, compiled.jnt_range[joints, 0], -np.inf)
+        self._upper: Array = np.where(limited, compiled.jnt_range[joints, 1], np.inf)
         self._compiled, self._product = compiled, np.zeros(compiled.nv)
         self._stiffness: Array = compiled.actuator_gainprm[self._actuators, 0].copy()
 
@@ -235,6 +239,7 @@ class JointServos:
         self._rates = self._rates + change
         self._target += self._step * self._rates
         np.clip(self._target, q - _LEAD, q + _LEAD, out=self._target)
+        np.clip(self._target, self._lower, self._upper, out=self._target)
         control = self._target + self._ahead * self._rates
         if change.any():
             mujoco().mj_mulM(self._compiled, data, self._product, self._ties @ (change / self._step))

@@ -150,6 +150,7 @@ class MujocoWorld:
             self._drive = GripperDrive(
                 spec, compiled, self._coordinates, gripper, grip, self._step, grasp == "tie", self._remark
             )
+            compiled = mujoco_model.compile_world(spec)
         held = () if self._drive is None else self._drive.coordinates
         driven = [s for s in coordinates if s in self._coordinates.address and s not in held]
         idle = [str(s) for s in coordinates if s not in self._coordinates.address]
