@@ -2,32 +2,96 @@
 
 from __future__ import annotations
 
+import math
+from dataclasses import replace
+from functools import cache
+
+import numpy as np
 import pytest
 from grasp_oracle import GraspJudge
 
 import kineverse as kv
-from kineverse.grasping import find_gripper, find_handle, sample_grasps
+from kineverse import lie
+from kineverse.errors import InvalidValueError
+from kineverse.grasping import Grasp, Handle, find_gripper, find_handle, sample_grasps
+
+KITCHEN = (
+    "fridge_door",
+    "oven_door",
+    "oven_left_drawer",
+    "sink_left_upper_drawer",
+    "oven_knob",
+    "stove_knob_1",
+)
+
+
+@cache
+def handles(name: str) -> tuple[Handle, ...]:
+    """Return a handle of each size and direction."""
+    model = kv.load(name)
+    coordinates = [f"kitchen/{c}" for c in KITCHEN] if name == "kitchen" else model.degrees_of_freedom
+    return tuple(find_handle(model, coordinate) for coordinate in coordinates)
+
+
+def check(judge: GraspJudge, grasp: Grasp) -> None:
+    """Check that nothing touches on the way and while the fingers close, and that then both do."""
+    judge.place(grasp, grasp.approach)
+    assert judge.distance() > 1e-3
+    judge.place(grasp, grasp.pose)
+    assert judge.distance() > 9e-4
+    judge.place(grasp, grasp.pose, grasp.thickness + 0.004)
+    assert judge.distance() > 9e-4
+    judge.place(grasp, grasp.pose, grasp.thickness - 0.001)
+    assert max(judge.finger_distances(grasp.handle.frame)) < 0.0, f"{grasp}: a finger does not touch"
 
 
 @pytest.mark.parametrize("robot", ["pr2", "fetch", "hsr"])
 @pytest.mark.parametrize("name", ["kitchen", "shelf_door", "shelf_drawers"])
 def test_every_object_can_be_grasped(robot: str, name: str) -> None:
     model = kv.load(name)
-    coordinates = model.degrees_of_freedom
     top = next(f for f, frame in model.frames.items() if frame.parent == "world")
     model.include(robot)
-    judge = GraspJudge(model, top)
     gripper = find_gripper(model, robot)
-    for coordinate in coordinates:
-        handle = find_handle(model, coordinate)
-        grasps = sample_grasps(model, gripper, handle, count=6, seed=1)
-        assert grasps
-        for grasp in grasps[:2]:
-            judge.place(grasp, grasp.approach)
-            assert judge.distance(grasp) > 1e-3
-            judge.place(grasp, grasp.pose)  # open
-            assert judge.distance(grasp) > 1e-3
-            judge.place(grasp, grasp.pose, grasp.thickness + 0.004)
-            assert judge.distance(grasp) > 5e-4
-            judge.place(grasp, grasp.pose, grasp.thickness - 0.001)
-            assert max(judge.finger_distances(grasp)) < 0.0, f"{grasp}: a finger does not touch"
+    judge = GraspJudge(model, top, gripper)
+    for handle in handles(name):
+        grasps = sample_grasps(model, gripper, handle, count=4, seed=1)
+        check(judge, grasps[0])
+        check(judge, grasps[-1])
+
+
+def test_grasps_differ_in_angle_place_and_half_turn() -> None:
+    model = kv.load("kitchen")
+    model.include("hsr")
+    gripper, handle = find_gripper(model, "hsr"), find_handle(model, "kitchen/fridge_door")
+    judge = GraspJudge(model, "kitchen/kitchen", gripper)
+    grasps = sample_grasps(model, gripper, handle, count=40, seed=3)
+    again = sample_grasps(model, gripper, handle, count=40, seed=3)
+    other = sample_grasps(model, gripper, handle, count=40, seed=4)
+    assert np.array_equal([g.pose for g in grasps], [g.pose for g in again])
+    assert not np.array_equal([g.pose for g in grasps], [g.pose for g in other])
+    assert len(grasps) == 40
+    tilts, places = [g.tilt for g in grasps], [g.place for g in grasps]
+    assert min(tilts) < -0.4 < 0.4 < max(tilts)
+    assert max(map(abs, tilts)) <= math.pi / 3
+    assert min(places) < -0.15 < 0.15 < max(places)
+    assert max(map(abs, places)) < handle.length / 2
+    up = [(handle.pose[:3, :3].T @ g.pose[:3, :3] @ gripper.grasp_pose[:3, 2])[2] for g in grasps]
+    assert {round(float(value)) for value in up} == {-1, 1}
+    for grasp in grasps[::8]:
+        check(judge, grasp)
+        # The hand approaches straight out of its fingers.
+        way = grasp.pose[:3, :3].T @ (grasp.pose - grasp.approach)[:3, 3]
+        assert np.allclose(way, 0.1 * gripper.grasp_pose[:3, 0])
+
+
+def test_a_bar_that_is_too_thick_or_without_room_is_refused() -> None:
+    model = kv.load("kitchen")
+    model.include("fetch")
+    gripper, handle = find_gripper(model, "fetch"), find_handle(model, "kitchen/fridge_door")
+    with pytest.raises(
+        InvalidValueError, match="is 200 mm thick, and the gripper of fetch/gripper_link opens 102 mm"
+    ):
+        sample_grasps(model, gripper, replace(handle, thickness=0.2))
+    inside = handle.pose @ lie.translation(np.array([-0.06, 0.0, 0.0]))  # as if the bar were in the door
+    with pytest.raises(InvalidValueError, match=r"no room at .* collide: .* at kitchen/fridge_door \("):
+        sample_grasps(model, gripper, replace(handle, pose=inside))

@@ -74,16 +74,28 @@ class Part:
         between = other.middle - self.middle
         if np.linalg.norm(between) > np.linalg.norm(self.size) / 2 + np.linalg.norm(other.size) / 2 + _TOUCH:
             return False
+        if _gap_bound(self, other) > _TOUCH:
+            return False
         return find_widest_gap(self.placed, other.placed, np.zeros((0, 3)))[0] <= _TOUCH
 
 
-def find_parts(scene: Scene) -> list[Part]:
-    """Return the convex parts of the bodies of a scene, as they are placed."""
+def find_parts(scene: Scene, near: Array | None = None, radius: float = math.inf) -> list[Part]:
+    """Return the convex parts of the bodies of a scene, as they are placed.
+
+    Parameters
+    ----------
+    scene
+        The scene.
+    near, radius
+        A point (3,), and the distance [m] beyond which parts are left out.
+    """
     parts = []
     for item in scene.collision_world.objects:
         solid = item.make_solid()
         pose = scene.pose(item.body) @ item.shape.origin.matrix
-        parts.append(_make_part(item, solid, pose))
+        middle = pose[:3, :3] @ solid.centre + pose[:3, 3]
+        if near is None or np.linalg.norm(middle - near) <= radius + solid.radius:
+            parts.append(_make_part(item, solid, pose))
     return parts
 
 
@@ -94,7 +106,8 @@ def _make_part(item: CollisionObject, solid: Solid, pose: Array) -> Part:
         boxes.append(np.linalg.svd(corners - corners.mean(axis=0), full_matrices=False)[2].T)
     geometry = item.shape.geometry
     local = Part(item.body, item.number, geometry, solid, np.eye(4), boxes[0], np.zeros(3), np.zeros(3))
-    spans = [(local.extent(axes.T), -local.extent(-axes.T)) for axes in boxes]
+    spans = [(solid.centre + solid.half, solid.centre - solid.half)]
+    spans += [(local.extent(axes.T), -local.extent(-axes.T)) for axes in boxes[1:]]
     volumes = [float(np.prod(high - low)) for high, low in spans]
     k = 1 if volumes[-1] < 0.99 * volumes[0] else 0
     axes, (high, low) = boxes[k], spans[k]

@@ -114,7 +114,8 @@ def sample_grasps(
     """
     if handle.thickness + _SLACK > gripper.width:
         raise InvalidValueError(
-            f"The {handle} is too thick for the {gripper}. find_handles and find_grippers list others."
+            f"The handle {handle.frame} is {handle.thickness * 1e3:.0f} mm thick, and the gripper of "
+            f"{gripper.hand} opens {gripper.width * 1e3:.0f} mm. find_handles and find_grippers list others."
         )
     surroundings = _Surroundings(model, gripper, handle, tuple(decomposed))
     found: list[tuple[float, Grasp]] = []
@@ -180,9 +181,8 @@ class _Surroundings:
         middle = (scene.pose(handle.frame) @ handle.pose)[:3, 3]
         near: dict[str, list[int]] = {}
         pieces: list[Part] = []
-        for part in find_parts(scene):
-            if np.linalg.norm(part.middle - middle) - np.linalg.norm(part.size) / 2 < _NEAR:
-                near.setdefault(part.body, []).append(part.number)
+        for part in find_parts(scene, middle, _NEAR):
+            near.setdefault(part.body, []).append(part.number)
             if (part.body, part.number) == (handle.frame, handle.shape):
                 pieces.append(part)
         # Of a decomposed handle, the bar is the piece in its middle.
@@ -245,10 +245,13 @@ def _frames_of_robot(model: ModelView, gripper: Gripper) -> dict[str, None]:
 
 
 def _explain(gripper: Gripper, handle: Handle, hits: Counter[tuple[str, str]]) -> str:
+    others = "find_handles and find_grippers list others."
     if not hits:
-        return f"The {gripper} does not open wide enough for the {handle} from any side."
+        return f"The gripper of {gripper.hand} opens too little for {handle.frame} from any side. {others}"
     listed = ", ".join(f"{a} at {b} ({n}×)" for (a, b), n in hits.most_common(4))
     return (
-        f"The {gripper} has no room at the {handle}: all {sum(hits.values())} tries collide, {listed}. "
-        "find_handles and find_grippers list others."
+        f"The gripper of {gripper.hand} has no room at the handle {handle.frame}, which is "
+        f"{handle.thickness * 1e3:.0f} mm thick and has {handle.clearance * 1e3:.0f} mm free behind it. All "
+        f"{sum(hits.values())} grasps that were tried collide: {listed}. {others} Meshes are convex hulls: "
+        "decomposed= takes the bodies of which kineverse decompose has made several."
     )

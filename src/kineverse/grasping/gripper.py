@@ -143,7 +143,8 @@ def _search(model: ModelView, robot: str, srdf: Srdf | None) -> tuple[tuple[Grip
                 place = np.asarray(model.fk(gripper.hand)(model.default_state()))[:3, 3]
                 found.append(((rank, -round(gripper.width, 4), round(float(place[1]), 4)), gripper))
                 continue
-        why.append(f"At {palm.root}: {'; '.join(reasons)}.")
+        more = [f"and {len(reasons) - _MOST_LISTED} more"] if len(reasons) > _MOST_LISTED else []
+        why.append(f"At {palm.root}: {'; '.join(reasons[:_MOST_LISTED] + more)}.")
     found.sort(key=lambda entry: entry[0])
     return tuple(gripper for _, gripper in found), why
 
@@ -161,9 +162,17 @@ def _best_pair(model: ModelView, robot: str, palm: Palm, reasons: list[str]) -> 
             usable.update(dict.fromkeys(branch.frames, _STAND_IN))
     alone = HandModel(model, hand, usable, joints)
     root = np.asarray(model.fk(palm.root, hand)({}))[:3, 3]
+    branches = []
+    for branch in palm.branches:
+        size = np.linalg.norm(np.ptp(alone.box_corners(f for f in branch.frames if f in usable), axis=0))
+        if size < _LARGEST:
+            branches.append(branch)
+        else:
+            names = ", ".join(map(str, branch.joints))
+            reasons.append(f"{branch.root} is {size:.2g} m large, more than a finger ({names})")
     best: tuple[Pads, Branch, Branch] | None = None
-    for k, a in enumerate(palm.branches):
-        for b in palm.branches[k + 1 :]:
+    for k, a in enumerate(branches):
+        for b in branches[k + 1 :]:
             pads, reason = find_pads(model, alone, a, b, root)
             if pads is None:
                 names = ", ".join(map(str, dict.fromkeys((*a.joints, *b.joints))))
@@ -171,8 +180,8 @@ def _best_pair(model: ModelView, robot: str, palm: Palm, reasons: list[str]) -> 
             elif best is None or _reach(pads) > _reach(best[0]) + 1e-6:
                 best = pads, a, b
     if best is None:
-        if len(palm.branches) > 2:
-            reasons.insert(0, f"{len(palm.branches)} branches, of which no two are opposed fingers")
+        if len(branches) > 2:
+            reasons.insert(0, f"{len(branches)} branches, of which no two are opposed fingers")
         return None
     pads, *pair = best
     for branch in palm.branches:
@@ -196,6 +205,10 @@ def _best_pair(model: ModelView, robot: str, palm: Palm, reasons: list[str]) -> 
         remarks=tuple(problems),
     )
 
+
+_MOST_LISTED = 6
+_LARGEST = 0.5
+"""Diagonal of the box around a finger that is too large for one [m]."""
 
 _STAND_IN = Body(collisions=(Shape(Sphere(5e-4)),))
 """Ball at the origin of a frame, in place of shapes that cannot be read."""

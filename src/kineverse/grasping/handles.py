@@ -20,7 +20,7 @@ from kineverse.symbols import Symbol
 from .bars import Part, ProtrudingBar, find_bars, find_parts, free_length
 from .finger_pairs import path_to_root
 
-_FREE = 0.08
+_FREE = 0.15
 """Free space in front of a bar that a hand needs [m]."""
 _PART_OF_RANGE = 0.05
 _WITHIN = 0.5

@@ -5,13 +5,14 @@ All poses and points are in the frame of the hand [m].
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
 
 from kineverse import lie
-from kineverse.geometry import DistanceResult
+from kineverse.geometry import DistanceResult, RayHit
 from kineverse.lie import Array
 from kineverse.model.model_view import ModelView
 from kineverse.symbols import Symbol
@@ -24,7 +25,7 @@ _NEAR = 4e-3
 """Opening at which fingers count as nearly closed: their pads face each other there [m]."""
 _FLAT = 2e-3
 """Unevenness of a pad [m]."""
-_CELLS = 20
+_CELLS = 14
 _REACH = 0.3
 """Length of the rays from the middle to the pads [m]."""
 _ALIGNED = 0.85
@@ -158,41 +159,59 @@ def _approach(motion: _Motion, y: Array, outwards: Array) -> Array:
 
 
 def _measure(motion: _Motion, axes: Array, height: float) -> tuple[Pads | None, str]:
-    x, y, z = axes.T
     motion.place(motion.nearly_closed)
-    corners = [motion.alone.box_corners(frames) for frames in (motion.a, motion.b)]
-    low = np.max([c.min(axis=0) for c in (corner @ axes for corner in corners)], axis=0)
-    high = np.min([c.max(axis=0) for c in (corner @ axes for corner in corners)], axis=0)
-    for _ in range(2):  # the pads, and then these alone, finer
-        if (low >= high)[[0, 2]].any():
-            return None, "they do not face each other"
-        cells = motion.scan(axes, height, (np.array([low[0], high[0]]), np.array([low[2], high[2]])))
-        if not len(cells):
-            return None, "they do not face each other"
-        gaps = cells[:, 2] + cells[:, 3]
-        pad = cells[gaps <= gaps.min() + _FLAT]
-        step = (high - low)[[0, 2]] / _CELLS
-        low[[0, 2]] = np.maximum(low[[0, 2]], pad[:, :2].min(axis=0) - step)
-        high[[0, 2]] = np.minimum(high[[0, 2]], pad[:, :2].max(axis=0) + step)
-    middle = pad[np.argmin(np.linalg.norm(pad[:, :2] - pad[:, :2].mean(axis=0), axis=1))]
-    origin = middle[0] * x + height * y + middle[1] * z
-    hits = [motion.scene.ray(origin, -y, _REACH), motion.scene.ray(origin, y, _REACH)]
-    if hits[0] is None or hits[1] is None:
+    edges = _find_edges(motion, axes, height)
+    hits = None if edges is None else motion.face(axes, height, edges.mean(axis=0))
+    if edges is None or hits is None:
         return None, "they do not face each other"
-    centre = pad[:, :2].mean(axis=0) - middle[:2]
-    shift = centre[0] * x + centre[1] * z
-    points = [_in_frame(motion.scene.pose(hit.body), hit.point + shift) for hit in hits if hit]
+    y = axes[:, 1]
     frames = (hits[0].body, hits[1].body)
+    points = [_in_frame(motion.scene.pose(hit.body), hit.point) for hit in hits]
     parts = np.linspace(0.0, 1.0, _SAMPLES)
     tracked = motion.track(frames, points, parts)
     gap = (tracked[:, 1] - tracked[:, 0]) @ y
     if (np.diff(gap) > 1e-4).any() or gap[-1] > _STILL_OPEN * gap[0] or gap[0] > _WIDEST:
         return None, f"their gap goes from {gap[0] * 1e3:.0f} to {gap[-1] * 1e3:.0f} mm, as no gripper's does"
     stroke = np.column_stack([parts, gap, tracked.mean(axis=1)])
-    length, width = (np.ptp(pad[:, :2], axis=0) + step).tolist()
+    length, width = (edges[1] - edges[0]).tolist()
     fingers = (tuple(motion.a), tuple(motion.b))
     opened, closed = motion.values(0.0), motion.values(1.0)
     return Pads(fingers, frames, np.array(points), axes, (length, width), opened, closed, stroke), ""
+
+
+def _find_edges(motion: _Motion, axes: Array, height: float) -> Array | None:
+    """Return the least and largest x and z (2, 2) of the facing surfaces; None if there are none.
+
+    They are where the gap is nearly the least one: cells of a grid, whose borders are then bisected.
+    """
+    corners = [motion.alone.box_corners(frames) @ axes[:, [0, 2]] for frames in motion.tips]
+    low, high = (
+        np.max([c.min(axis=0) for c in corners], axis=0),
+        np.min([c.max(axis=0) for c in corners], axis=0),
+    )
+    if (low >= high).any():
+        return None
+    step = (high - low) / _CELLS
+    cells = [low + step * (np.array(k) + 0.5) for k in np.ndindex(_CELLS, _CELLS)]
+    gaps = np.array([motion.gap_at(axes, height, cell) for cell in cells])
+    if not np.isfinite(gaps).any():
+        return None
+    pad = np.array(cells)[gaps <= gaps.min() + _FLAT]
+    middle = pad[np.argmin(np.linalg.norm(pad - pad.mean(axis=0), axis=1))]
+    edges = np.stack([pad.min(axis=0), pad.max(axis=0)])
+    for side, sign in ((0, -1.0), (1, 1.0)):
+        for axis in (0, 1):
+            inside, outside = middle.copy(), middle.copy()
+            inside[axis] = edges[side, axis]
+            outside[axis] = edges[side, axis] + sign * step[axis]
+            if motion.gap_at(axes, height, inside) > gaps.min() + _FLAT:
+                continue  # not a rectangle: the cells are all that is known
+            for _ in range(8):
+                between = (inside + outside) / 2
+                is_pad = motion.gap_at(axes, height, between) <= gaps.min() + _FLAT
+                inside, outside = (between, outside) if is_pad else (inside, between)
+            edges[side, axis] = inside[axis]
+    return edges
 
 
 class _Motion:
@@ -273,21 +292,23 @@ class _Motion:
             rows.append([_at(self.scene.pose(f), p) for f, p in zip(frames, points, strict=True)])
         return np.array(rows)
 
-    def scan(self, axes: Array, height: float, spans: tuple[Array, Array]) -> Array:
-        """Return the cells (n, 4) where both fingers face the plane between them: x, z, both distances.
+    def face(self, axes: Array, height: float, place: Array) -> tuple[RayHit, RayHit] | None:
+        """Return where rays along -y and y hit the tips of the first and second finger, or None.
 
-        The plane is normal to y at a height. Rays are cast from it along -y to the first finger and along y
-        to the second.
+        They start at a place (x, z) in the plane normal to y at a height.
         """
         x, y, z = axes.T
-        cells = []
-        for u in _centres(spans[0]):
-            for w in _centres(spans[1]):
-                origin = u * x + height * y + w * z
-                hits = self.scene.ray(origin, -y, _REACH), self.scene.ray(origin, y, _REACH)
-                if hits[0] and hits[1] and hits[0].body in self.tips[0] and hits[1].body in self.tips[1]:
-                    cells.append((u, w, hits[0].distance, hits[1].distance))
-        return np.array(cells).reshape(-1, 4)
+        origin = place[0] * x + height * y + place[1] * z
+        first, second = self.scene.ray(origin, -y, _REACH), self.scene.ray(origin, y, _REACH)
+        if first is None or second is None:
+            return None
+        faces = first.body in self.tips[0] and second.body in self.tips[1]
+        return (first, second) if faces else None
+
+    def gap_at(self, axes: Array, height: float, place: Array) -> float:
+        """Return the length between these hits, infinite if there are none."""
+        hits = self.face(axes, height, place)
+        return math.inf if hits is None else hits[0].distance + hits[1].distance
 
     def turn(self, frame: str) -> Array:
         """Return the rotation vector (3,) of a frame from open to closed [rad]."""
@@ -301,11 +322,6 @@ def _tips(model: ModelView, frames: Sequence[str]) -> list[str]:
     """Return the frames on which none of the others moves."""
     inner = {f for g in frames for f in path_to_root(model, g) if f in frames and model.speeds_of(g, f)}
     return [f for f in frames if f not in inner]
-
-
-def _centres(span: Array) -> Array:
-    edges = np.linspace(span[0], span[1], _CELLS + 1)
-    return (edges[1:] + edges[:-1]) / 2
 
 
 def _at(pose: Array, point: Array) -> Array:
