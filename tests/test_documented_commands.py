@@ -105,7 +105,7 @@ def test_documented_commands_print_the_documented_output(page, at_the_root, page
             assert printed.out, command
         listed = words[1:] in ([], ["articulations"])
         shown = words[0] == "view" or "--view" in words
-        opened += shown and not listed and "--picture" not in words
+        opened += shown and not listed and not {"--picture", "--plot"} & {*words}
     assert pages == [(200, True)] * opened
 
 

@@ -9,10 +9,9 @@ import numpy as np
 import pytest
 
 import kineverse as kv
-from kineverse.articulations import OmniBase
+from cupboards import cupboard, state
 from kineverse.errors import DuplicateNameError, InvalidValueError, UnknownNameError
 from kineverse.lie import inverse, log_so3
-from kineverse.model.body import Body, Box, Pose, Shape
 from kineverse.worlds import Contact, Observation, Sensors, SensorSampler
 
 NOISY = Sensors.parse(
@@ -20,34 +19,9 @@ NOISY = Sensors.parse(
 )
 
 
-def box(*size: float, at: tuple[float, float, float] = (0, 0, 0)) -> Body:
-    pose = np.eye(4)
-    pose[:3, 3] = at
-    return Body(collisions=(Shape(Box(size), Pose.from_matrix(pose)),))
-
-
 @pytest.fixture(scope="module")
 def model() -> kv.Model:
-    """A base with a head 1 m up, before a cupboard at x = 2 with a door, behind which is a drawer."""
-    model = kv.Model()
-    door, drawer, pan = (kv.position(name) for name in ("cupboard/door", "cupboard/drawer", "robot/pan"))
-    with model.edit() as edit:
-        edit.apply(OmniBase(name="robot/base", parent="world", child="robot/base"))
-        edit.add_frame("robot/neck", "robot/base", kv.translation(0, 0, 1), body=box(0.2, 0.2, 0.2))
-        edit.add_frame("robot/head_tilt_link", "robot/neck", kv.rotation_z(pan), body=box(0.1, 0.1, 0.1))
-        edit.add_frame("cupboard", "world", kv.translation(2, 0, 1), body=box(0.02, 1, 1, at=(0.5, 0, 0)))
-        edit.add_frame("cupboard/hinge", "cupboard", kv.translation(0, 0.5, 0) @ kv.rotation_z(-door))
-        edit.add_frame("cupboard/panel", "cupboard/hinge", np.eye(4), body=box(0.02, 1, 1, at=(0, -0.5, 0)))
-        edit.add_frame(
-            "cupboard/drawer", "cupboard", kv.translation(0.3 - drawer, 0, 0), body=box(0.2, 0.2, 0.2)
-        )
-        edit.add_frame("wall", "world", kv.translation(4, 0, 1), body=box(0.1, 1, 1))
-        edit.constrain("cupboard/door/range", 0, door, 2)
-    return model
-
-
-def state(model: kv.Model, **values: float) -> kv.State:
-    return model.default_state().updated({name.replace("__", "/"): v for name, v in values.items()})
+    return cupboard()
 
 
 def readings(sampler: SensorSampler, at: kv.State, count: int, step: float = 1 / 30) -> list[Observation]:
@@ -106,7 +80,7 @@ def test_outliers_fill_a_cube_about_the_marker(model):
 def test_odometry_drifts_with_the_way_not_with_the_steps(model, steps):
     """After 2 m straight ahead: sd of x and heading = settings times √2; y has what the heading adds."""
     ends = []
-    for seed in range(150):
+    for seed in range(100):
         sampler = SensorSampler(Sensors(odometry=0.02, turn=0.03), model, "robot", seed)
         for k in range(steps + 1):
             seen = sampler.observe(0.1 * k, state(model, robot__base__x=2 * k / steps))

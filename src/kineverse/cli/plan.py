@@ -17,13 +17,13 @@ from kineverse.cli.output import format_table, show_activity
 from kineverse.cli.plan_arguments import (
     FrameTarget,
     Request,
+    add_robot_option,
     choose_coordinates,
+    include_robot,
     make_grip,
     make_hold,
     parse_frame_target,
     parse_request,
-    parse_robot,
-    place_base,
 )
 from kineverse.cli.view import (
     add_page_options,
@@ -92,11 +92,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         dest="start",
         help="the same, or a JSON file of values; the default state",
     )
-    parser.add_argument(
-        "--robot",
-        metavar="ROBOT[@X,Y,ANGLE]",
-        help="a robot that is put into the model, by name or file, and the place of its base",
-    )
+    add_robot_option(parser)
     parser.add_argument(
         "--move",
         nargs="+",
@@ -234,11 +230,7 @@ def _prepare(
         standing: dict[kv.Symbol, float] = {}
         robot = next(iter(model.frames), "").partition("/")[0]
         if arguments.robot is not None:
-            source, place = parse_robot(arguments.robot)
-            before = {*model.articulations}
-            names = model.include(source, root=arguments.root, strict=arguments.strict, loops=arguments.loops)
-            standing = place_base(model, [a for a in model.articulations if a not in before], place)
-            robot = next((n.partition(" ")[2].partition("/")[0] for n in names if "/" in n), "")
+            robot, standing = include_robot(arguments, model)
     srdf = None if arguments.srdf is None else read_srdf(arguments.srdf, model, _srdf_prefix(model, robot))
     for line in () if srdf is None else srdf.warnings[:3]:
         print(f"kineverse: note: {arguments.srdf}: {line}", file=sys.stderr)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import argparse
 import json
 import math
 from collections.abc import Iterable, Mapping
@@ -137,6 +138,30 @@ def parse_frame_target(word: str, option: str) -> FrameTarget:
     position_only = len(parts) == 3 and not plus
     numbers = tuple(parse_value(part) for part in parts)
     return FrameTarget(frame, target, numbers, mask or ("xyz" if position_only else _ALL))
+
+
+def add_robot_option(parser: argparse.ArgumentParser) -> None:
+    """Add ``--robot`` to a command."""
+    parser.add_argument(
+        "--robot",
+        metavar="ROBOT[@X,Y,ANGLE]",
+        help="a robot that is put into the model, by name or file, and the place of its base",
+    )
+
+
+def include_robot(arguments: argparse.Namespace, model: kv.Model) -> tuple[str, dict[kv.Symbol, float]]:
+    """Put the robot of ``--robot`` into a model, and return its prefix and the place of its base by symbol.
+
+    Raises
+    ------
+    KineverseError
+        If it cannot be loaded, or has no mobile base that could be placed.
+    """
+    source, place = parse_robot(arguments.robot)
+    before = {*model.articulations}
+    names = model.include(source, root=arguments.root, strict=arguments.strict, loops=arguments.loops)
+    standing = place_base(model, [a for a in model.articulations if a not in before], place)
+    return next((n.partition(" ")[2].partition("/")[0] for n in names if "/" in n), ""), standing
 
 
 def parse_robot(text: str) -> tuple[str, tuple[float, float, float] | None]:

@@ -101,6 +101,7 @@ def picture(
     near: float | None = None,
     decomposed: bool = False,
     overlay: Sequence[Drawable] = (),
+    over: Sequence[Drawable] = (),
 ) -> npt.NDArray[np.uint8]:
     """Return a picture of a model as (height, width, 3) bytes.
 
@@ -126,6 +127,8 @@ def picture(
         True to use the hulls of decomposed meshes for collision shapes and lines.
     overlay
         Further parts on frames of the model, such as spheres, as transparent as their colours.
+    over
+        Further parts that are drawn over the others, even if they are behind them, such as arrows.
 
     Raises
     ------
@@ -147,13 +150,13 @@ def picture(
     scene = TriangleSoup.from_drawables(items, at)
     if camera is None:
         camera = choose_camera(scene, weigh_drawables(model, items), at, width / height)
-    over: list[Drawable] = []
+    front = list(over)
     if frames or not len(scene.corners):
-        over += create_axes(model, scene.corners, at)
+        front += create_axes(model, scene.corners, at)
     if found is not None:
         length = ARROW * camera.height
-        over += create_marker_drawables(ProximityMarkers.from_result(found, length), length)
-    return _draw(scene, TriangleSoup.from_drawables(over, at), size, camera)
+        front += create_marker_drawables(ProximityMarkers.from_result(found, length), length)
+    return _draw(scene, TriangleSoup.from_drawables(front, at), size, camera)
 
 
 def draw_picture(

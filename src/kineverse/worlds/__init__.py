@@ -1,8 +1,20 @@
 """Worlds in which skills are tried: they know nothing of controllers (layer 5)."""
 
 from .mujoco_world import MujocoWorld
+from .recorder import Recorder
+from .recording import RunRecording, read_run_recording
 from .sensor_sampler import SensorSampler
 from .sensors import Sensors
 from .world import Contact, Observation, World
 
-__all__ = ["Contact", "MujocoWorld", "Observation", "SensorSampler", "Sensors", "World"]
+__all__ = [
+    "Contact",
+    "MujocoWorld",
+    "Observation",
+    "Recorder",
+    "RunRecording",
+    "SensorSampler",
+    "Sensors",
+    "World",
+    "read_run_recording",
+]
