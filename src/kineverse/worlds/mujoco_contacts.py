@@ -69,6 +69,19 @@ class MujocoContacts:
             for (a, b), (point, normal, distance, force) in found.items()
         )
 
+    def largest_force(self, data: Any) -> float:
+        """Return the largest normal force between a body of the robot and another body [N]."""
+        if not data.ncon:
+            return 0.0
+        contact = data.contact
+        bodies: Array = self._compiled.geom_bodyid[contact.geom]
+        wanted = (self._is_robot[bodies].sum(axis=1) == 1) & (contact.efc_address >= 0)
+        if not wanted.any():
+            return 0.0
+        pairs = np.sort(bodies[wanted], axis=1) @ (self._compiled.nbody, 1)
+        forces = data.efc_force[contact.efc_address[wanted]]
+        return float(np.bincount(np.unique(pairs, return_inverse=True)[1], forces).max())
+
     def grip(self, data: Any) -> dict[str, tuple[float, float]]:
         """Return the normal forces of both fingers by what they touch [N].
 

@@ -199,6 +199,14 @@ class MujocoWorld:
         """Number of commands since the last reset that were stale when they came."""
         return self._refused
 
+    @property
+    def peak_force(self) -> float:
+        """Largest normal force between the robot and another body in all steps of the last apply [N].
+
+        :meth:`contacts` has the forces of the last step alone, so it may miss a short blow.
+        """
+        return self._peak_force
+
     def reset(self, state: StateLike) -> None:
         """Start anew from a state, at time 0, with nothing in the gripper and all speeds zero."""
         qpos = self._coordinates.positions(state)
@@ -206,7 +214,7 @@ class MujocoWorld:
         engine.mj_resetData(self._compiled, data)
         data.qpos[:] = qpos
         engine.mj_forward(self._compiled, data)
-        self._ticks, self._end, self._refused, self._moving = 0, 0.0, 0, False
+        self._ticks, self._end, self._refused, self._peak_force = 0, 0.0, 0, 0.0
         self._speeds = np.zeros(len(self._map.speeds))
         self._commands: deque[_Command] = deque()
         self._active: _Command | None = None
@@ -259,8 +267,10 @@ class MujocoWorld:
         self._end = now + length
         if self._drive is not None:
             self._drive.update_limits(self._data)
+        self._peak_force = 0.0
         while self.time < self._end - _ROUNDING:
             self._advance()
+            self._peak_force = max(self._peak_force, self._contacts.largest_force(self._data))
 
     def contacts(self) -> tuple[Contact, ...]:
         """Return the bodies of the robot that touch something else, and those of furniture that collide."""
