@@ -26,6 +26,7 @@ from urdf_texts import SHARED
 import kineverse as kv
 from hypothesis_profiles import attempts
 from kineverse.model.body import Body, Box, Ellipsoid, Inertia, Mesh, Shape
+from kineverse.model.operations import SetBody
 
 FILES = readable_urdf_files()
 
@@ -263,3 +264,26 @@ def test_models_read_from_documents_are_written_alike(name: str, tmp_path: Path)
             assert errors[1].angle == pytest.approx(errors[0].angle, rel=1e-3)
             if not options:  # else a sum of two motions may have been one, and names differ
                 assert_same_motion(expected, kv.load(tmp_path / "m.xml"))
+
+
+def test_springs_of_mechanisms_reach_the_joints_they_act_on(tmp_path: Path) -> None:
+    saved = load_cached("articulations/latch").save(tmp_path / "m.xml")
+    assert not any("stiffness" in remark for remark in saved.remarks)
+    bolt = dict(kv.load(tmp_path / "m.xml").articulations["latch/gate/bolt"].dynamics)
+    assert (bolt["spring_stiffness"], bolt["spring_reference"]) == (300.0, -0.01)
+
+
+def test_joints_that_follow_carry_force(tmp_path: Path) -> None:
+    """Forces of 50 N and -100 N balance through a joint that moves half as far."""
+    with (model := kv.Model()).edit() as edit:
+        for name, q in (("motor", None), ("finger", 0.5 * kv.position("motor"))):
+            edit.apply(kv.Prismatic(name=name, parent="world", child=name, position=q, lower=-1, upper=1))
+            edit.apply(SetBody(name, Body(inertia=Inertia(0.2, (1e-4, 0, 0, 1e-4, 0, 1e-4)))))
+    model.save(tmp_path / "m.xml")
+    compiled = mujoco.MjModel.from_xml_path(str(tmp_path / "m.xml"))
+    compiled.opt.gravity[:], compiled.dof_damping[:] = 0.0, 1.0
+    data = mujoco.MjData(compiled)
+    data.qfrc_applied[:] = 50.0, -100.0
+    mujoco.mj_step(compiled, data, 500)
+    assert np.abs(data.qvel).max() < 1e-6
+    assert abs(data.qpos[1] - 0.5 * data.qpos[0]) < 3e-4

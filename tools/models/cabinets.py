@@ -115,9 +115,20 @@ def _sliding(d: Description, name: str, parent: str, at: Vector, shapes: list[Sh
 
 
 def flap(
-    d: Description, name: str, parent: str, shapes: list[Shape], *, z: float, bar: tuple[float, float]
+    d: Description,
+    name: str,
+    parent: str,
+    shapes: list[Shape],
+    *,
+    z: float,
+    bar: tuple[float, float],
+    friction: float,
+    damping: float,
 ) -> None:
-    """Add a door that opens downwards about its lower edge, .032 before the front plane at height `z`."""
+    """Add a door that opens downwards about its lower edge, .032 before the front plane at height `z`.
+
+    Its spring, which a URDF cannot say, is in `kineverse.shipped.springs`.
+    """
     d.moving(
         name,
         parent,
@@ -128,6 +139,8 @@ def flap(
         limits=(0, pi / 2),
         velocity=1.5,
         effort=60,
+        friction=friction,
+        damping=damping,
     )
     handle(d, name, (0.011, 0, bar[0]), bar[1])
 

@@ -27,6 +27,8 @@ class Joint:
     velocity: float = 0.0
     effort: float = 0.0
     mimic: tuple[str, float, float] | None = None
+    friction: float = 0.0
+    damping: float = 0.0
 
 
 @dataclass(frozen=True)
@@ -84,11 +86,12 @@ class Description:
         rpy: Vector = ZERO,
         joint: str | None = None,
         mimic: tuple[str, float, float] | None = None,
+        friction: float = 0.0,
+        damping: float = 0.0,
     ) -> None:
         """Add a link that slides or turns about `axis`; the joint takes the link's name if it has none."""
-        self._add(
-            link, shapes, Joint(joint or link, kind, parent, at, rpy, axis, limits, velocity, effort, mimic)
-        )
+        name, motion = joint or link, (axis, limits, velocity, effort, mimic, friction, damping)
+        self._add(link, shapes, Joint(name, kind, parent, at, rpy, *motion))
 
     def _add(self, name: str, shapes: Iterable[Shape], joint: Joint) -> None:
         shapes = tuple(shapes)
@@ -161,6 +164,9 @@ def _joint_lines(child: str, joint: Joint) -> list[str]:
             span = f'lower="{_number(joint.limits[0])}" upper="{_number(joint.limits[1])}" '
         speed, effort = _number(joint.velocity), _number(joint.effort)
         lines.append(f'    <limit {span}velocity="{speed}" effort="{effort}"/>')
+    if joint.friction or joint.damping:
+        damping, friction = _number(joint.damping), _number(joint.friction)
+        lines.append(f'    <dynamics damping="{damping}" friction="{friction}"/>')
     if joint.mimic:
         master, factor, offset = joint.mimic
         lines.append(

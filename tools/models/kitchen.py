@@ -144,7 +144,8 @@ def _sink_area(d: Description) -> None:
         slab((-0.031, -0.029), (-0.26, 0.26), (0.03, height - 0.10), "steel"),
         *for_the_eye([slab((0.011, 0.012), (0.16, 0.26), (height - 0.052, height - 0.032), "glow")]),
     ]
-    flap(d, "dishwasher_door", "dishwasher", shapes, z=z[0] + hinge, bar=(height - 0.09, 0.40))
+    bar = (height - 0.09, 0.40)
+    flap(d, "dishwasher_door", "dishwasher", shapes, z=z[0] + hinge, bar=bar, friction=6, damping=2)
 
     d.section("Sink and tap")
     shapes = open_box(
@@ -214,7 +215,7 @@ def _oven_area(d: Description) -> None:
         slab((-0.029, 0.011), (half - 0.07, half), (low + 0.07, high - 0.10), "steel"),
         slab((-0.012, 0.008), (-half + 0.07, half - 0.07), (low + 0.07, high - 0.10), "smoked_glass"),
     ]
-    flap(d, "oven_door", "oven", shapes, z=z[0] + hinge, bar=(high - 0.05, 0.44))
+    flap(d, "oven_door", "oven", shapes, z=z[0] + hinge, bar=(high - 0.05, 0.44), friction=3, damping=1)
     knob(d, "oven_knob", "oven", (0.04, 0.17, panel + 0.06), radius=0.026)
 
 

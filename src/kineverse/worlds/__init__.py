@@ -2,6 +2,7 @@
 
 from .judge import Judge
 from .kinematic_world import Event, KinematicWorld
+from .mujoco_world import MujocoWorld
 from .recorder import Recorder
 from .recording import RunRecording, read_run_recording
 from .sensor_sampler import SensorSampler
@@ -13,6 +14,7 @@ __all__ = [
     "Event",
     "Judge",
     "KinematicWorld",
+    "MujocoWorld",
     "Observation",
     "Recorder",
     "RunRecording",

@@ -189,6 +189,7 @@ class LinkTreeBuilder:
         self._refused_symbols: set[Symbol] = set()
         self._left_out = check_left_out_names(leave_out, model)
         self._articulations = {record.child: name for name, record in _non_loop_articulations(model)}
+        self._owners = {s: r for _, r in _non_loop_articulations(model) for s in r.coordinates}
         self._values: dict[Symbol, Expression] = {}
         self._terms = TermGraph({})
         self._quaternions = dict(find_quaternions(model))
@@ -368,7 +369,6 @@ class LinkTreeBuilder:
         """Return the link of a frame, with a joint for each of its motions."""
         record = self._articulation_of(name)
         label = self._articulations.get(name, name)
-        dynamics = dict(record.dynamics) if record is not None else {}
         follows = None
         if record is not None and record.follows is not None:
             position = self.resolve(record.follows)
@@ -393,13 +393,40 @@ class LinkTreeBuilder:
                 # The limits of an articulation are on the position that it states, not on the opposite one.
                 axis, coefficients = _negative(axis), opposite
             made.append(JointDescription(own, motion.is_rotation, axis, motion.point, symbol, coefficients))
-        given = _split_dynamics(dynamics, made)
-        made = [replace(joint, dynamics=own) for joint, own in zip(made, given, strict=True)]
+        made = [replace(joint, dynamics=self._dynamics_of(joint, record, len(made))) for joint in made]
         body = self.model.bodies.get(name, NO_BODY)
         fixed = "" if made else joints.take(label, name, f"{name}/fixed")
         return LinkDescription(
             name, self.model.frames[name].parent, found.pose, made, body, fixed, record is not None
         )
+
+    def _dynamics_of(
+        self, joint: JointDescription | BallJointDescription, record: Articulation | None, count: int
+    ) -> dict[str, object]:
+        """Return the dynamics of a joint: those of its articulation, or those under the joint's last name.
+
+        Parameters
+        ----------
+        joint
+            The joint.
+        record
+            Articulation of the link; a mechanism may also move other links.
+        count
+            Number of joints of the link.
+        """
+        if isinstance(joint, BallJointDescription):
+            is_only = count == 1
+        elif joint.is_independent:
+            record = self._owners.get(joint.symbol, record)
+            is_only = record is not None and len(record.coordinates) <= 1
+        else:
+            is_only = count == 1 and record is not None and not record.coordinates
+        if record is None:
+            return {}
+        if is_only:
+            return dict(record.dynamics)
+        start = f"{joint.name.rpartition('/')[2]}/"
+        return {k.removeprefix(start): v for k, v in record.dynamics if k.startswith(start)}
 
     def _carrier_links(
         self,
@@ -469,19 +496,6 @@ def _quaternion_coordinates(found: MotionChain) -> Iterator[Symbol]:
     for motion in found.motions:
         if isinstance(motion, QuaternionMotion):
             yield from motion.factor.symbols
-
-
-def _split_dynamics(
-    dynamics: dict[str, object], joints: list[JointDescription | BallJointDescription]
-) -> list[dict[str, object]]:
-    """Return the dynamics of each joint: all of them for a single joint, else those under its last name."""
-    if len(joints) == 1:
-        return [dynamics]
-    result = []
-    for joint in joints:
-        start = f"{joint.name.rpartition('/')[2]}/"
-        result.append({k.removeprefix(start): v for k, v in dynamics.items() if k.startswith(start)})
-    return result
 
 
 def _negative(axis: tuple[float, float, float]) -> tuple[float, float, float]:

@@ -34,7 +34,7 @@ def mujoco() -> Any:
         import mujoco as package
     except ImportError as error:
         raise MissingDependencyError(
-            f"Reading MJCF needs MuJoCo's parser: {install_command('mjcf')}"
+            f"MJCF and worlds with physics need MuJoCo: {install_command('mjcf')}"
         ) from error
     return package
 

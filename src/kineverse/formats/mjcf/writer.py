@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Collection, Iterable, Mapping
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -49,6 +50,8 @@ _AXES = ((1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0))
 _MAX_BODY_DOFS = 6
 _ARMATURE = 1e-3
 """Armature [kg m²] or [kg] of dependent joints in links with many joints; avoids singular inertia."""
+_TIE_SOLREF, _TIE_SOLIMP = (0.004, 1.0), (0.99, 0.999, 0.001)
+"""Equalities of dependent joints: with MuJoCo's default, a mimic joint gives way under load."""
 _QUATERNION = ("qx", "qy", "qz", "qw")
 _DYNAMICS = {
     "damping": "damping",
@@ -56,6 +59,8 @@ _DYNAMICS = {
     "armature": "armature",
     "spring_stiffness": "stiffness",
     "spring_reference": "springref",
+    "stiffness": "stiffness",
+    "rest": "springref",
 }
 
 
@@ -65,6 +70,7 @@ def to_mjcf(
     leave_out: Iterable[str] = (),
     tolerance: float | None = None,
     strict: bool = False,
+    visuals: bool = True,
 ) -> WrittenFile:
     """Convert a model to MJCF.
 
@@ -81,6 +87,8 @@ def to_mjcf(
     strict
         If True, constraints that MJCF cannot represent are errors. Otherwise they are left out, with a
         remark.
+    visuals
+        False to leave out the visual shapes.
 
     Raises
     ------
@@ -90,6 +98,8 @@ def to_mjcf(
     """
     builder = LinkTreeBuilder(model, MJCF_CAPABILITIES, leave_out, tolerance, strict)
     description = builder.build()
+    if not visuals:
+        _drop_visuals(description)
     home = {s.path: v for s, v in builder.home_positions().items()}
     unsupported, remarks = builder.unsupported, description.remarks
     excluded: dict[str, str] = {}
@@ -113,6 +123,13 @@ def to_mjcf(
         if file is None or file in excluded:
             raise FormatError(f"MuJoCo does not open what would be written: {error}.")
         excluded[file] = error
+
+
+def _drop_visuals(description: RobotDescription) -> None:
+    """Remove the visual shapes of all bodies."""
+    description.world_body = replace(description.world_body, visuals=())
+    for link in description.links:
+        link.body = replace(link.body, visuals=())
 
 
 class MjcfWriter:
@@ -284,6 +301,8 @@ class MjcfWriter:
                     joint1=joint.name,
                     joint2=joint.symbol.path,
                     polycoef=coefficients,
+                    solref=_TIE_SOLREF,
+                    solimp=_TIE_SOLIMP,
                 )
         for frame in dict.fromkeys(
             end for loop in self._description.loops for pair in loop.ends for end in pair

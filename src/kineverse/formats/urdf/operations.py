@@ -8,6 +8,7 @@ operations name the elements: ``joint pr2/l_elbow_flex_joint``, ``body pr2/l_elb
 from __future__ import annotations
 
 from collections.abc import Callable, Container, Iterable, Iterator
+from dataclasses import replace
 from typing import Any
 
 from kineverse.articulations import (
@@ -33,6 +34,7 @@ from kineverse.model.operation import Operation
 from kineverse.model.operations import AddFrame, SetBody, SoftLimits
 from kineverse.model.registry import FileContent
 from kineverse.shipped.bases import mobile_base
+from kineverse.shipped.springs import joint_spring
 from kineverse.symbols import position
 
 from .reader import parse_urdf
@@ -51,13 +53,20 @@ _ROOT = Pose()
 
 
 def urdf_file_operations(file: FileContent) -> Iterator[tuple[str, Operation]]:
-    """Yield the operations of a URDF file, each with its tag; a shipped robot has its mobile base first."""
+    """Yield the operations of a URDF file, each with its tag.
+
+    A shipped robot has its mobile base first, and joints of shipped models have their springs.
+    """
     robot = parse_urdf(file.content, file.path.name, str(file.path.absolute().parent), file.root, file.strict)
     base = mobile_base(file.shipped, file.prefix) if file.shipped else None
     if base is not None:
         yield base.default_tag(), base
     parent = WORLD if base is None else base.child
+    joints = f"{file.prefix}/" if file.prefix else ""
     for operation in urdf_operations(robot, file.prefix, parent, file.strict):
+        if file.shipped and isinstance(operation, JointOperation):
+            spring = joint_spring(file.shipped, operation.name.removeprefix(joints))
+            operation = replace(operation, dynamics=(*operation.dynamics, *spring))
         yield operation.default_tag(), operation
 
 

@@ -1,0 +1,273 @@
+"""Models as MuJoCo specifications: joints with friction, contacts, servos, and excluded pairs of bodies."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from kineverse.errors import FormatError
+from kineverse.formats.export.capabilities import UnsupportedError
+from kineverse.formats.mjcf.mujoco_api import capture_mujoco_warnings, mujoco
+from kineverse.formats.mjcf.writer import to_mjcf
+from kineverse.geometry.collision_filter import allowed_pairs, read_rules
+from kineverse.model.model_view import ModelView
+
+from .mujoco_coordinates import MujocoCoordinates
+
+CURVE_TOLERANCE = 0.01
+"""Largest error of a frame [m], [rad] where a joint follows a curve, which MuJoCo has as a polynomial."""
+_DRAWER = 3.0, 5.0
+_DOOR = 1.0, 1.0
+_KNOB = 0.02, 0.02
+"""Friction [N], [N m] and damping [N s/m], [N m s] of furniture that states neither."""
+_KNOB_MASS = 1.0
+_DENSITY, _MESH_MASS = 500.0, 0.5
+"""Assumed density of bodies without inertia [kg/m³], and mass of a mesh [kg], whose volume is not known."""
+_CONDIM = 6
+_STIFF_SOLIMP = (0.99, 0.999, 0.001)
+"""Impedance of limits, ties and friction in joints; MuJoCo's default gives way by some 10 %."""
+_FOLDER = Path("/")
+
+
+def export_spec(model: ModelView, leave_out: Iterable[str], remark: Callable[[str], None]) -> Any:
+    """Return a model as an ``MjSpec``, without its visual shapes.
+
+    A motion along a curve is approximated within :data:`CURVE_TOLERANCE`.
+
+    Raises
+    ------
+    FormatError
+        Naming all that MuJoCo cannot move.
+    """
+    engine, path, names = mujoco(), _FOLDER / "world.xml", tuple(leave_out)
+    try:
+        written = to_mjcf(model, path, names, visuals=False)
+    except UnsupportedError:
+        written = to_mjcf(model, path, names, CURVE_TOLERANCE, visuals=False)
+    for text in written.remarks:
+        remark(text)
+    for frame, error in written.errors.items():
+        remark(f"'{frame}' moves by a polynomial in place of a curve, off by {error} at most")
+    with capture_mujoco_warnings():
+        spec = engine.MjSpec.from_string(written.content.decode())
+    companions = {
+        path.relative_to(_FOLDER).as_posix(): data for path, data in written.companion_files.items()
+    }
+    spec.assets = companions
+    for mesh in spec.meshes:
+        if mesh.file not in companions:
+            mesh.file = str(_FOLDER / mesh.file)
+    return spec
+
+
+def compile_world(spec: Any) -> Any:
+    """Return the ``MjModel`` of a specification.
+
+    Raises
+    ------
+    FormatError
+        With the reason that MuJoCo gives.
+    """
+    engine = mujoco()
+    with capture_mujoco_warnings():
+        try:
+            return spec.compile()
+        except (ValueError, RuntimeError, engine.FatalError, engine.UnexpectedError) as error:
+            raise FormatError(f"MuJoCo does not take the world: {error}") from None
+
+
+def rigid_parts(body: Any) -> list[Any]:
+    """Return a body of a specification and all below it that do not move in it."""
+    parts = [body]
+    for part in parts:
+        parts += [child for child in part.bodies if not child.joints]
+    return parts
+
+
+def add_masses(spec: Any, remark: Callable[[str], None]) -> None:
+    """Give moving bodies without inertia that of their collision shapes."""
+    engine, assumed = mujoco(), []
+    for body in spec.bodies:
+        parts = rigid_parts(body) if body.joints else []
+        if not parts or any(part.explicitinertial and part.mass > 0 for part in parts):
+            continue
+        geoms = [geom for part in parts for geom in part.geoms]
+        for geom in geoms:
+            if geom.type == engine.mjtGeom.mjGEOM_MESH:
+                geom.mass = _MESH_MASS
+            else:
+                geom.mass, geom.density = math.nan, _DENSITY
+        for part in parts:
+            part.explicitinertial = False
+        if geoms:
+            assumed.append(body.name)
+    if assumed:
+        remark(
+            f"{', '.join(assumed)} {'has' if len(assumed) == 1 else 'have'} no inertia: that of the "
+            f"collision shapes is taken, of {_DENSITY:g} kg/m³, and {_MESH_MASS:g} kg for a mesh"
+        )
+
+
+def remark_missing_shapes(spec: Any, robot: Callable[[str], bool], remark: Callable[[str], None]) -> None:
+    """Remark on moving furniture without collision shapes, which nothing can touch."""
+    moving = [body for body in spec.bodies if body.joints and not robot(body.name)]
+    names = [body.name for body in moving if not any(part.geoms for part in rigid_parts(body))]
+    if names:
+        remark(f"nothing can touch {', '.join(names)}: without collision shapes")
+
+
+def add_joint_friction(
+    spec: Any,
+    compiled: Any,
+    coordinates: Iterable[str],
+    friction: Mapping[str, float],
+    remark: Callable[[str], None],
+) -> None:
+    """Give friction and damping to the joints of furniture.
+
+    Parameters
+    ----------
+    spec, compiled
+        The specification, and its ``MjModel`` without friction.
+    coordinates
+        Names of the coordinates of furniture.
+    friction
+        Friction by coordinate [N], [N m], in place of that of the model.
+    remark
+        Receives the assumptions.
+    """
+    engine = mujoco()
+    assumed: dict[str, list[str]] = {}
+    for name in coordinates:
+        joint = spec.joint(name)
+        if joint is None or joint.type not in (engine.mjtJoint.mjJNT_SLIDE, engine.mjtJoint.mjJNT_HINGE):
+            continue
+        if not np.any(joint.damping) and not joint.frictionloss:
+            body = compiled.jnt_bodyid[compiled.joint(name).id]
+            slides = joint.type == engine.mjtJoint.mjJNT_SLIDE
+            light = compiled.body_subtreemass[body] < _KNOB_MASS
+            given = _DRAWER if slides else _KNOB if light else _DOOR
+            joint.frictionloss = given[0]
+            joint.damping = _like(joint.damping, given[1])
+            units = ("N", "N s/m") if slides else ("N m", "N m s")
+            what = f"friction {given[0]:g} {units[0]} and damping {given[1]:g} {units[1]}"
+            assumed.setdefault(what, []).append(name)
+        # With MuJoCo's default a door creeps although friction holds it.
+        stiff = _solref(spec), _STIFF_SOLIMP
+        joint.solref_friction[:2], joint.solimp_friction[:3] = stiff
+        if name in friction:
+            joint.frictionloss = friction[name]
+            remark(f"'{name}' has the friction {friction[name]:g}, as asked for")
+    for what, names in assumed.items():
+        remark(f"{what} are assumed, as the model states none: {', '.join(names)}")
+
+
+def add_tipping_springs(spec: Any, model: ModelView, remark: Callable[[str], None]) -> None:
+    """Give a mechanism the spring that tips at an angle: τ = stiffness (q - tipping), weight included.
+
+    The parts that it moves have no weight of their own then.
+    """
+    for name, record in model.articulations.items():
+        known = dict(record.dynamics)
+        stiffness, tipping = known.get("spring/stiffness"), known.get("spring/tipping")
+        joint = spec.joint(record.coordinates[0].path) if len(record.coordinates) == 1 else None
+        if joint is None or not isinstance(stiffness, (int, float)) or not isinstance(tipping, (int, float)):
+            continue
+        joint.stiffness, joint.springref = _like(joint.stiffness, -float(stiffness)), float(tipping)
+        for frame in model.frames:
+            if record.coordinates[0] in model.symbols_of(frame):
+                spec.body(frame).gravcomp = 1.0
+        remark(f"'{name}' has its spring, which includes the weight of what it moves: gravity does not act")
+
+
+def add_contact_rules(
+    spec: Any,
+    model: ModelView,
+    fingers: Iterable[Sequence[str]],
+    friction: float,
+    remark: Callable[[str], None],
+) -> None:
+    """Set the stiffness of constraints and exclude the pairs of bodies that a scene does not check.
+
+    Parameters
+    ----------
+    spec
+        The specification.
+    model
+        The model.
+    fingers
+        Frames of each finger, whose contacts have six dimensions: they resist turning, too.
+    friction
+        Coefficient of sliding friction.
+    remark
+        Receives the assumptions.
+    """
+    engine, held = mujoco(), {name for finger in fingers for name in finger}
+    for body in spec.bodies:
+        for geom in body.geoms:
+            geom.friction[0] = friction
+            if body.name in held:
+                geom.condim, geom.priority = _CONDIM, 1
+    option = spec.option
+    option.cone, option.impratio = engine.mjtCone.mjCONE_ELLIPTIC, 10.0
+    option.integrator = engine.mjtIntegrator.mjINT_IMPLICITFAST
+    bodies = [body.name for body in spec.bodies if body.geoms and body.name in model.frames]
+    checked = allowed_pairs(model, bodies, read_rules(model))
+    for i, k in zip(*np.nonzero(np.triu(1 - checked, 1)), strict=True):
+        spec.add_exclude(bodyname1=bodies[i], bodyname2=bodies[k])
+    solref = _solref(spec)
+    for joint in spec.joints:
+        joint.solref_limit[:2], joint.solimp_limit[:3] = solref, _STIFF_SOLIMP
+    for tie in spec.equalities:
+        tie.solref[:2], tie.solimp[:3] = solref, _STIFF_SOLIMP
+    remark(f"contacts have friction {friction:g}, elliptic cones and impratio {option.impratio:g}")
+
+
+def overlapping_pairs(
+    compiled: Any, coordinates: MujocoCoordinates, samples: int, seed: int
+) -> list[tuple[str, str]]:
+    """Return the pairs of bodies that overlap in the default state, or in all sampled ones.
+
+    Parameters
+    ----------
+    compiled
+        The ``MjModel``.
+    coordinates
+        Positions of the model in it.
+    samples
+        Number of sampled states.
+    seed
+        Their seed.
+    """
+    engine, data, random = mujoco(), mujoco().MjData(compiled), np.random.default_rng(seed)
+
+    def touching() -> set[tuple[int, int]]:
+        engine.mj_kinematics(compiled, data)
+        engine.mj_comPos(compiled, data)
+        engine.mj_collision(compiled, data)
+        geoms = data.contact.geom[data.contact.dist < 0]
+        return {(a, b) for a, b in np.sort(compiled.geom_bodyid[geoms], axis=1).tolist()}
+
+    data.qpos[:] = coordinates.positions(coordinates.default)
+    at_home, move = touching(), coordinates.sampler()
+    always: set[tuple[int, int]] | None = None
+    for _ in range(samples):
+        move(data, random)
+        always = touching() if always is None else always & touching()
+        if not always:
+            break
+    return [(compiled.body(a).name, compiled.body(b).name) for a, b in sorted(at_home | (always or set()))]
+
+
+def _like(present: Any, value: float) -> Any:
+    """Return a coefficient in the form of the present one: in newer MuJoCo, the first of a polynomial."""
+    return np.array([value, *[0.0] * (np.size(present) - 1)]) if np.ndim(present) else value
+
+
+def _solref(spec: Any) -> tuple[float, float]:
+    """Return the time constant [s] and the damping ratio of stiff constraints: two steps are the least."""
+    return 2.0 * float(spec.option.timestep), 1.0

@@ -1,0 +1,343 @@
+"""World with physics: a robot and its furniture in MuJoCo."""
+
+from __future__ import annotations
+
+import logging
+from collections import deque
+from collections.abc import Iterable, Mapping
+from typing import Any, Literal, NamedTuple
+
+import numpy as np
+
+from kineverse._checks import finite_number
+from kineverse.errors import InvalidValueError, UnknownNameError, suggest
+from kineverse.formats.mjcf.mujoco_api import mujoco
+from kineverse.grasping.gripper import Gripper, find_grippers
+from kineverse.lie import Array
+from kineverse.model.model_view import ModelView
+from kineverse.state import State, StateLike
+from kineverse.symbols import Symbol
+
+from . import mujoco_model
+from .mujoco_contacts import MujocoContacts
+from .mujoco_coordinates import MujocoCoordinates
+from .mujoco_gripper import GripperDrive
+from .mujoco_servos import BANDWIDTH, JointServos, SpeedMap
+from .sensor_sampler import SensorSampler, is_of_robot
+from .sensors import Sensors
+from .world import Contact, Observation
+
+logger = logging.getLogger(__name__)
+_SAMPLES = 60
+_ROUNDING = 1e-9
+_GRASPS = ("friction", "tie")
+
+
+class _Command(NamedTuple):
+    """Speeds of the robot that act from one time until another [s]."""
+
+    speeds: Array
+    start: float
+    end: float
+
+
+class MujocoWorld:
+    """World with physics.
+
+    Servos turn speeds of the robot into forces; forces move everything. :attr:`remarks` say what was added to
+    the model and what was left out. The world knows nothing of where the speeds come from.
+
+    Parameters
+    ----------
+    model
+        Model of the robot and of everything that moves.
+    robot
+        Prefix of the robot: coordinates and bodies below it are the robot's.
+    gripper
+        Gripper that holds things; None for the likeliest one of the robot, if it has any.
+    step
+        Time step [s].
+    grip
+        Force of each finger on what is held [N].
+    friction
+        Coefficient of sliding friction of all bodies.
+    grasp
+        ``"friction"``: contacts alone hold. ``"tie"``: a body that both fingers touch is welded to the hand.
+    timeout
+        Age [s] of a command with a stamp beyond which the robot stops.
+    delay
+        Time [s] from a command to its effect.
+    sensors
+        Settings of the sensors whose readings :meth:`observe` returns; None for exact ones.
+    leave_out
+        Names of constraints that are left out without another remark, as of :meth:`kineverse.Model.save`.
+    door_friction
+        Friction of furniture by coordinate [N], [N m], in place of that of the model.
+    bandwidth
+        Bandwidth of the servos [1/s].
+    seed
+        Seed of sampled configurations.
+
+    Raises
+    ------
+    MissingDependencyError
+        If MuJoCo is not installed.
+    FormatError
+        Naming all motions of the model that MuJoCo cannot represent.
+    UnknownNameError
+        If nothing of the model is below the prefix, or no furniture has a coordinate of ``door_friction``.
+    InvalidValueError
+        For parameters out of their range.
+    """
+
+    name = "mujoco"
+
+    def __init__(
+        self,
+        model: ModelView,
+        robot: str,
+        gripper: Gripper | None = None,
+        *,
+        step: float = 0.002,
+        grip: float = 50.0,
+        friction: float = 1.0,
+        grasp: Literal["friction", "tie"] = "friction",
+        timeout: float = 0.04,
+        delay: float = 0.0,
+        sensors: Sensors | None = None,
+        leave_out: Iterable[str] = (),
+        door_friction: Mapping[Symbol, float] | Mapping[str, float] | None = None,
+        bandwidth: float = BANDWIDTH,
+        seed: int = 0,
+    ) -> None:
+        positive = {"step": step, "grip": grip, "timeout": timeout, "bandwidth": bandwidth}
+        for field, value in (*positive.items(), ("friction", friction), ("delay", delay)):
+            number = finite_number(value)
+            if number is None or number < 0 or (field in positive and not number):
+                raise InvalidValueError(f"'{field}' of a world is a positive number, not {value!r}.")
+        if grasp not in _GRASPS:
+            raise InvalidValueError(f"'grasp' of a world is 'friction' or 'tie', not {grasp!r}.")
+        self.model, self.robot = model, robot
+        self._step, self._timeout, self._delay = float(step), float(timeout), float(delay)
+        self._remarks: dict[str, None] = {}
+        coordinates = [s for s in model.degrees_of_freedom if self._is_robot(s.path)]
+        if not coordinates:
+            prefixes = sorted({s.path.split("/")[0] for s in model.degrees_of_freedom})
+            raise UnknownNameError(
+                f"No coordinate of the model is below '{robot}'. {suggest(robot, prefixes, 'prefix')}"
+            )
+        furniture = [s.path for s in model.degrees_of_freedom if not self._is_robot(s.path)]
+        frictions = _friction_by_name(door_friction or {}, furniture)
+        if gripper is None:
+            gripper = next(iter(find_grippers(model, robot)), None)
+        fingers = () if gripper is None else gripper.fingers
+        spec = mujoco_model.export_spec(model, leave_out, self._remark)
+        spec.option.timestep = self._step
+        mujoco_model.add_masses(spec, self._remark)
+        mujoco_model.remark_missing_shapes(spec, self._is_robot, self._remark)
+        compiled = mujoco_model.compile_world(spec)
+        mujoco_model.add_joint_friction(spec, compiled, furniture, frictions, self._remark)
+        mujoco_model.add_tipping_springs(spec, model, self._remark)
+        mujoco_model.add_contact_rules(spec, model, fingers, friction, self._remark)
+        self._float_robot(spec)
+        compiled = mujoco_model.compile_world(spec)
+        self._coordinates = MujocoCoordinates(model, compiled)
+        self._exclude_overlaps(spec, compiled, seed)
+        self._drive = None
+        if gripper is None:
+            self._remark(f"no gripper of '{robot}' is known, so it holds nothing")
+        else:
+            self._drive = GripperDrive(
+                spec, compiled, self._coordinates, gripper, grip, self._step, grasp == "tie", self._remark
+            )
+            compiled = mujoco_model.compile_world(spec)
+        held = () if self._drive is None else self._drive.coordinates
+        driven = [s for s in coordinates if s in self._coordinates.address and s not in held]
+        idle = [str(s) for s in coordinates if s not in self._coordinates.address]
+        if idle:
+            self._remark(
+                f"no servo drives {', '.join(idle)}: each is not the position of one joint in MuJoCo"
+            )
+        self._servos = JointServos(
+            spec, compiled, self._coordinates, driven, model, self._step, bandwidth, seed, self._remark
+        )
+        self._compiled = mujoco_model.compile_world(spec)
+        self._data = mujoco().MjData(self._compiled)
+        self._contacts = MujocoContacts(self._compiled, self._is_robot, fingers)
+        self._servos.connect(self._compiled)
+        if self._drive is not None:
+            self._drive.connect(self._compiled, self._contacts, seed)
+        self._map = SpeedMap(model, [*driven, *held], self._coordinates.address)
+        self._is_finger = self._map.columns_of(held)
+        self._count = len(driven)
+        self._sampler = SensorSampler(sensors or Sensors(), model, robot, seed)
+        self.remarks = tuple(self._remarks)
+        self.reset(model.default_state())
+
+    def __repr__(self) -> str:
+        return f"<MujocoWorld of '{self.robot}' at {self.time:g} s>"
+
+    @property
+    def time(self) -> float:
+        """Time since the last reset [s]."""
+        return self._ticks * self._step
+
+    @property
+    def state(self) -> State:
+        """True values of all coordinates; its stamp is the time [s]."""
+        return self._coordinates.state(self._data.qpos, self.time)
+
+    @property
+    def held(self) -> str | None:
+        """Frame of the body that both fingers press, or that is tied to them; None if there is none."""
+        if self._drive is None:
+            return None
+        return self._drive.tied or self._drive.pressed(self._data)
+
+    @property
+    def refused(self) -> int:
+        """Number of commands since the last reset that were stale when they came."""
+        return self._refused
+
+    @property
+    def peak_force(self) -> float:
+        """Largest normal force between the robot and another body in all steps of the last apply [N].
+
+        :meth:`contacts` has the forces of the last step alone, so it may miss a short blow.
+        """
+        return self._peak_force
+
+    def reset(self, state: StateLike) -> None:
+        """Start anew from a state, at time 0, with nothing in the gripper and all speeds zero."""
+        qpos = self._coordinates.positions(state)
+        engine, data = mujoco(), self._data
+        engine.mj_resetData(self._compiled, data)
+        data.qpos[:] = qpos
+        engine.mj_forward(self._compiled, data)
+        self._ticks, self._end, self._refused, self._peak_force = 0, 0.0, 0, 0.0
+        self._speeds = np.zeros(len(self._map.speeds))
+        self._commands: deque[_Command] = deque()
+        self._active: _Command | None = None
+        self._servos.reset(data)
+        if self._drive is not None:
+            self._drive.reset(data)
+        engine.mj_forward(self._compiled, data)
+        self._sampler.reset()
+
+    def apply(self, speeds: StateLike, duration: float, *, stamp: float | None = None) -> None:
+        """Advance by a duration with speeds of the robot.
+
+        Speeds of anything else are not read. Fingers keep the last speed that was given. Once both touch one
+        body they press it with the world's force, until a speed opens them.
+
+        Parameters
+        ----------
+        speeds
+            Speeds of the robot by symbol or name [m/s], [rad/s]; an empty mapping stops it.
+        duration
+            Time [s]; the world stops at the first time step that is not before.
+        stamp
+            Time of the state from which the speeds were computed [s]: beyond the age of the world's time-out
+            they are refused, or act no longer. None for speeds that act for the whole duration.
+
+        Raises
+        ------
+        InvalidValueError
+            For speeds that are not finite, a duration that is not positive, and a stamp that is no number.
+        UnknownNameError
+            For speeds that the model does not have.
+        """
+        length = finite_number(duration)
+        if length is None or length <= 0:
+            raise InvalidValueError(f"A duration is a positive number of seconds, not {duration!r}.")
+        taken = None if stamp is None else finite_number(stamp)
+        if stamp is not None and taken is None:
+            raise InvalidValueError(f"The stamp of speeds is a time in seconds, not {stamp!r}.")
+        vector, given = self._map.vector(speeds)
+        keep = self._is_finger & ~given
+        vector[keep] = self._speeds[keep]
+        now = self._end
+        if taken is not None and not now - self._timeout <= taken + _ROUNDING <= now + 2 * _ROUNDING:
+            self._refused += 1
+            logger.info("speeds of %g s are refused at %g s", taken, now)
+            vector = np.where(self._is_finger, self._speeds, 0.0)
+        self._speeds = vector
+        until = now + length if taken is None else min(now + length, taken + self._timeout)
+        self._commands.append(_Command(vector, now + self._delay, until + self._delay))
+        self._end = now + length
+        if self._drive is not None:
+            self._drive.update_limits(self._data)
+        self._peak_force = 0.0
+        while self.time < self._end - _ROUNDING:
+            self._advance()
+            self._peak_force = max(self._peak_force, self._contacts.largest_force(self._data))
+
+    def contacts(self) -> tuple[Contact, ...]:
+        """Return the bodies of the robot that touch something else, and those of furniture that collide."""
+        return self._contacts.contacts(self._data)
+
+    def observe(self) -> Observation:
+        """Return the latest sensor readings that have arrived."""
+        return self._sampler.observe(self.time, self.state, self.contacts())
+
+    def _advance(self) -> None:
+        """Simulate one time step."""
+        now, data = self.time, self._data
+        while self._commands and self._commands[0].start <= now + _ROUNDING:
+            self._active = self._commands.popleft()
+        active = self._active
+        if active is None:
+            speeds = np.zeros(len(self._map.speeds))
+        elif now < active.end - _ROUNDING:
+            speeds = active.speeds
+        else:
+            speeds = np.where(self._is_finger, active.speeds, 0.0)
+        rates = self._map.rates(speeds, data.qpos)
+        self._servos.drive(data, rates[: self._count])
+        if self._drive is not None:
+            self._drive.drive(data, rates[self._count :])
+        mujoco().mj_step(self._compiled, data)
+        self._ticks += 1
+
+    def _is_robot(self, name: str) -> bool:
+        """Return whether a frame or coordinate is the robot's."""
+        return is_of_robot(name, self.robot)
+
+    def _remark(self, text: str) -> None:
+        """Add a remark once."""
+        self._remarks[text] = None
+
+    def _float_robot(self, spec: Any) -> None:
+        """Take the weight of the robot away."""
+        for body in spec.bodies:
+            if self._is_robot(body.name):
+                body.gravcomp = 1.0
+        self._remark(f"gravity does not act on '{self.robot}': its servos are taken to carry the weight")
+
+    def _exclude_overlaps(self, spec: Any, compiled: Any, seed: int) -> None:
+        """Exclude pairs of the robot with itself, and of furniture with itself, that overlap for good."""
+        found = mujoco_model.overlapping_pairs(compiled, self._coordinates, _SAMPLES, seed)
+        pairs = [pair for pair in found if self._is_robot(pair[0]) == self._is_robot(pair[1])]
+        for one, other in pairs:
+            spec.add_exclude(bodyname1=one, bodyname2=other)
+        if pairs:
+            self._remark(
+                "these pairs overlap at the default state or always, and do not collide: "
+                + ", ".join(f"{a} with {b}" for a, b in pairs)
+            )
+
+
+def _friction_by_name(given: Mapping[Any, float], furniture: list[str]) -> dict[str, float]:
+    """Return friction by the name of a coordinate of furniture, after checking it."""
+    found = {}
+    for key, value in given.items():
+        number = finite_number(value)
+        if str(key) not in furniture:
+            raise UnknownNameError(
+                f"No furniture moves by '{key}', so it has no friction. "
+                f"{suggest(str(key), furniture, 'coordinate')}"
+            )
+        if number is None or number < 0:
+            raise InvalidValueError(f"The friction of '{key}' is a number of N or N m, not {value!r}.")
+        found[str(key)] = number
+    return found
