@@ -1,0 +1,536 @@
+"""Pushing controller: the papers' push (2020, eq. 5-11) with contacts that are touched, held and changed.
+
+Per step the nearest points r on the pusher and p on the object with normal n (from p to r) are numbers, and
+so are their derivatives over all speeds. They enter the quadratic program as parameters with gradients::
+
+    d = (r - p)·n                                   eq. 5, gap
+    ḋ >= -γ d                                       eq. 6, contact slots
+    ∂p/∂q q̇·n <= 0                                  eq. 7, push, never pull
+    q → target                                      eq. 8
+    tip → w, along the tangent v = (-∇p × n) × n    eq. 9
+    -V t <= q̇ <= V t,   t = (d ≺ ε) ∧ ...           eq. 10, 11, still unless touched
+
+The trend of t is a goal, so the robot touches what it has to move. While touching, further rows keep the
+prediction honest: the object does not run from the pusher (ḋ <= 0), and r stays where it touched p.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass
+
+import numpy as np
+
+from kineverse.control import Command, Controller, Goal, Keep
+from kineverse.control.tasks import Task
+from kineverse.errors import InvalidValueError, UnknownNameError, suggest
+from kineverse.expressions.expression import Expression, array, as_expression
+from kineverse.expressions.functions import sqrt
+from kineverse.geometry import Rule, Scene
+from kineverse.geometry.objects import matches_pattern
+from kineverse.geometry.results import DistanceResults
+from kineverse.lie import Array
+from kineverse.logic import less
+from kineverse.model.frame_dependence import FrameDependence
+from kineverse.model.model_view import ModelView
+from kineverse.state import State, StateLike
+from kineverse.symbols import Symbol, parameter
+
+from .push_contact import PushContacts, PushSurface, find_push_tool
+
+TOUCHING = 1e-3
+"""Largest gap of a contact [m]."""
+LOST = 3e-3
+"""Gap at which a contact is lost [m]."""
+_CONE, _CONE_END = math.cos(math.radians(25.0)), math.cos(math.radians(40.0))
+_PRESS = 2e-4
+"""Depth that rows of touching bodies allow, so that contact is kept [m]."""
+_APART = 4e-3
+"""Gap between pusher and object away from the contact [m]."""
+_NEAR = 0.012
+"""Distance of the tip from the axis of a contact within which it approaches the surface [m]."""
+_FUNNEL = 0.08
+"""Largest height of the way to a contact above the surface [m]."""
+_STANDOFF = 2e-3
+_FAR = 0.05
+_SPEED = 0.25
+"""Largest speed of the contact point [m/s]."""
+_REACH_SPEED = 0.5
+_BLOCKED_STEPS = 60
+_BLOCKED_WAY = 0.004
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class PushView:
+    """Points and vectors of a push in the world, for drawings (2022 paper, Fig. 6).
+
+    Attributes
+    ----------
+    p, r
+        Nearest points on the object and on the robot (3,) [m].
+    n
+        Contact normal from p to r.
+    push
+        Direction -∇p in which p has to move.
+    tangent
+        Active tangent v, towards places where n opposes the push more.
+    target
+        Contact point that was chosen (3,) [m].
+    distance
+        Gap [m]; infinite beyond the radius of queries.
+    """
+
+    p: Array
+    r: Array
+    n: Array
+    push: Array
+    tangent: Array
+    target: Array
+    distance: float
+
+
+class Pushing:
+    """Controller that pushes an articulated object to a value of its coordinate.
+
+    Parameters
+    ----------
+    model
+        Model of robot and object.
+    what
+        The coordinate to change, as symbol or name.
+    bodies
+        Bodies of the robot that may touch the object, names or patterns: the pusher.
+    state
+        Present state.
+    target
+        Wanted value [m], [rad].
+    robot
+        Prefix of the robot; by default that of the first of ``bodies``.
+    object_frames
+        Bodies of the object that may be pushed, names or patterns; by default all that the coordinate moves.
+    dt
+        Time of a step [s].
+    still
+        Further coordinates that stay still.
+    rules
+        Rules of the collision filter.
+    logic
+        ``"and"`` for the trend rule of :mod:`kineverse.logic`; ``"product"`` for the product rule; None for no
+        trends, for comparison only.
+
+    Attributes
+    ----------
+    controller
+        The controller.
+    coordinate
+        The coordinate.
+    touching
+        Whether the pusher touches where it should.
+    losses
+        Number of contacts that were lost.
+    blocked
+        Number of contact points given up.
+    contacts
+        Number of contact points chosen.
+    view
+        Points and vectors of the last step.
+
+    Raises
+    ------
+    UnknownNameError, InvalidValueError
+        For unknown names, a coordinate that moves no body, and a target beyond its limits.
+    """
+
+    def __init__(
+        self,
+        model: ModelView,
+        what: Symbol | str,
+        bodies: str | Iterable[str],
+        state: StateLike,
+        *,
+        target: float,
+        robot: str | None = None,
+        object_frames: str | Iterable[str] | None = None,
+        dt: float = 0.02,
+        still: Iterable[Symbol | str] = (),
+        rules: Iterable[Rule] = (),
+        logic: str | None = "and",
+    ) -> None:
+        if logic not in ("and", "product", None):
+            raise InvalidValueError(f"logic= is 'and', 'product' or None, not {logic!r}.")
+        self.model, self.target = model, float(target)
+        self.coordinate = coordinate = model.symbol(what) if isinstance(what, str) else what
+        lower, upper = model.limits(coordinate)
+        if not lower - 1e-9 <= target <= upper + 1e-9:
+            raise InvalidValueError(
+                f"'{coordinate}' is between {lower:g} and {upper:g}, so it cannot be pushed to {target:g}."
+            )
+        plain = Scene(model)
+        self.pusher = _match(plain.bodies, bodies, "bodies=")
+        self.robot = self.pusher[0].split("/")[0] if robot is None else robot
+        own = tuple(b for b in plain.bodies if b.startswith(f"{self.robot}/"))
+        moved = plain.bodies_moved_by([coordinate])
+        self.object_bodies = tuple(b for b in moved if b not in own)
+        if not self.object_bodies:
+            raise InvalidValueError(f"'{coordinate}' moves no body with a shape, so nothing can be pushed.")
+        pushed = self.object_bodies
+        if object_frames is not None:
+            pushed = _match(pushed, object_frames, "object_frames=")
+        at = model.default_state().updated(dict(state))
+        self.tool = find_push_tool(model, self.pusher, at)
+        self.surface = PushSurface(
+            model, coordinate, pushed, own, at, (at[coordinate], (at[coordinate] + target) / 2, target)
+        )
+        self.scene = Scene(model, rules=(*_furniture_rules(plain.bodies, own), *rules))
+        hand = FrameDependence(model, model.speeds)
+        self._logic = logic
+        self._build(dt, tuple(still))
+        self._slots = slots = self.controller.contact_slots
+        index = {b: k for k, b in enumerate(self.scene.bodies)}
+        self._is_pusher = np.array([b in self.pusher for b in index])
+        self._is_pushed = np.array([b in self.object_bodies for b in index])
+        self._body_names = tuple(index)
+        del hand
+        slots.set_margin(self.pusher, self.object_bodies, _APART)
+        self._pressing = False
+        self.reset()
+
+    # -- the quadratic program -----------------------------------------------------------------------------
+
+    def _build(self, dt: float, still: tuple[Symbol | str, ...]) -> None:
+        """Build the controller: tasks on expressions of parameters, which each step sets."""
+        model, q = self.model, self.coordinate
+        speed = q.derivative()
+        world_T_hand = model.fk(self.tool.frame)
+        tip = world_T_hand[:3, :3] @ self.tool.tip + world_T_hand[:3, 3]
+        axis = world_T_hand[:3, :3] @ self.tool.axis
+        speeds = sorted({s for s in model.rates.over_free_speeds(tip.gradient())}, key=lambda s: s.sort_key)
+        speeds = [*speeds, speed]
+
+        self._parameters: dict[str, list[Symbol]] = {}
+
+        def numbers(name: str, count: int) -> list[Symbol]:
+            self._parameters[name] = [parameter(f"push/{name}/{k}", 0.0) for k in range(count)]
+            return self._parameters[name]
+
+        gap = numbers("gap", 1)[0]
+        relative = array(numbers("relative", 3 * len(speeds))).reshape(3, len(speeds))
+        slip = numbers("slip", 2)
+        pushed = numbers("pushed", 1)[0]
+        target, facing = array(numbers("target", 3)), array(numbers("facing", 3))
+        normal = array(numbers("normal", 3))
+        w_reach, w_touch, w_hold, engaged = (numbers(n, 1)[0] for n in ("reach", "touch", "hold", "engaged"))
+        d = gap.with_gradient({s: relative[0, k] for k, s in enumerate(speeds)})
+        slips = array(
+            [
+                e.with_gradient({s: relative[i + 1, k] for k, s in enumerate(speeds)})
+                for i, e in enumerate(slip)
+            ]
+        )
+        offset = tip - target
+        lateral = offset - normal * (normal @ offset)
+        aside = sqrt(lateral @ lateral + 1e-8)
+        touched = less(d, TOUCHING)
+        aligned = less(aside, _NEAR)
+        v = as_expression(speed)
+        ḋ = sum((relative[0, k] * s for k, s in enumerate(speeds)), as_expression(0.0))
+        most = engaged * less(gap, LOST) * 1e3
+        far = 1e3 * (1 - engaged)
+        tasks: list[Task] = [
+            Goal(q, self.target, name="object", gain=4.0, speed=numbers("pace", 1)[0], weight=self._weight()),
+            Goal(tip, target, name="reach", gain=3.0, speed=_REACH_SPEED, weight=w_reach),
+            Goal(axis, facing, name="facing", gain=2.0, speed=1.0, weight=0.05),
+            Goal(slips, 0.0, name="no slip", gain=5.0, weight=w_hold),
+            Goal(d, -_PRESS, name="press", gain=10.0, weight=w_hold),
+            Keep(-most, v, most, name="still unless touched"),
+            Keep(-math.inf, pushed * v, far, name="push, never pull"),
+            Keep(-math.inf, ḋ, far, name="object does not run away"),
+        ]
+        truth: Expression | None = None
+        if self._logic == "and":
+            truth = touched & aligned
+        elif self._logic == "product":
+            truth = touched * aligned
+        if truth is not None:
+            tasks.append(Goal(truth, 1.0, name="touch", gain=0.15, weight=w_touch))
+        free = {s.position for s in speeds}
+        self.controller = Controller(
+            model, tasks, dt=dt, still=still, scene=self.scene, margin=0.005, smooth=0.02, contacts=24
+        )
+        del free
+        self.speeds = self.controller.speeds
+        self._columns = [self.speeds.index(s) if s in self.speeds else -1 for s in speeds]
+        self._object_column = self.speeds.index(speed)
+        place = {s: k for k, s in enumerate(self.controller.inputs)}
+        self._values = np.array([s.value or 0.0 for s in self.controller.inputs])
+        self._coordinates = tuple(s for s in self.controller.inputs if s.value is None)
+        self._places = {
+            name: np.array([place[s] for s in symbols], dtype=np.intp)
+            for name, symbols in self._parameters.items()
+        }
+        hand = model.fk(self.tool.frame)
+        from kineverse.compile import compile as compile_expressions
+
+        self._pose_function = compile_expressions([hand])
+        self._pose = self._pose_function.bind()
+        self._pose_inputs = self._pose_function.inputs
+
+    def _weight(self) -> float:
+        """Return the weight of the object's goal, so that it counts as a motion of its fastest point."""
+        return 1.0
+
+    def wait(self, timeout: float | None = None) -> bool:
+        """Wait until everything is compiled, at most for a time [s], and return whether it is."""
+        return self.controller.wait(timeout)
+
+    def reset(self) -> None:
+        """Forget all contacts."""
+        self.controller.reset()
+        self.touching, self.losses, self.blocked, self.contacts = False, 0, 0, 0
+        self._chosen: int | None = None
+        self._given_up: dict[int, int] = {}
+        self._anchor: tuple[int, int, Array, Array] | None = None
+        self._best, self._since = math.inf, 0
+        self.step_count = 0
+        self.view: PushView | None = None
+
+    # -- the step ------------------------------------------------------------------------------------------
+
+    def done(self, state: State, tolerance: float = 0.02) -> bool:
+        """Return True if the coordinate is within a tolerance of the target."""
+        return abs(state[self.coordinate] - self.target) < tolerance
+
+    def step(self, state: State) -> Command:
+        """Return the command for one time step at a state.
+
+        Raises
+        ------
+        InfeasibleError, NotFiniteError
+            As :meth:`.Controller.step`.
+        """
+        self.step_count += 1
+        x, n = self._values, len(self._coordinates)
+        x[:n] = state.vector(self._coordinates)
+        found = self.controller.query_contacts(x)
+        self._pose.input[:] = state.vector(self._pose_inputs)
+        self._pose()
+        pose = self._pose.outputs[0]
+        tip = pose[:3, :3] @ self.tool.tip + pose[:3, 3]
+        points = self.surface.at(state)
+        self._watch_progress(state, tip, points)
+        if self._chosen is None:
+            self._choose(points, tip)
+        k = self._chosen
+        assert k is not None
+        contact = self._nearest(found, state)
+        self._update_touching(contact, points)
+        self._write(state, tip, points, k, contact)
+        return self.controller.step(x)
+
+    def _set(self, name: str, values: float | Array) -> None:
+        self._values[self._places[name]] = values
+
+    def _nearest(
+        self, found: DistanceResults, state: State
+    ) -> tuple[int, int, Array, Array, Array, float, Array, float] | None:
+        """Return bodies, points r and p, normal, gap, velocity of p and alignment of the pair that pushes best."""
+        if not len(found):
+            return None
+        a, b = found.body_indices.T
+        forward = self._is_pusher[a] & self._is_pushed[b]
+        backward = self._is_pusher[b] & self._is_pushed[a]
+        rows = np.flatnonzero(forward | backward)
+        if not len(rows):
+            return None
+        least = found.distances[rows[0]]
+        best = None
+        for row in rows[:6].tolist():
+            gap = float(found.distances[row])
+            if gap > max(least + TOUCHING, _PRESS):
+                break
+            if forward[row]:
+                robot, thing = int(a[row]), int(b[row])
+                r, p, normal = found.points_a[row], found.points_b[row], -found.normals[row]
+            else:
+                robot, thing = int(b[row]), int(a[row])
+                r, p, normal = found.points_b[row], found.points_a[row], found.normals[row]
+            velocity = self._velocity(thing, p)
+            speed = float(np.sqrt(velocity @ velocity))
+            alignment = -float(normal @ velocity) / speed if speed > 1e-9 else -1.0
+            if best is None or alignment > best[-1]:
+                best = (robot, thing, r, p, normal, gap, velocity, alignment)
+        return best
+
+    def _velocity(self, body: int, point: Array) -> Array:
+        """Return the velocity (3,) of a point of the object per unit of its motion to the target."""
+        column = self._slots.point_jacobian(body, point)[:, self._object_column]
+        return np.asarray(self.surface.sign * column)
+
+    def _update_touching(self, contact: tuple[object, ...] | None, points: PushContacts) -> None:
+        """Note that the pusher has come to touch, or has lost its contact."""
+        if self.touching:
+            if contact is None or contact[5] > LOST:  # type: ignore[operator]
+                self.losses += 1
+                self._release()
+            elif contact[7] < _CONE_END:  # type: ignore[operator]
+                self._give_up()
+        elif contact is not None and contact[5] < TOUCHING and contact[7] > _CONE:  # type: ignore[operator]
+            self.touching = True
+            self._best, self._since = math.inf, 0
+            self._anchor = None
+
+    def _release(self) -> None:
+        self.touching, self._anchor = False, None
+        self._best, self._since = math.inf, 0
+
+    def _give_up(self) -> None:
+        """Leave the present contact point for another one."""
+        if self._chosen is not None:
+            self._given_up[self._chosen] = self._given_up.get(self._chosen, 0) + 1
+            self.blocked += 1
+        self._chosen = None
+        self._release()
+
+    def _choose(self, points: PushContacts, tip: Array) -> None:
+        """Choose the contact point that pushes best."""
+        score = self.score(points)
+        score = score - 0.5 * np.sqrt(((points.points - tip) ** 2).sum(axis=1))
+        for k, times in self._given_up.items():
+            near = np.sqrt(((points.points - points.points[k]) ** 2).sum(axis=1)) < 0.1
+            score = score - np.where(near, 0.6 * times, 0.0)
+        self._chosen = int(np.argmax(score))
+        self.contacts += 1
+        self._best, self._since = math.inf, 0
+
+    def score(self, points: PushContacts) -> Array:
+        """Return how well the object can be pushed at each point (N,)."""
+        inside = points.alignment > _CONE
+        return np.asarray(
+            np.where(inside, 0.0, -3.0)
+            + points.alignment
+            + np.minimum(points.leverage, 0.8)
+            + 0.7 * self.surface.room
+        )
+
+    def _watch_progress(self, state: State, tip: Array, points: PushContacts) -> None:
+        """Give a contact point up without progress, or where the direction of the push has left its cone."""
+        k = self._chosen
+        if k is None:
+            return
+        if self.touching:
+            rest = abs(state[self.coordinate] - self.target)
+        else:
+            rest = float(np.linalg.norm(points.points[k] - tip))
+            if points.alignment[k] < _CONE_END:
+                self._give_up()
+                return
+        if rest < self._best - _BLOCKED_WAY:
+            self._best, self._since = rest, 0
+            return
+        self._since += 1
+        if self._since > _BLOCKED_STEPS:
+            self._give_up()
+
+    def _write(
+        self,
+        state: State,
+        tip: Array,
+        points: PushContacts,
+        k: int,
+        contact: tuple[int, int, Array, Array, Array, float, Array, float] | None,
+    ) -> None:
+        """Set the parameters of the program."""
+        c, m = points.points[k], points.normals[k]
+        offset = tip - c
+        height = float(offset @ m)
+        lateral = offset - height * m
+        aside = float(np.sqrt(lateral @ lateral))
+        near = aside < _NEAR
+        wanted = _STANDOFF if near else min(_FUNNEL, _STANDOFF + 1.5 * (aside - _NEAR))
+        goal = c + wanted * m
+        self._set("target", goal)
+        self._set("normal", m)
+        self._set("facing", -m)
+        speed = float(np.linalg.norm(points.velocities[k]))
+        self._set("pace", _SPEED / max(speed, 1e-3))
+        self._press(self.touching or (near and height < 0.03))
+        self._set("reach", 0.0 if self.touching else 1.0)
+        self._set("touch", 0.0 if self.touching else 1.0)
+        self._set("hold", 10.0 if self.touching else 0.0)
+        self._set("engaged", float(self.touching))
+        relative = np.zeros((3, len(self._columns)))
+        self._set("gap", _FAR)
+        self._set("slip", 0.0)
+        self._set("pushed", 0.0)
+        distance, r, p, normal, velocity = math.inf, tip, c, m, points.velocities[k]
+        if contact is not None:
+            robot, thing, r, p, normal, distance, velocity, _ = contact
+            across, up = _tangents(normal)
+            J = self._slots.point_jacobian(robot, r) - self._slots.point_jacobian(thing, p)
+            frame = np.array([normal, across, up])
+            rows = frame @ J
+            for i, column in enumerate(self._columns):
+                if column >= 0:
+                    relative[:, i] = rows[:, column]
+            self._set("gap", distance)
+            own = self._slots.point_jacobian(thing, p)[:, self._object_column]
+            self._set("pushed", float(normal @ own))
+            if self.touching:
+                drift = self._drift(robot, thing, r, p)
+                self._set("slip", frame[1:] @ drift)
+        self._set("relative", relative.ravel())
+        push = velocity / max(float(np.linalg.norm(velocity)), 1e-9)
+        tangent = np.cross(np.cross(push, normal), normal)
+        self.view = PushView(p, r, normal, push, tangent, c, distance)
+
+    def _drift(self, robot: int, thing: int, r: Array, p: Array) -> Array:
+        """Return how far the point of the first touch on the robot has slid on the object, (3,) [m]."""
+        a, b = (self.scene.pose(self._body_names[k]) for k in (robot, thing))
+        if self._anchor is None or self._anchor[:2] != (robot, thing):
+            self._anchor = (robot, thing, a[:3, :3].T @ (r - a[:3, 3]), b[:3, :3].T @ (p - b[:3, 3]))
+        _, _, on_robot, on_object = self._anchor
+        return np.asarray(
+            a[:3, :3] @ on_robot + a[:3, 3] - (b[:3, :3] @ on_object + b[:3, 3])
+        )
+
+    def _press(self, pressing: bool) -> None:
+        """Let the pusher touch the object, or keep it away."""
+        if pressing != self._pressing:
+            self._pressing = pressing
+            self._slots.set_margin(self.pusher, self.object_bodies, -_PRESS if pressing else _APART)
+
+
+def _tangents(normal: Array) -> tuple[Array, Array]:
+    """Return two unit vectors that are orthogonal to a normal and to each other."""
+    helper = np.eye(3)[int(np.argmin(np.abs(normal)))]
+    across = np.cross(normal, helper)
+    across /= np.sqrt(across @ across)
+    return across, np.cross(normal, across)
+
+
+def _match(known: Iterable[str], names: str | Iterable[str], argument: str) -> tuple[str, ...]:
+    """Return the known bodies that match names or patterns."""
+    known = tuple(known)
+    patterns = (names,) if isinstance(names, str) else tuple(names)
+    for pattern in patterns:
+        if not any(matches_pattern(b, (pattern,)) for b in known):
+            raise UnknownNameError(
+                f"{argument} No body is named or matched by '{pattern}'. {suggest(pattern, known, 'body')}"
+            )
+    if not patterns:
+        raise InvalidValueError(f"{argument} lists no body, so nothing may touch the object.")
+    return tuple(b for b in known if matches_pattern(b, patterns))
+
+
+def _furniture_rules(bodies: Iterable[str], robot: Iterable[str]) -> tuple[Rule, ...]:
+    """Return rules that except furniture among itself, whose joints keep it apart."""
+    own = set(robot)
+    others = [b for b in bodies if b not in own]
+    roots = dict.fromkeys(b.split("/")[0] + "/*" if "/" in b else b for b in others)
+    if any(matches_pattern(b, tuple(roots)) for b in own):
+        roots = dict.fromkeys(others)
+    names = tuple(roots)
+    return tuple(
+        Rule(a, b, False, "furniture") for i, a in enumerate(names) for b in names[i:]
+    )
