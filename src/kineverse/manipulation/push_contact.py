@@ -27,7 +27,7 @@ from kineverse.symbols import Symbol
 
 _SPACING = 0.05
 """Distance of sampled points [m]."""
-_INSET = 0.025
+_INSET = 0.04
 """Distance of sampled points from edges, where the surface is that large [m]."""
 _MOST = 7
 _ROOM = 0.06
@@ -116,18 +116,18 @@ class PushSurface:
         self._inputs = self._function.inputs
         self.sign = 1.0 if values[-1] >= values[0] else -1.0
         scene = Scene(model, leave_out=tuple(ignored))
-        found: list[tuple[int, Array, Array, float]] = []
-        for value in values:
-            found += self._sample(scene, state.updated({coordinate: value}))
+        states = [state.updated({coordinate: value}) for value in values]
+        found = [point for at in states for point in self._sample(scene, at)]
         if not found:
             raise InvalidValueError(
                 f"No surface of {', '.join(bodies)} opposes the motion of '{coordinate}' towards "
                 f"{values[-1]:g}, so it cannot be pushed there."
             )
+        found = _without_doubles(found)
         self.owner = np.array([k for k, *_ in found], dtype=np.intp)
-        self._points = np.array([p for _, p, *_ in found])
-        self._normals = np.array([n for _, _, n, _ in found])
-        self.room = np.array([room for *_, room in found])
+        self._points = np.array([p for _, p, _ in found])
+        self._normals = np.array([n for _, _, n in found])
+        self.room = np.min([self._find_room(scene, at) for at in states], axis=0)
 
     def __len__(self) -> int:
         return len(self.owner)
@@ -159,8 +159,8 @@ class PushSurface:
         twist = self._place(state)[1][self.bodies.index(body)]
         return np.asarray(twist[:3] + np.cross(twist[3:], point))
 
-    def _sample(self, scene: Scene, state: State) -> list[tuple[int, Array, Array, float]]:
-        """Return body, point and normal in the body, and room of the points that rays reach at a state."""
+    def _sample(self, scene: Scene, state: State) -> list[tuple[int, Array, Array]]:
+        """Return body, point and normal in the body of the points that rays reach at a state."""
         scene.update(state)
         world = scene.collision_world
         world.prepare()
@@ -180,10 +180,27 @@ class PushSurface:
                     hit = scene.ray(start, u, _OUTSIDE + 4 * solid.radius)
                     if hit is None or hit.body != body or hit.distance <= 0.0 or -hit.normal @ u < 0.5:
                         continue
-                    ahead = scene.point(hit.point + _ROOM * hit.normal, 2 * _ROOM)
-                    room = 1.0 if ahead is None else min(max(ahead.distance / _ROOM, 0.0), 1.0)
-                    found.append((k, R.T @ (hit.point - t), R.T @ hit.normal, room))
+                    found.append((k, R.T @ (hit.point - t), R.T @ hit.normal))
         return found
+
+    def _find_room(self, scene: Scene, state: State) -> Array:
+        """Return the free space (N,) in front of all points at a state."""
+        scene.update(state)
+        at = self.at(state)
+        room = np.ones(len(self))
+        for k, ahead in enumerate(at.points + _ROOM * at.normals):
+            near = scene.point(ahead, _ROOM)
+            if near is not None:
+                room[k] = max(near.distance / _ROOM, 0.0)
+        return room
+
+
+def _without_doubles(found: list[tuple[int, Array, Array]]) -> list[tuple[int, Array, Array]]:
+    """Return points without those that are about the same."""
+    kept: dict[tuple[float, ...], tuple[int, Array, Array]] = {}
+    for body, point, normal in found:
+        kept.setdefault((body, *np.round(point / _SAME).tolist(), *np.round(normal, 1).tolist()), (body, point, normal))
+    return list(kept.values())
 
 
 def _grid(solid: Solid, placed: Array, twist: Array) -> Array:

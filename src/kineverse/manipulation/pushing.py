@@ -19,6 +19,7 @@ from __future__ import annotations
 import math
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
+from typing import TypeAlias
 
 import numpy as np
 
@@ -39,6 +40,8 @@ from kineverse.symbols import Symbol, parameter
 
 from .push_contact import PushContacts, PushSurface, find_push_tool
 
+_Contact: TypeAlias = tuple[int, int, Array, Array, Array, float, Array, float]
+"""Bodies of robot and object, r, p, normal, gap, velocity of p, alignment."""
 TOUCHING = 1e-3
 """Largest gap of a contact [m]."""
 LOST = 3e-3
@@ -183,7 +186,6 @@ class Pushing:
             model, coordinate, pushed, own, at, (at[coordinate], (at[coordinate] + target) / 2, target)
         )
         self.scene = Scene(model, rules=(*_furniture_rules(plain.bodies, own), *rules))
-        hand = FrameDependence(model, model.speeds)
         self._logic = logic
         self._build(dt, tuple(still))
         self._slots = slots = self.controller.contact_slots
@@ -191,7 +193,7 @@ class Pushing:
         self._is_pusher = np.array([b in self.pusher for b in index])
         self._is_pushed = np.array([b in self.object_bodies for b in index])
         self._body_names = tuple(index)
-        del hand
+        self._hand = self.scene.bodies.index(self._hand_body())
         slots.set_margin(self.pusher, self.object_bodies, _APART)
         self._pressing = False
         self.reset()
@@ -254,11 +256,9 @@ class Pushing:
             truth = touched * aligned
         if truth is not None:
             tasks.append(Goal(truth, 1.0, name="touch", gain=0.15, weight=w_touch))
-        free = {s.position for s in speeds}
         self.controller = Controller(
             model, tasks, dt=dt, still=still, scene=self.scene, margin=0.005, smooth=0.02, contacts=24
         )
-        del free
         self.speeds = self.controller.speeds
         self._columns = [self.speeds.index(s) if s in self.speeds else -1 for s in speeds]
         self._object_column = self.speeds.index(speed)
@@ -280,6 +280,12 @@ class Pushing:
         """Return the weight of the object's goal, so that it counts as a motion of its fastest point."""
         return 1.0
 
+    def _hand_body(self) -> str:
+        """Return a body of the pusher that moves with its frame."""
+        motion = FrameDependence(self.model, self.model.speeds)
+        own = motion.moving_ancestors(self.tool.frame)
+        return next((b for b in self.pusher if motion.moving_ancestors(b) == own), self.pusher[0])
+
     def wait(self, timeout: float | None = None) -> bool:
         """Wait until everything is compiled, at most for a time [s], and return whether it is."""
         return self.controller.wait(timeout)
@@ -290,7 +296,8 @@ class Pushing:
         self.touching, self.losses, self.blocked, self.contacts = False, 0, 0, 0
         self._chosen: int | None = None
         self._given_up: dict[int, int] = {}
-        self._anchor: tuple[int, int, Array, Array] | None = None
+        self._anchor: tuple[int, Array] | None = None
+        self._aside = math.inf
         self._best, self._since = math.inf, 0
         self.step_count = 0
         self.view: PushView | None = None
@@ -323,8 +330,11 @@ class Pushing:
             self._choose(points, tip)
         k = self._chosen
         assert k is not None
+        offset = tip - points.points[k]
+        offset = offset - points.normals[k] * (points.normals[k] @ offset)
+        self._aside = float(np.sqrt(offset @ offset))
         contact = self._nearest(found, state)
-        self._update_touching(contact, points)
+        self._update_touching(contact)
         self._write(state, tip, points, k, contact)
         return self.controller.step(x)
 
@@ -333,7 +343,7 @@ class Pushing:
 
     def _nearest(
         self, found: DistanceResults, state: State
-    ) -> tuple[int, int, Array, Array, Array, float, Array, float] | None:
+    ) -> _Contact | None:
         """Return bodies, points r and p, normal, gap, velocity of p and alignment of the pair that pushes best."""
         if not len(found):
             return None
@@ -367,15 +377,20 @@ class Pushing:
         column = self._slots.point_jacobian(body, point)[:, self._object_column]
         return np.asarray(self.surface.sign * column)
 
-    def _update_touching(self, contact: tuple[object, ...] | None, points: PushContacts) -> None:
+    def _update_touching(self, contact: _Contact | None) -> None:
         """Note that the pusher has come to touch, or has lost its contact."""
         if self.touching:
-            if contact is None or contact[5] > LOST:  # type: ignore[operator]
+            if contact is None or contact[5] > LOST:
                 self.losses += 1
                 self._release()
-            elif contact[7] < _CONE_END:  # type: ignore[operator]
+            elif contact[7] < _CONE_END:
                 self._give_up()
-        elif contact is not None and contact[5] < TOUCHING and contact[7] > _CONE:  # type: ignore[operator]
+        elif (
+            self._aside < 2 * _NEAR
+            and contact is not None
+            and contact[5] < TOUCHING
+            and contact[7] > _CONE
+        ):
             self.touching = True
             self._best, self._since = math.inf, 0
             self._anchor = None
@@ -438,7 +453,7 @@ class Pushing:
         tip: Array,
         points: PushContacts,
         k: int,
-        contact: tuple[int, int, Array, Array, Array, float, Array, float] | None,
+        contact: _Contact | None,
     ) -> None:
         """Set the parameters of the program."""
         c, m = points.points[k], points.normals[k]
@@ -470,29 +485,30 @@ class Pushing:
             J = self._slots.point_jacobian(robot, r) - self._slots.point_jacobian(thing, p)
             frame = np.array([normal, across, up])
             rows = frame @ J
+            rows[1:] = frame[1:] @ (
+                self._slots.point_jacobian(self._hand, tip) - self._slots.point_jacobian(thing, tip)
+            )
             for i, column in enumerate(self._columns):
                 if column >= 0:
                     relative[:, i] = rows[:, column]
             self._set("gap", distance)
             own = self._slots.point_jacobian(thing, p)[:, self._object_column]
             self._set("pushed", float(normal @ own))
-            if self.touching:
-                drift = self._drift(robot, thing, r, p)
-                self._set("slip", frame[1:] @ drift)
+            self._set("slip", frame[1:] @ self._drift(thing, tip))
         self._set("relative", relative.ravel())
         push = velocity / max(float(np.linalg.norm(velocity)), 1e-9)
         tangent = np.cross(np.cross(push, normal), normal)
         self.view = PushView(p, r, normal, push, tangent, c, distance)
 
-    def _drift(self, robot: int, thing: int, r: Array, p: Array) -> Array:
-        """Return how far the point of the first touch on the robot has slid on the object, (3,) [m]."""
-        a, b = (self.scene.pose(self._body_names[k]) for k in (robot, thing))
-        if self._anchor is None or self._anchor[:2] != (robot, thing):
-            self._anchor = (robot, thing, a[:3, :3].T @ (r - a[:3, 3]), b[:3, :3].T @ (p - b[:3, 3]))
-        _, _, on_robot, on_object = self._anchor
-        return np.asarray(
-            a[:3, :3] @ on_robot + a[:3, 3] - (b[:3, :3] @ on_object + b[:3, 3])
-        )
+    def _drift(self, thing: int, tip: Array) -> Array:
+        """Return how far the tip has moved on the object since the first touch, (3,) [m]."""
+        pose = self.scene.pose(self._body_names[thing])
+        if not self.touching:
+            self._anchor = None
+            return np.zeros(3)
+        if self._anchor is None or self._anchor[0] != thing:
+            self._anchor = (thing, pose[:3, :3].T @ (tip - pose[:3, 3]))
+        return np.asarray(tip - pose[:3, :3] @ self._anchor[1] - pose[:3, 3])
 
     def _press(self, pressing: bool) -> None:
         """Let the pusher touch the object, or keep it away."""
