@@ -61,6 +61,16 @@ class PushContacts:
     leverage: Array
 
 
+@dataclass(frozen=True, slots=True, eq=False)
+class PushPoint:
+    """One contact point at one state; see :class:`PushContacts`."""
+
+    point: Array
+    normal: Array
+    velocity: Array
+    alignment: float
+
+
 class PushSurface:
     """Sampled surface of an object that a coordinate moves, as far as a push can reach it.
 
@@ -154,10 +164,15 @@ class PushSurface:
         )
         return PushContacts(points, normals, velocities, alignment, speeds / max(speeds.max(), 1e-9))
 
-    def velocity(self, state: State, body: str, point: Array) -> Array:
-        """Return the velocity (3,) of a point of a body in the world, per unit of the coordinate."""
-        twist = self._place(state)[1][self.bodies.index(body)]
-        return np.asarray(twist[:3] + np.cross(twist[3:], point))
+    def point_at(self, state: State, index: int) -> PushPoint:
+        """Return one point at a state."""
+        poses, twists = self._place(state)
+        body = self.owner[index]
+        R, twist = poses[body, :, :3], twists[body]
+        point = R @ self._points[index] + poses[body, :, 3]
+        normal = R @ self._normals[index]
+        velocity = twist[:3] + cross(twist[3:], point)
+        return PushPoint(point, normal, velocity, find_alignment(normal, velocity))
 
     def _sample(self, scene: Scene, state: State) -> list[tuple[int, Array, Array]]:
         """Return body, point and normal in the body of the points that rays reach at a state."""
@@ -199,7 +214,9 @@ def _without_doubles(found: list[tuple[int, Array, Array]]) -> list[tuple[int, A
     """Return points without those that are about the same."""
     kept: dict[tuple[float, ...], tuple[int, Array, Array]] = {}
     for body, point, normal in found:
-        kept.setdefault((body, *np.round(point / _SAME).tolist(), *np.round(normal, 1).tolist()), (body, point, normal))
+        kept.setdefault(
+            (body, *np.round(point / _SAME).tolist(), *np.round(normal, 1).tolist()), (body, point, normal)
+        )
     return list(kept.values())
 
 
@@ -299,3 +316,16 @@ def _ancestors(model: ModelView, frame: str) -> list[str]:
         found.append(frame)
         frame = frames[frame].parent
     return found
+
+
+def cross(a: Array, b: Array) -> Array:
+    """Return the cross product (3,) of two vectors (3,), faster than numpy's."""
+    x, y, z = a.tolist()
+    u, v, w = b.tolist()
+    return np.array([y * w - z * v, z * u - x * w, x * v - y * u])
+
+
+def find_alignment(normal: Array, velocity: Array) -> float:
+    """Return the cosine between -n and a velocity; -1 for a point that does not move."""
+    speed = math.sqrt(float(velocity @ velocity))
+    return -float(normal @ velocity) / speed if speed > 1e-9 else -1.0

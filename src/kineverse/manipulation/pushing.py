@@ -16,16 +16,19 @@ prediction honest: the object does not run from the pusher (ḋ <= 0), and r sta
 
 from __future__ import annotations
 
+import contextlib
 import math
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable
 from dataclasses import dataclass
 from typing import TypeAlias
 
 import numpy as np
 
+from kineverse.compile import compile  # noqa: A004
 from kineverse.control import Command, Controller, Goal, Keep
+from kineverse.control.formulation import find_speeds
 from kineverse.control.tasks import Task
-from kineverse.errors import InvalidValueError, UnknownNameError, suggest
+from kineverse.errors import InvalidValueError, KineverseError, UnknownNameError, suggest
 from kineverse.expressions.expression import Expression, array, as_expression
 from kineverse.expressions.functions import sqrt
 from kineverse.geometry import Rule, Scene
@@ -38,7 +41,7 @@ from kineverse.model.model_view import ModelView
 from kineverse.state import State, StateLike
 from kineverse.symbols import Symbol, parameter
 
-from .push_contact import PushContacts, PushSurface, find_push_tool
+from .push_contact import PushContacts, PushPoint, PushSurface, cross, find_alignment, find_push_tool
 
 _Contact: TypeAlias = tuple[int, int, Array, Array, Array, float, Array, float]
 """Bodies of robot and object, r, p, normal, gap, velocity of p, alignment."""
@@ -60,6 +63,11 @@ _FAR = 0.05
 _SPEED = 0.25
 """Largest speed of the contact point [m/s]."""
 _REACH_SPEED = 0.5
+_LOW = 0.03
+"""Height of the tip above a contact point from which on the pusher may touch [m]."""
+_HOLD_WEIGHT = 10.0
+_SURROUNDINGS = 0.1
+"""Distance within which other points count as given up, too [m]."""
 _BLOCKED_STEPS = 60
 _BLOCKED_WAY = 0.004
 
@@ -119,8 +127,8 @@ class Pushing:
     rules
         Rules of the collision filter.
     logic
-        ``"and"`` for the trend rule of :mod:`kineverse.logic`; ``"product"`` for the product rule; None for no
-        trends, for comparison only.
+        ``"and"`` for the trend rule of :mod:`kineverse.logic`; for comparison ``"product"`` for the product
+        rule, and None for no trends.
 
     Attributes
     ----------
@@ -197,6 +205,9 @@ class Pushing:
         slots.set_margin(self.pusher, self.object_bodies, _APART)
         self._pressing = False
         self.reset()
+        with contextlib.suppress(KineverseError):
+            self.step(at)  # what is computed once is computed now
+        self.reset()
 
     # -- the quadratic program -----------------------------------------------------------------------------
 
@@ -207,8 +218,9 @@ class Pushing:
         world_T_hand = model.fk(self.tool.frame)
         tip = world_T_hand[:3, :3] @ self.tool.tip + world_T_hand[:3, 3]
         axis = world_T_hand[:3, :3] @ self.tool.axis
-        speeds = sorted({s for s in model.rates.over_free_speeds(tip.gradient())}, key=lambda s: s.sort_key)
-        speeds = [*speeds, speed]
+        resting = find_speeds(model, still, "still")
+        moving = set(model.rates.over_free_speeds(tip.gradient())) - resting - {speed}
+        speeds = [*sorted(moving, key=lambda s: s.sort_key), speed]
 
         self._parameters: dict[str, list[Symbol]] = {}
 
@@ -240,7 +252,7 @@ class Pushing:
         most = engaged * less(gap, LOST) * 1e3
         far = 1e3 * (1 - engaged)
         tasks: list[Task] = [
-            Goal(q, self.target, name="object", gain=4.0, speed=numbers("pace", 1)[0], weight=self._weight()),
+            Goal(q, self.target, name="object", gain=4.0, speed=numbers("pace", 1)[0]),
             Goal(tip, target, name="reach", gain=3.0, speed=_REACH_SPEED, weight=w_reach),
             Goal(axis, facing, name="facing", gain=2.0, speed=1.0, weight=0.05),
             Goal(slips, 0.0, name="no slip", gain=5.0, weight=w_hold),
@@ -260,7 +272,7 @@ class Pushing:
             model, tasks, dt=dt, still=still, scene=self.scene, margin=0.005, smooth=0.02, contacts=24
         )
         self.speeds = self.controller.speeds
-        self._columns = [self.speeds.index(s) if s in self.speeds else -1 for s in speeds]
+        self._columns = [self.speeds.index(s) for s in speeds]
         self._object_column = self.speeds.index(speed)
         place = {s: k for k, s in enumerate(self.controller.inputs)}
         self._values = np.array([s.value or 0.0 for s in self.controller.inputs])
@@ -269,16 +281,8 @@ class Pushing:
             name: np.array([place[s] for s in symbols], dtype=np.intp)
             for name, symbols in self._parameters.items()
         }
-        hand = model.fk(self.tool.frame)
-        from kineverse.compile import compile as compile_expressions
-
-        self._pose_function = compile_expressions([hand])
-        self._pose = self._pose_function.bind()
-        self._pose_inputs = self._pose_function.inputs
-
-    def _weight(self) -> float:
-        """Return the weight of the object's goal, so that it counts as a motion of its fastest point."""
-        return 1.0
+        self._tip_function = compile([tip])
+        self._tip = self._tip_function.bind()
 
     def _hand_body(self) -> str:
         """Return a body of the pusher that moves with its frame."""
@@ -299,8 +303,7 @@ class Pushing:
         self._anchor: tuple[int, Array] | None = None
         self._aside = math.inf
         self._best, self._since = math.inf, 0
-        self.step_count = 0
-        self.view: PushView | None = None
+        self._view: tuple[Array, Array, Array, Array, Array, float] | None = None
 
     # -- the step ------------------------------------------------------------------------------------------
 
@@ -316,35 +319,31 @@ class Pushing:
         InfeasibleError, NotFiniteError
             As :meth:`.Controller.step`.
         """
-        self.step_count += 1
         x, n = self._values, len(self._coordinates)
         x[:n] = state.vector(self._coordinates)
         found = self.controller.query_contacts(x)
-        self._pose.input[:] = state.vector(self._pose_inputs)
-        self._pose()
-        pose = self._pose.outputs[0]
-        tip = pose[:3, :3] @ self.tool.tip + pose[:3, 3]
-        points = self.surface.at(state)
-        self._watch_progress(state, tip, points)
-        if self._chosen is None:
-            self._choose(points, tip)
-        k = self._chosen
-        assert k is not None
-        offset = tip - points.points[k]
-        offset = offset - points.normals[k] * (points.normals[k] @ offset)
-        self._aside = float(np.sqrt(offset @ offset))
-        contact = self._nearest(found, state)
+        self._tip.input[:] = state.vector(self._tip_function.inputs)
+        self._tip()
+        tip = self._tip.outputs[0].copy()
+        point = None if self._chosen is None else self.surface.point_at(state, self._chosen)
+        if point is not None and self._is_stuck(state, tip, point):
+            self._give_up()
+            point = None
+        if point is None:
+            point = self._choose(state, tip)
+        offset = tip - point.point
+        offset = offset - point.normal * float(point.normal @ offset)
+        self._aside = math.sqrt(float(offset @ offset))
+        contact = self._nearest(found)
         self._update_touching(contact)
-        self._write(state, tip, points, k, contact)
+        self._write(tip, point, contact)
         return self.controller.step(x)
 
     def _set(self, name: str, values: float | Array) -> None:
         self._values[self._places[name]] = values
 
-    def _nearest(
-        self, found: DistanceResults, state: State
-    ) -> _Contact | None:
-        """Return bodies, points r and p, normal, gap, velocity of p and alignment of the pair that pushes best."""
+    def _nearest(self, found: DistanceResults) -> _Contact | None:
+        """Return the near pair of pusher and object that pushes best; see :data:`_Contact`."""
         if not len(found):
             return None
         a, b = found.body_indices.T
@@ -366,8 +365,7 @@ class Pushing:
                 robot, thing = int(b[row]), int(a[row])
                 r, p, normal = found.points_b[row], found.points_a[row], found.normals[row]
             velocity = self._velocity(thing, p)
-            speed = float(np.sqrt(velocity @ velocity))
-            alignment = -float(normal @ velocity) / speed if speed > 1e-9 else -1.0
+            alignment = find_alignment(normal, velocity)
             if best is None or alignment > best[-1]:
                 best = (robot, thing, r, p, normal, gap, velocity, alignment)
         return best
@@ -385,12 +383,7 @@ class Pushing:
                 self._release()
             elif contact[7] < _CONE_END:
                 self._give_up()
-        elif (
-            self._aside < 2 * _NEAR
-            and contact is not None
-            and contact[5] < TOUCHING
-            and contact[7] > _CONE
-        ):
+        elif self._aside < 2 * _NEAR and contact is not None and contact[5] < TOUCHING and contact[7] > _CONE:
             self.touching = True
             self._best, self._since = math.inf, 0
             self._anchor = None
@@ -407,16 +400,17 @@ class Pushing:
         self._chosen = None
         self._release()
 
-    def _choose(self, points: PushContacts, tip: Array) -> None:
-        """Choose the contact point that pushes best."""
-        score = self.score(points)
-        score = score - 0.5 * np.sqrt(((points.points - tip) ** 2).sum(axis=1))
+    def _choose(self, state: State, tip: Array) -> PushPoint:
+        """Choose the contact point that pushes best, and return it."""
+        points = self.surface.at(state)
+        score = self.score(points) - 0.5 * np.sqrt(((points.points - tip) ** 2).sum(axis=1))
         for k, times in self._given_up.items():
-            near = np.sqrt(((points.points - points.points[k]) ** 2).sum(axis=1)) < 0.1
+            near = ((points.points - points.points[k]) ** 2).sum(axis=1) < _SURROUNDINGS**2
             score = score - np.where(near, 0.6 * times, 0.0)
         self._chosen = int(np.argmax(score))
         self.contacts += 1
         self._best, self._since = math.inf, 0
+        return self.surface.point_at(state, self._chosen)
 
     def score(self, points: PushContacts) -> Array:
         """Return how well the object can be pushed at each point (N,)."""
@@ -428,77 +422,65 @@ class Pushing:
             + 0.7 * self.surface.room
         )
 
-    def _watch_progress(self, state: State, tip: Array, points: PushContacts) -> None:
-        """Give a contact point up without progress, or where the direction of the push has left its cone."""
-        k = self._chosen
-        if k is None:
-            return
+    def _is_stuck(self, state: State, tip: Array, point: PushPoint) -> bool:
+        """Return True without progress for a while, or if the push has left the cone of the contact point."""
         if self.touching:
             rest = abs(state[self.coordinate] - self.target)
         else:
-            rest = float(np.linalg.norm(points.points[k] - tip))
-            if points.alignment[k] < _CONE_END:
-                self._give_up()
-                return
+            if point.alignment < _CONE_END:
+                return True
+            offset = point.point - tip
+            rest = math.sqrt(float(offset @ offset))
         if rest < self._best - _BLOCKED_WAY:
             self._best, self._since = rest, 0
-            return
-        self._since += 1
-        if self._since > _BLOCKED_STEPS:
-            self._give_up()
+        else:
+            self._since += 1
+        return self._since > _BLOCKED_STEPS
 
-    def _write(
-        self,
-        state: State,
-        tip: Array,
-        points: PushContacts,
-        k: int,
-        contact: _Contact | None,
-    ) -> None:
+    def _write(self, tip: Array, point: PushPoint, contact: _Contact | None) -> None:
         """Set the parameters of the program."""
-        c, m = points.points[k], points.normals[k]
-        offset = tip - c
-        height = float(offset @ m)
-        lateral = offset - height * m
-        aside = float(np.sqrt(lateral @ lateral))
-        near = aside < _NEAR
-        wanted = _STANDOFF if near else min(_FUNNEL, _STANDOFF + 1.5 * (aside - _NEAR))
-        goal = c + wanted * m
-        self._set("target", goal)
+        c, m, velocity = point.point, point.normal, point.velocity
+        near, height = self._aside < _NEAR, float((tip - c) @ m)
+        standoff = _STANDOFF if near else min(_FUNNEL, _STANDOFF + 1.5 * (self._aside - _NEAR))
+        self._set("target", c + standoff * m)
         self._set("normal", m)
         self._set("facing", -m)
-        speed = float(np.linalg.norm(points.velocities[k]))
-        self._set("pace", _SPEED / max(speed, 1e-3))
-        self._press(self.touching or (near and height < 0.03))
+        self._set("pace", _SPEED / max(math.sqrt(float(velocity @ velocity)), 1e-3))
+        self._press(self.touching or (near and height < _LOW))
         self._set("reach", 0.0 if self.touching else 1.0)
         self._set("touch", 0.0 if self.touching else 1.0)
-        self._set("hold", 10.0 if self.touching else 0.0)
+        self._set("hold", _HOLD_WEIGHT if self.touching else 0.0)
         self._set("engaged", float(self.touching))
-        relative = np.zeros((3, len(self._columns)))
-        self._set("gap", _FAR)
-        self._set("slip", 0.0)
-        self._set("pushed", 0.0)
-        distance, r, p, normal, velocity = math.inf, tip, c, m, points.velocities[k]
-        if contact is not None:
+        distance, r, p, normal = math.inf, tip, c, m
+        if contact is None:
+            for name in ("relative", "slip", "pushed"):
+                self._set(name, 0.0)
+            self._set("gap", _FAR)
+        else:
             robot, thing, r, p, normal, distance, velocity, _ = contact
             across, up = _tangents(normal)
-            J = self._slots.point_jacobian(robot, r) - self._slots.point_jacobian(thing, p)
-            frame = np.array([normal, across, up])
-            rows = frame @ J
-            rows[1:] = frame[1:] @ (
-                self._slots.point_jacobian(self._hand, tip) - self._slots.point_jacobian(thing, tip)
+            slots = self._slots
+            J = slots.point_jacobian(thing, p)
+            relative = np.empty((3, len(self.speeds)))
+            relative[0] = normal @ (slots.point_jacobian(robot, r) - J)
+            tangents = np.array([across, up])
+            relative[1:] = tangents @ (
+                slots.point_jacobian(self._hand, tip) - slots.point_jacobian(thing, tip)
             )
-            for i, column in enumerate(self._columns):
-                if column >= 0:
-                    relative[:, i] = rows[:, column]
+            self._set("relative", relative[:, self._columns].ravel())
             self._set("gap", distance)
-            own = self._slots.point_jacobian(thing, p)[:, self._object_column]
-            self._set("pushed", float(normal @ own))
-            self._set("slip", frame[1:] @ self._drift(thing, tip))
-        self._set("relative", relative.ravel())
-        push = velocity / max(float(np.linalg.norm(velocity)), 1e-9)
-        tangent = np.cross(np.cross(push, normal), normal)
-        self.view = PushView(p, r, normal, push, tangent, c, distance)
+            self._set("pushed", float(normal @ J[:, self._object_column]))
+            self._set("slip", tangents @ self._drift(thing, tip))
+        self._view = (r, p, normal, velocity, c, distance)
+
+    @property
+    def view(self) -> PushView | None:
+        """Points and vectors of the last step; None before the first."""
+        if self._view is None:
+            return None
+        r, p, normal, velocity, c, distance = self._view
+        push = velocity / max(math.sqrt(float(velocity @ velocity)), 1e-9)
+        return PushView(p, r, normal, push, cross(cross(push, normal), normal), c, distance)
 
     def _drift(self, thing: int, tip: Array) -> Array:
         """Return how far the tip has moved on the object since the first touch, (3,) [m]."""
@@ -519,10 +501,9 @@ class Pushing:
 
 def _tangents(normal: Array) -> tuple[Array, Array]:
     """Return two unit vectors that are orthogonal to a normal and to each other."""
-    helper = np.eye(3)[int(np.argmin(np.abs(normal)))]
-    across = np.cross(normal, helper)
-    across /= np.sqrt(across @ across)
-    return across, np.cross(normal, across)
+    across = cross(normal, np.eye(3)[int(np.argmin(np.abs(normal)))])
+    across /= math.sqrt(float(across @ across))
+    return across, cross(normal, across)
 
 
 def _match(known: Iterable[str], names: str | Iterable[str], argument: str) -> tuple[str, ...]:
@@ -547,6 +528,4 @@ def _furniture_rules(bodies: Iterable[str], robot: Iterable[str]) -> tuple[Rule,
     if any(matches_pattern(b, tuple(roots)) for b in own):
         roots = dict.fromkeys(others)
     names = tuple(roots)
-    return tuple(
-        Rule(a, b, False, "furniture") for i, a in enumerate(names) for b in names[i:]
-    )
+    return tuple(Rule(a, b, False, "furniture") for i, a in enumerate(names) for b in names[i:])
