@@ -68,6 +68,7 @@ _LOW = 0.03
 _HOLD_WEIGHT = 10.0
 _SURROUNDINGS = 0.1
 """Distance within which other points count as given up, too [m]."""
+_DEEPEST = 2e-4
 _BLOCKED_STEPS = 60
 _BLOCKED_WAY = 0.004
 
@@ -310,6 +311,22 @@ class Pushing:
     def done(self, state: State, tolerance: float = 0.02) -> bool:
         """Return True if the coordinate is within a tolerance of the target."""
         return abs(state[self.coordinate] - self.target) < tolerance
+
+    def first_contact(self, state: State) -> str:
+        """Return the bodies that penetrate each other at a state, the robot's with anything; empty if none."""
+        self.scene.update(state)
+        found = self._slots.scene.watch(f"{self.robot}/*", "*", radius=0.0)(0.0)
+        deep = [pair for pair in found if pair.distance < -_DEEPEST]
+        return f"contact of {deep[0].a} and {deep[0].b}" if deep else ""
+
+    @property
+    def penetration(self) -> float:
+        """Deepest penetration at the last step of pairs that may not touch [m], 0 if there is none."""
+        found = self._slots.found
+        a, b = found.body_indices.T
+        may = (self._is_pusher[a] & self._is_pushed[b]) | (self._is_pusher[b] & self._is_pushed[a])
+        distances = found.distances[~may]
+        return max(0.0, -float(distances[0])) if len(distances) else 0.0
 
     def step(self, state: State) -> Command:
         """Return the command for one time step at a state.
