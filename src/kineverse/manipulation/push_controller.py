@@ -68,6 +68,10 @@ _LOW = 0.03
 _HOLD_WEIGHT = 10.0
 _SURROUNDINGS = 0.1
 """Distance within which other points count as given up, too [m]."""
+_JAMMED = 4e-4
+"""Depth at which the object counts as not giving way [m]."""
+_RAMP = 0.02
+"""Speed of the contact point beyond the measured one that is tried [m/s]."""
 _DEEPEST = 2e-4
 _BLOCKED_STEPS = 60
 _BLOCKED_WAY = 0.004
@@ -250,7 +254,7 @@ class Pushing:
         aligned = less(aside, _NEAR)
         v = as_expression(speed)
         ḋ = sum((relative[0, k] * s for k, s in enumerate(speeds)), as_expression(0.0))
-        most = engaged * less(gap, LOST) * 1e3
+        most = engaged * less(gap, LOST) * less(-_JAMMED, gap) * 1e3
         far = 1e3 * (1 - engaged)
         tasks: list[Task] = [
             Goal(q, self.target, name="object", gain=4.0, speed=numbers("pace", 1)[0]),
@@ -303,6 +307,8 @@ class Pushing:
         self._given_up: dict[int, int] = {}
         self._anchor: tuple[int, Array] | None = None
         self._aside = math.inf
+        self._moved = 0.0
+        self._value: float | None = None
         self._best, self._since = math.inf, 0
         self._view: tuple[Array, Array, Array, Array, Array, float] | None = None
 
@@ -337,6 +343,9 @@ class Pushing:
             As :meth:`.Controller.step`.
         """
         x, n = self._values, len(self._coordinates)
+        value = state[self.coordinate]
+        self._moved = max(self.surface.sign * (value - self._value), 0.0) if self._value is not None else 0.0
+        self._value = value
         x[:n] = state.vector(self._coordinates)
         found = self.controller.query_contacts(x)
         self._tip.input[:] = state.vector(self._tip_function.inputs)
@@ -462,7 +471,9 @@ class Pushing:
         self._set("target", c + standoff * m)
         self._set("normal", m)
         self._set("facing", -m)
-        self._set("pace", _SPEED / max(math.sqrt(float(velocity @ velocity)), 1e-3))
+        leverage = max(math.sqrt(float(velocity @ velocity)), 1e-3)
+        # An object that does not give way is not pushed further than a ramp of speed leads in a step.
+        self._set("pace", min(_SPEED, self._moved * leverage / self.controller.dt + _RAMP) / leverage)
         self._press(self.touching or (near and height < _LOW))
         self._set("reach", 0.0 if self.touching else 1.0)
         self._set("touch", 0.0 if self.touching else 1.0)
