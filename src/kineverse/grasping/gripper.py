@@ -3,12 +3,24 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
+import numpy as np
+
+from kineverse import lie
+from kineverse.errors import UnknownNameError
 from kineverse.formats.srdf.description import Srdf
 from kineverse.lie import Array
+from kineverse.model.body import Body, Shape, Sphere
 from kineverse.model.model_view import ModelView
 from kineverse.symbols import Symbol
+
+from .finger_pairs import Branch, Palm, find_palms, hand_frame, path_to_root
+from .hand_model import HandModel, bodies_with_shapes, usable_bodies
+from .pads import Pads, find_pads, reaches_pads
+
+_TYPICAL = 0.015
+"""Thickness of a bar for which the grasp pose is given [m]."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -17,23 +29,32 @@ class Gripper:
 
     Attributes
     ----------
+    robot
+        Prefix of the robot in the model.
     hand
         Frame that carries the fingers.
     grasp_pose
-        Pose hand_T_grasp (4, 4) [m]: its origin lies between the finger pads, x points out of the hand, y
-        along the closing motion.
+        Pose hand_T_grasp (4, 4) [m]: its origin lies between the finger pads around a thin bar, x points out
+        of the hand, y along the closing motion, from the first finger to the second.
     fingers
-        Frames of the one finger, and of the other.
+        Frames of the one finger, and of the other, that have shapes.
     bodies
-        Frames of the hand and all fingers: the group that may touch what is grasped.
+        Frames of the hand and all fingers that have shapes: the group that may touch what is grasped.
     joints
         Free coordinates that open and close the fingers.
     opened, closed
-        Values of these coordinates for open and for closed fingers [m], [rad].
+        Values of these coordinates for open fingers, and for fingers that touch or do not close further [m],
+        [rad].
     width
         Gap between the open fingers [m].
+    pads
+        The facing surfaces.
+    remarks
+        Shapes that cannot be read, and why. Without any shape, a finger is where its frames are: then the
+        width and the grasp pose are rough.
     """
 
+    robot: str
     hand: str
     grasp_pose: Array
     fingers: tuple[tuple[str, ...], tuple[str, ...]]
@@ -42,10 +63,30 @@ class Gripper:
     opened: Mapping[Symbol, float]
     closed: Mapping[Symbol, float]
     width: float
+    pads: Pads = field(repr=False)
+    remarks: tuple[str, ...] = ()
+
+    def values_at(self, gap: float) -> dict[Symbol, float]:
+        """Return the values of the joints at which the pads have a gap [m], within what they can."""
+        return self.pads.values_at(gap)
+
+    def grasp_pose_at(self, gap: float) -> Array:
+        """Return hand_T_grasp (4, 4) [m] for pads with a gap [m]: fingers that turn move the pads along x."""
+        pose = self.grasp_pose.copy()
+        pose[:3, 3] = self.pads.middle_at(gap)
+        return pose
+
+    def __str__(self) -> str:
+        joints = ", ".join(f"{s} from {self.opened[s]:.4g} to {self.closed[s]:.4g}" for s in self.joints)
+        missing = f"; {len(self.remarks)} shapes are missing" if self.remarks else ""
+        return f"gripper of {self.hand}, opens {self.width * 1e3:.0f} mm by {joints}{missing}"
 
 
 def find_grippers(model: ModelView, robot: str, srdf: Srdf | None = None) -> tuple[Gripper, ...]:
     """Return the grippers of a robot, the likeliest for manipulation first; empty if it has none.
+
+    Grippers of the end effectors of a semantic description come first, then the wider ones. Of equally wide
+    ones, that further to the right comes first.
 
     Parameters
     ----------
@@ -56,7 +97,7 @@ def find_grippers(model: ModelView, robot: str, srdf: Srdf | None = None) -> tup
     srdf
         Semantic description, whose end effectors come first.
     """
-    raise NotImplementedError
+    return _search(model, robot, srdf)[0]
 
 
 def find_gripper(model: ModelView, robot: str, hand: str | None = None, srdf: Srdf | None = None) -> Gripper:
@@ -74,4 +115,91 @@ def find_gripper(model: ModelView, robot: str, hand: str | None = None, srdf: Sr
     UnknownNameError
         If the robot has no gripper, or none at this frame; the message lists the grippers.
     """
-    raise NotImplementedError
+    found, why = _search(model, robot, srdf)
+    name = f"The robot '{robot}'" if robot else "The model"
+    if not found:
+        reasons = "".join(f"\n  {line}" for line in why) or " None of its links carries two moving branches."
+        raise UnknownNameError(f"{name} has no gripper with two opposed fingers.{reasons}")
+    if hand is None:
+        return found[0]
+    model.fk(hand)  # raises for an unknown frame
+    for gripper in found:
+        if hand in (gripper.hand, *gripper.bodies) or not model.speeds_of(hand, gripper.hand):
+            return gripper
+    listed = ", ".join(repr(gripper.hand) for gripper in found)
+    raise UnknownNameError(f"{name} has no gripper at '{hand}'. Its grippers are at: {listed}.")
+
+
+def _search(model: ModelView, robot: str, srdf: Srdf | None) -> tuple[tuple[Gripper, ...], list[str]]:
+    """Return the grippers, and for each link without one the reason."""
+    found: list[tuple[tuple[float, ...], Gripper]] = []
+    why: list[str] = []
+    for rank, palm in find_palms(model, robot, srdf):
+        reasons = list(palm.refused)
+        if len(palm.branches) > 1:
+            gripper = _best_pair(model, robot, palm, reasons)
+            if gripper is not None:
+                # The hand at the default state, as the robot sees it: y points to the left.
+                place = np.asarray(model.fk(gripper.hand)(model.default_state()))[:3, 3]
+                found.append(((rank, -round(gripper.width, 4), round(float(place[1]), 4)), gripper))
+                continue
+        why.append(f"At {palm.root}: {'; '.join(reasons)}.")
+    found.sort(key=lambda entry: entry[0])
+    return tuple(gripper for _, gripper in found), why
+
+
+def _best_pair(model: ModelView, robot: str, palm: Palm, reasons: list[str]) -> Gripper | None:
+    """Return the gripper on a link whose pads are farthest out; else add why there is none to the reasons."""
+    hand = hand_frame(model, palm.branches)
+    joints = tuple(dict.fromkeys(s for b in palm.branches for s in b.joints))
+    below = [f for f in palm.frames if hand in path_to_root(model, f)]
+    moving = [f for b in palm.branches for f in b.frames]
+    bodies = bodies_with_shapes(model, [*below, *moving])
+    usable, problems = usable_bodies(bodies)
+    for branch in palm.branches:
+        if not any(f in usable for f in branch.frames):
+            usable.update(dict.fromkeys(branch.frames, _STAND_IN))
+    alone = HandModel(model, hand, usable, joints)
+    root = np.asarray(model.fk(palm.root, hand)({}))[:3, 3]
+    best: tuple[Pads, Branch, Branch] | None = None
+    for k, a in enumerate(palm.branches):
+        for b in palm.branches[k + 1 :]:
+            pads, reason = find_pads(model, alone, a, b, root)
+            if pads is None:
+                names = ", ".join(map(str, dict.fromkeys((*a.joints, *b.joints))))
+                reasons.append(f"{a.root} and {b.root}: {reason} ({names})")
+            elif best is None or _reach(pads) > _reach(best[0]) + 1e-6:
+                best = pads, a, b
+    if best is None:
+        if len(palm.branches) > 2:
+            reasons.insert(0, f"{len(palm.branches)} branches, of which no two are opposed fingers")
+        return None
+    pads, *pair = best
+    for branch in palm.branches:
+        if branch not in pair and reaches_pads(alone, branch, pads):
+            names = ", ".join(b.root for b in (*pair, branch))
+            reasons.append(f"{names} are three fingers, and grasps are sampled for two")
+            return None
+    width = float(pads.stroke[0, 1])
+    pose = lie.transform(pads.axes, pads.middle_at(min(_TYPICAL, width / 2)))
+    return Gripper(
+        robot=robot,
+        hand=hand,
+        grasp_pose=pose,
+        fingers=pads.fingers,
+        bodies=tuple(bodies),
+        joints=tuple(pads.opened),
+        opened=pads.opened,
+        closed=pads.closed,
+        width=width,
+        pads=pads,
+        remarks=tuple(problems),
+    )
+
+
+_STAND_IN = Body(collisions=(Shape(Sphere(5e-4)),))
+"""Ball at the origin of a frame, in place of shapes that cannot be read."""
+
+
+def _reach(pads: Pads) -> float:
+    return float(pads.middle_at(_TYPICAL) @ pads.axes[:, 0])
