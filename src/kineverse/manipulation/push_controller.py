@@ -63,9 +63,13 @@ _FAR = 0.05
 _SPEED = 0.25
 """Largest speed of the contact point [m/s]."""
 _REACH_SPEED = 0.5
+_RETREAT = 0.1
+"""Distance from the object at which a retreat ends [m]."""
 _LOW = 0.03
 """Height of the tip above a contact point from which on the pusher may touch [m]."""
 _HOLD_WEIGHT = 10.0
+_DISTANCE_COST, _GIVEN_UP_COST = 0.5, 0.6
+"""Cost of a contact point by its distance from the tip [1/m], and by the times that it was given up."""
 _SURROUNDINGS = 0.1
 """Distance within which other points count as given up, too [m]."""
 _JAMMED = 4e-4
@@ -147,6 +151,10 @@ class Pushing:
         Number of contacts that were lost.
     blocked
         Number of contact points given up.
+    jammed
+        Number of those at which the pusher touched, and the object did not move.
+    retreating
+        Set it to True to take the pusher away from the object.
     contacts
         Number of contact points chosen.
     view
@@ -302,7 +310,8 @@ class Pushing:
     def reset(self) -> None:
         """Forget all contacts."""
         self.controller.reset()
-        self.touching, self.losses, self.blocked, self.contacts = False, 0, 0, 0
+        self.touching, self.losses, self.blocked, self.contacts, self.jammed = False, 0, 0, 0, 0
+        self.retreating = False
         self._chosen: int | None = None
         self._given_up: dict[int, int] = {}
         self._anchor: tuple[int, Array] | None = None
@@ -319,7 +328,7 @@ class Pushing:
         return abs(state[self.coordinate] - self.target) < tolerance
 
     def first_contact(self, state: State) -> str:
-        """Return the bodies that penetrate each other at a state, the robot's with anything; empty if none."""
+        """Return which body of the robot penetrates something at a state; empty if none does."""
         self.scene.update(state)
         found = self._slots.scene.watch(f"{self.robot}/*", "*", radius=0.0)(0.0)
         deep = [pair for pair in found if pair.distance < -_DEEPEST]
@@ -348,22 +357,27 @@ class Pushing:
         self._value = value
         x[:n] = state.vector(self._coordinates)
         found = self.controller.query_contacts(x)
-        self._tip.input[:] = state.vector(self._tip_function.inputs)
-        self._tip()
-        tip = self._tip.outputs[0].copy()
+        tip = self._tip_at(state)
         point = None if self._chosen is None else self.surface.point_at(state, self._chosen)
-        if point is not None and self._is_stuck(state, tip, point):
+        if point is not None and not self.retreating and self._is_stuck(state, tip, point):
             self._give_up()
             point = None
         if point is None:
-            point = self._choose(state, tip)
+            point = self.choose(state)
         offset = tip - point.point
         offset = offset - point.normal * float(point.normal @ offset)
         self._aside = math.sqrt(float(offset @ offset))
         contact = self._nearest(found)
-        self._update_touching(contact)
+        if not self.retreating:
+            self._update_touching(contact)
         self._write(tip, point, contact)
         return self.controller.step(x)
+
+    def _tip_at(self, state: State) -> Array:
+        """Return the foremost point of the pusher (3,) at a state."""
+        self._tip.input[:] = state.vector(self._tip_function.inputs)
+        self._tip()
+        return np.array(self._tip.outputs[0])
 
     def _set(self, name: str, values: float | Array) -> None:
         self._values[self._places[name]] = values
@@ -420,20 +434,32 @@ class Pushing:
 
     def _give_up(self) -> None:
         """Leave the present contact point for another one."""
+        self.jammed += self.touching
         if self._chosen is not None:
             self._given_up[self._chosen] = self._given_up.get(self._chosen, 0) + 1
             self.blocked += 1
         self._chosen = None
         self._release()
 
-    def _choose(self, state: State, tip: Array) -> PushPoint:
-        """Choose the contact point that pushes best, and return it."""
+    def rank(self, state: State, limit: float = 0.1) -> list[int]:
+        """Return contact points at a state, the best first, each some distance from better ones [m]."""
         points = self.surface.at(state)
-        score = self.score(points) - 0.5 * np.sqrt(((points.points - tip) ** 2).sum(axis=1))
+        tip = self._tip_at(state)
+        score = self.score(points) - _DISTANCE_COST * np.sqrt(((points.points - tip) ** 2).sum(axis=1))
         for k, times in self._given_up.items():
             near = ((points.points - points.points[k]) ** 2).sum(axis=1) < _SURROUNDINGS**2
-            score = score - np.where(near, 0.6 * times, 0.0)
-        self._chosen = int(np.argmax(score))
+            score = score - np.where(near, _GIVEN_UP_COST * times, 0.0)
+        ranked: list[int] = []
+        while score.max() > -math.inf:
+            best = int(np.argmax(score))
+            ranked.append(best)
+            near = ((points.points - points.points[best]) ** 2).sum(axis=1) < limit**2
+            score = np.where(near, -math.inf, score)
+        return ranked
+
+    def choose(self, state: State, index: int | None = None) -> PushPoint:
+        """Choose a contact point, by default the best, and return it."""
+        self._chosen = self.rank(state, math.inf)[0] if index is None else index
         self.contacts += 1
         self._best, self._since = math.inf, 0
         return self.surface.point_at(state, self._chosen)
@@ -466,8 +492,10 @@ class Pushing:
     def _write(self, tip: Array, point: PushPoint, contact: _Contact | None) -> None:
         """Set the parameters of the program."""
         c, m, velocity = point.point, point.normal, point.velocity
-        near, height = self._aside < _NEAR, float((tip - c) @ m)
-        standoff = _STANDOFF if near else min(_FUNNEL, _STANDOFF + 1.5 * (self._aside - _NEAR))
+        near, height = self._aside < _NEAR and not self.retreating, float((tip - c) @ m)
+        standoff = _STANDOFF if near else min(_FUNNEL, _STANDOFF + 1.5 * max(self._aside - _NEAR, 0.0))
+        if self.retreating:
+            self.touching, standoff = False, _RETREAT
         self._set("target", c + standoff * m)
         self._set("normal", m)
         self._set("facing", -m)
@@ -476,7 +504,7 @@ class Pushing:
         self._set("pace", min(_SPEED, self._moved * leverage / self.controller.dt + _RAMP) / leverage)
         self._press(self.touching or (near and height < _LOW))
         self._set("reach", 0.0 if self.touching else 1.0)
-        self._set("touch", 0.0 if self.touching else 1.0)
+        self._set("touch", 0.0 if self.touching or self.retreating else 1.0)
         self._set("hold", _HOLD_WEIGHT if self.touching else 0.0)
         self._set("engaged", float(self.touching))
         distance, r, p, normal = math.inf, tip, c, m

@@ -225,4 +225,3 @@ class _Sampler:
                 middle = (lower + upper) / 2
                 values[symbol] = middle + 0.6 * (self._generator.uniform(lower, upper) - middle)
         return values
-
