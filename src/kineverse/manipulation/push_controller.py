@@ -68,6 +68,8 @@ _RETREAT = 0.1
 _LOW = 0.03
 """Height of the tip above a contact point from which on the pusher may touch [m]."""
 _HOLD_WEIGHT = 10.0
+_SPIN_WEIGHT = 0.01
+"""Weight against turns of the pusher about its axis, which change nothing but the nearest points."""
 _DISTANCE_COST, _GIVEN_UP_COST = 0.5, 0.6
 """Cost of a contact point by its distance from the tip [1/m], and by the times that it was given up."""
 _SURROUNDINGS = 0.1
@@ -262,12 +264,15 @@ class Pushing:
         aligned = less(aside, _NEAR)
         v = as_expression(speed)
         ḋ = sum((relative[0, k] * s for k, s in enumerate(speeds)), as_expression(0.0))
+        twist = model.jacobian(self.tool.frame, form="world", symbols=speeds)
+        turn = twist[3:] @ array(speeds)
         most = engaged * less(gap, LOST) * less(-_JAMMED, gap) * 1e3
         far = 1e3 * (1 - engaged)
         tasks: list[Task] = [
             Goal(q, self.target, name="object", gain=4.0, speed=numbers("pace", 1)[0]),
             Goal(tip, target, name="reach", gain=3.0, speed=_REACH_SPEED, weight=w_reach),
             Goal(axis, facing, name="facing", gain=2.0, speed=1.0, weight=0.05),
+            Goal(axis @ turn, 0.0, name="no spin", weight=_SPIN_WEIGHT),
             Goal(slips, 0.0, name="no slip", gain=5.0, weight=w_hold),
             Goal(d, -_PRESS, name="press", gain=10.0, weight=w_hold),
             Keep(-most, v, most, name="still unless touched"),
