@@ -296,7 +296,7 @@ class Pushing:
         self._values = np.array([s.value or 0.0 for s in self.controller.inputs])
         self._coordinates = tuple(s for s in self.controller.inputs if s.value is None)
         self._places = {
-            name: np.array([place[s] for s in symbols], dtype=np.intp)
+            name: np.array([place[s] for s in symbols if s in place], dtype=np.intp)
             for name, symbols in self._parameters.items()
         }
         self._tip_function = compile([tip])
@@ -385,7 +385,9 @@ class Pushing:
         return np.array(self._tip.outputs[0])
 
     def _set(self, name: str, values: float | Array) -> None:
-        self._values[self._places[name]] = values
+        places = self._places[name]
+        if len(places):  # without trends some serve nothing
+            self._values[places] = values
 
     def _nearest(self, found: DistanceResults) -> _Contact | None:
         """Return the near pair of pusher and object that pushes best; see :data:`_Contact`."""
