@@ -42,7 +42,7 @@ def plan_push_approach(
     model, tool = pushing.model, pushing.tool
     moving = [s.position for s in pushing.speeds if s.position != pushing.coordinate]
     free = [s for s in moving if s in model.degrees_of_freedom and s not in model.rates]
-    planner = Planner(model, free, rules=pushing.scene.rules)
+    planner = Planner(model, free, rules=pushing.scene.rules, leave_out=pushing.leave_out)
     planner.place(state)
     world_T_hand = model.fk(tool.frame)
     tip = world_T_hand[:3, :3] @ tool.tip + world_T_hand[:3, 3]
