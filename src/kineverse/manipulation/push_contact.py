@@ -172,7 +172,7 @@ class PushSurface:
         R, twist = poses[body, :, :3], twists[body]
         point = R @ self._points[index] + poses[body, :, 3]
         normal = R @ self._normals[index]
-        velocity = twist[:3] + cross(twist[3:], point)
+        velocity = twist[:3] + cross_product(twist[3:], point)
         return PushPoint(point, normal, velocity, find_alignment(normal, velocity))
 
     def _sample(self, scene: Scene, state: State) -> list[tuple[int, Array, Array]]:
@@ -323,7 +323,7 @@ def _ancestors(model: ModelView, frame: str) -> list[str]:
     return found
 
 
-def cross(a: Array, b: Array) -> Array:
+def cross_product(a: Array, b: Array) -> Array:
     """Return the cross product (3,) of two vectors (3,), faster than numpy's."""
     x, y, z = a.tolist()
     u, v, w = b.tolist()

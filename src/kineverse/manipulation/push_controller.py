@@ -24,61 +24,43 @@ from typing import TypeAlias
 
 import numpy as np
 
-from kineverse.compile import compile  # noqa: A004
-from kineverse.control import Command, Controller, Goal, Keep
-from kineverse.control.formulation import find_speeds
-from kineverse.control.tasks import Task
-from kineverse.errors import InvalidValueError, KineverseError, UnknownNameError, suggest
-from kineverse.expressions.expression import Expression, array, as_expression
-from kineverse.expressions.functions import sqrt
+from kineverse.control import Command
+from kineverse.errors import InvalidValueError, KineverseError
 from kineverse.geometry import Rule, Scene
-from kineverse.geometry.objects import Exclusion, matches_pattern
+from kineverse.geometry.objects import Exclusion
 from kineverse.geometry.results import DistanceResults
 from kineverse.lie import Array
-from kineverse.logic import less
 from kineverse.model.frame_dependence import FrameDependence
 from kineverse.model.model_view import ModelView
 from kineverse.state import State, StateLike
-from kineverse.symbols import Symbol, parameter
+from kineverse.symbols import Symbol
 
-from .push_contact import PushContacts, PushPoint, PushSurface, cross, find_alignment, find_push_tool
+from .push_contact import PushContacts, PushPoint, PushSurface, cross_product, find_alignment, find_push_tool
+from .push_program import LOST, NEAR, PRESS, TOUCHING, PushProgram
+from .push_scene import find_overlapping_links, furniture_rules, match_bodies
 
 _Contact: TypeAlias = tuple[int, int, Array, Array, Array, float, Array, float]
 """Bodies of robot and object, r, p, normal, gap, velocity of p, alignment."""
-TOUCHING = 1e-3
-"""Largest gap of a contact [m]."""
-LOST = 3e-3
-"""Gap at which a contact is lost [m]."""
 _CONE, _CONE_END = math.cos(math.radians(25.0)), math.cos(math.radians(40.0))
-_PRESS = 2e-4
-"""Depth that rows of touching bodies allow, so that contact is kept [m]."""
 _APART = 4e-3
 """Gap between pusher and object away from the contact [m]."""
-_NEAR = 0.012
-"""Distance of the tip from the axis of a contact within which it approaches the surface [m]."""
 _FUNNEL = 0.08
 """Largest height of the way to a contact above the surface [m]."""
 _STANDOFF = 2e-3
 _FAR = 0.05
 _SPEED = 0.25
 """Largest speed of the contact point [m/s]."""
-_REACH_SPEED = 0.5
 _RETREAT = 0.1
 """Distance from the object at which a retreat ends [m]."""
 _LOW = 0.03
 """Height of the tip above a contact point from which on the pusher may touch [m]."""
 _HOLD_WEIGHT = 10.0
-_SPIN_WEIGHT = 0.01
-"""Weight against turns of the pusher about its axis, which change nothing but the nearest points."""
 _DISTANCE_COST, _GIVEN_UP_COST = 0.5, 0.6
 """Cost of a contact point by its distance from the tip [1/m], and by the times that it was given up."""
 _SURROUNDINGS = 0.1
 """Distance within which other points count as given up, too [m]."""
-_JAMMED = 4e-4
-"""Depth at which the object counts as not giving way [m]."""
 _RAMP = 0.02
 """Speed of the contact point beyond the measured one that is tried [m/s]."""
-_SAMPLES = 24
 _DEEPEST = 2e-4
 _BLOCKED_STEPS = 60
 _BLOCKED_WAY = 0.004
@@ -199,7 +181,7 @@ class Pushing:
             )
         self.rules, self.leave_out = tuple(rules), tuple(leave_out)
         plain = Scene(model, rules=self.rules, leave_out=self.leave_out)
-        self.pusher = _match(plain.bodies, bodies, "bodies=")
+        self.pusher = match_bodies(plain.bodies, bodies, "bodies=")
         self.robot = self.pusher[0].split("/")[0] if robot is None else robot
         own = tuple(b for b in plain.bodies if b.startswith(f"{self.robot}/"))
         moved = plain.bodies_moved_by([coordinate])
@@ -208,7 +190,7 @@ class Pushing:
             raise InvalidValueError(f"'{coordinate}' moves no body with a shape, so nothing can be pushed.")
         pushed = self.object_bodies
         if object_frames is not None:
-            pushed = _match(pushed, object_frames, "object_frames=")
+            pushed = match_bodies(pushed, object_frames, "object_frames=")
         at = model.default_state().updated(dict(state))
         self.tool = find_push_tool(model, self.pusher, at, self.leave_out)
         self.surface = PushSurface(
@@ -219,13 +201,16 @@ class Pushing:
             at,
             (at[coordinate], (at[coordinate] + target) / 2, target),
         )
-        furniture = _furniture_rules(plain.bodies, own)
-        self.overlapping = _find_overlapping(plain, own, at)
+        furniture = furniture_rules(plain.bodies, own)
+        self.overlapping = find_overlapping_links(plain, own, at)
         self.scene = Scene(
             model, rules=(*furniture, *self.overlapping, *self.rules), leave_out=self.leave_out
         )
-        self._logic = logic
-        self._build(dt, tuple(still))
+        self._program = PushProgram(
+            model, coordinate, self.target, self.tool, self.scene, dt=dt, still=still, logic=logic
+        )
+        self.controller = self._program.controller
+        self.speeds = self.controller.speeds
         self._slots = slots = self.controller.contact_slots
         index = {b: k for k, b in enumerate(self.scene.bodies)}
         self._is_pusher = np.array([b in self.pusher for b in index])
@@ -239,84 +224,6 @@ class Pushing:
         with contextlib.suppress(KineverseError):
             self.step(at)  # what is computed once is computed now
         self.reset()
-
-    # -- the quadratic program -----------------------------------------------------------------------------
-
-    def _build(self, dt: float, still: tuple[Symbol | str, ...]) -> None:
-        """Build the controller: tasks on expressions of parameters, which each step sets."""
-        model, q = self.model, self.coordinate
-        speed = q.derivative()
-        world_T_hand = model.fk(self.tool.frame)
-        tip = world_T_hand[:3, :3] @ self.tool.tip + world_T_hand[:3, 3]
-        axis = world_T_hand[:3, :3] @ self.tool.axis
-        resting = find_speeds(model, still, "still")
-        moving = set(model.rates.over_free_speeds(tip.gradient())) - resting - {speed}
-        speeds = [*sorted(moving, key=lambda s: s.sort_key), speed]
-
-        self._parameters: dict[str, list[Symbol]] = {}
-
-        def numbers(name: str, count: int) -> list[Symbol]:
-            self._parameters[name] = [parameter(f"push/{name}/{k}", 0.0) for k in range(count)]
-            return self._parameters[name]
-
-        gap = numbers("gap", 1)[0]
-        relative = array(numbers("relative", 3 * len(speeds))).reshape(3, len(speeds))
-        slip = numbers("slip", 2)
-        pushed = numbers("pushed", 1)[0]
-        target, facing = array(numbers("target", 3)), array(numbers("facing", 3))
-        normal = array(numbers("normal", 3))
-        w_reach, w_touch, w_hold, engaged = (numbers(n, 1)[0] for n in ("reach", "touch", "hold", "engaged"))
-        d = gap.with_gradient({s: relative[0, k] for k, s in enumerate(speeds)})
-        slips = array(
-            [
-                e.with_gradient({s: relative[i + 1, k] for k, s in enumerate(speeds)})
-                for i, e in enumerate(slip)
-            ]
-        )
-        offset = tip - target
-        lateral = offset - normal * (normal @ offset)
-        aside = sqrt(lateral @ lateral + 1e-8)
-        touched = less(d, TOUCHING)
-        aligned = less(aside, _NEAR)
-        v = as_expression(speed)
-        ḋ = sum((relative[0, k] * s for k, s in enumerate(speeds)), as_expression(0.0))
-        twist = model.jacobian(self.tool.frame, form="world", symbols=speeds)
-        turn = twist[3:] @ array(speeds)
-        most = engaged * less(gap, LOST) * less(-_JAMMED, gap) * 1e3
-        far = 1e3 * (1 - engaged)
-        tasks: list[Task] = [
-            Goal(q, self.target, name="object", gain=4.0, speed=numbers("pace", 1)[0]),
-            Goal(tip, target, name="reach", gain=3.0, speed=_REACH_SPEED, weight=w_reach),
-            Goal(axis, facing, name="facing", gain=2.0, speed=1.0, weight=0.05),
-            Goal(axis @ turn, 0.0, name="no spin", weight=_SPIN_WEIGHT),
-            Goal(slips, 0.0, name="no slip", gain=5.0, weight=w_hold),
-            Goal(d, -_PRESS, name="press", gain=10.0, weight=w_hold),
-            Keep(-most, v, most, name="still unless touched"),
-            Keep(-math.inf, pushed * v, far, name="push, never pull"),
-            Keep(-math.inf, ḋ, far, name="object does not run away"),
-        ]
-        truth: Expression | None = None
-        if self._logic == "and":
-            truth = touched & aligned
-        elif self._logic == "product":
-            truth = touched * aligned
-        if truth is not None:
-            tasks.append(Goal(truth, 1.0, name="touch", gain=0.15, weight=w_touch))
-        self.controller = Controller(
-            model, tasks, dt=dt, still=still, scene=self.scene, margin=0.005, smooth=0.02, contacts=24
-        )
-        self.speeds = self.controller.speeds
-        self._columns = [self.speeds.index(s) for s in speeds]
-        self._object_column = self.speeds.index(speed)
-        place = {s: k for k, s in enumerate(self.controller.inputs)}
-        self._values = np.array([s.value or 0.0 for s in self.controller.inputs])
-        self._coordinates = tuple(s for s in self.controller.inputs if s.value is None)
-        self._places = {
-            name: np.array([place[s] for s in symbols if s in place], dtype=np.intp)
-            for name, symbols in self._parameters.items()
-        }
-        self._tip_function = compile([tip])
-        self._tip = self._tip_function.bind()
 
     def _hand_body(self) -> str:
         """Return a body of the pusher that moves with its frame."""
@@ -372,13 +279,11 @@ class Pushing:
         InfeasibleError, NotFiniteError
             As :meth:`.Controller.step`.
         """
-        x, n = self._values, len(self._coordinates)
         value = state[self.coordinate]
         self._moved = max(self.surface.sign * (value - self._value), 0.0) if self._value is not None else 0.0
         self._value = value
-        x[:n] = state.vector(self._coordinates)
-        found = self.controller.query_contacts(x)
-        tip = self._tip_at(state)
+        found = self._program.load(state)
+        tip = self._program.tip(state)
         point = None if self._chosen is None else self.surface.point_at(state, self._chosen)
         if point is not None and not self.retreating and self._is_stuck(state, tip, point):
             self._give_up()
@@ -392,18 +297,7 @@ class Pushing:
         if not self.retreating:
             self._update_touching(contact)
         self._write(tip, point, contact)
-        return self.controller.step(x)
-
-    def _tip_at(self, state: State) -> Array:
-        """Return the foremost point of the pusher (3,) at a state."""
-        self._tip.input[:] = state.vector(self._tip_function.inputs)
-        self._tip()
-        return np.array(self._tip.outputs[0])
-
-    def _set(self, name: str, values: float | Array) -> None:
-        places = self._places[name]
-        if len(places):  # without trends some serve nothing
-            self._values[places] = values
+        return self._program.step()
 
     def _nearest(self, found: DistanceResults) -> _Contact | None:
         """Return the near pair of pusher and object that pushes best; see :data:`_Contact`."""
@@ -419,7 +313,7 @@ class Pushing:
         best = None
         for row in rows[:6].tolist():
             gap = float(found.distances[row])
-            if gap > max(least + TOUCHING, _PRESS):
+            if gap > max(least + TOUCHING, PRESS):
                 break
             if forward[row]:
                 robot, thing = int(a[row]), int(b[row])
@@ -435,7 +329,7 @@ class Pushing:
 
     def _velocity(self, body: int, point: Array) -> Array:
         """Return the velocity (3,) of a point of the object per unit of its motion to the target."""
-        column = self._slots.point_jacobian(body, point)[:, self._object_column]
+        column = self._slots.point_jacobian(body, point)[:, self._program.object_column]
         return np.asarray(self.surface.sign * column)
 
     def _update_touching(self, contact: _Contact | None) -> None:
@@ -446,7 +340,7 @@ class Pushing:
                 self._release()
             elif contact[7] < _CONE_END:
                 self._give_up()
-        elif self._aside < 2 * _NEAR and contact is not None and contact[5] < TOUCHING and contact[7] > _CONE:
+        elif self._aside < 2 * NEAR and contact is not None and contact[5] < TOUCHING and contact[7] > _CONE:
             self.touching = True
             self._best, self._since = math.inf, 0
             self._anchor = None
@@ -467,7 +361,7 @@ class Pushing:
     def rank(self, state: State, limit: float = 0.1) -> list[int]:
         """Return contact points at a state, the best first, each some distance from better ones [m]."""
         points = self.surface.at(state)
-        tip = self._tip_at(state)
+        tip = self._program.tip(state)
         score = self.score(points) - _DISTANCE_COST * np.sqrt(((points.points - tip) ** 2).sum(axis=1))
         for k, times in self._given_up.items():
             near = ((points.points - points.points[k]) ** 2).sum(axis=1) < _SURROUNDINGS**2
@@ -515,26 +409,26 @@ class Pushing:
     def _write(self, tip: Array, point: PushPoint, contact: _Contact | None) -> None:
         """Set the parameters of the program."""
         c, m, velocity = point.point, point.normal, point.velocity
-        near, height = self._aside < _NEAR and not self.retreating, float((tip - c) @ m)
-        standoff = _STANDOFF if near else min(_FUNNEL, _STANDOFF + 1.5 * max(self._aside - _NEAR, 0.0))
+        near, height = self._aside < NEAR and not self.retreating, float((tip - c) @ m)
+        standoff = _STANDOFF if near else min(_FUNNEL, _STANDOFF + 1.5 * max(self._aside - NEAR, 0.0))
         if self.retreating:
             self.touching, standoff = False, _RETREAT
-        self._set("target", c + standoff * m)
-        self._set("normal", m)
-        self._set("facing", -m)
+        self._program.set("target", c + standoff * m)
+        self._program.set("normal", m)
+        self._program.set("facing", -m)
         leverage = max(math.sqrt(float(velocity @ velocity)), 1e-3)
         # An object that does not give way is not pushed further than a ramp of speed leads in a step.
-        self._set("pace", min(_SPEED, self._moved * leverage / self.controller.dt + _RAMP) / leverage)
+        self._program.set("pace", min(_SPEED, self._moved * leverage / self.controller.dt + _RAMP) / leverage)
         self._press(self.touching or (near and height < _LOW))
-        self._set("reach", 0.0 if self.touching else 1.0)
-        self._set("touch", 0.0 if self.touching or self.retreating else 1.0)
-        self._set("hold", _HOLD_WEIGHT if self.touching else 0.0)
-        self._set("engaged", float(self.touching))
+        self._program.set("reach", 0.0 if self.touching else 1.0)
+        self._program.set("touch", 0.0 if self.touching or self.retreating else 1.0)
+        self._program.set("hold", _HOLD_WEIGHT if self.touching else 0.0)
+        self._program.set("engaged", float(self.touching))
         distance, r, p, normal = math.inf, tip, c, m
         if contact is None:
             for name in ("relative", "slip", "pushed"):
-                self._set(name, 0.0)
-            self._set("gap", _FAR)
+                self._program.set(name, 0.0)
+            self._program.set("gap", _FAR)
         else:
             robot, thing, r, p, normal, distance, velocity, _ = contact
             across, up = _tangents(normal)
@@ -546,10 +440,10 @@ class Pushing:
             relative[1:] = tangents @ (
                 slots.point_jacobian(self._hand, tip) - slots.point_jacobian(thing, tip)
             )
-            self._set("relative", relative[:, self._columns].ravel())
-            self._set("gap", distance)
-            self._set("pushed", float(normal @ J[:, self._object_column]))
-            self._set("slip", tangents @ self._drift(thing, tip))
+            self._program.set("relative", relative[:, self._program.columns].ravel())
+            self._program.set("gap", distance)
+            self._program.set("pushed", float(normal @ J[:, self._program.object_column]))
+            self._program.set("slip", tangents @ self._drift(thing, tip))
         self._view = (r, p, normal, velocity, c, distance)
 
     @property
@@ -559,7 +453,7 @@ class Pushing:
             return None
         r, p, normal, velocity, c, distance = self._view
         push = velocity / max(math.sqrt(float(velocity @ velocity)), 1e-9)
-        return PushView(p, r, normal, push, cross(cross(push, normal), normal), c, distance)
+        return PushView(p, r, normal, push, cross_product(cross_product(push, normal), normal), c, distance)
 
     def _drift(self, thing: int, tip: Array) -> Array:
         """Return how far the tip has moved on the object since the first touch, (3,) [m]."""
@@ -575,54 +469,11 @@ class Pushing:
         """Let the pusher touch the object, or keep it away."""
         if pressing != self._pressing:
             self._pressing = pressing
-            self._slots.set_margin(self.pusher, self.object_bodies, -_PRESS if pressing else _APART)
+            self._slots.set_margin(self.pusher, self.object_bodies, -PRESS if pressing else _APART)
 
 
 def _tangents(normal: Array) -> tuple[Array, Array]:
     """Return two unit vectors that are orthogonal to a normal and to each other."""
-    across = cross(normal, np.eye(3)[int(np.argmin(np.abs(normal)))])
+    across = cross_product(normal, np.eye(3)[int(np.argmin(np.abs(normal)))])
     across /= math.sqrt(float(across @ across))
-    return across, cross(normal, across)
-
-
-def _match(known: Iterable[str], names: str | Iterable[str], argument: str) -> tuple[str, ...]:
-    """Return the known bodies that match names or patterns."""
-    known = tuple(known)
-    patterns = (names,) if isinstance(names, str) else tuple(names)
-    for pattern in patterns:
-        if not any(matches_pattern(b, (pattern,)) for b in known):
-            raise UnknownNameError(
-                f"{argument} No body is named or matched by '{pattern}'. {suggest(pattern, known, 'body')}"
-            )
-    if not patterns:
-        raise InvalidValueError(f"{argument} lists no body, so nothing may touch the object.")
-    return tuple(b for b in known if matches_pattern(b, patterns))
-
-
-def _find_overlapping(scene: Scene, own: tuple[str, ...], state: State) -> tuple[Rule, ...]:
-    """Return rules for pairs of the robot that overlap at a state, or at all of some random ones."""
-    model = scene.model
-    watch = scene.watch(own, own, radius=0.0)
-    bounds = [
-        (s, *model.limits(s)) for b in own for s in model.fk(b).symbols if s in model.degrees_of_freedom
-    ]
-    free = {s: (a, b) for s, a, b in bounds if math.isfinite(a) and math.isfinite(b)}
-    generator = np.random.default_rng(0)
-    found: list[set[tuple[str, str]]] = []
-    for k in range(_SAMPLES):
-        values = {s: float(generator.uniform(a, b)) for s, (a, b) in free.items()}
-        scene.update(state.updated(values) if k else state)
-        found.append({(pair.a, pair.b) for pair in watch()})
-    pairs = found[0] | set.intersection(*found[1:])
-    return tuple(Rule(a, b, False, "overlapping") for a, b in sorted(pairs))
-
-
-def _furniture_rules(bodies: Iterable[str], robot: Iterable[str]) -> tuple[Rule, ...]:
-    """Return rules that except furniture among itself, whose joints keep it apart."""
-    own = set(robot)
-    others = [b for b in bodies if b not in own]
-    roots = dict.fromkeys(b.split("/")[0] + "/*" if "/" in b else b for b in others)
-    if any(matches_pattern(b, tuple(roots)) for b in own):
-        roots = dict.fromkeys(others)
-    names = tuple(roots)
-    return tuple(Rule(a, b, False, "furniture") for i, a in enumerate(names) for b in names[i:])
+    return across, cross_product(normal, across)

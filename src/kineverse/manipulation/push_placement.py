@@ -158,10 +158,9 @@ class _Sampler:
         self._point = Target("push/start/point", np.zeros(3))
         self._facing = Target("push/start/facing", np.array([1.0, 0.0, 0.0]))
         still = [s for s in model.degrees_of_freedom if not s.path.startswith(f"{pushing.robot}/")]
-        exact: list[Task] = [
-            Hold(tip, self._point.expression, name="tip"),
-            Goal(axis, self._facing.expression, name="facing", weight=0.1),
-        ]
+        exact: list[Task] = [Hold(tip, self._point.expression, name="tip")]
+        if axis.gradient():
+            exact.append(Goal(axis, self._facing.expression, name="facing", weight=0.1))
         nearby = Goal(tip, self._point.expression, name="tip")
         # A pusher that cannot face the contact may still reach it with another part than its tip.
         self._solvers = [
