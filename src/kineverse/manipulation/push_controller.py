@@ -213,8 +213,11 @@ class Pushing:
         self.speeds = self.controller.speeds
         self._slots = slots = self.controller.contact_slots
         index = {b: k for k, b in enumerate(self.scene.bodies)}
-        self._is_pusher = np.array([b in self.pusher for b in index])
-        self._is_pushed = np.array([b in self.object_bodies for b in index])
+        pushers = np.array([b in self.pusher for b in index])
+        pushed_ones = np.array([b in self.object_bodies for b in index])
+        forward = np.outer(pushers, pushed_ones)
+        # 1 for pairs of pusher and object, -1 for the other order, 0 for all others.
+        self._kinds = forward.astype(np.int8) - forward.T.astype(np.int8)
         self._body_names = tuple(index)
         self._hand = self.scene.bodies.index(self._hand_body())
         self._all = self.scene.watch(f"{self.robot}/*", "*", radius=0.0, moving=self.speeds)
@@ -267,8 +270,7 @@ class Pushing:
         """Deepest penetration at the last step of pairs that may not touch [m], 0 if there is none."""
         found = self._slots.found
         a, b = found.body_indices.T
-        may = (self._is_pusher[a] & self._is_pushed[b]) | (self._is_pusher[b] & self._is_pushed[a])
-        distances = found.distances[~may]
+        distances = found.distances[self._kinds[a, b] == 0]
         return max(0.0, -float(distances[0])) if len(distances) else 0.0
 
     def step(self, state: State) -> Command:
@@ -304,9 +306,8 @@ class Pushing:
         if not len(found):
             return None
         a, b = found.body_indices.T
-        forward = self._is_pusher[a] & self._is_pushed[b]
-        backward = self._is_pusher[b] & self._is_pushed[a]
-        rows = np.flatnonzero(forward | backward)
+        kinds = self._kinds[a, b]
+        rows = np.flatnonzero(kinds)
         if not len(rows):
             return None
         least = found.distances[rows[0]]
@@ -315,7 +316,7 @@ class Pushing:
             gap = float(found.distances[row])
             if gap > max(least + TOUCHING, PRESS):
                 break
-            if forward[row]:
+            if kinds[row] > 0:
                 robot, thing = int(a[row]), int(b[row])
                 r, p, normal = found.points_a[row], found.points_b[row], -found.normals[row]
             else:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterable
+from itertools import pairwise
 
 import numpy as np
 
@@ -39,6 +40,9 @@ _TOUCH_SPEED = 0.15
 """Rate at which the trend of contact is followed [m/s]."""
 _SPIN_WEIGHT = 0.01
 """Weight against turns of the pusher about its axis, which change nothing but the nearest points."""
+_MARGIN, _RADIUS = 5e-3, 0.035
+"""Distance that pairs which may not touch keep, and from which they count [m]."""
+_SMOOTH = 0.02
 _ANY = 1e3
 """Speed that restricts nothing."""
 
@@ -140,7 +144,15 @@ class PushProgram:
         if truth is not None:
             tasks.append(Goal(truth, 1.0, name="touch", gain=_TOUCH_SPEED, weight=w_touch))
         self.controller = Controller(
-            model, tasks, dt=dt, still=still, scene=scene, margin=0.005, smooth=0.02, contacts=24
+            model,
+            tasks,
+            dt=dt,
+            still=still,
+            scene=scene,
+            margin=0.005,
+            radius=0.035,
+            smooth=0.02,
+            contacts=24,
         )
         order = self.controller.speeds
         self.columns = [order.index(s) for s in speeds]
@@ -148,10 +160,13 @@ class PushProgram:
         place = {s: k for k, s in enumerate(self.controller.inputs)}
         self._values = np.array([s.value or 0.0 for s in self.controller.inputs])
         self._coordinates = tuple(s for s in self.controller.inputs if s.value is None)
-        self._places = {
-            name: np.array([place[s] for s in symbols if s in place], dtype=np.intp)
-            for name, symbols in parameters.items()
-        }
+        # Parameters are kept in one vector, and without trends some of them serve nothing.
+        every = [symbol for symbols in parameters.values() for symbol in symbols]
+        ends = np.cumsum([0, *map(len, parameters.values())]).tolist()
+        self._slices = {name: slice(*end) for name, end in zip(parameters, pairwise(ends), strict=True)}
+        self._numbers = np.zeros(len(every))
+        self._used = np.array([k for k, s in enumerate(every) if s in place], dtype=np.intp)
+        self._places = np.array([place[every[k]] for k in self._used], dtype=np.intp)
         self._tip_function = compile([tip])
         self._tip = self._tip_function.bind()
 
@@ -162,12 +177,11 @@ class PushProgram:
 
     def set(self, name: str, values: float | Array) -> None:
         """Set parameters by name: a number, or one for each."""
-        places = self._places[name]
-        if len(places):  # without trends some serve nothing
-            self._values[places] = values
+        self._numbers[self._slices[name]] = values
 
     def step(self) -> Command:
         """Return the command for one time step, at the state that was loaded."""
+        self._values[self._places] = self._numbers[self._used]
         return self.controller.step(self._values)
 
     def tip(self, state: State) -> Array:
