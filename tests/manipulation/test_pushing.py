@@ -20,7 +20,7 @@ from kineverse.manipulation.push_trials import try_push
 from kineverse.manipulation.pushing import push
 from kineverse.manipulation.session import Session
 from kineverse.model.body import Body, Box, Pose, Shape
-from kineverse.worlds import KinematicWorld
+from kineverse.worlds import KinematicWorld, World
 
 PUSHER = "robot/finger"
 
@@ -147,6 +147,26 @@ def test_push_shuts_what_touch_alone_can_move(what: str, value: float) -> None:
     assert trial.outcome.measures["jitter"] < 0.1
 
 
+class Noisy:
+    """Belief whose value of the drawer is off by a slowly changing error of 3 mm."""
+
+    def __init__(self) -> None:
+        self._generator, self._error = np.random.default_rng(0), 0.0
+
+    def update(self, world: World, commands: kv.State | None = None) -> kv.State:
+        self._error = 0.95 * self._error + 0.3 * 0.003 * self._generator.standard_normal()
+        off = world.state["drawer"] + self._error
+        return world.state.updated({"drawer": off}, stamp=world.time)
+
+
+def test_push_on_estimates_presses_until_it_touches() -> None:
+    world = KinematicWorld(room(), "robot")
+    world.reset(opened(drawer=0.2) | {"robot/base/y": -1.0})
+    outcome = push(Session(world, belief=Noisy()), "drawer", bodies=PUSHER, deviation=0.003)
+    assert outcome, outcome.reason
+    assert outcome.measures["losses"] == 0
+
+
 def test_surface_without_a_side_that_opposes_the_motion_is_refused() -> None:
     model = room()
     with pytest.raises(InvalidValueError, match="No surface of wall opposes"):
@@ -218,6 +238,7 @@ def test_push_says_what_is_wrong() -> None:
     refuse(InvalidValueError, "lists no body", bodies=())
     refuse(InvalidValueError, "between 0 and 1.5", target=2.0)
     refuse(InvalidValueError, "'and', 'product' or None", logic="or")
+    refuse(InvalidValueError, "cannot tell whether it touches", deviation=0.1)
     refuse(InvalidValueError, "moves no body", what="robot/lift", target=1.0)
     refuse(UnknownNameError, "object_frames=", object_frames="wall")
     refuse(UnknownNameError, "dor", what="dor")

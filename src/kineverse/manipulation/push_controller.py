@@ -59,6 +59,7 @@ _DISTANCE_COST, _GIVEN_UP_COST = 0.5, 0.6
 """Cost of a contact point by its distance from the tip [1/m], and by the times that it was given up."""
 _SURROUNDINGS = 0.1
 """Distance within which other points count as given up, too [m]."""
+_LARGEST_DEVIATION = 0.01
 _RAMP = 0.02
 """Speed of the contact point beyond the measured one that is tried [m/s]."""
 _DEEPEST = 2e-4
@@ -123,6 +124,9 @@ class Pushing:
     logic
         ``"and"`` for the trend rule of :mod:`kineverse.logic`; for comparison ``"product"`` for the product
         rule, and None for no trends.
+    deviation
+        Standard deviation of the gap if the states are estimates [m]. A contact is then a gap of 1 mm and
+        three deviations, or a touch that is reported, and rows give way by as much.
 
     Attributes
     ----------
@@ -135,6 +139,8 @@ class Pushing:
         The coordinate.
     touching
         Whether the pusher touches where it should.
+    touched
+        Whether a touch sensor of the pusher reports a touch; set it before each step, if there is one.
     losses
         Number of contacts that were lost.
     blocked
@@ -169,10 +175,17 @@ class Pushing:
         rules: Iterable[Rule] = (),
         leave_out: Iterable[Exclusion] = (),
         logic: str | None = "and",
+        deviation: float = 0.0,
     ) -> None:
         if logic not in ("and", "product", None):
             raise InvalidValueError(f"logic= is 'and', 'product' or None, not {logic!r}.")
+        if not 0.0 <= deviation < _LARGEST_DEVIATION:
+            raise InvalidValueError(
+                f"deviation= is from 0 to {_LARGEST_DEVIATION:g} m, not {deviation!r}: with a larger one the "
+                "pusher cannot tell whether it touches."
+            )
         self.model, self.target = model, float(target)
+        self.deviation, self._slack = float(deviation), 3.0 * float(deviation)
         self.coordinate = coordinate = model.symbol(what) if isinstance(what, str) else what
         lower, upper = model.limits(coordinate)
         if not lower - 1e-9 <= target <= upper + 1e-9:
@@ -207,7 +220,15 @@ class Pushing:
             model, rules=(*furniture, *self.overlapping, *self.rules), leave_out=self.leave_out
         )
         self._program = PushProgram(
-            model, coordinate, self.target, self.tool, self.scene, dt=dt, still=still, logic=logic
+            model,
+            coordinate,
+            self.target,
+            self.tool,
+            self.scene,
+            dt=dt,
+            still=still,
+            logic=logic,
+            slack=self._slack,
         )
         self.controller = self._program.controller
         self.speeds = self.controller.speeds
@@ -242,7 +263,7 @@ class Pushing:
         """Forget all contacts."""
         self.controller.reset()
         self.touching, self.losses, self.blocked, self.contacts, self.jammed = False, 0, 0, 0, 0
-        self.retreating = False
+        self.retreating = self.touched = False
         self._chosen: int | None = None
         self._given_up: dict[int, int] = {}
         self._anchor: tuple[int, Array] | None = None
@@ -336,7 +357,7 @@ class Pushing:
     def _update_touching(self, contact: _Contact | None) -> None:
         """Note that the pusher has come to touch, or has lost its contact."""
         if self.touching:
-            if contact is None or contact[5] > LOST:
+            if contact is None or (contact[5] > LOST + self._slack and not self.touched):
                 self.losses += 1
                 self._release()
             elif contact[7] < _CONE_END:
@@ -470,7 +491,9 @@ class Pushing:
         """Let the pusher touch the object, or keep it away."""
         if pressing != self._pressing:
             self._pressing = pressing
-            self._slots.set_margin(self.pusher, self.object_bodies, -PRESS if pressing else _APART)
+            self._slots.set_margin(
+                self.pusher, self.object_bodies, -PRESS - self._slack if pressing else _APART
+            )
 
 
 def _tangents(normal: Array) -> tuple[Array, Array]:

@@ -60,6 +60,8 @@ class PushProgram:
         Collision scene of the controller.
     dt, still, logic
         As for :class:`.Pushing`.
+    slack
+        Error of gaps that is allowed for [m].
 
     Attributes
     ----------
@@ -82,6 +84,7 @@ class PushProgram:
         dt: float,
         still: Iterable[Symbol | str],
         logic: str | None,
+        slack: float,
     ) -> None:
         still = tuple(still)
         speed = coordinate.derivative()
@@ -115,19 +118,19 @@ class PushProgram:
         offset = tip - target
         lateral = offset - normal * (normal @ offset)
         aside = sqrt(lateral @ lateral + 1e-8)
-        touched = less(d, TOUCHING)
+        touched = less(d, TOUCHING + slack)
         aligned = less(aside, NEAR)
         v = as_expression(speed)
         ḋ = sum((relative[0, k] * s for k, s in enumerate(speeds)), as_expression(0.0))
         twist = model.jacobian(tool.frame, form="world", symbols=speeds)
         turn = twist[3:] @ array(speeds)
-        most = engaged * less(gap, LOST) * less(-_JAMMED, gap) * _ANY
+        most = engaged * less(gap, LOST + slack) * less(-_JAMMED - slack, gap) * _ANY
         far = _ANY * (1 - engaged)
         tasks: list[Task] = [
             Goal(coordinate, target_value, name="object", gain=4.0, speed=numbers("pace", 1)[0]),
             Goal(tip, target, name="reach", gain=3.0, speed=_REACH_SPEED, weight=w_reach),
             Goal(slips, 0.0, name="no slip", gain=5.0, weight=w_hold),
-            Goal(d, -PRESS, name="press", gain=10.0, weight=w_hold),
+            Goal(d, -PRESS - slack, name="press", gain=10.0, weight=w_hold),
             Keep(-most, v, most, name="still unless touched"),
             Keep(-math.inf, pushed * v, far, name="push, never pull"),
             Keep(-math.inf, ḋ, far, name="object does not run away"),

@@ -45,6 +45,7 @@ def push(
     rules: Iterable[Rule] = (),
     leave_out: Iterable[Exclusion] = (),
     logic: str | None = "and",
+    deviation: float = 0.0,
     plan: bool = True,
     retreat: bool = False,
     pushing: Pushing | None = None,
@@ -71,7 +72,7 @@ def push(
         Largest time in the world [s].
     tolerance
         Largest distance from the target [m], [rad].
-    still, rules, leave_out, logic
+    still, rules, leave_out, logic, deviation
         As for :class:`.Pushing`.
     plan
         Whether approaches are planned where the way of the controller is blocked.
@@ -111,6 +112,7 @@ def push(
             rules=rules,
             leave_out=leave_out,
             logic=logic,
+            deviation=deviation,
         )
         pushing.wait()
     pushing.reset()
@@ -145,6 +147,7 @@ class _Run:
         self._seconds, self._tolerance, self._plan = seconds, tolerance, plan
         self._first, self._begin = session.steps, session.world.time
         self._approaches = 0
+        self._senses = pushing.deviation > 0.0
         self._changes: list[np.ndarray[Any, np.dtype[np.float64]]] = []
         self._last: np.ndarray[Any, np.dtype[np.float64]] | None = None
 
@@ -186,6 +189,8 @@ class _Run:
     def _step(self, phase: str) -> None:
         session, pushing = self._session, self._pushing
         session.phase = phase
+        if self._senses:
+            pushing.touched = not session.world.observe().touching.isdisjoint(pushing.pusher)
         with session.timed("push"):
             command = pushing.step(session.state)
         speeds = np.fromiter(command.speeds.values(), dtype=float)
