@@ -1,0 +1,194 @@
+"""Quadratic program of pushes (2020 paper, eq. 5-11): tasks on parameters that each step sets."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterable
+from itertools import pairwise
+
+import numpy as np
+
+from kineverse.compile import compile  # noqa: A004
+from kineverse.control import Command, Controller, Goal, Keep
+from kineverse.control.formulation import find_speeds
+from kineverse.control.tasks import Task
+from kineverse.expressions.expression import Expression, array, as_expression
+from kineverse.expressions.functions import sqrt
+from kineverse.geometry import Scene
+from kineverse.geometry.results import DistanceResults
+from kineverse.lie import Array
+from kineverse.logic import less
+from kineverse.model.model_view import ModelView
+from kineverse.state import State
+from kineverse.symbols import Symbol, parameter
+
+from .push_contact import PushTool
+
+TOUCHING = 1e-3
+"""Largest gap of a contact [m]."""
+LOST = 3e-3
+"""Gap at which a contact is lost [m]."""
+PRESS = 2e-4
+"""Depth that rows of touching bodies allow, so that contact is kept [m]."""
+NEAR = 0.012
+"""Distance of the tip from the axis of a contact within which it approaches the surface [m]."""
+_JAMMED = 4e-4
+"""Depth at which the object counts as not giving way [m]."""
+_REACH_SPEED = 0.5
+"""Largest speed of the tip on its way to a contact [m/s]."""
+_TOUCH_SPEED = 0.15
+"""Rate at which the trend of contact is followed [m/s]."""
+_SPIN_WEIGHT = 0.01
+"""Weight against turns of the pusher about its axis, which change nothing but the nearest points."""
+_MARGIN, _RADIUS = 5e-3, 0.035
+"""Distance that pairs which may not touch keep, and from which they count [m]."""
+_SMOOTH = 0.02
+_ANY = 1e3
+"""Speed that restricts nothing."""
+
+
+class PushProgram:
+    """Controller of a push, whose tasks depend on the numbers of the present contact.
+
+    Parameters
+    ----------
+    model, coordinate, target_value
+        Model, the coordinate to change, and its wanted value.
+    tool
+        The pusher.
+    scene
+        Collision scene of the controller.
+    dt, still, logic
+        As for :class:`.Pushing`.
+    slack
+        Error of gaps that is allowed for [m].
+
+    Attributes
+    ----------
+    controller
+        The controller.
+    columns
+        Its speeds in the order of the parameters ``relative``, by their index.
+    object_column
+        Index of the object's speed among the speeds of the controller.
+    """
+
+    def __init__(
+        self,
+        model: ModelView,
+        coordinate: Symbol,
+        target_value: float,
+        tool: PushTool,
+        scene: Scene,
+        *,
+        dt: float,
+        still: Iterable[Symbol | str],
+        logic: str | None,
+        slack: float,
+    ) -> None:
+        still = tuple(still)
+        speed = coordinate.derivative()
+        world_T_hand = model.fk(tool.frame)
+        tip = world_T_hand[:3, :3] @ tool.tip + world_T_hand[:3, 3]
+        axis = world_T_hand[:3, :3] @ tool.axis
+        resting = find_speeds(model, still, "still")
+        moving = set(model.rates.over_free_speeds(tip.gradient())) - resting - {speed}
+        speeds = [*sorted(moving, key=lambda s: s.sort_key), speed]
+
+        parameters: dict[str, list[Symbol]] = {}
+
+        def numbers(name: str, count: int) -> list[Symbol]:
+            parameters[name] = [parameter(f"push/{name}/{k}", 0.0) for k in range(count)]
+            return parameters[name]
+
+        gap = numbers("gap", 1)[0]
+        relative = array(numbers("relative", 3 * len(speeds))).reshape(3, len(speeds))
+        slip = numbers("slip", 2)
+        pushed = numbers("pushed", 1)[0]
+        target, facing = array(numbers("target", 3)), array(numbers("facing", 3))
+        normal = array(numbers("normal", 3))
+        w_reach, w_touch, w_hold, engaged = (numbers(n, 1)[0] for n in ("reach", "touch", "hold", "engaged"))
+        d = gap.with_gradient({s: relative[0, k] for k, s in enumerate(speeds)})
+        slips = array(
+            [
+                e.with_gradient({s: relative[i + 1, k] for k, s in enumerate(speeds)})
+                for i, e in enumerate(slip)
+            ]
+        )
+        offset = tip - target
+        lateral = offset - normal * (normal @ offset)
+        aside = sqrt(lateral @ lateral + 1e-8)
+        touched = less(d, TOUCHING + slack)
+        aligned = less(aside, NEAR)
+        v = as_expression(speed)
+        ḋ = sum((relative[0, k] * s for k, s in enumerate(speeds)), as_expression(0.0))
+        twist = model.jacobian(tool.frame, form="world", symbols=speeds)
+        turn = twist[3:] @ array(speeds)
+        most = engaged * less(gap, LOST + slack) * less(-_JAMMED - slack, gap) * _ANY
+        far = _ANY * (1 - engaged)
+        tasks: list[Task] = [
+            Goal(coordinate, target_value, name="object", gain=4.0, speed=numbers("pace", 1)[0]),
+            Goal(tip, target, name="reach", gain=3.0, speed=_REACH_SPEED, weight=w_reach),
+            Goal(slips, 0.0, name="no slip", gain=5.0, weight=w_hold),
+            Goal(d, -PRESS - slack, name="press", gain=10.0, weight=w_hold),
+            Keep(-most, v, most, name="still unless touched"),
+            Keep(-math.inf, pushed * v, far, name="push, never pull"),
+            Keep(-math.inf, ḋ, far, name="object does not run away"),
+        ]
+        if axis.gradient():  # the pusher of a gantry keeps its direction
+            tasks.append(Goal(axis, facing, name="facing", gain=2.0, speed=1.0, weight=0.05))
+        if (axis @ turn).gradient():
+            tasks.append(Goal(axis @ turn, 0.0, name="no spin", weight=_SPIN_WEIGHT))
+        truth: Expression | None = None
+        if logic == "and":
+            truth = touched & aligned
+        elif logic == "product":
+            truth = touched * aligned
+        if truth is not None:
+            tasks.append(Goal(truth, 1.0, name="touch", gain=_TOUCH_SPEED, weight=w_touch))
+        self.controller = Controller(
+            model,
+            tasks,
+            dt=dt,
+            still=still,
+            scene=scene,
+            margin=0.005,
+            radius=0.035,
+            smooth=0.02,
+            contacts=24,
+        )
+        order = self.controller.speeds
+        self.columns = [order.index(s) for s in speeds]
+        self.object_column = order.index(speed)
+        place = {s: k for k, s in enumerate(self.controller.inputs)}
+        self._values = np.array([s.value or 0.0 for s in self.controller.inputs])
+        self._coordinates = tuple(s for s in self.controller.inputs if s.value is None)
+        # Parameters are kept in one vector, and without trends some of them serve nothing.
+        every = [symbol for symbols in parameters.values() for symbol in symbols]
+        ends = np.cumsum([0, *map(len, parameters.values())]).tolist()
+        self._slices = {name: slice(*end) for name, end in zip(parameters, pairwise(ends), strict=True)}
+        self._numbers = np.zeros(len(every))
+        self._used = np.array([k for k, s in enumerate(every) if s in place], dtype=np.intp)
+        self._places = np.array([place[every[k]] for k in self._used], dtype=np.intp)
+        self._tip_function = compile([tip])
+        self._tip = self._tip_function.bind()
+
+    def load(self, state: State) -> DistanceResults:
+        """Take a state, and return the near pairs of bodies."""
+        self._values[: len(self._coordinates)] = state.vector(self._coordinates)
+        return self.controller.query_contacts(self._values)
+
+    def set(self, name: str, values: float | Array) -> None:
+        """Set parameters by name: a number, or one for each."""
+        self._numbers[self._slices[name]] = values
+
+    def step(self) -> Command:
+        """Return the command for one time step, at the state that was loaded."""
+        self._values[self._places] = self._numbers[self._used]
+        return self.controller.step(self._values)
+
+    def tip(self, state: State) -> Array:
+        """Return the foremost point of the pusher (3,) at a state [m]."""
+        self._tip.input[:] = state.vector(self._tip_function.inputs)
+        self._tip()
+        return np.array(self._tip.outputs[0])

@@ -1,0 +1,249 @@
+"""Pushing: contact points, the controller, the skill in the kinematic world, and base placement."""
+
+from __future__ import annotations
+
+from functools import cache
+
+import numpy as np
+import pytest
+
+import kineverse as kv
+from kineverse.articulations import OmniBase
+from kineverse.control.contact_slots import ContactSlots
+from kineverse.errors import InvalidValueError, UnknownNameError
+from kineverse.geometry import Scene
+from kineverse.manipulation.push_approach import plan_push_approach
+from kineverse.manipulation.push_contact import PushSurface, find_push_tool
+from kineverse.manipulation.push_controller import Pushing
+from kineverse.manipulation.push_placement import find_push_start, roll_out
+from kineverse.manipulation.push_trials import try_push
+from kineverse.manipulation.pushing import push
+from kineverse.manipulation.session import Session
+from kineverse.model.body import Body, Box, Pose, Shape
+from kineverse.worlds import KinematicWorld, World
+
+PUSHER = "robot/finger"
+
+
+def box(*size: float, at: tuple[float, float, float] = (0, 0, 0)) -> Body:
+    pose = np.eye(4)
+    pose[:3, 3] = at
+    shape = Shape(Box(size), Pose.from_matrix(pose))
+    return Body(visuals=(shape,), collisions=(shape,))
+
+
+@cache
+def room() -> kv.Model:
+    """A base with a lift and a finger, before a door about z, a flap about y, and a drawer."""
+    model = kv.Model()
+    lift, door, flap, drawer = (kv.position(n) for n in ("robot/lift", "door", "flap", "drawer"))
+    with model.edit() as edit:
+        edit.apply(OmniBase(name="robot/base", parent="world", child="robot/base", speed=1.0, turn=1.0))
+        edit.add_frame("robot/torso", "robot/base", np.eye(4), body=box(0.3, 0.3, 0.3, at=(0, 0, 0.2)))
+        edit.add_frame("robot/arm", "robot/torso", kv.translation(0, 0, lift), body=box(0.1, 0.1, 0.1))
+        edit.add_frame(PUSHER, "robot/arm", kv.translation(0.5, 0, 0), body=box(0.2, 0.03, 0.03))
+        edit.add_frame("wall", "world", kv.translation(2.2, 0, 1), body=box(0.1, 3, 2))
+        edit.add_frame("door", "world", kv.translation(1.6, 1.2, 1) @ kv.rotation_z(-door))
+        edit.add_frame("door/panel", "door", np.eye(4), body=box(0.02, 0.5, 0.6, at=(0, -0.25, 0)))
+        edit.add_frame("flap", "world", kv.translation(1.6, 0, 0.6) @ kv.rotation_y(-flap))
+        edit.add_frame("flap/panel", "flap", np.eye(4), body=box(0.02, 0.5, 0.5, at=(0, 0, 0.25)))
+        edit.add_frame("drawer", "world", kv.translation(1.6 - drawer, -1, 0.8), body=box(0.02, 0.5, 0.3))
+        edit.add_frame("drawer/handle", "drawer", kv.translation(-0.05, 0, 0), body=box(0.02, 0.2, 0.02))
+        edit.constrain("lift", 0.3, lift, 1.6)
+        edit.constrain("lift/speed", -0.5, lift.derivative(), 0.5)
+        for symbol, most in ((door, 1.5), (flap, 1.5), (drawer, 0.4)):
+            edit.constrain(f"{symbol}/range", 0, symbol, most)
+            edit.constrain(f"{symbol}/speed", -1, symbol.derivative(), 1)
+    return model
+
+
+def opened(**values: float) -> kv.State:
+    """Return the state with a lifted arm and open objects."""
+    return room().default_state().updated({"robot/lift": 0.8, **values})
+
+
+class Locked(KinematicWorld):
+    """World in which a coordinate does not move."""
+
+    def apply(self, speeds: object, duration: float, *, stamp: float | None = None) -> None:
+        value = self.state["door"]
+        super().apply(speeds, duration, stamp=stamp)  # type: ignore[arg-type]
+        time = self.time
+        self.reset(self.state.updated({"door": value}))
+        self._time = time
+
+
+def test_contact_points_lie_on_the_surface_and_move_as_finite_differences_say() -> None:
+    model, start = room(), opened(flap=0.7)
+    flap = model.symbol("flap")
+    own = [b for b in Scene(model).bodies if b.startswith("robot/")]
+    surface = PushSurface(model, flap, ["flap/panel"], own, start, [0.7, 0.0])
+    scene = Scene(model, leave_out=own)
+    at, after = surface.at(start), surface.at(start.updated({flap: 0.7 - 1e-6}))
+    np.testing.assert_allclose((after.points - at.points) / 1e-6, at.velocities, atol=1e-5)
+    scene.update(start)
+    for k in range(len(surface)):
+        near = scene.point(at.points[k] + 0.01 * at.normals[k])
+        assert near is not None
+        assert near.body == "flap/panel"
+        assert near.distance == pytest.approx(0.01, abs=1e-9)
+        one = surface.point_at(start, k)
+        np.testing.assert_allclose(one.velocity, at.velocities[k], atol=1e-12)
+        assert one.alignment == pytest.approx(at.alignment[k])
+    # Pushed perpendicularly, with the shorter lever near the hinge.
+    assert at.alignment.min() > 0.9
+    np.testing.assert_allclose(at.normals @ [-np.cos(0.7), 0, -np.sin(0.7)], 1.0, atol=1e-9)
+
+
+def test_pusher_points_away_from_what_carries_it() -> None:
+    tool = find_push_tool(room(), [PUSHER], opened())
+    assert tool.frame == PUSHER
+    np.testing.assert_allclose(tool.axis, [1, 0, 0], atol=1e-12)
+    np.testing.assert_allclose(tool.tip, [0.1, 0, 0], atol=1e-6)
+
+
+def test_contact_slots_keep_a_margin_for_each_pair_and_know_velocities_of_points() -> None:
+    model = room()
+    scene, speeds = Scene(model), tuple(model.speeds)
+    slots = ContactSlots(scene, speeds, 4, margin=0.005, radius=0.3, gain=10.0)
+    state = opened(drawer=0.4) | {"robot/base/x": 0.4, "robot/base/y": -1.0}
+    slots.update(state.vector(slots.inputs))
+    nearest = slots.found[0]
+    assert {nearest.a, nearest.b} == {PUSHER, "drawer/handle"}
+    n = len(speeds)
+
+    def lower() -> float:
+        arrays = np.zeros((n, n)), np.zeros(n), np.zeros((4, n)), np.full(4, -np.inf), np.full(4, np.inf)
+        slots.write(*arrays, 5.0)
+        return float(arrays[3][0])
+
+    assert lower() == pytest.approx(-10 * (nearest.distance - 0.005))
+    slots.set_margin(PUSHER, ["drawer", "drawer/*"], -0.001)
+    assert lower() == pytest.approx(-10 * (nearest.distance + 0.001))
+    point, step = np.array([0.9, -1.0, 0.8]), 1e-6
+    J = slots.point_jacobian(scene.bodies.index(PUSHER), point)
+    in_finger = np.linalg.inv(model.fk(PUSHER)(state)) @ [*point, 1]
+    for k, speed in enumerate(speeds):
+        moved = model.integrate(state, {speed: 1.0}, step)
+        change = (model.fk(PUSHER)(moved) @ in_finger)[:3] - point
+        np.testing.assert_allclose(J[:, k], change / step, atol=1e-5)
+    with pytest.raises(UnknownNameError, match="flnger"):
+        slots.set_margin("robot/flnger", "*", 0.0)
+    with pytest.raises(InvalidValueError, match="margin"):
+        slots.set_margin(PUSHER, "drawer", 1.0)
+
+
+@pytest.mark.parametrize(("what", "value"), [("door", 0.6), ("flap", 0.7), ("drawer", 0.4)])
+def test_push_shuts_what_touch_alone_can_move(what: str, value: float) -> None:
+    """The world reads no speed of the object; the finger stays where it touched, and nothing else is hit."""
+    world = KinematicWorld(room(), "robot")
+    trial = try_push(world, opened(**{what: value}), what, bodies=PUSHER, place=False, steps=900)
+    assert trial.outcome, trial.outcome.reason
+    assert abs(world.state[what]) < 0.02
+    assert trial.outcome.measures["losses"] == 0
+    assert trial.penetration[0] <= 5e-4
+    assert trial.pressed <= 1e-3
+    assert trial.violation <= 1e-6
+    assert trial.outcome.measures["jitter"] < 0.1
+
+
+class Noisy:
+    """Belief whose value of the drawer is off by a slowly changing error of 3 mm."""
+
+    def __init__(self) -> None:
+        self._generator, self._error = np.random.default_rng(0), 0.0
+
+    def update(self, world: World, commands: kv.State | None = None) -> kv.State:
+        self._error = 0.95 * self._error + 0.3 * 0.003 * self._generator.standard_normal()
+        off = world.state["drawer"] + self._error
+        return world.state.updated({"drawer": off}, stamp=world.time)
+
+
+def test_push_on_estimates_presses_until_it_touches() -> None:
+    world = KinematicWorld(room(), "robot")
+    world.reset(opened(drawer=0.2) | {"robot/base/y": -1.0})
+    outcome = push(Session(world, belief=Noisy()), "drawer", bodies=PUSHER, deviation=0.003)
+    assert outcome, outcome.reason
+    assert outcome.measures["losses"] == 0
+
+
+def test_surface_without_a_side_that_opposes_the_motion_is_refused() -> None:
+    model = room()
+    with pytest.raises(InvalidValueError, match="No surface of wall opposes"):
+        PushSurface(model, model.symbol("door"), ["wall"], (), opened(), [0.3, 0.0])
+
+
+def test_start_is_placed_and_rolled_out_and_trends_make_it_touch() -> None:
+    model = room()
+    away = opened(door=0.6) | {"robot/base/x": -2.0, "robot/base/angle": 2.5}
+    pushing = Pushing(model, "door", PUSHER, away, target=0.0)
+    found = find_push_start(pushing, away, seed=1)
+    assert found, found.why
+    assert sum(found.reasons.values()) == found.samples - 1
+    assert found.state is not None
+    assert found.state["door"] == 0.6
+    assert roll_out(pushing, found.state, 600)[0] == ""
+
+    def touches(logic: str | None) -> bool:
+        other, state = Pushing(model, "door", PUSHER, away, target=0.0, logic=logic), found.state
+        for _ in range(120):
+            command = other.step(state)
+            if other.touching:
+                return True
+            assert command.speeds[model.symbol("door:velocity")] == pytest.approx(0.0, abs=1e-9)
+            state = model.integrate(state, command.speeds, 0.02)
+        return False
+
+    assert touches("and")
+    assert touches("product")
+    assert not touches(None)
+    never = find_push_start(pushing, away, samples=2, accept=lambda state: "not today")
+    assert not never
+    assert "not today" in never.why
+
+
+def test_approach_is_planned_to_a_contact_point() -> None:
+    model, start = room(), opened(drawer=0.4)
+    pushing = Pushing(model, "drawer", PUSHER, start, target=0.0)
+    path, point = plan_push_approach(pushing, start)
+    assert path.found, path.why
+    tip = model.fk(PUSHER)(path.at(1.0)) @ [*pushing.tool.tip, 1]
+    assert np.linalg.norm(tip[:3] - pushing.surface.at(start).points[point]) == pytest.approx(0.03, abs=1e-4)
+
+
+def test_locked_object_is_told_and_not_penetrated() -> None:
+    world = Locked(room(), "robot")
+    world.reset(opened(door=0.6) | {"robot/base/y": 0.8, "robot/base/x": 0.3})
+    deepest = []
+    outcome = push(
+        Session(world), "door", bodies=PUSHER, plan=False,
+        on_step=lambda pushing: deepest.append(pushing.view.distance),
+    )  # fmt: skip
+    assert not outcome
+    assert "does not move" in outcome.reason
+    assert outcome.value == pytest.approx(0.6)
+    assert min(deepest) > -1.5e-3
+
+
+def test_push_says_what_is_wrong() -> None:
+    model, start = room(), opened(door=0.6)
+
+    def refuse(error: type[Exception], match: str, **changes: object) -> None:
+        values = {"what": "door", "bodies": PUSHER, "target": 0.0} | changes
+        what, bodies = values.pop("what"), values.pop("bodies")
+        with pytest.raises(error, match=match):
+            Pushing(model, what, bodies, start, **values)  # type: ignore[arg-type]
+
+    refuse(UnknownNameError, "robot/finger", bodies="robot/fingr")
+    refuse(InvalidValueError, "lists no body", bodies=())
+    refuse(InvalidValueError, "between 0 and 1.5", target=2.0)
+    refuse(InvalidValueError, "'and', 'product' or None", logic="or")
+    refuse(InvalidValueError, "cannot tell whether it touches", deviation=0.1)
+    refuse(InvalidValueError, "moves no body", what="robot/lift", target=1.0)
+    refuse(UnknownNameError, "object_frames=", object_frames="wall")
+    refuse(UnknownNameError, "dor", what="dor")
+    world = KinematicWorld(model, "robot")
+    world.reset(start | {"robot/base/x": 1.75})
+    outcome = push(Session(world), "door", bodies=PUSHER)
+    assert not outcome
+    assert "contact of" in outcome.reason
