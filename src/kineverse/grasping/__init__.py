@@ -1,5 +1,16 @@
 """Grasping: grippers, handles, and grasps of handles (layer 5)."""
 
+from .grasps import Grasp, sample_grasps
 from .gripper import Gripper, find_gripper, find_grippers
+from .handles import Handle, find_handle, find_handles
 
-__all__ = ["Gripper", "find_gripper", "find_grippers"]
+__all__ = [
+    "Grasp",
+    "Gripper",
+    "Handle",
+    "find_gripper",
+    "find_grippers",
+    "find_handle",
+    "find_handles",
+    "sample_grasps",
+]

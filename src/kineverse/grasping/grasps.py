@@ -2,13 +2,43 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+import math
+from collections import Counter
+from collections.abc import Iterator
+from dataclasses import dataclass, replace
 
+import numpy as np
+
+from kineverse import lie
+from kineverse.errors import InvalidValueError
+from kineverse.geometry import Scene
+from kineverse.geometry.objects import collision_shapes
 from kineverse.lie import Array
+from kineverse.model.body import Body
 from kineverse.model.model_view import ModelView
 
+from .bars import Part, find_parts
+from .finger_pairs import path_to_root
 from .gripper import Gripper
+from .hand_model import HandModel
 from .handles import Handle
+
+_RETREAT = 0.1
+"""Distance of the pose from which the hand approaches [m]."""
+_SLACK = 4e-3
+"""Gap of the pads minus the thickness of the bar, before the fingers touch [m]."""
+_MARGIN = 1e-3
+"""Least distance of the hand from the object before the fingers touch [m]."""
+_MOST_TILT, _MOST_TILT_OF_KNOB = math.radians(60), math.radians(20)
+_DEPTHS = (0.0, 0.5, 1.0, -0.5)
+"""Parts of the depth of the pads at which a bar is tried first; 1 is at their tips."""
+_CANDIDATES = 6
+"""Candidates for each grasp that is asked for."""
+_NEAR = 0.6
+"""Distance from the bar up to which shapes are looked at [m]."""
+_REACH = 0.05
+"""Distance up to which the clearance of a grasp counts [m]."""
+_CLOSING = 5
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -23,25 +53,174 @@ class Grasp:
         Pose handle.frame_T_hand (4, 4) of the hand's frame while it holds [m].
     approach
         Pose handle.frame_T_hand (4, 4) before the hand approaches, outside of the handle [m].
+    tilt
+        Angle about the bar from its x axis to the direction from which the hand comes [rad].
+    place
+        Coordinate of the middle of the pads along the bar [m].
+    thickness
+        Length of the bar between the pads [m].
+    clearance
+        Least distance of the hand to everything but the bar, while it approaches and closes [m]: at most
+        50 mm.
     """
 
     gripper: Gripper
     handle: Handle
     pose: Array
     approach: Array
+    tilt: float
+    place: float
+    thickness: float
+    clearance: float
+
+    def __str__(self) -> str:
+        tilt, place = math.degrees(self.tilt), self.place * 1e3
+        return f"grasp of {self.handle.frame} by {self.gripper.hand}: tilted {tilt:.0f}°, at {place:.0f} mm"
 
 
 def sample_grasps(
     model: ModelView, gripper: Gripper, handle: Handle, count: int = 64, seed: int = 0
 ) -> tuple[Grasp, ...]:
-    """Return grasps across a bar, without contact of the open gripper with the object, the best first.
+    """Return grasps across a bar, without contact of the gripper with the object, the best first.
 
     Grasps differ in the angle about the bar, the place along it, the depth, and by half a turn about the
-    approach.
+    approach; around a knob also in the angle about its axis. The way from ``approach`` to ``pose`` and the
+    closing fingers are free of collisions with everything that is not the robot's, at its default values.
+    Upright grasps at the middle of the bar and of the pads come first, of similar ones the clearer.
 
     Raises
     ------
     InvalidValueError
         If the bar is thicker than the gripper opens, or too near to its panel for the fingers.
     """
-    raise NotImplementedError
+    if handle.thickness + _SLACK > gripper.width:
+        raise InvalidValueError(
+            f"The {handle} is too thick for the {gripper}. find_handles and find_grippers list others."
+        )
+    surroundings = _Surroundings(model, gripper, handle)
+    found: list[tuple[float, Grasp]] = []
+    hits: Counter[tuple[str, str]] = Counter()
+    rng = np.random.default_rng(seed)
+    for grasp, cost in _candidates(gripper, handle, surroundings.bar, _CANDIDATES * count, rng):
+        pair = surroundings.find_contact(grasp)
+        if pair is not None:
+            hits[pair] += 1
+            continue
+        clearance = surroundings.clearance(grasp)
+        found.append((cost - min(clearance, 0.02) / 0.02, replace(grasp, clearance=clearance)))
+        if len(found) == count:
+            break
+    if not found:
+        raise InvalidValueError(_explain(gripper, handle, hits))
+    found.sort(key=lambda entry: entry[0])
+    return tuple(grasp for _, grasp in found)
+
+
+def _candidates(
+    gripper: Gripper, handle: Handle, bar: Part, count: int, rng: np.random.Generator
+) -> Iterator[tuple[Grasp, float]]:
+    """Yield grasps that close around the bar, and what they cost: centred and upright ones little."""
+    length, width = gripper.pads.size
+    is_knob = handle.length < 1.5 * handle.thickness
+    along = max(handle.length / 2 - width / 2 - 5e-3, 0.0)
+    overlap = min(handle.depth, max(handle.depth / 2 + 3e-3, 8e-3))  # of bar and pads, along the approach
+    deep = max((length + handle.depth) / 2 - overlap, 0.0)
+    frame_R_bar = handle.pose[:3, :3]
+    for k in range(count):
+        # First both half turns at some depths, upright at the middle: knobs leave little more.
+        part = np.array([0.0, 0.0, _DEPTHS[k // 2]]) if k < 2 * len(_DEPTHS) else rng.uniform(-1.0, 1.0, 3)
+        spin = rng.uniform(-math.pi / 2, math.pi / 2) if is_knob and k > 1 else 0.0
+        tilt, place, depth = part * (_MOST_TILT_OF_KNOB if is_knob else _MOST_TILT, along, deep)
+        bar_R_grasp = lie.rotation_x(np.array(spin)) @ lie.rotation_z(np.array(tilt + math.pi))
+        if k % 2:
+            bar_R_grasp = bar_R_grasp @ lie.rotation_x(np.array(math.pi))
+        across = frame_R_bar @ bar_R_grasp[:, 1]
+        thickness = float(bar.extent(np.stack([across, -across])).sum())
+        if thickness + _SLACK > gripper.width:
+            continue
+        z = np.array([0.0, 0.0, 0.0 if is_knob else place])
+        bar_T_grasp = lie.transform(bar_R_grasp, z - depth * bar_R_grasp[:, 0])
+        back = lie.translation(np.array([-_RETREAT, 0.0, 0.0]))
+        grasp_T_hand = lie.inverse(gripper.grasp_pose_at(thickness))
+        pose, approach = (handle.pose @ bar_T_grasp @ T for T in (grasp_T_hand, back @ grasp_T_hand))
+        grasp = Grasp(gripper, handle, pose, approach, float(tilt), float(z[2]), thickness, 0.0)
+        yield grasp, float(np.abs(part).sum())
+
+
+class _Surroundings:
+    """Bodies around a handle, and a hand that is tried there, all in the frame of the handle."""
+
+    def __init__(self, model: ModelView, gripper: Gripper, handle: Handle) -> None:
+        robot = _frames_of_robot(model, gripper)
+        scene = Scene(model, leave_out=[f for f in model.bodies if f in robot])
+        scene.update(model.default_state())
+        frame_T_world = lie.inverse(scene.pose(handle.frame))
+        middle = (scene.pose(handle.frame) @ handle.pose)[:3, 3]
+        near: dict[str, list[int]] = {}
+        for part in find_parts(scene):
+            if np.linalg.norm(part.middle - middle) - np.linalg.norm(part.size) / 2 < _NEAR:
+                near.setdefault(part.body, []).append(part.number)
+            if (part.body, part.number) == (handle.frame, handle.shape):
+                self.bar = replace(part, pose=frame_T_world @ part.pose)
+        obstacles = {}
+        for name, numbers in near.items():
+            shapes, pose = collision_shapes(model.bodies[name]), frame_T_world @ scene.pose(name)
+            kept = [shapes[k] for k in dict.fromkeys(numbers) if (name, k) != (handle.frame, handle.shape)]
+            if kept:
+                obstacles[f"{_OBJECT}{name}"] = (pose, Body(collisions=tuple(kept)))
+        bar = collision_shapes(model.bodies[handle.frame])[handle.shape]
+        obstacles[_BAR] = (np.eye(4), Body(collisions=(bar,)))
+        rigid = [f for f in robot if not model.speeds_of(f, gripper.hand)]
+        frames = dict.fromkeys((*rigid, *gripper.bodies))
+        self._hand = HandModel(model, gripper.hand, frames, gripper.joints, obstacles)
+        watch, bodies = self._hand.scene.watch, self._hand.bodies
+        self._contacts = watch(bodies, list(obstacles), _REACH)
+        others = [name for name in obstacles if name != _BAR]
+        self._others = watch(bodies, others, _REACH) if others else None
+
+    def find_contact(self, grasp: Grasp) -> tuple[str, str] | None:
+        """Return the bodies of hand and object that come too near to each other, or None."""
+        rows = self._rows(grasp)
+        if self._contacts.first_within(self._hand.coordinates, rows, _MARGIN) is None:
+            return None
+        pair = self._contacts(_MARGIN)[0]
+        hand, other = (pair.b, pair.a) if pair.a.startswith(_OBJECT) else (pair.a, pair.b)
+        return hand, "the bar" if other == _BAR else other.removeprefix(_OBJECT)
+
+    def clearance(self, grasp: Grasp) -> float:
+        """Return the least distance of the hand to everything but the bar [m], at most 50 mm."""
+        if self._others is None:
+            return _REACH
+        return min(self._others.least_distance(self._hand.coordinates, self._rows(grasp)), _REACH)
+
+    def _rows(self, grasp: Grasp) -> Array:
+        """Return configurations (n, m) at the hold, and then on the way there: the first ones often touch."""
+        gripper = grasp.gripper
+        gaps = np.linspace(grasp.thickness + _SLACK, gripper.width, _CLOSING)
+        rows = [self._hand.row(gripper.values_at(gap), grasp.pose) for gap in gaps]
+        for part in (0.1, 0.25, 0.5, 1.0):
+            pose = grasp.pose.copy()
+            pose[:3, 3] += part * (grasp.approach - grasp.pose)[:3, 3]
+            rows.append(self._hand.row(gripper.opened, pose))
+        return np.array(rows)
+
+
+_OBJECT, _BAR = "object/", "object/the bar"
+
+
+def _frames_of_robot(model: ModelView, gripper: Gripper) -> dict[str, None]:
+    """Return the frames of the gripper's robot: those below its prefix, or all that stand on its base."""
+    top = path_to_root(model, gripper.hand)[-1]
+    if gripper.robot:
+        return dict.fromkeys(f for f in model.frames if f.startswith(f"{gripper.robot}/"))
+    return dict.fromkeys(f for f in model.frames if path_to_root(model, f)[-1] == top)
+
+
+def _explain(gripper: Gripper, handle: Handle, hits: Counter[tuple[str, str]]) -> str:
+    if not hits:
+        return f"The {gripper} does not open wide enough for the {handle} from any side."
+    listed = ", ".join(f"{a} at {b} ({n}×)" for (a, b), n in hits.most_common(4))
+    return (
+        f"The {gripper} has no room at the {handle}: all {sum(hits.values())} tries collide, {listed}. "
+        "find_handles and find_grippers list others."
+    )

@@ -3,12 +3,23 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
+import numpy as np
+
+from kineverse import lie
+from kineverse.errors import UnknownNameError
 from kineverse.formats.srdf.description import Srdf
 from kineverse.lie import Array
 from kineverse.model.model_view import ModelView
 from kineverse.symbols import Symbol
+
+from .finger_pairs import Palm, find_palms, hand_frame, path_to_root
+from .hand_model import HandModel
+from .pads import Pads, find_pads
+
+_TYPICAL = 0.015
+"""Thickness of a bar for which the grasp pose is given [m]."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -17,23 +28,29 @@ class Gripper:
 
     Attributes
     ----------
+    robot
+        Prefix of the robot in the model.
     hand
         Frame that carries the fingers.
     grasp_pose
-        Pose hand_T_grasp (4, 4) [m]: its origin lies between the finger pads, x points out of the hand, y
-        along the closing motion.
+        Pose hand_T_grasp (4, 4) [m]: its origin lies between the finger pads around a thin bar, x points out
+        of the hand, y along the closing motion, from the first finger to the second.
     fingers
-        Frames of the one finger, and of the other.
+        Frames of the one finger, and of the other, that have shapes.
     bodies
-        Frames of the hand and all fingers: the group that may touch what is grasped.
+        Frames of the hand and all fingers that have shapes: the group that may touch what is grasped.
     joints
         Free coordinates that open and close the fingers.
     opened, closed
-        Values of these coordinates for open and for closed fingers [m], [rad].
+        Values of these coordinates for open fingers, and for fingers that touch or do not close further [m],
+        [rad].
     width
         Gap between the open fingers [m].
+    pads
+        The facing surfaces.
     """
 
+    robot: str
     hand: str
     grasp_pose: Array
     fingers: tuple[tuple[str, ...], tuple[str, ...]]
@@ -42,10 +59,29 @@ class Gripper:
     opened: Mapping[Symbol, float]
     closed: Mapping[Symbol, float]
     width: float
+    pads: Pads = field(repr=False)
+
+    def values_at(self, gap: float) -> dict[Symbol, float]:
+        """Return the values of the joints at which the pads have a gap [m], within what they can."""
+        part = self.pads.part_at(gap)
+        return {s: self.opened[s] + part * (self.closed[s] - self.opened[s]) for s in self.joints}
+
+    def grasp_pose_at(self, gap: float) -> Array:
+        """Return hand_T_grasp (4, 4) [m] for pads with a gap [m]: fingers that turn move the pads along x."""
+        pose = self.grasp_pose.copy()
+        pose[:3, 3] = self.pads.middle_at(gap)
+        return pose
+
+    def __str__(self) -> str:
+        joints = ", ".join(f"{s} from {self.opened[s]:.4g} to {self.closed[s]:.4g}" for s in self.joints)
+        return f"gripper of {self.hand}, opens {self.width * 1e3:.0f} mm by {joints}"
 
 
 def find_grippers(model: ModelView, robot: str, srdf: Srdf | None = None) -> tuple[Gripper, ...]:
     """Return the grippers of a robot, the likeliest for manipulation first; empty if it has none.
+
+    Grippers of the end effectors of a semantic description come first, then the wider ones. Of equally wide
+    ones, that further to the right comes first.
 
     Parameters
     ----------
@@ -56,7 +92,7 @@ def find_grippers(model: ModelView, robot: str, srdf: Srdf | None = None) -> tup
     srdf
         Semantic description, whose end effectors come first.
     """
-    raise NotImplementedError
+    return _search(model, robot, srdf)[0]
 
 
 def find_gripper(model: ModelView, robot: str, hand: str | None = None, srdf: Srdf | None = None) -> Gripper:
@@ -74,4 +110,67 @@ def find_gripper(model: ModelView, robot: str, hand: str | None = None, srdf: Sr
     UnknownNameError
         If the robot has no gripper, or none at this frame; the message lists the grippers.
     """
-    raise NotImplementedError
+    found, why = _search(model, robot, srdf)
+    name = f"The robot '{robot}'" if robot else "The model"
+    if not found:
+        reasons = (
+            "".join(f"\n  {line}" for line in why) or " No link carries two joints with limits and shapes."
+        )
+        raise UnknownNameError(f"{name} has no gripper with two opposed fingers.{reasons}")
+    if hand is None:
+        return found[0]
+    model.fk(hand)  # raises for an unknown frame
+    for gripper in found:
+        if hand in (gripper.hand, *gripper.bodies) or not model.speeds_of(hand, gripper.hand):
+            return gripper
+    listed = ", ".join(repr(gripper.hand) for gripper in found)
+    raise UnknownNameError(f"{name} has no gripper at '{hand}'. Its grippers are at: {listed}.")
+
+
+def _search(model: ModelView, robot: str, srdf: Srdf | None) -> tuple[tuple[Gripper, ...], list[str]]:
+    """Return the grippers, and for each link without one the reason."""
+    found: list[tuple[tuple[float, ...], Gripper]] = []
+    why: list[str] = []
+    for rank, palm in find_palms(model, robot, srdf):
+        gripper, reasons = _best_pair(model, robot, palm)
+        if gripper is not None:
+            # The hand at the default state, as the robot sees it: y points to the left.
+            place = np.asarray(model.fk(gripper.hand)(model.default_state()))[:3, 3]
+            found.append(((rank, -round(gripper.width, 4), round(float(place[1]), 4)), gripper))
+        else:
+            names = ", ".join(str(s) for s in dict.fromkeys(s for b in palm.branches for s in b.joints))
+            why.append(f"{palm.root} with {names}: {'; '.join(reasons)}")
+    found.sort(key=lambda entry: entry[0])
+    return tuple(gripper for _, gripper in found), why
+
+
+def _best_pair(model: ModelView, robot: str, palm: Palm) -> tuple[Gripper | None, list[str]]:
+    hand = hand_frame(model, palm.branches)
+    joints = tuple(dict.fromkeys(s for b in palm.branches for s in b.joints))
+    below = [f for f in palm.frames if hand in path_to_root(model, f)]
+    moving = [f for b in palm.branches for f in b.frames]
+    alone = HandModel(model, hand, [*below, *moving], joints)
+    root = np.asarray(model.fk(palm.root, hand)({}))[:3, 3]
+    best: Pads | None = None
+    reasons = []
+    for k, a in enumerate(palm.branches):
+        for b in palm.branches[k + 1 :]:
+            pads, reason = find_pads(model, alone, a, b, root)
+            if pads is None:
+                reasons.append(f"{a.root} and {b.root}: {reason}")
+            elif best is None or _reach(pads) > _reach(best) + 1e-6:
+                best = pads
+    if best is None:
+        return None, reasons
+    return _make_gripper(model, robot, hand, alone, best), []
+
+
+def _reach(pads: Pads) -> float:
+    return float(pads.middle_at(_TYPICAL) @ pads.axes[:, 0])
+
+
+def _make_gripper(model: ModelView, robot: str, hand: str, alone: HandModel, pads: Pads) -> Gripper:
+    width = float(pads.stroke[0, 1])
+    pose = lie.transform(pads.axes, pads.middle_at(min(_TYPICAL, width / 2)))
+    joints, opened, closed = tuple(pads.opened), pads.opened, pads.closed
+    return Gripper(robot, hand, pose, pads.fingers, alone.bodies, joints, opened, closed, width, pads)

@@ -2,28 +2,51 @@
 
 from __future__ import annotations
 
+import math
+from collections.abc import Sequence
 from dataclasses import dataclass
 
+import numpy as np
+
+from kineverse import lie
+from kineverse.errors import UnknownNameError
+from kineverse.geometry import Scene
 from kineverse.lie import Array
+from kineverse.model.frame_dependence import FrameDependence
 from kineverse.model.model_view import ModelView
+from kineverse.state import State
 from kineverse.symbols import Symbol
+
+from .bars import Part, ProtrudingBar, find_bars, find_parts, free_length
+from .finger_pairs import path_to_root
+
+_FREE = 0.08
+"""Free space in front of a bar that a hand needs [m]."""
+_PART_OF_RANGE = 0.05
+_WITHIN = 0.5
+"""Cosine above which a bar points along the opening motion, and below minus which it points inside."""
+_PLACES = 9
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Handle:
-    """Bar that a gripper can hold.
+    """ProtrudingBar that a gripper can hold.
 
     Attributes
     ----------
     frame
-        Frame of the body with the collision shapes of the bar.
+        Frame of the body with the shapes of the bar.
     coordinate
         Coordinate of the object that moves it.
     pose
         Pose frame_T_bar (4, 4) [m]: its origin is the middle of the bar, z is along the bar, x points away
         from what the bar is fixed to: a hand approaches along -x.
-    length, thickness, clearance
-        Size of the bar along z and across y, and the free space between bar and panel along x [m].
+    length, thickness, depth, clearance
+        Size of the bar along z, across y and along x, and the free space between bar and panel along x [m].
+    shape
+        Index of the bar among the shapes of the body.
+    is_visual
+        True if the body has visual shapes alone: the bar is then taken from these.
     """
 
     frame: str
@@ -31,11 +54,25 @@ class Handle:
     pose: Array
     length: float
     thickness: float
+    depth: float
     clearance: float
+    shape: int
+    is_visual: bool = False
+
+    def __str__(self) -> str:
+        sizes = f"{self.length * 1e3:.0f} mm long, {self.thickness * 1e3:.0f} mm thick"
+        kind = ", from visual shapes" if self.is_visual else ""
+        return f"handle {self.frame}: {sizes}, {self.clearance * 1e3:.0f} mm free behind it{kind}"
 
 
 def find_handles(model: ModelView, coordinate: Symbol | str) -> tuple[Handle, ...]:
     """Return the handles that a coordinate moves, the best first; empty if there is none.
+
+    A handle is a bar or a knob: a slim convex shape that stands out from the rest of its rigid link, with
+    free space in front of it and not on the inner side. Bars that point along the opening motion come first,
+    and of these the ones that the coordinate moves the most: the farthest from the axis of a door.
+
+    Everything else is at its default value. Bodies without collision shapes count by their visual shapes.
 
     Parameters
     ----------
@@ -43,8 +80,13 @@ def find_handles(model: ModelView, coordinate: Symbol | str) -> tuple[Handle, ..
         Model of the object.
     coordinate
         Coordinate of a door, a drawer or any other mechanism.
+
+    Raises
+    ------
+    UnknownNameError
+        If the model has no such coordinate.
     """
-    raise NotImplementedError
+    return _search(model, coordinate)[0]
 
 
 def find_handle(model: ModelView, coordinate: Symbol | str, frame: str | None = None) -> Handle:
@@ -55,4 +97,109 @@ def find_handle(model: ModelView, coordinate: Symbol | str, frame: str | None = 
     UnknownNameError
         If there is none; the message says which bodies the coordinate moves and why none is a handle.
     """
-    raise NotImplementedError
+    found, why = _search(model, coordinate)
+    if frame is not None:
+        model.fk(frame)  # raises for an unknown frame
+        at = [handle for handle in found if handle.frame == frame]
+        if found and not at:
+            listed = ", ".join(repr(handle.frame) for handle in found)
+            raise UnknownNameError(f"'{coordinate}' moves no handle at '{frame}'. Its handles: {listed}.")
+        found = tuple(at)
+    if not found:
+        raise UnknownNameError(f"'{coordinate}' moves no handle. {why}")
+    return found[0]
+
+
+def _search(model: ModelView, coordinate: Symbol | str) -> tuple[tuple[Handle, ...], str]:
+    """Return the handles, and a sentence on why there is none."""
+    symbol = coordinate if isinstance(coordinate, Symbol) else model.symbol(coordinate)
+    motion = FrameDependence(model, [symbol])
+    moved = [name for name in model.frames if motion.moves(name)]
+    if not moved:
+        return (), "It moves no frame."
+    tops = {path_to_root(model, name)[-1] for name in moved}
+    scene = Scene(model, leave_out=[f for f in model.bodies if path_to_root(model, f)[-1] not in tops])
+    if not any(f in scene.bodies for f in moved):
+        return (), f"It moves {_listed(moved)}, without shapes."
+    state, opening = _open_a_little(model, symbol)
+    scene.update(state)
+    parts = find_parts(scene)
+    poses = {name: scene.pose(name) for name in moved if name in scene.bodies}
+    scene.update(opening)
+    shifts = {name: scene.pose(name) for name in poses}
+    links = {name: _link(model, name) for name in scene.bodies}
+    own = {links[name] for name in poses if motion.moving_ancestors(name)[-1] == links[name]}
+    still = [part for part in parts if part.body not in poses and not _moves(model, part.body)]
+    rated = []
+    for link in sorted(own):
+        body = [part for part in parts if links[part.body] == link]
+        others = [
+            part
+            for part in parts
+            if links[part.body] in own | _carriers(model, link) and links[part.body] != link
+        ]
+        around = [*still, *others]
+        for bar in find_bars(body, around):
+            before, after = poses[bar.part.body], shifts[bar.part.body]
+            shift = (after @ lie.inverse(before) @ np.append(bar.part.middle, 1.0))[:3] - bar.part.middle
+            along = float(bar.rotation[:, 0] @ shift) / max(float(np.linalg.norm(shift)), 1e-6)
+            if along < -_WITHIN or not _is_free(bar, [*body, *around]):
+                continue
+            handle = _make_handle(model, symbol, bar, before, [*body, *around])
+            rated.append((along < _WITHIN, -round(float(np.linalg.norm(shift)), 4), handle.thickness, handle))
+    rated.sort(key=lambda row: row[:3])
+    why = f"It moves {_listed([f for f in moved if f in scene.bodies])}: no slim shape of these stands out, "
+    why += "with free space in front of it."
+    return tuple(row[3] for row in rated), why
+
+
+def _link(model: ModelView, frame: str) -> str:
+    """Return the first frame from a frame upwards that moves in its parent, or the topmost one."""
+    path = path_to_root(model, frame)
+    return next((f for f in path if model.speeds_of(f, model.frames[f].parent)), path[-1])
+
+
+def _carriers(model: ModelView, link: str) -> set[str]:
+    return {_link(model, f) for f in path_to_root(model, link)}
+
+
+def _moves(model: ModelView, frame: str) -> bool:
+    return bool(model.speeds_of(frame))
+
+
+def _open_a_little(model: ModelView, symbol: Symbol) -> tuple[State, State]:
+    """Return the default state, and one in which a coordinate is on its way to the further limit."""
+    state = model.default_state()
+    start = state[symbol]
+    low, high = model.limits(symbol)
+    low, high = (start - 1.0 if math.isinf(low) else low), (start + 1.0 if math.isinf(high) else high)
+    end = high if high - start >= start - low else low
+    return state, state.updated({symbol: start + _PART_OF_RANGE * (end - start)})
+
+
+def _is_free(bar: ProtrudingBar, parts: Sequence[Part]) -> bool:
+    x = bar.rotation[:, 0]
+    front = bar.part.middle + (float(bar.part.extent(x[None])[0]) - float(bar.part.middle @ x) + 1e-4) * x
+    return free_length(front, x, parts, bar.cluster, _FREE) > _FREE
+
+
+def _make_handle(
+    model: ModelView, symbol: Symbol, bar: ProtrudingBar, body: Array, parts: Sequence[Part]
+) -> Handle:
+    axes = bar.rotation.T
+    high, low = bar.part.extent(axes), -bar.part.extent(-axes)
+    middle = bar.rotation @ ((high + low) / 2)
+    depth, thickness, length = (high - low).tolist()
+    x, z = axes[0], axes[2]
+    places = np.linspace(-0.4, 0.4, _PLACES) * length
+    back = [middle + place * z - (depth / 2 + 1e-5) * x for place in places]
+    clearance = float(np.median([free_length(origin, -x, parts, bar.cluster) for origin in back]))
+    pose = lie.round_exact(lie.inverse(body) @ lie.transform(bar.rotation, middle))
+    frame = bar.part.body
+    is_visual = not model.bodies[frame].collisions
+    return Handle(frame, symbol, pose, length, thickness, depth, clearance, bar.part.number, is_visual)
+
+
+def _listed(names: Sequence[str], most: int = 6) -> str:
+    more = f" and {len(names) - most} more" if len(names) > most else ""
+    return ", ".join(names[:most]) + more

@@ -1,0 +1,240 @@
+"""Convex parts of placed bodies, and bars among them: slim parts that stand out from what they are fixed to.
+
+All poses, points and directions are in the world [m].
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Collection, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from kineverse.geometry import Scene
+from kineverse.geometry.rays import intersect_ray
+from kineverse.geometry.shapes import Solid, solid_from_geometry
+from kineverse.geometry.support import PlacedSolid, directional_gaps, find_widest_gap
+from kineverse.lie import Array, unit_vector
+from kineverse.model.body import Sphere
+
+MOST_THICK = 0.09
+"""Largest thickness of a bar [m]: hardly a gripper opens further."""
+_LONG = 1.5
+"""Length per width above which a part is a bar, and a knob below."""
+_STANDS_OUT = 3e-3
+"""Least length by which a bar stands out from what it is fixed to [m]."""
+_TOUCH = 2e-3
+"""Largest gap of parts that are fixed to each other [m]."""
+_STEPS = 144
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Part:
+    """Convex shape of a placed body.
+
+    Attributes
+    ----------
+    body, number
+        Frame of the body, and index of the shape.
+    solid, pose
+        The shape as collision scenes have it, and its pose (4, 4) in the world.
+    axes, size, middle
+        Box around it: axes (3, 3) in columns, the longest edge first, lengths (3,), middle (3,).
+    """
+
+    body: str
+    number: int
+    solid: Solid
+    pose: Array
+    axes: Array
+    size: Array
+    middle: Array
+
+    @property
+    def placed(self) -> PlacedSolid:
+        """The solid with its rotation and position."""
+        return self.solid, self.pose[:3, :3], self.pose[:3, 3]
+
+    @property
+    def is_slim(self) -> bool:
+        """True if a hand can close around it in some direction."""
+        return bool(self.size[1] <= MOST_THICK)
+
+    def extent(self, directions: Array) -> Array:
+        """Return the largest coordinates (n,) along unit directions (n, 3)."""
+        return -directional_gaps((_POINT, np.eye(3), np.zeros(3)), self.placed, -directions) - _POINT_RADIUS
+
+    def touches(self, other: Part) -> bool:
+        """Return True if another part is in contact, up to some 2 mm."""
+        between = other.middle - self.middle
+        if np.linalg.norm(between) > np.linalg.norm(self.size) / 2 + np.linalg.norm(other.size) / 2 + _TOUCH:
+            return False
+        return find_widest_gap(self.placed, other.placed, np.zeros((0, 3)))[0] <= _TOUCH
+
+
+def find_parts(scene: Scene) -> list[Part]:
+    """Return the convex parts of the bodies of a scene, as they are placed."""
+    parts = []
+    for item in scene.collision_world.objects:
+        solid = item.make_solid()
+        pose = scene.pose(item.body) @ item.shape.origin.matrix
+        parts.append(_part(item.body, item.number, solid, pose))
+    return parts
+
+
+def _part(body: str, number: int, solid: Solid, pose: Array) -> Part:
+    boxes = [np.eye(3)]
+    if solid.core is not None and solid.core.corners.size:  # the principal axes of a hull
+        corners = solid.core.corners.T
+        boxes.append(np.linalg.svd(corners - corners.mean(axis=0), full_matrices=False)[2].T)
+    local = Part(body, number, solid, np.eye(4), boxes[0], np.zeros(3), np.zeros(3))
+    spans = [(local.extent(axes.T), -local.extent(-axes.T)) for axes in boxes]
+    volumes = [float(np.prod(high - low)) for high, low in spans]
+    k = 1 if volumes[-1] < 0.99 * volumes[0] else 0
+    axes, (high, low) = boxes[k], spans[k]
+    order = np.argsort(low - high, kind="stable")
+    turned = pose[:3, :3] @ axes
+    middle = turned @ ((high + low) / 2) + pose[:3, 3]
+    return Part(body, number, solid, pose, turned[:, order], (high - low)[order], middle)
+
+
+_POINT_RADIUS = 1e-7
+_POINT = solid_from_geometry(Sphere(_POINT_RADIUS))
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class ProtrudingBar:
+    """Part that a hand can close around.
+
+    Attributes
+    ----------
+    part
+        The part.
+    cluster
+        It and the slim parts that are fixed to it: mounts, or further pieces of a handle.
+    rotation
+        (3, 3): z along the bar, x away from what the bar is fixed to.
+    stands_out
+        Length by which it stands out along x from what it is fixed to [m].
+    """
+
+    part: Part
+    cluster: tuple[Part, ...]
+    rotation: Array
+    stands_out: float
+
+
+def find_bars(link: Sequence[Part], around: Sequence[Part]) -> list[ProtrudingBar]:
+    """Return the bars among the parts of a rigid link, one for each cluster of slim parts.
+
+    Parameters
+    ----------
+    link
+        Parts of the link.
+    around
+        Parts of other links, which carry the link.
+    """
+    bars = []
+    for cluster in _clusters([part for part in link if part.is_slim]):
+        inside = {id(part) for part in cluster}
+        rest = [part for part in link if id(part) not in inside]
+        found = [bar for part in cluster if (bar := _bar(part, cluster, rest, around))]
+        if found:
+            furthest = max(bar.stands_out for bar in found)
+            outer = [bar for bar in found if bar.stands_out > furthest - _STANDS_OUT]
+            bars.append(max(outer, key=lambda bar: float(bar.part.size[0])))
+    return bars
+
+
+def _clusters(parts: Sequence[Part]) -> list[tuple[Part, ...]]:
+    """Return the connected components of parts that touch."""
+    left, clusters = list(parts), []
+    while left:
+        cluster = [left.pop(0)]
+        for part in cluster:
+            touching = [other for other in left if part.touches(other)]
+            left = [other for other in left if all(other is not one for one in touching)]
+            cluster += touching
+        clusters.append(tuple(cluster))
+    return clusters
+
+
+def _bar(
+    part: Part, cluster: tuple[Part, ...], rest: Sequence[Part], around: Sequence[Part]
+) -> ProtrudingBar | None:
+    fixture = rest or _nearest(part, around)
+    if not fixture:
+        return None
+    is_long = part.size[0] > _LONG * part.size[1]
+    turns = np.linspace(0.0, 2 * np.pi, _STEPS, endpoint=False)
+    circle = np.outer(np.cos(turns), part.axes[:, 1]) + np.outer(np.sin(turns), part.axes[:, 2])
+    knob = np.concatenate([part.axes.T, -part.axes.T])
+    if is_long:
+        normals = np.concatenate([other.axes.T for other in fixture])
+        normals = normals - np.outer(normals @ part.axes[:, 0], part.axes[:, 0])
+        lengths = np.linalg.norm(normals, axis=1)
+        normals = normals[lengths > 0.5] / lengths[lengths > 0.5, None]
+        found = _most_outwards(part, fixture, np.concatenate([normals, -normals, circle]))
+    else:
+        found = _most_outwards(part, fixture, knob)
+    if is_long and found[0] < _STANDS_OUT and part.size[0] <= 2 * MOST_THICK:
+        found = _most_outwards(part, fixture, knob)  # a peg that stands out along its length
+    stands_out, x = found
+    if stands_out < _STANDS_OUT:
+        return None
+    along = [axis - (axis @ x) * x for axis in part.axes.T if abs(axis @ x) < 0.5]
+    z = unit_vector(along[0])
+    return ProtrudingBar(part, cluster, np.stack([x, np.cross(z, x), z], axis=1), stands_out)
+
+
+def _most_outwards(part: Part, fixture: Sequence[Part], directions: Array) -> tuple[float, Array]:
+    """Return how far a part stands out from its fixture, and the direction (3,) in which that is the most.
+
+    Directions that come first are preferred: that of a panel's normal to a direction near to it.
+    """
+    beyond = part.extent(directions) - np.max([other.extent(directions) for other in fixture], axis=0)
+    best = int(np.argmax(beyond >= beyond.max() - 1e-4))
+    return float(beyond[best]), directions[best]
+
+
+def _nearest(part: Part, around: Sequence[Part]) -> list[Part]:
+    """Return the part of other links that a part without a fixture of its own is fixed to."""
+    near = sorted(around, key=lambda other: _gap_bound(part, other))[:8]
+    return sorted(near, key=lambda other: find_widest_gap(part.placed, other.placed, np.zeros((0, 3)))[0])[:1]
+
+
+def _gap_bound(a: Part, b: Part) -> float:
+    """Return a lower bound of the distance of two parts, along the axes of both."""
+    axes = np.concatenate([a.axes.T, -a.axes.T, b.axes.T, -b.axes.T])
+    return float(directional_gaps(a.placed, b.placed, axes).max())
+
+
+def free_length(
+    origin: Array, direction: Array, parts: Sequence[Part], but: Collection[Part], length: float = math.inf
+) -> float:
+    """Return the length of a ray to the first of some parts [m]; infinite if none is within a length.
+
+    Parameters
+    ----------
+    origin, direction
+        (3,), the direction of length one.
+    parts, but
+        The parts, and those among them that are not looked at.
+    length
+        Length of the ray [m].
+    """
+    nearest, skipped = math.inf, {id(part) for part in but}
+    for part in parts:
+        radius = float(np.linalg.norm(part.size)) / 2
+        to_middle = part.middle - origin
+        along = float(to_middle @ direction)
+        if id(part) in skipped or along < -radius or along - radius > min(nearest, length):
+            continue
+        if float(to_middle @ to_middle) - along * along > radius * radius:
+            continue
+        rotation, position = part.pose[:3, :3], part.pose[:3, 3]
+        hit = intersect_ray(part.solid, rotation.T @ (origin - position), rotation.T @ direction)
+        if hit is not None and hit[0] <= length:
+            nearest = min(nearest, hit[0])
+    return nearest

@@ -1,0 +1,142 @@
+"""Fingers in a kinematic tree: small branches that joints move on one rigid link."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass
+
+from kineverse.formats.srdf.description import Srdf
+from kineverse.model.frame import WORLD
+from kineverse.model.model_view import ModelView
+from kineverse.symbols import Symbol
+
+from .hand_model import has_shapes
+
+MOST_JOINTS = 3
+"""Most free coordinates of one finger."""
+
+
+@dataclass(frozen=True, slots=True)
+class Branch:
+    """Part of a kinematic tree that a joint moves on a rigid link.
+
+    Attributes
+    ----------
+    root
+        The frame that moves in its parent.
+    frames
+        All frames from there on, parents first.
+    joints
+        The free coordinates that move them on the link, sorted.
+    """
+
+    root: str
+    frames: tuple[str, ...]
+    joints: tuple[Symbol, ...]
+
+
+@dataclass(frozen=True, slots=True)
+class Palm:
+    """Rigid link with branches that may be fingers.
+
+    Attributes
+    ----------
+    root
+        The frame of the link that moves in its parent, or stands in the world.
+    frames
+        Its frames, parents first.
+    branches
+        The branches on it with shapes, few joints, and limits, in the order of the model.
+    """
+
+    root: str
+    frames: tuple[str, ...]
+    branches: tuple[Branch, ...]
+
+
+def robot_frames(model: ModelView, robot: str) -> tuple[str, ...]:
+    """Return the frames of a robot in the order of the model: those below its prefix, or all."""
+    return tuple(name for name in model.frames if not robot or name.startswith(f"{robot}/"))
+
+
+def find_palms(model: ModelView, robot: str, srdf: Srdf | None = None) -> list[tuple[int, Palm]]:
+    """Return the rigid links of a robot with two or more branches that may be fingers.
+
+    With each comes the index of the first end effector of a semantic description whose links it carries.
+    """
+    parents = {name: model.frames[name].parent for name in robot_frames(model, robot)}
+    moving = {f: model.speeds_of(f, parent) for f, parent in parents.items()}
+    link: dict[str, str] = {}
+    for frame in _parents_first(parents):
+        parent = parents[frame]
+        # The robot's root and the world are one rigid link for no robot: nothing grasps with the ground.
+        link[frame] = frame if moving[frame] or parent not in link else link[parent]
+    children: dict[str, list[str]] = {}
+    for frame in link:
+        if link[frame] == frame and parents[frame] in link:
+            children.setdefault(link[parents[frame]], []).append(frame)
+    palms = []
+    for root, roots in children.items():
+        branches = [_branch(model, frame, parents) for frame in roots]
+        fingers = tuple(b for b in branches if _may_be_finger(model, b))
+        if len(fingers) > 1:
+            palm = Palm(root, tuple(f for f in link if link[f] == root), fingers)
+            palms.append((_srdf_rank(palm, srdf), palm))
+    return palms
+
+
+def _parents_first(parents: Mapping[str, str]) -> Iterable[str]:
+    """Return frames with each after its parent."""
+    done: dict[str, None] = {}
+    for frame in parents:
+        path = []
+        while frame in parents and frame not in done:
+            path.append(frame)
+            frame = parents[frame]
+        done.update(dict.fromkeys(reversed(path)))
+    return done
+
+
+def _branch(model: ModelView, root: str, parents: Mapping[str, str]) -> Branch:
+    frames = {root: None}
+    for frame in _parents_first(parents):
+        if parents[frame] in frames:
+            frames[frame] = None
+    speeds = {s for f in frames for s in model.speeds_of(f, parents[root])}
+    return Branch(root, tuple(frames), tuple(sorted((s.position for s in speeds), key=str)))
+
+
+def _may_be_finger(model: ModelView, branch: Branch) -> bool:
+    if not 1 <= len(branch.joints) <= MOST_JOINTS:
+        return False
+    if not all(math.isfinite(bound) for s in branch.joints for bound in model.limits(s)):
+        return False
+    return any(f in model.bodies and has_shapes(model.bodies[f]) for f in branch.frames)
+
+
+def _srdf_rank(palm: Palm, srdf: Srdf | None) -> int:
+    """Return the index of the first end effector whose links the palm carries."""
+    carried = {f for b in palm.branches for f in b.frames}
+    effectors = [] if srdf is None else list(srdf.end_effectors.values())
+    for k, effector in enumerate(effectors):
+        group = srdf.groups.get(effector.group) if srdf else None
+        if group is not None and carried & set(group.links):
+            return k
+    return len(effectors)
+
+
+def hand_frame(model: ModelView, branches: Iterable[Branch]) -> str:
+    """Return the lowest frame that carries all branches: their common parent."""
+    paths = [path_to_root(model, model.frames[branch.root].parent) for branch in branches]
+    shared = set(paths[0]).intersection(*paths[1:])
+    return next(frame for frame in paths[0] if frame in shared)
+
+
+def path_to_root(model: ModelView, frame: str) -> list[str]:
+    """Return a frame and all frames above it, without the world."""
+    path = []
+    while frame != WORLD:
+        path.append(frame)
+        frame = model.frames[frame].parent
+    return path

@@ -1,0 +1,275 @@
+"""Geometry of two opposed fingers: closing motion, pads, and the gap between them.
+
+All poses and points are in the frame of the hand [m].
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from kineverse import lie
+from kineverse.geometry import DistanceResult
+from kineverse.lie import Array
+from kineverse.model.model_view import ModelView
+from kineverse.symbols import Symbol
+
+from .finger_pairs import Branch
+from .hand_model import HandModel
+
+_SAMPLES = 33
+_NEAR = 4e-3
+"""Opening at which fingers count as nearly closed: their pads face each other there [m]."""
+_FLAT = 2e-3
+"""Unevenness of a pad [m]."""
+_CELLS = 20
+_REACH = 0.3
+"""Length of the rays from the middle to the pads [m]."""
+_ALIGNED = 0.85
+"""Cosine of the angle below which an axis is taken for the approach direction."""
+_LEAST_STROKE = 5e-3
+"""Least change of the gap of a gripper [m]."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Pads:
+    """Two facing surfaces on fingers, and how they close.
+
+    Attributes
+    ----------
+    fingers
+        Frames of both fingers that have shapes.
+    frames
+        The frames that carry the pads.
+    points
+        (2, 3) the middle of each in its own frame.
+    axes
+        (3, 3) rotation hand_R_grasp: x out of the hand, y from the first pad to the second.
+    size
+        Lengths along x and z.
+    opened, closed
+        Values of the joints at both ends of the motion.
+    stroke
+        Rows (n, 5): part of the motion from 0 (open) to 1 (closed), gap along y, and the middle of both pads.
+    """
+
+    fingers: tuple[tuple[str, ...], tuple[str, ...]]
+    frames: tuple[str, str]
+    points: Array
+    axes: Array
+    size: tuple[float, float]
+    opened: Mapping[Symbol, float]
+    closed: Mapping[Symbol, float]
+    stroke: Array
+
+    def part_at(self, gap: float) -> float:
+        """Return the part of the motion at which the pads have a gap [m], or the nearest end of it."""
+        return float(np.interp(-gap, -self.stroke[:, 1], self.stroke[:, 0]))
+
+    def middle_at(self, gap: float) -> Array:
+        """Return the middle (3,) between the pads when they have a gap [m]."""
+        part = self.part_at(gap)
+        return np.array([np.interp(part, self.stroke[:, 0], self.stroke[:, k]) for k in (2, 3, 4)])
+
+
+def find_pads(
+    model: ModelView, alone: HandModel, a: Branch, b: Branch, root: Array
+) -> tuple[Pads | None, str]:
+    """Return the pads of two branches, or None with the reason why they are no opposed fingers.
+
+    Parameters
+    ----------
+    model
+        Model of the robot, for the limits of the joints.
+    alone
+        The hand with both branches.
+    a, b
+        The branches.
+    root
+        Position (3,) of the joint that moves the hand: the fingers point away from it.
+    """
+    motion = _Motion(model, alone, a, b)
+    why = motion.find_closing()
+    if why:
+        return None, why
+    nearly = motion.nearly_closed
+    motion.place(nearly)
+    near = motion.nearest()
+    carriers, tips = (near.a, near.b), (near.point_a, near.point_b)
+    points = [_in_frame(alone.scene.pose(f), p) for f, p in zip(carriers, tips, strict=True)]
+    moved = motion.track(carriers, points, (nearly, max(nearly - 0.02, 0.0)))
+    opening = moved[1] - moved[0]  # motion of both points while the fingers open a little
+    across = opening[1] - opening[0]
+    if np.linalg.norm(across) < 1e-9:
+        return None, "the fingers do not part"
+    y = lie.round_exact(across / np.linalg.norm(across))
+    if y[np.argmax(np.abs(y))] < 0.0:  # of two equal choices the one along an axis of the hand
+        motion.exchange()
+        y, opening, moved = -y, opening[::-1], moved[:, ::-1]
+    if (opening[0] @ y) * (opening[1] @ y) > -1e-3 * float(across @ across):
+        return None, "only one of the two moves"
+    x = _approach(motion, (a, b), y, moved[0].mean(axis=0) - root)
+    axes = lie.round_exact(np.stack([x, y, np.cross(x, y)], axis=1))
+    return _measure(motion, axes, float(moved[0].mean(axis=0) @ y))
+
+
+def _approach(motion: _Motion, branches: tuple[Branch, Branch], y: Array, outwards: Array) -> Array:
+    """Return the unit vector (3,) out of the hand, normal to y: along an axis of the hand if one is near."""
+    axes = [*np.eye(3)]
+    for branch in branches:
+        turn = motion.turn(branch.root)
+        if np.linalg.norm(turn) > 1e-3:
+            axes.insert(0, np.cross(y, lie.unit_vector(turn)))
+    outwards = lie.unit_vector(outwards - (outwards @ y) * y)
+    for axis in axes:
+        if abs(axis @ y) < 0.02 and abs(axis @ outwards) > _ALIGNED:
+            axis = axis - (axis @ y) * y
+            return lie.unit_vector(np.copysign(1.0, axis @ outwards) * axis)
+    return outwards
+
+
+def _measure(motion: _Motion, axes: Array, height: float) -> tuple[Pads | None, str]:
+    x, y, z = axes.T
+    motion.place(motion.nearly_closed)
+    corners = [motion.alone.box_corners(frames) for frames in (motion.a, motion.b)]
+    low = np.max([c.min(axis=0) for c in (corner @ axes for corner in corners)], axis=0)
+    high = np.min([c.max(axis=0) for c in (corner @ axes for corner in corners)], axis=0)
+    for _ in range(2):  # the pads, and then these alone, finer
+        if (low >= high)[[0, 2]].any():
+            return None, "they do not face each other"
+        cells = motion.scan(axes, height, (np.array([low[0], high[0]]), np.array([low[2], high[2]])))
+        if not len(cells):
+            return None, "they do not face each other"
+        gaps = cells[:, 2] + cells[:, 3]
+        pad = cells[gaps <= gaps.min() + _FLAT]
+        step = (high - low)[[0, 2]] / _CELLS
+        low[[0, 2]] = np.maximum(low[[0, 2]], pad[:, :2].min(axis=0) - step)
+        high[[0, 2]] = np.minimum(high[[0, 2]], pad[:, :2].max(axis=0) + step)
+    middle = pad[np.argmin(np.linalg.norm(pad[:, :2] - pad[:, :2].mean(axis=0), axis=1))]
+    origin = middle[0] * x + height * y + middle[1] * z
+    hits = [motion.scene.ray(origin, -y, _REACH), motion.scene.ray(origin, y, _REACH)]
+    if hits[0] is None or hits[1] is None:
+        return None, "they do not face each other"
+    centre = pad[:, :2].mean(axis=0) - middle[:2]
+    shift = centre[0] * x + centre[1] * z
+    points = [_in_frame(motion.scene.pose(hit.body), hit.point + shift) for hit in hits if hit]
+    frames = (hits[0].body, hits[1].body)
+    parts = np.linspace(0.0, 1.0, _SAMPLES)
+    tracked = motion.track(frames, points, parts)
+    gap = (tracked[:, 1] - tracked[:, 0]) @ y
+    stroke = np.column_stack([parts, gap, tracked.mean(axis=1)])
+    length, width = (np.ptp(pad[:, :2], axis=0) + step).tolist()
+    fingers = (tuple(motion.a), tuple(motion.b))
+    opened, closed = motion.values(0.0), motion.values(1.0)
+    return Pads(fingers, frames, np.array(points), axes, (length, width), opened, closed, stroke), ""
+
+
+class _Motion:
+    """Closing motion of two branches, as a line through the values of their joints."""
+
+    def __init__(self, model: ModelView, alone: HandModel, a: Branch, b: Branch) -> None:
+        self.alone, self.scene = alone, alone.scene
+        self.a, self.b = ([f for f in branch.frames if f in alone.bodies] for branch in (a, b))
+        self.joints = tuple(dict.fromkeys((*a.joints, *b.joints)))
+        self.limits = {s: model.limits(s) for s in self.joints}
+        self.opened: dict[Symbol, float] = {}
+        self.closed: dict[Symbol, float] = {}
+        self.nearly_closed = 1.0
+
+    def find_closing(self) -> str:
+        """Find the values that open and close the fingers; return the reason if they do not."""
+        middle = {s: (low + high) / 2 for s, (low, high) in self.limits.items()}
+        for s, (low, high) in self.limits.items():
+            at_low, at_high = (self.gap({**middle, s: value}) for value in (low, high))
+            self.opened[s], self.closed[s] = (low, high) if at_low > at_high else (high, low)
+            if abs(at_low - at_high) < 1e-6:
+                self.opened[s] = self.closed[s] = middle[s]
+        parts = np.linspace(0.0, 1.0, _SAMPLES)
+        gaps = np.array([self.gap(self.values(part)) for part in parts.tolist()])
+        if gaps.max() - gaps.min() < _LEAST_STROKE or gaps.max() <= 0.0:
+            return "the gap between them does not change"
+        touch = int(np.argmax(gaps <= 0.0)) if (gaps <= 0.0).any() else int(np.argmin(gaps))
+        end = float(parts[touch])
+        if gaps[touch] < 0.0 and touch:
+            end = self._bisect(0.0, float(parts[touch - 1]), end)
+        wide = np.flatnonzero(gaps[: touch + 1] >= max(gaps[touch], 0.0) + _NEAR)
+        if not len(wide):
+            return "the fingers hardly open before they touch"
+        k = int(wide[-1])
+        self.nearly_closed = self._bisect(max(gaps[touch], 0.0) + _NEAR, float(parts[k]), end) / end
+        self.closed = self.values(end)
+        return ""
+
+    def _bisect(self, gap: float, wide: float, tight: float) -> float:
+        for _ in range(20):
+            middle = (wide + tight) / 2
+            wide, tight = (middle, tight) if self.gap(self.values(middle)) > gap else (wide, middle)
+        return wide
+
+    def exchange(self) -> None:
+        """Exchange the two branches."""
+        self.a, self.b = self.b, self.a
+
+    def values(self, part: float) -> dict[Symbol, float]:
+        """Return the values of the joints at a part of the motion from 0 (open) to 1 (closed)."""
+        return {s: self.opened[s] + part * (self.closed[s] - self.opened[s]) for s in self.joints}
+
+    def place(self, part: float) -> None:
+        """Place the hand at a part of the motion."""
+        self.alone.place(self.values(part))
+
+    def gap(self, values: Mapping[Symbol, float]) -> float:
+        """Return the distance of the two branches."""
+        self.alone.place(values)
+        return self.nearest().distance
+
+    def nearest(self) -> DistanceResult:
+        """Return the nearest pair of bodies of the two branches, the first one's first."""
+        found = self.scene.distances((f, g) for f in self.a for g in self.b)
+        return min(found, key=lambda pair: pair.distance)
+
+    def track(self, frames: Sequence[str], points: Sequence[Array], parts: Iterable[float]) -> Array:
+        """Return the positions (n, 2, 3) of points of two frames at parts of the motion."""
+        rows = []
+        for part in parts:
+            self.place(part)
+            rows.append([_at(self.scene.pose(f), p) for f, p in zip(frames, points, strict=True)])
+        return np.array(rows)
+
+    def scan(self, axes: Array, height: float, spans: tuple[Array, Array]) -> Array:
+        """Return the cells (n, 4) where both fingers face the plane between them: x, z, both distances.
+
+        The plane is normal to y at a height. Rays are cast from it along -y to the first finger and along y
+        to the second.
+        """
+        x, y, z = axes.T
+        cells = []
+        for u in _centres(spans[0]):
+            for w in _centres(spans[1]):
+                origin = u * x + height * y + w * z
+                hits = self.scene.ray(origin, -y, _REACH), self.scene.ray(origin, y, _REACH)
+                if hits[0] and hits[1] and hits[0].body in self.a and hits[1].body in self.b:
+                    cells.append((u, w, hits[0].distance, hits[1].distance))
+        return np.array(cells).reshape(-1, 4)
+
+    def turn(self, frame: str) -> Array:
+        """Return the rotation vector (3,) of a frame from open to closed [rad]."""
+        self.place(0.0)
+        start = self.scene.pose(frame)[:3, :3]
+        self.place(1.0)
+        return np.asarray(lie.log_so3(self.scene.pose(frame)[:3, :3] @ start.T))
+
+
+def _centres(span: Array) -> Array:
+    edges = np.linspace(span[0], span[1], _CELLS + 1)
+    return (edges[1:] + edges[:-1]) / 2
+
+
+def _at(pose: Array, point: Array) -> Array:
+    return pose[:3, :3] @ point + pose[:3, 3]
+
+
+def _in_frame(pose: Array, point: Array) -> Array:
+    return pose[:3, :3].T @ (point - pose[:3, 3])
