@@ -3,7 +3,7 @@
 >>> import kineverse as kv
 >>> model = kv.load("kitchens/17")
 >>> model.degrees_of_freedom[:2]
-(kitchen/base_1_pull_out, kitchen/base_2_drawer_1)
+(kitchen/base_1_door, kitchen/base_1_drawer)
 
 A seed is any whole number that is not negative. It gives the same kitchen everywhere: 8 to 14 doors, drawers
 and flaps, with bar handles, in one row or two at an aisle of 1.0 to 1.6 m. The middle of the aisle is the

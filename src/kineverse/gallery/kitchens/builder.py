@@ -32,6 +32,8 @@ class Style:
         Thickness of a bar, and the free space between bar and front [m].
     length
         Largest length of a bar [m]; fronts that are narrower have shorter ones.
+    travel
+        Travel of the drawers [m].
     plinth, counter, worktop, top
         Heights of the upper edge of the plinth, the lower and the upper side of the countertop, and the upper
         edge of tall units [m].
@@ -48,6 +50,7 @@ class Style:
     thickness: float
     clearance: float
     length: float
+    travel: float
     plinth: float
     counter: float
     worktop: float

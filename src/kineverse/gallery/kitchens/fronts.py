@@ -30,7 +30,8 @@ GRAVITY = 9.81
 _UPRIGHT = (1.0, 0.0, 0.0, 0.0, 0.0, -1.0, 0.0, 1.0, 0.0)
 _LEVEL = (1.0, 0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0, 1.0)
 _RUNNER = 0.013
-_LONGEST_TRAVEL, _BEHIND = 0.5, 0.05
+_BEHIND = 0.03
+"""Length of a drawer that stays in its carcass [m]."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -85,7 +86,7 @@ def drawer(
     y, z = area.front
     middle, half = (z[0] + z[1]) / 2, (z[1] - z[0]) / 2
     side = (area.y[1] - area.y[0]) / 2 - WALL - _RUNNER
-    back = -(depth - WALL - 0.02)
+    back = -(depth - WALL - 0.01)
     low = -half + 0.02
     solids = [
         slab(FRONT, (y[0], y[1]), (-half, half), material or builder.style.front),
@@ -93,7 +94,6 @@ def drawer(
             (back, FRONT[0]), (-side, side), (low, min(half - 0.035, low + rim)), 0.012, BIRCH, opening="+z"
         ),
     ]
-    travel = round(min(_LONGEST_TRAVEL, -back - _BEHIND), 2)
     mass = compute_inertia(solids).mass
     builder.joint(
         Prismatic,
@@ -103,7 +103,7 @@ def drawer(
         solids,
         axis=(1.0, 0.0, 0.0),
         lower=0.0,
-        upper=travel,
+        upper=min(builder.style.travel, round(-back - _BEHIND, 3)),
         velocity=1.0,
         dynamics=(("effort", 100.0), ("damping", round(1.5 * mass, 2)), ("friction", round(0.4 * mass, 2))),
     )

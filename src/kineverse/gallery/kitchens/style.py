@@ -32,6 +32,7 @@ def draw_style(rng: np.random.Generator) -> Style:
         thickness=round(float(rng.uniform(0.008, 0.016)), 4),
         clearance=round(float(rng.uniform(0.025, 0.045)), 4),
         length=round(float(rng.uniform(0.12, 0.4)), 3),
+        travel=round(float(rng.uniform(0.35, 0.5)), 2),
         plinth=round(float(rng.uniform(0.08, 0.12)), 3),
         counter=counter,
         worktop=worktop,
