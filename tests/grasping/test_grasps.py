@@ -2,13 +2,10 @@
 
 from __future__ import annotations
 
-import numpy as np
 import pytest
 from grasp_oracle import GraspJudge
 
 import kineverse as kv
-from kineverse import lie
-from kineverse.errors import InvalidValueError
 from kineverse.grasping import find_gripper, find_handle, sample_grasps
 
 

@@ -11,7 +11,7 @@ from kineverse.model.frame import WORLD
 from kineverse.model.model_view import ModelView
 from kineverse.symbols import Symbol
 
-from .hand_model import has_shapes
+from .hand_model import bodies_with_shapes
 
 MOST_JOINTS = 3
 """Most free coordinates of one finger."""
@@ -28,7 +28,7 @@ class Branch:
     frames
         All frames from there on, parents first.
     joints
-        The free coordinates that move them on the link, sorted.
+        The free coordinates that move their bodies on the link, sorted.
     """
 
     root: str
@@ -48,11 +48,14 @@ class Palm:
         Its frames, parents first.
     branches
         The branches on it with shapes, few joints, and limits, in the order of the model.
+    refused
+        Why each other branch on it is no finger.
     """
 
     root: str
     frames: tuple[str, ...]
     branches: tuple[Branch, ...]
+    refused: tuple[str, ...]
 
 
 def robot_frames(model: ModelView, robot: str) -> tuple[str, ...]:
@@ -61,7 +64,7 @@ def robot_frames(model: ModelView, robot: str) -> tuple[str, ...]:
 
 
 def find_palms(model: ModelView, robot: str, srdf: Srdf | None = None) -> list[tuple[int, Palm]]:
-    """Return the rigid links of a robot with two or more branches that may be fingers.
+    """Return the rigid links of a robot with two or more moving branches.
 
     With each comes the index of the first end effector of a semantic description whose links it carries.
     """
@@ -79,9 +82,11 @@ def find_palms(model: ModelView, robot: str, srdf: Srdf | None = None) -> list[t
     palms = []
     for root, roots in children.items():
         branches = [_branch(model, frame, parents) for frame in roots]
-        fingers = tuple(b for b in branches if _may_be_finger(model, b))
-        if len(fingers) > 1:
-            palm = Palm(root, tuple(f for f in link if link[f] == root), fingers)
+        why = [_why_no_finger(model, branch) for branch in branches]
+        if len(branches) > 1:
+            fingers = tuple(branch for branch, reason in zip(branches, why, strict=True) if not reason)
+            frames = tuple(f for f in link if link[f] == root)
+            palm = Palm(root, frames, fingers, tuple(filter(None, why)))
             palms.append((_srdf_rank(palm, srdf), palm))
     return palms
 
@@ -103,16 +108,21 @@ def _branch(model: ModelView, root: str, parents: Mapping[str, str]) -> Branch:
     for frame in _parents_first(parents):
         if parents[frame] in frames:
             frames[frame] = None
-    speeds = {s for f in frames for s in model.speeds_of(f, parents[root])}
+    shaped = bodies_with_shapes(model, frames) or frames
+    speeds = {s for f in shaped for s in model.speeds_of(f, parents[root])}
     return Branch(root, tuple(frames), tuple(sorted((s.position for s in speeds), key=str)))
 
 
-def _may_be_finger(model: ModelView, branch: Branch) -> bool:
-    if not 1 <= len(branch.joints) <= MOST_JOINTS:
-        return False
+def _why_no_finger(model: ModelView, branch: Branch) -> str:
+    """Return the reason why a branch is no finger; empty if it may be one."""
+    names = ", ".join(map(str, branch.joints[: MOST_JOINTS + 1]))
+    if len(branch.joints) > MOST_JOINTS:
+        return f"{branch.root} has more joints than a finger's {MOST_JOINTS} ({names} ...)"
     if not all(math.isfinite(bound) for s in branch.joints for bound in model.limits(s)):
-        return False
-    return any(f in model.bodies and has_shapes(model.bodies[f]) for f in branch.frames)
+        return f"{branch.root} has no limits ({names})"
+    if not bodies_with_shapes(model, branch.frames):
+        return f"{branch.root} has no shapes ({names})"
+    return ""
 
 
 def _srdf_rank(palm: Palm, srdf: Srdf | None) -> int:

@@ -20,7 +20,7 @@ from kineverse.model.model_view import ModelView
 from .bars import Part, find_parts
 from .finger_pairs import path_to_root
 from .gripper import Gripper
-from .hand_model import HandModel
+from .hand_model import HandModel, bodies_with_shapes
 from .handles import Handle
 
 _RETREAT = 0.1
@@ -171,12 +171,12 @@ class _Surroundings:
         bar = collision_shapes(model.bodies[handle.frame])[handle.shape]
         obstacles[_BAR] = (np.eye(4), Body(collisions=(bar,)))
         rigid = [f for f in robot if not model.speeds_of(f, gripper.hand)]
-        frames = dict.fromkeys((*rigid, *gripper.bodies))
-        self._hand = HandModel(model, gripper.hand, frames, gripper.joints, obstacles)
-        watch, bodies = self._hand.scene.watch, self._hand.bodies
-        self._contacts = watch(bodies, list(obstacles), _REACH)
+        bodies = bodies_with_shapes(model, dict.fromkeys((*rigid, *gripper.bodies)))
+        self._hand = HandModel(model, gripper.hand, bodies, gripper.joints, obstacles)
+        watch = self._hand.scene.watch
+        self._contacts = watch(self._hand.bodies, list(obstacles), _REACH)
         others = [name for name in obstacles if name != _BAR]
-        self._others = watch(bodies, others, _REACH) if others else None
+        self._others = watch(self._hand.bodies, others, _REACH) if others else None
 
     def find_contact(self, grasp: Grasp) -> tuple[str, str] | None:
         """Return the bodies of hand and object that come too near to each other, or None."""

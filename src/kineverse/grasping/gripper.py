@@ -11,12 +11,13 @@ from kineverse import lie
 from kineverse.errors import UnknownNameError
 from kineverse.formats.srdf.description import Srdf
 from kineverse.lie import Array
+from kineverse.model.body import Body, Shape, Sphere
 from kineverse.model.model_view import ModelView
 from kineverse.symbols import Symbol
 
-from .finger_pairs import Palm, find_palms, hand_frame, path_to_root
-from .hand_model import HandModel
-from .pads import Pads, find_pads
+from .finger_pairs import Branch, Palm, find_palms, hand_frame, path_to_root
+from .hand_model import HandModel, bodies_with_shapes, usable_bodies
+from .pads import Pads, find_pads, reaches_pads
 
 _TYPICAL = 0.015
 """Thickness of a bar for which the grasp pose is given [m]."""
@@ -48,6 +49,9 @@ class Gripper:
         Gap between the open fingers [m].
     pads
         The facing surfaces.
+    remarks
+        Shapes that cannot be read, and why. Without any shape, a finger is where its frames are: then the
+        width and the grasp pose are rough.
     """
 
     robot: str
@@ -60,11 +64,11 @@ class Gripper:
     closed: Mapping[Symbol, float]
     width: float
     pads: Pads = field(repr=False)
+    remarks: tuple[str, ...] = ()
 
     def values_at(self, gap: float) -> dict[Symbol, float]:
         """Return the values of the joints at which the pads have a gap [m], within what they can."""
-        part = self.pads.part_at(gap)
-        return {s: self.opened[s] + part * (self.closed[s] - self.opened[s]) for s in self.joints}
+        return self.pads.values_at(gap)
 
     def grasp_pose_at(self, gap: float) -> Array:
         """Return hand_T_grasp (4, 4) [m] for pads with a gap [m]: fingers that turn move the pads along x."""
@@ -74,7 +78,8 @@ class Gripper:
 
     def __str__(self) -> str:
         joints = ", ".join(f"{s} from {self.opened[s]:.4g} to {self.closed[s]:.4g}" for s in self.joints)
-        return f"gripper of {self.hand}, opens {self.width * 1e3:.0f} mm by {joints}"
+        missing = f"; {len(self.remarks)} shapes are missing" if self.remarks else ""
+        return f"gripper of {self.hand}, opens {self.width * 1e3:.0f} mm by {joints}{missing}"
 
 
 def find_grippers(model: ModelView, robot: str, srdf: Srdf | None = None) -> tuple[Gripper, ...]:
@@ -113,9 +118,7 @@ def find_gripper(model: ModelView, robot: str, hand: str | None = None, srdf: Sr
     found, why = _search(model, robot, srdf)
     name = f"The robot '{robot}'" if robot else "The model"
     if not found:
-        reasons = (
-            "".join(f"\n  {line}" for line in why) or " No link carries two joints with limits and shapes."
-        )
+        reasons = "".join(f"\n  {line}" for line in why) or " None of its links carries two moving branches."
         raise UnknownNameError(f"{name} has no gripper with two opposed fingers.{reasons}")
     if hand is None:
         return found[0]
@@ -132,45 +135,71 @@ def _search(model: ModelView, robot: str, srdf: Srdf | None) -> tuple[tuple[Grip
     found: list[tuple[tuple[float, ...], Gripper]] = []
     why: list[str] = []
     for rank, palm in find_palms(model, robot, srdf):
-        gripper, reasons = _best_pair(model, robot, palm)
-        if gripper is not None:
-            # The hand at the default state, as the robot sees it: y points to the left.
-            place = np.asarray(model.fk(gripper.hand)(model.default_state()))[:3, 3]
-            found.append(((rank, -round(gripper.width, 4), round(float(place[1]), 4)), gripper))
-        else:
-            names = ", ".join(str(s) for s in dict.fromkeys(s for b in palm.branches for s in b.joints))
-            why.append(f"{palm.root} with {names}: {'; '.join(reasons)}")
+        reasons = list(palm.refused)
+        if len(palm.branches) > 1:
+            gripper = _best_pair(model, robot, palm, reasons)
+            if gripper is not None:
+                # The hand at the default state, as the robot sees it: y points to the left.
+                place = np.asarray(model.fk(gripper.hand)(model.default_state()))[:3, 3]
+                found.append(((rank, -round(gripper.width, 4), round(float(place[1]), 4)), gripper))
+                continue
+        why.append(f"At {palm.root}: {'; '.join(reasons)}.")
     found.sort(key=lambda entry: entry[0])
     return tuple(gripper for _, gripper in found), why
 
 
-def _best_pair(model: ModelView, robot: str, palm: Palm) -> tuple[Gripper | None, list[str]]:
+def _best_pair(model: ModelView, robot: str, palm: Palm, reasons: list[str]) -> Gripper | None:
+    """Return the gripper on a link whose pads are farthest out; else add why there is none to the reasons."""
     hand = hand_frame(model, palm.branches)
     joints = tuple(dict.fromkeys(s for b in palm.branches for s in b.joints))
     below = [f for f in palm.frames if hand in path_to_root(model, f)]
     moving = [f for b in palm.branches for f in b.frames]
-    alone = HandModel(model, hand, [*below, *moving], joints)
+    bodies = bodies_with_shapes(model, [*below, *moving])
+    usable, problems = usable_bodies(bodies)
+    for branch in palm.branches:
+        if not any(f in usable for f in branch.frames):
+            usable.update(dict.fromkeys(branch.frames, _STAND_IN))
+    alone = HandModel(model, hand, usable, joints)
     root = np.asarray(model.fk(palm.root, hand)({}))[:3, 3]
-    best: Pads | None = None
-    reasons = []
+    best: tuple[Pads, Branch, Branch] | None = None
     for k, a in enumerate(palm.branches):
         for b in palm.branches[k + 1 :]:
             pads, reason = find_pads(model, alone, a, b, root)
             if pads is None:
-                reasons.append(f"{a.root} and {b.root}: {reason}")
-            elif best is None or _reach(pads) > _reach(best) + 1e-6:
-                best = pads
+                names = ", ".join(map(str, dict.fromkeys((*a.joints, *b.joints))))
+                reasons.append(f"{a.root} and {b.root}: {reason} ({names})")
+            elif best is None or _reach(pads) > _reach(best[0]) + 1e-6:
+                best = pads, a, b
     if best is None:
-        return None, reasons
-    return _make_gripper(model, robot, hand, alone, best), []
+        if len(palm.branches) > 2:
+            reasons.insert(0, f"{len(palm.branches)} branches, of which no two are opposed fingers")
+        return None
+    pads, *pair = best
+    for branch in palm.branches:
+        if branch not in pair and reaches_pads(alone, branch, pads):
+            names = ", ".join(b.root for b in (*pair, branch))
+            reasons.append(f"{names} are three fingers, and grasps are sampled for two")
+            return None
+    width = float(pads.stroke[0, 1])
+    pose = lie.transform(pads.axes, pads.middle_at(min(_TYPICAL, width / 2)))
+    return Gripper(
+        robot=robot,
+        hand=hand,
+        grasp_pose=pose,
+        fingers=pads.fingers,
+        bodies=tuple(bodies),
+        joints=tuple(pads.opened),
+        opened=pads.opened,
+        closed=pads.closed,
+        width=width,
+        pads=pads,
+        remarks=tuple(problems),
+    )
+
+
+_STAND_IN = Body(collisions=(Shape(Sphere(5e-4)),))
+"""Ball at the origin of a frame, in place of shapes that cannot be read."""
 
 
 def _reach(pads: Pads) -> float:
     return float(pads.middle_at(_TYPICAL) @ pads.axes[:, 0])
-
-
-def _make_gripper(model: ModelView, robot: str, hand: str, alone: HandModel, pads: Pads) -> Gripper:
-    width = float(pads.stroke[0, 1])
-    pose = lie.transform(pads.axes, pads.middle_at(min(_TYPICAL, width / 2)))
-    joints, opened, closed = tuple(pads.opened), pads.opened, pads.closed
-    return Gripper(robot, hand, pose, pads.fingers, alone.bodies, joints, opened, closed, width, pads)

@@ -7,7 +7,10 @@ from collections.abc import Iterable, Mapping
 import numpy as np
 
 from kineverse import lie
+from kineverse.errors import FormatError, InvalidValueError, summarize_error
 from kineverse.geometry import Scene
+from kineverse.geometry.objects import collision_shapes
+from kineverse.geometry.shapes import solid_from_geometry
 from kineverse.lie import Array
 from kineverse.model.body import Body, Pose
 from kineverse.model.frame import WORLD
@@ -28,8 +31,8 @@ class HandModel:
         Model of the robot.
     hand
         Frame that is placed.
-    frames
-        Frames of the bodies, which move with respect to the hand by the joints alone.
+    bodies
+        Bodies with shapes by their frame, which move with respect to the hand by the joints alone.
     joints
         Free coordinates of the fingers.
     obstacles
@@ -40,28 +43,28 @@ class HandModel:
     scene
         Collision scene of the bodies and obstacles.
     bodies
-        The frames that have shapes.
+        The frames of the bodies.
     """
 
     def __init__(
         self,
         model: ModelView,
         hand: str,
-        frames: Iterable[str],
+        bodies: Mapping[str, Body],
         joints: Iterable[Symbol],
         obstacles: Mapping[str, tuple[Array, Body]] | None = None,
     ) -> None:
-        self.joints = tuple(joints)
-        self.bodies = tuple(f for f in frames if f in model.bodies and has_shapes(model.bodies[f]))
+        self.bodies = tuple(bodies)
         alone = Model()
         with alone.edit() as edit:
             place = [translation(*_PLACE[:3]), rpy(*_PLACE[3:])]
-            edit.add_frame(hand, WORLD, place, model.bodies.get(hand))
-            for frame in self.bodies:
+            edit.add_frame(hand, WORLD, place, bodies.get(hand))
+            for frame, body in bodies.items():
                 if frame != hand:
-                    edit.add_frame(frame, hand, model.fk(frame, hand), model.bodies[frame])
+                    edit.add_frame(frame, hand, model.fk(frame, hand), body)
             for name, (pose, body) in (obstacles or {}).items():
                 edit.add_frame(name, WORLD, Pose.from_matrix(lie.orthonormalize(pose)), body)
+        self.joints = tuple(s for s in joints if s in alone.symbols)
         self.model = alone
         self.scene = Scene(alone)
         self.place({})
@@ -95,6 +98,22 @@ class HandModel:
 _SIGNS = np.array(np.meshgrid([-1.0, 1.0], [-1.0, 1.0], [-1.0, 1.0])).reshape(3, -1).T
 
 
-def has_shapes(body: Body) -> bool:
-    """Return True if a body has collision shapes, or visual shapes in their place."""
-    return bool(body.collisions or body.visuals)
+def bodies_with_shapes(model: ModelView, frames: Iterable[str]) -> dict[str, Body]:
+    """Return the bodies of some frames that have collision shapes, or visual shapes in their place."""
+    return {f: model.bodies[f] for f in frames if f in model.bodies and collision_shapes(model.bodies[f])}
+
+
+def usable_bodies(bodies: Mapping[str, Body]) -> tuple[dict[str, Body], list[str]]:
+    """Return bodies without the shapes that cannot be read, and what is wrong with these."""
+    usable, problems = {}, []
+    for name, body in bodies.items():
+        kept = []
+        for shape in collision_shapes(body):
+            try:
+                solid_from_geometry(shape.geometry)
+                kept.append(shape)
+            except (FormatError, InvalidValueError, OSError) as error:
+                problems.append(f"{name}: {summarize_error(error, advice=False)}")
+        if kept:
+            usable[name] = Body(collisions=tuple(kept))
+    return usable, problems

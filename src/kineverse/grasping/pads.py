@@ -16,7 +16,7 @@ from kineverse.lie import Array
 from kineverse.model.model_view import ModelView
 from kineverse.symbols import Symbol
 
-from .finger_pairs import Branch
+from .finger_pairs import Branch, path_to_root
 from .hand_model import HandModel
 
 _SAMPLES = 33
@@ -29,6 +29,10 @@ _REACH = 0.3
 """Length of the rays from the middle to the pads [m]."""
 _ALIGNED = 0.85
 """Cosine of the angle below which an axis is taken for the approach direction."""
+_SLOWER = 0.4
+"""Least motion of one finger against the other's; fingers that mirror each other have 1."""
+_STILL_OPEN, _WIDEST = 0.6, 0.4
+"""Largest gap of closed fingers as a part of that of open ones, and the largest gap at all [m]."""
 _LEAST_STROKE = 5e-3
 """Least change of the gap of a gripper [m]."""
 
@@ -68,6 +72,11 @@ class Pads:
         """Return the part of the motion at which the pads have a gap [m], or the nearest end of it."""
         return float(np.interp(-gap, -self.stroke[:, 1], self.stroke[:, 0]))
 
+    def values_at(self, gap: float) -> dict[Symbol, float]:
+        """Return the values of the joints at which the pads have a gap [m], within what they can."""
+        part = self.part_at(gap)
+        return {s: self.opened[s] + part * (self.closed[s] - self.opened[s]) for s in self.opened}
+
     def middle_at(self, gap: float) -> Array:
         """Return the middle (3,) between the pads when they have a gap [m]."""
         part = self.part_at(gap)
@@ -90,8 +99,17 @@ def find_pads(
     root
         Position (3,) of the joint that moves the hand: the fingers point away from it.
     """
-    motion = _Motion(model, alone, a, b)
-    why = motion.find_closing()
+    shared = tuple(s for s in a.joints if s in b.joints)
+    pads, why = _find_pads(_Motion(model, alone, a, b, shared), root) if shared else (None, "")
+    if pads is None:  # further joints, such as springs, move only where the fingers have none in common
+        pads, why = _find_pads(
+            _Motion(model, alone, a, b, tuple(dict.fromkeys((*a.joints, *b.joints)))), root
+        )
+    return pads, why
+
+
+def _find_pads(motion: _Motion, root: Array) -> tuple[Pads | None, str]:
+    why, alone = motion.find_closing(), motion.alone
     if why:
         return None, why
     nearly = motion.nearly_closed
@@ -108,18 +126,27 @@ def find_pads(
     if y[np.argmax(np.abs(y))] < 0.0:  # of two equal choices the one along an axis of the hand
         motion.exchange()
         y, opening, moved = -y, opening[::-1], moved[:, ::-1]
-    if (opening[0] @ y) * (opening[1] @ y) > -1e-3 * float(across @ across):
-        return None, "only one of the two moves"
-    x = _approach(motion, (a, b), y, moved[0].mean(axis=0) - root)
+    speeds = sorted((float(-opening[0] @ y), float(opening[1] @ y)))
+    if speeds[0] < _SLOWER * speeds[1]:
+        return None, "they do not move against each other"
+    x = _approach(motion, y, moved[0].mean(axis=0) - root)
     axes = lie.round_exact(np.stack([x, y, np.cross(x, y)], axis=1))
     return _measure(motion, axes, float(moved[0].mean(axis=0) @ y))
 
 
-def _approach(motion: _Motion, branches: tuple[Branch, Branch], y: Array, outwards: Array) -> Array:
+def reaches_pads(alone: HandModel, branch: Branch, pads: Pads) -> bool:
+    """Return True if another branch reaches as far as the pads do when these are nearly closed."""
+    alone.place(pads.values_at(_NEAR))
+    corners = alone.box_corners(f for f in branch.frames if f in alone.bodies)
+    x = pads.axes[:, 0]
+    return bool((corners @ x).max() > pads.middle_at(_NEAR) @ x - pads.size[0] / 4)
+
+
+def _approach(motion: _Motion, y: Array, outwards: Array) -> Array:
     """Return the unit vector (3,) out of the hand, normal to y: along an axis of the hand if one is near."""
     axes = [*np.eye(3)]
-    for branch in branches:
-        turn = motion.turn(branch.root)
+    for frame in (*motion.a, *motion.b):
+        turn = motion.turn(frame)
         if np.linalg.norm(turn) > 1e-3:
             axes.insert(0, np.cross(y, lie.unit_vector(turn)))
     outwards = lie.unit_vector(outwards - (outwards @ y) * y)
@@ -159,6 +186,8 @@ def _measure(motion: _Motion, axes: Array, height: float) -> tuple[Pads | None, 
     parts = np.linspace(0.0, 1.0, _SAMPLES)
     tracked = motion.track(frames, points, parts)
     gap = (tracked[:, 1] - tracked[:, 0]) @ y
+    if (np.diff(gap) > 1e-4).any() or gap[-1] > _STILL_OPEN * gap[0] or gap[0] > _WIDEST:
+        return None, f"their gap goes from {gap[0] * 1e3:.0f} to {gap[-1] * 1e3:.0f} mm, as no gripper's does"
     stroke = np.column_stack([parts, gap, tracked.mean(axis=1)])
     length, width = (np.ptp(pad[:, :2], axis=0) + step).tolist()
     fingers = (tuple(motion.a), tuple(motion.b))
@@ -169,11 +198,17 @@ def _measure(motion: _Motion, axes: Array, height: float) -> tuple[Pads | None, 
 class _Motion:
     """Closing motion of two branches, as a line through the values of their joints."""
 
-    def __init__(self, model: ModelView, alone: HandModel, a: Branch, b: Branch) -> None:
+    def __init__(
+        self, model: ModelView, alone: HandModel, a: Branch, b: Branch, joints: tuple[Symbol, ...]
+    ) -> None:
         self.alone, self.scene = alone, alone.scene
         self.a, self.b = ([f for f in branch.frames if f in alone.bodies] for branch in (a, b))
-        self.joints = tuple(dict.fromkeys((*a.joints, *b.joints)))
-        self.limits = {s: model.limits(s) for s in self.joints}
+        # The roots of fingers are near to each other whether these are open or closed.
+        self.tips = [_tips(model, frames) for frames in (self.a, self.b)]
+        self.joints = joints
+        self.limits = {s: model.limits(s) for s in joints}
+        defaults = model.default_state()
+        self._still = {s: defaults[s] for s in alone.joints if s not in joints}
         self.opened: dict[Symbol, float] = {}
         self.closed: dict[Symbol, float] = {}
         self.nearly_closed = 1.0
@@ -210,7 +245,7 @@ class _Motion:
 
     def exchange(self) -> None:
         """Exchange the two branches."""
-        self.a, self.b = self.b, self.a
+        self.a, self.b, self.tips = self.b, self.a, self.tips[::-1]
 
     def values(self, part: float) -> dict[Symbol, float]:
         """Return the values of the joints at a part of the motion from 0 (open) to 1 (closed)."""
@@ -218,16 +253,16 @@ class _Motion:
 
     def place(self, part: float) -> None:
         """Place the hand at a part of the motion."""
-        self.alone.place(self.values(part))
+        self.alone.place({**self._still, **self.values(part)})
 
     def gap(self, values: Mapping[Symbol, float]) -> float:
-        """Return the distance of the two branches."""
-        self.alone.place(values)
+        """Return the distance of the tips of the two branches."""
+        self.alone.place({**self._still, **values})
         return self.nearest().distance
 
     def nearest(self) -> DistanceResult:
-        """Return the nearest pair of bodies of the two branches, the first one's first."""
-        found = self.scene.distances((f, g) for f in self.a for g in self.b)
+        """Return the nearest pair of bodies at the tips of the two branches, the first one's first."""
+        found = self.scene.distances((f, g) for f in self.tips[0] for g in self.tips[1])
         return min(found, key=lambda pair: pair.distance)
 
     def track(self, frames: Sequence[str], points: Sequence[Array], parts: Iterable[float]) -> Array:
@@ -250,7 +285,7 @@ class _Motion:
             for w in _centres(spans[1]):
                 origin = u * x + height * y + w * z
                 hits = self.scene.ray(origin, -y, _REACH), self.scene.ray(origin, y, _REACH)
-                if hits[0] and hits[1] and hits[0].body in self.a and hits[1].body in self.b:
+                if hits[0] and hits[1] and hits[0].body in self.tips[0] and hits[1].body in self.tips[1]:
                     cells.append((u, w, hits[0].distance, hits[1].distance))
         return np.array(cells).reshape(-1, 4)
 
@@ -260,6 +295,12 @@ class _Motion:
         start = self.scene.pose(frame)[:3, :3]
         self.place(1.0)
         return np.asarray(lie.log_so3(self.scene.pose(frame)[:3, :3] @ start.T))
+
+
+def _tips(model: ModelView, frames: Sequence[str]) -> list[str]:
+    """Return the frames on which none of the others moves."""
+    inner = {f for g in frames for f in path_to_root(model, g) if f in frames and model.speeds_of(g, f)}
+    return [f for f in frames if f not in inner]
 
 
 def _centres(span: Array) -> Array:
