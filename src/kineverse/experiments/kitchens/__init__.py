@@ -1,0 +1,125 @@
+"""``kitchens``: robots open and close everything in generated kitchens, in the kinematic world.
+
+Each kitchen is generated from a seed; see :mod:`kineverse.gallery.kitchens`. A robot begins in the middle of
+the aisle for each object, with all shut. It opens the object, and closes it again if that succeeded.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import partial
+
+from kineverse.experiments.manipulation.robots import RobotSource, find_robots
+from kineverse.experiments.manipulation.skills import make_world, open_in_world, run_trial
+from kineverse.experiments.manipulation.tables import (
+    make_failure_table,
+    make_quality_table,
+    make_success_figure,
+    make_success_table,
+    make_time_table,
+    make_trial_numbers,
+)
+from kineverse.experiments.manipulation.trial_pool import run_jobs
+from kineverse.experiments.manipulation.trials import Trial
+from kineverse.experiments.registry import Options, Progress
+from kineverse.experiments.report import Report
+from kineverse.model.model import Model
+
+OPTIONS = ("quick", "data", "seed", "count", "robot", "processes")
+
+COUNT, QUICK_COUNT = 50, 1
+WORLD = "kinematic"
+KITCHEN = "kitchen"
+OPEN_SHARE = 0.98
+"""Share of the range at which an object is wanted open; the limit itself is no target with room to err."""
+
+
+@dataclass(frozen=True)
+class KitchenJob:
+    """All objects of one kitchen, with one robot.
+
+    Attributes
+    ----------
+    seed
+        Seed of the kitchen.
+    robot
+        The robot.
+    objects
+        Names of the coordinates; empty for all.
+    """
+
+    seed: int
+    robot: RobotSource
+    objects: tuple[str, ...] = ()
+
+
+def run(progress: Progress, options: Options) -> Report:
+    """Open and close everything; the option ``quick`` takes one kitchen, and one robot."""
+    count = options.count or (QUICK_COUNT if options.quick else COUNT)
+    robots = find_robots(options.robot, options.data)
+    if options.quick and not options.robot:
+        robots = robots[:1]
+    seeds = range(options.seed, options.seed + count)
+    jobs = [KitchenJob(seed, robot) for seed in seeds for robot in robots]
+    trials = run_jobs(run_kitchen, jobs, progress, "kitchens", "kitchen", options.processes)
+    return report_trials(trials, seeds)
+
+
+def report_trials(trials: list[Trial], seeds: range) -> Report:
+    """Return the report on the trials."""
+    title = (
+        f"{len(seeds)} generated kitchens, seeds {seeds[0]} to {seeds[-1]}, opened and closed ({WORLD} world)"
+    )
+    return Report(
+        name="kitchens",
+        title=title,
+        tables=(
+            make_success_table(trials, "Objects that were opened and closed"),
+            make_time_table(trials),
+            make_quality_table(trials),
+            make_failure_table(trials),
+        ),
+        numbers={"seeds": [seeds[0], seeds[-1]], "world": WORLD, **make_trial_numbers(trials)},
+        figure=make_success_figure(trials, "height", "height of the handle [m]"),
+    )
+
+
+def run_kitchen(job: KitchenJob) -> list[Trial]:
+    """Return the trials of one kitchen and one robot."""
+    model = make_kitchen_with(job.robot, job.seed)
+    start = job.robot.start_state(model)
+    heights = {q: find_handle_height(model, q) for q in list_objects(model, KITCHEN)}
+    trials = []
+    for what in job.objects or heights:
+        lower, upper = model.limits(what)
+        world = make_world(WORLD, model, job.robot.prefix, start)
+        for skill, target in (("open", lower + OPEN_SHARE * (upper - lower)), ("close", lower)):
+            act = partial(open_in_world, world, what, target)
+            trial = run_trial(
+                str(job.seed), job.robot.name, what, skill, act, height=heights.get(what, float("nan"))
+            )
+            trials.append(trial)
+            if not trial.done:
+                break
+    return trials
+
+
+def make_kitchen_with(robot: RobotSource, seed: int) -> Model:
+    """Return a robot in a generated kitchen."""
+    model = robot.load()
+    with model.edit() as edit:
+        edit.include(f"kitchens/{seed}", KITCHEN)
+    return model
+
+
+def list_objects(model: Model, prefix: str) -> tuple[str, ...]:
+    """Return the names of the coordinates below a prefix."""
+    return tuple(str(q) for q in model.degrees_of_freedom if str(q).startswith(f"{prefix}/"))
+
+
+def find_handle_height(model: Model, what: str) -> float:
+    """Return the height of an object's handle while all is shut [m]; NaN without a frame of that name."""
+    for name in (f"{what}_handle", f"{what}/handle"):
+        if name in model.frames:
+            return float(model.fk(name)(model.default_state())[2, 3])
+    return float("nan")
