@@ -20,6 +20,7 @@ from kineverse.compile import compile  # noqa: A004
 from kineverse.errors import InvalidValueError
 from kineverse.expressions.expression import Expression, array, as_expression
 from kineverse.geometry import Rule, Scene
+from kineverse.geometry.prepared_query import PairFlags, flag_between, flag_matching
 from kineverse.geometry.results import DistanceResults
 from kineverse.lie import Array
 from kineverse.model.frame_dependence import FrameDependence
@@ -100,6 +101,8 @@ class ContactSlots:
         moved = [motion.moving_ancestors(b) if k in watched else () for k, b in enumerate(scene.bodies)]
         groups = {group: k for k, group in enumerate(dict.fromkeys(((), *moved)))}
         self._group = np.array([groups[group] for group in moved], dtype=np.intp)
+        self._margins: Array | None = None
+        self._selected: dict[tuple[tuple[str, ...], tuple[str, ...]], PairFlags] = {}
         members = dict(zip(moved, scene.bodies, strict=True))
         twists: list[Expression] = [as_expression(np.zeros((6, len(speeds))))]
         twist = twist or (lambda body: model.jacobian(body, form="world", symbols=speeds))
@@ -129,6 +132,50 @@ class ContactSlots:
         self.found = self._query(self.radius)
         self._twists.input[:] = values[self._twist_values]
         self._twists()
+
+    def set_margin(self, one: str | Iterable[str], other: str | Iterable[str], margin: float) -> None:
+        """Set the distance that some pairs keep [m]; negative for bodies that press on each other.
+
+        Parameters
+        ----------
+        one, other
+            Names of bodies or patterns, or several; a pair has one body of each.
+        margin
+            Distance, smaller than the radius.
+
+        Raises
+        ------
+        UnknownNameError
+            If a name or pattern matches no body.
+        InvalidValueError
+            For a margin that is not smaller than the radius.
+        """
+        if not (math.isfinite(margin) and margin < self.radius):
+            raise InvalidValueError(f"A margin is smaller than the radius {self.radius!r} m, not {margin!r}.")
+        bodies = self.scene.bodies
+        if self._margins is None:
+            self._margins = np.full((len(bodies), len(bodies)), self.margin)
+        ones, others = (tuple([names] if isinstance(names, str) else names) for names in (one, other))
+        if (ones, others) not in self._selected:
+            self._selected[ones, others] = flag_between(
+                flag_matching(bodies, ones), flag_matching(bodies, others)
+            )
+        self._margins[self._selected[ones, others]] = margin
+
+    def point_jacobian(self, body: int, point: Array) -> Array:
+        """Return the velocity (3, n) of a point of a body over the columns, at the last update.
+
+        Parameters
+        ----------
+        body
+            Index of the body in the scene's ``bodies``.
+        point
+            The point in the world (3,) [m].
+        """
+        twist = self._twists.outputs[0][self._group[body]]
+        x, y, z = point
+        across = np.array([[0.0, z, -y], [-z, 0.0, x], [y, -x, 0.0]])
+        return np.asarray(twist[:3] + across @ twist[3:])
 
     def write(
         self,
@@ -164,7 +211,8 @@ class ContactSlots:
         points = np.concatenate([found.points_b[:used], found.points_a[:used]])
         both = _project(np.concatenate([normals, -normals]), points, twists[groups.T[::-1].ravel()])
         rows = both[:used] + both[used:]
-        gap = distances - self.margin
+        margins = self.margin if self._margins is None else self._margins[tuple(found.body_indices[:used].T)]
+        gap = distances - margins
         A[:used, :n] = rows
         lower[:used] = -self.gain * np.maximum(gap, 0.0)
         near = gap < 0.0

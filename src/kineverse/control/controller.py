@@ -19,6 +19,7 @@ from kineverse.errors import (
 )
 from kineverse.expressions.expression import ExpressionLike
 from kineverse.geometry import Scene
+from kineverse.geometry.results import DistanceResults
 from kineverse.lie import Array
 from kineverse.model.model_view import ModelView
 from kineverse.state import State, StateLike, as_state
@@ -146,6 +147,7 @@ class Controller:
         )
         self.inputs = self._program.inputs
         self._contacts: ContactSlots | None = None
+        self._queried = False
         self._default_radius = radius is None
         if scene is not None and contacts:
             self._contacts = ContactSlots(
@@ -254,6 +256,35 @@ class Controller:
                 raise InvalidValueError(f"The value of '{symbol}' has to be finite, not {number!r}.")
             self._values[self._parameters[symbol]] = self._settings[symbol] = number
 
+    @property
+    def contact_slots(self) -> ContactSlots:
+        """The rows of contacts.
+
+        Raises
+        ------
+        InvalidValueError
+            For a controller without a scene.
+        """
+        if self._contacts is None:
+            raise InvalidValueError("This controller has no rows of contacts; give it a scene=.")
+        return self._contacts
+
+    def query_contacts(self, state: StateLike | npt.ArrayLike) -> DistanceResults:
+        """Return the near pairs at a state, for parameters of tasks that depend on them.
+
+        The next :meth:`step`, at the same state, uses them and asks no more.
+
+        Raises
+        ------
+        UnknownNameError, ShapeError, InvalidValueError
+            As :meth:`step`; also for a controller without a scene.
+        """
+        slots = self.contact_slots
+        self._read(state)
+        slots.update(self._values[self._contact_values])
+        self._queried = True
+        return slots.found
+
     def step(self, state: StateLike | npt.ArrayLike) -> Command:
         """Return the command for one time step at a state.
 
@@ -277,7 +308,9 @@ class Controller:
         self._read(state)
         if self._contacts is not None:
             self._evaluate.input[: len(self._program_values)] = self._values[self._program_values]
-            self._contacts.update(self._values[self._contact_values])
+            if not self._queried:
+                self._contacts.update(self._values[self._contact_values])
+            self._queried = False
         read = perf_counter()
         self._evaluate()
         H, f, A, lower, upper, residuals, check, largest, *_ = self._evaluate.outputs

@@ -1,0 +1,67 @@
+"""Planned approaches of pushes: paths without collisions to where a pusher faces a contact point."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+
+from kineverse.control import Goal
+from kineverse.planning import Path, Planner
+from kineverse.state import State
+
+from .push_controller import Pushing
+
+_STANDOFF = 0.03
+_TILT = math.radians(60.0)
+"""Largest angle between the pusher's axis and the direction of the push."""
+_CONFIGURATIONS = 48
+_MARGIN = 3e-3
+
+
+def plan_push_approach(
+    pushing: Pushing, state: State, *, points: int = 6, seconds: float = 2.0, seed: int = 0
+) -> tuple[Path, int]:
+    """Return a path of the robot to a contact point, and the index of the point.
+
+    Coordinates that rates drive, such as those of a base on rolling wheels, stand still. Without a way the
+    path is that of the last point, and says why.
+
+    Parameters
+    ----------
+    pushing
+        The push, whose contact points are tried in the order of :meth:`.Pushing.rank`.
+    state
+        Present state.
+    points
+        Largest number of contact points that are tried.
+    seconds
+        Largest time for each of them [s].
+    seed
+        Seed of the searches.
+    """
+    model, tool = pushing.model, pushing.tool
+    moving = [s.position for s in pushing.speeds if s.position != pushing.coordinate]
+    free = [s for s in moving if s in model.degrees_of_freedom and s not in model.rates]
+    planner = Planner(model, free, rules=pushing.scene.rules, margin=_MARGIN)
+    planner.place(state)
+    world_T_hand = model.fk(tool.frame)
+    tip = world_T_hand[:3, :3] @ tool.tip + world_T_hand[:3, 3]
+    axis = world_T_hand[:3, :3] @ tool.axis
+    at = pushing.surface.at(state)
+    path, chosen = None, -1
+    for chosen in pushing.rank(state)[:points]:
+        point, normal = at.points[chosen], at.normals[chosen]
+        goal = Goal(tip, point + _STANDOFF * normal, name="tip")
+        found = planner.solutions(goal, _CONFIGURATIONS, seconds=seconds, seed=seed)
+        if not len(found):
+            path = planner.plan(None, [goal], seconds=seconds, seed=seed)  # says why
+            continue
+        states = [state.updated(dict(zip(planner.symbols, q, strict=True))) for q in found.tolist()]
+        facing = np.array([-normal @ axis(at_goal) for at_goal in states])
+        good = found[facing > math.cos(_TILT)]
+        path = planner.plan(None, good if len(good) else found, seconds=seconds, seed=seed)
+        if path.found:
+            break
+    assert path is not None
+    return path, chosen

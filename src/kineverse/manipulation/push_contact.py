@@ -1,0 +1,331 @@
+"""Contact points of pushes: places on an object's surface whose normal opposes the motion of the object.
+
+A coordinate q that is to move in direction σ moves the point p of the object at ``σ ∂p/∂q``. Pushing at p,
+with outward normal n, is possible without sliding while the angle between -n and that velocity is within the
+friction cone, ``-n·σ∂p/∂q >= cos(α) |∂p/∂q|``.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+import numpy.typing as npt
+
+from kineverse.compile import compile  # noqa: A004
+from kineverse.errors import InvalidValueError
+from kineverse.expressions.expression import array
+from kineverse.geometry import Scene
+from kineverse.geometry.shapes import Solid
+from kineverse.geometry.support import smoothed_support
+from kineverse.lie import Array
+from kineverse.model.model_view import ModelView
+from kineverse.state import State
+from kineverse.symbols import Symbol
+
+_SPACING = 0.05
+"""Distance of sampled points [m]."""
+_INSET = 0.04
+"""Distance of sampled points from edges, where the surface is that large [m]."""
+_MOST = 7
+_ROOM = 0.06
+"""Free space in front of a point that a hand needs [m]."""
+_OUTSIDE = 0.1
+_SAME = 0.01
+_FRONT = 0.004
+"""Depth of the foremost part of a pusher [m]."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class PushContacts:
+    """Contact points at one state, in the world.
+
+    Attributes
+    ----------
+    points, normals
+        (N, 3) points [m] and outward unit normals.
+    velocities
+        (N, 3) velocities of the points per unit of the coordinate, in the direction of the target.
+    alignment
+        (N,) cosine between -n and the velocity; -1 for a point that does not move.
+    leverage
+        (N,) speed of the points relative to the fastest, in [0, 1].
+    """
+
+    points: Array
+    normals: Array
+    velocities: Array
+    alignment: Array
+    leverage: Array
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class PushPoint:
+    """One contact point at one state; see :class:`PushContacts`."""
+
+    point: Array
+    normal: Array
+    velocity: Array
+    alignment: float
+
+
+class PushSurface:
+    """Sampled surface of an object that a coordinate moves, as far as a push can reach it.
+
+    Rays that run with the object's motion find the points, so what is behind something else is left out.
+
+    Parameters
+    ----------
+    model
+        The model.
+    coordinate
+        The coordinate that is to change.
+    bodies
+        Bodies of the object that may be pushed.
+    ignored
+        Bodies that hide nothing, such as those of the robot.
+    state
+        State of everything else.
+    values
+        Values of the coordinate on its way, the present one first.
+
+    Attributes
+    ----------
+    bodies
+        The bodies.
+    owner
+        (N,) index of the body of each point in :attr:`bodies`.
+    room
+        (N,) free space in front of each point, in [0, 1]; 1 for that of a hand.
+
+    Raises
+    ------
+    InvalidValueError
+        If no surface of the bodies can be pushed in that direction.
+    """
+
+    def __init__(
+        self,
+        model: ModelView,
+        coordinate: Symbol,
+        bodies: Sequence[str],
+        ignored: Iterable[str],
+        state: State,
+        values: Sequence[float],
+    ) -> None:
+        self.bodies = tuple(bodies)
+        self._coordinate = coordinate
+        speed = coordinate.derivative()
+        poses = [model.fk(body)[:3, :] for body in bodies]
+        twists = [model.jacobian(body, form="world", symbols=[speed]).ravel() for body in bodies]
+        stacked = [array([e for pose in poses for e in pose.ravel()]), array([e for t in twists for e in t])]
+        self._function = compile(stacked)
+        self._evaluate = self._function.bind()
+        self._inputs = self._function.inputs
+        self.sign = 1.0 if values[-1] >= values[0] else -1.0
+        scene = Scene(model, leave_out=tuple(ignored))
+        states = [state.updated({coordinate: value}) for value in values]
+        found = [point for at in states for point in self._sample(scene, at)]
+        if not found:
+            raise InvalidValueError(
+                f"No surface of {', '.join(bodies)} opposes the motion of '{coordinate}' towards "
+                f"{values[-1]:g}, so it cannot be pushed there."
+            )
+        found = _without_doubles(found)
+        self.owner = np.array([k for k, *_ in found], dtype=np.intp)
+        self._points = np.array([p for _, p, _ in found])
+        self._normals = np.array([n for _, _, n in found])
+        self.room = np.min([self._find_room(scene, at) for at in states], axis=0)
+
+    def __len__(self) -> int:
+        return len(self.owner)
+
+    def _place(self, state: State) -> tuple[Array, Array]:
+        """Return poses (B, 3, 4) and twists (B, 6) of the bodies at a state, per unit of the coordinate."""
+        self._evaluate.input[:] = state.vector(self._inputs)
+        self._evaluate()
+        poses, twists = self._evaluate.outputs
+        return poses.reshape(-1, 3, 4), self.sign * twists.reshape(-1, 6)
+
+    def at(self, state: State) -> PushContacts:
+        """Return all points at a state."""
+        poses, twists = self._place(state)
+        own = poses[self.owner]
+        points = np.einsum("kij,kj->ki", own[:, :, :3], self._points) + own[:, :, 3]
+        normals = np.einsum("kij,kj->ki", own[:, :, :3], self._normals)
+        twist = twists[self.owner]
+        velocities = twist[:, :3] + np.cross(twist[:, 3:], points)
+        speeds = np.sqrt((velocities**2).sum(axis=1))
+        moving = speeds > 1e-9
+        alignment = np.where(
+            moving, -(normals * velocities).sum(axis=1) / np.where(moving, speeds, 1.0), -1.0
+        )
+        return PushContacts(points, normals, velocities, alignment, speeds / max(speeds.max(), 1e-9))
+
+    def point_at(self, state: State, index: int) -> PushPoint:
+        """Return one point at a state."""
+        poses, twists = self._place(state)
+        body = self.owner[index]
+        R, twist = poses[body, :, :3], twists[body]
+        point = R @ self._points[index] + poses[body, :, 3]
+        normal = R @ self._normals[index]
+        velocity = twist[:3] + cross(twist[3:], point)
+        return PushPoint(point, normal, velocity, find_alignment(normal, velocity))
+
+    def _sample(self, scene: Scene, state: State) -> list[tuple[int, Array, Array]]:
+        """Return body, point and normal in the body of the points that rays reach at a state."""
+        scene.update(state)
+        world = scene.collision_world
+        world.prepare()
+        poses, twists = self._place(state)
+        found = []
+        for k, body in enumerate(self.bodies):
+            R, t = poses[k, :, :3], poses[k, :, 3]
+            for item in world.members[world.body_index(body)]:
+                solid, placed = world.solid(item), world.table.poses[item]
+                for x in _grid(solid, placed, twists[k]):
+                    u = twists[k, :3] + np.cross(twists[k, 3:], x)
+                    speed = float(np.linalg.norm(u))
+                    if speed < 1e-9:
+                        continue
+                    u /= speed
+                    start = x - u * (_OUTSIDE + 2 * solid.radius)
+                    hit = scene.ray(start, u, _OUTSIDE + 4 * solid.radius)
+                    if hit is None or hit.body != body or hit.distance <= 0.0 or -hit.normal @ u < 0.5:
+                        continue
+                    found.append((k, R.T @ (hit.point - t), R.T @ hit.normal))
+        return found
+
+    def _find_room(self, scene: Scene, state: State) -> Array:
+        """Return the free space (N,) in front of all points at a state."""
+        scene.update(state)
+        at = self.at(state)
+        room = np.ones(len(self))
+        for k, ahead in enumerate(at.points + _ROOM * at.normals):
+            near = scene.point(ahead, _ROOM)
+            if near is not None:
+                room[k] = max(near.distance / _ROOM, 0.0)
+        return room
+
+
+def _without_doubles(found: list[tuple[int, Array, Array]]) -> list[tuple[int, Array, Array]]:
+    """Return points without those that are about the same."""
+    kept: dict[tuple[float, ...], tuple[int, Array, Array]] = {}
+    for body, point, normal in found:
+        kept.setdefault(
+            (body, *np.round(point / _SAME).tolist(), *np.round(normal, 1).tolist()), (body, point, normal)
+        )
+    return list(kept.values())
+
+
+def _grid(solid: Solid, placed: Array, twist: Array) -> Array:
+    """Return points (N, 3) in the middle plane of a solid's box across its motion, in the world."""
+    R, t = placed[:, :3], placed[:, 3]
+    centre = R @ solid.centre + t
+    along = R.T @ (twist[:3] + np.cross(twist[3:], centre))
+    flat = int(np.argmax(np.abs(along) * (1.0 / np.maximum(solid.half, 1e-4))))
+    axes = []
+    for i, half in enumerate(solid.half.tolist()):
+        inner = max(half - _INSET, 0.0)
+        count = 1 if i == flat or inner == 0.0 else min(2 * math.ceil(inner / _SPACING) + 1, _MOST)
+        axes.append(np.linspace(-inner, inner, count) if count > 1 else np.zeros(1))
+    local = np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1).reshape(-1, 3) + solid.centre
+    return np.asarray(local @ R.T + t)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class PushTool:
+    """Foremost point of a group of bodies.
+
+    Attributes
+    ----------
+    frame
+        Frame that carries the group.
+    tip
+        The point in this frame (3,) [m].
+    axis
+        Unit vector in this frame in which the group points (3,).
+    bodies
+        The bodies of the group.
+    """
+
+    frame: str
+    tip: Array
+    axis: Array
+    bodies: tuple[str, ...]
+
+
+def find_push_tool(model: ModelView, bodies: Sequence[str], state: State) -> PushTool:
+    """Return the foremost point of a group of bodies, away from what carries the group.
+
+    Parameters
+    ----------
+    model
+        The model.
+    bodies
+        Bodies that may touch what is pushed, such as those of a gripper.
+    state
+        A state of the whole model.
+    """
+    chains = [_ancestors(model, body) for body in bodies]
+    common = [frame for frame in chains[0] if all(frame in chain for chain in chains)]
+    frame = common[0]
+    scene = Scene(model)
+    scene.update(state)
+    world = scene.collision_world
+    world.prepare()
+    placed: list[tuple[Solid, npt.NDArray[np.float64], npt.NDArray[np.float64]]] = []
+    for body in bodies:
+        for item in world.members[world.body_index(body)]:
+            pose = world.table.poses[item]
+            placed.append((world.solid(item), pose[:, :3].copy(), pose[:, 3].copy()))
+    centres = np.array([R @ solid.centre + t for solid, R, t in placed])
+    carrier = next((f for f in common if f in world.bodies and f not in bodies), frame)
+    fk = {name: np.asarray(model.fk(name)(state)) for name in {frame, carrier}}
+    axis = centres.mean(axis=0) - fk[carrier][:3, 3]
+    if np.linalg.norm(axis) < _SAME:
+        axis = fk[frame][:3, 0]
+    axis = axis / np.linalg.norm(axis)
+    # The frame's own axis, if it is about the same: shapes are seldom exactly symmetric.
+    nearest = fk[frame][:3, :3] * np.sign(axis @ fk[frame][:3, :3])
+    k = int(np.argmax(axis @ nearest))
+    if axis @ nearest[:, k] > 0.9:
+        axis = nearest[:, k]
+    tips = np.array([_front(one, axis) for one in placed])
+    heights = tips @ axis
+    tip = tips[heights > heights.max() - _FRONT].mean(axis=0)
+    R, t = fk[frame][:3, :3], fk[frame][:3, 3]
+    return PushTool(frame, R.T @ (tip - t), R.T @ axis, tuple(bodies))
+
+
+def _front(placed: tuple[Solid, Array, Array], axis: Array) -> Array:
+    """Return the foremost point (3,) of a solid along an axis."""
+    solid, R, t = placed
+    if solid.core is not None:
+        return np.asarray(smoothed_support(placed, axis))
+    half = np.abs(R.T @ axis) @ solid.half
+    return np.asarray(R @ solid.centre + t + axis * half)
+
+
+def _ancestors(model: ModelView, frame: str) -> list[str]:
+    """Return a frame and all that carry it, nearest first."""
+    frames, found = model.frames, []
+    while frame in frames:
+        found.append(frame)
+        frame = frames[frame].parent
+    return found
+
+
+def cross(a: Array, b: Array) -> Array:
+    """Return the cross product (3,) of two vectors (3,), faster than numpy's."""
+    x, y, z = a.tolist()
+    u, v, w = b.tolist()
+    return np.array([y * w - z * v, z * u - x * w, x * v - y * u])
+
+
+def find_alignment(normal: Array, velocity: Array) -> float:
+    """Return the cosine between -n and a velocity; -1 for a point that does not move."""
+    speed = math.sqrt(float(velocity @ velocity))
+    return -float(normal @ velocity) / speed if speed > 1e-9 else -1.0

@@ -1,0 +1,227 @@
+"""Base placement for pushes: start states from which a push goes through, found by sampling and roll-outs."""
+
+from __future__ import annotations
+
+import math
+from collections import Counter
+from collections.abc import Callable
+from dataclasses import dataclass
+from time import perf_counter
+
+import numpy as np
+
+from kineverse.control import Goal, Hold, InverseKinematics, Target
+from kineverse.control.tasks import Task
+from kineverse.errors import KineverseError
+from kineverse.expressions.expression import array
+from kineverse.state import State
+from kineverse.symbols import Symbol
+
+from .push_controller import Pushing
+
+_STANDOFF = 0.03
+"""Distance of the tip from the contact point at the start [m]."""
+_TILT = math.radians(50.0)
+"""Largest angle between the pusher's axis and the direction of the push at a start that is exact."""
+_NEARBY = 0.12
+"""Largest entry of the distance of the tip at a start that is not [m]."""
+_NEAREST, _FARTHEST = 0.35, 1.1
+_SIDE, _TURN = math.radians(70.0), math.radians(45.0)
+_MARGIN = 0.01
+_CANDIDATES = 1.0
+"""Largest difference of the score of contact points to the best one."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class PushStart:
+    """Result of :func:`find_push_start`, true if a start was found.
+
+    Attributes
+    ----------
+    state
+        State of everything from which the push goes through; None if none was found.
+    samples
+        Number of sampled base poses.
+    reasons
+        Number of samples by the reason of their failure.
+    steps
+        Number of steps of the push in the roll-out.
+    seconds
+        Duration of the search [s].
+    """
+
+    state: State | None
+    samples: int
+    reasons: Counter[str]
+    steps: int
+    seconds: float
+
+    def __bool__(self) -> bool:
+        return self.state is not None
+
+    @property
+    def why(self) -> str:
+        """Text with the number of samples and the reasons of failures."""
+        failed = ", ".join(f"{count} {reason}" for reason, count in self.reasons.most_common(6))
+        found = f"Found after {self.samples} samples" if self else f"None of {self.samples} samples"
+        return f"{found}; failed: {failed}." if failed else f"{found}."
+
+
+def find_push_start(
+    pushing: Pushing,
+    state: State,
+    *,
+    samples: int = 200,
+    seconds: float = 30.0,
+    steps: int = 900,
+    seed: int = 0,
+    accept: Callable[[State], str] | None = None,
+) -> PushStart:
+    """Return a start state of the robot from which a push goes through in a roll-out of its own prediction.
+
+    A sample is a contact point and a pose of the base in front of it. Inverse kinematics brings the pusher to
+    the point, collisions included, and the push is rolled out from there. The first one without lost contacts
+    and penetration is taken. Robots without a mobile base are sampled over their arms alone.
+
+    Parameters
+    ----------
+    pushing
+        The push; its contacts are forgotten.
+    state
+        State of everything; the robot is moved away from where it is.
+    samples, seconds
+        Largest number of samples, and largest time [s].
+    steps
+        Largest number of steps of a roll-out.
+    seed
+        Seed of the samples.
+    accept
+        Further test of a start, such as a trial in a world: returns the reason against it, or nothing.
+    """
+    begin, reasons = perf_counter(), Counter[str]()
+    sampler = _Sampler(pushing, state, np.random.default_rng(seed))
+    for k in range(samples):
+        if perf_counter() - begin > seconds:
+            return PushStart(None, k, reasons, 0, perf_counter() - begin)
+        start = sampler.sample()
+        if isinstance(start, str):
+            reasons[start] += 1
+            continue
+        problem, taken = roll_out(pushing, start, steps)
+        if not problem and accept is not None:
+            problem = accept(start)
+        if not problem:
+            return PushStart(start, k + 1, reasons, taken, perf_counter() - begin)
+        reasons[problem] += 1
+    return PushStart(None, samples, reasons, 0, perf_counter() - begin)
+
+
+def roll_out(pushing: Pushing, start: State, steps: int, tolerance: float = 0.015) -> tuple[str, int]:
+    """Return why a push fails in its own prediction, empty if it goes through, and the number of steps."""
+    state = start
+    pushing.reset()
+    try:
+        contact = pushing.first_contact(state)
+        if contact:
+            return contact, 0
+        for k in range(steps):
+            if pushing.done(state, tolerance):
+                return "", k
+            command = pushing.step(state)
+            if pushing.losses:
+                return "lost the contact", k
+            if pushing.blocked:
+                return f"blocked at {state[pushing.coordinate]:.2f}", k
+            if pushing.penetration > _DEEPEST:
+                return "penetration", k
+            state = pushing.model.integrate(state, command.speeds, pushing.controller.dt)
+    except KineverseError as error:
+        return f"{type(error).__name__}", 0
+    finally:
+        pushing.reset()
+    return "out of time", steps
+
+
+_DEEPEST = 4e-4
+"""Largest penetration of a roll-out, in pairs that may not touch [m]."""
+
+
+class _Sampler:
+    """Sampler of start states: a contact point, a base in front of it, and inverse kinematics."""
+
+    def __init__(self, pushing: Pushing, state: State, generator: np.random.Generator) -> None:
+        self._pushing, self._state, self._generator = pushing, state, generator
+        model, tool = pushing.model, pushing.tool
+        world_T_hand = model.fk(tool.frame)
+        tip = world_T_hand[:3, :3] @ tool.tip + world_T_hand[:3, 3]
+        axis = world_T_hand[:3, :3] @ tool.axis
+        self._point = Target("push/start/point", np.zeros(3))
+        self._facing = Target("push/start/facing", np.array([1.0, 0.0, 0.0]))
+        still = [s for s in model.degrees_of_freedom if not s.path.startswith(f"{pushing.robot}/")]
+        exact: list[Task] = [
+            Hold(tip, self._point.expression, name="tip"),
+            Goal(axis, self._facing.expression, name="facing", weight=0.1),
+        ]
+        nearby = Goal(tip, self._point.expression, name="tip")
+        # A pusher that cannot face the contact may still reach it with another part than its tip.
+        self._solvers = [
+            InverseKinematics(
+                model, tasks, still=still, scene=pushing.scene, margin=_MARGIN, tolerance=tolerance
+            )
+            for tasks, tolerance in ((exact, 2 * math.sin(_TILT / 2)), ([nearby], _NEARBY))
+        ]
+        self._tried = 0
+        self._base: InverseKinematics | None = None
+        root = next(b for b in pushing.scene.bodies if b.startswith(f"{pushing.robot}/"))
+        pose = model.fk(root)
+        if pose.symbols:
+            self._planar = Target("push/start/base", np.array([0.0, 0.0, 1.0, 0.0]))
+            planar = array([pose[0, 3], pose[1, 3], pose[0, 0], pose[1, 0]])
+            self._base = InverseKinematics(model, [Goal(planar, self._planar.expression, name="base")])
+        self._points = pushing.surface.at(state)
+        score = pushing.score(self._points)
+        good = np.flatnonzero(score > score.max() - _CANDIDATES)
+        weights = np.exp(2.0 * (score[good] - score.max()))
+        self._candidates, self._weights = good, weights / weights.sum()
+
+    def sample(self) -> State | str:
+        """Return a start state, or why there is none."""
+        random, state = self._generator, self._state
+        k = int(random.choice(self._candidates, p=self._weights))
+        point, normal = self._points.points[k], self._points.normals[k]
+        values = dict(self._arm())
+        if self._base is not None:
+            out = normal[:2] if np.hypot(*normal[:2]) > 0.1 else random.standard_normal(2)
+            angle = math.atan2(out[1], out[0]) + random.uniform(-_SIDE, _SIDE)
+            distance = random.uniform(_NEAREST, _FARTHEST)
+            x, y = point[:2] + distance * np.array([math.cos(angle), math.sin(angle)])
+            turn = angle + math.pi + random.uniform(-_TURN, _TURN)
+            wanted = self._planar.values(np.array([x, y, math.cos(turn), math.sin(turn)]))
+            found = self._base.solve(dict(state) | wanted, starts=1)
+            if not found.solved:
+                return "base not there"
+            values |= {s: found.best[s] for s in self._base.coordinates}
+        at = state.updated(values)
+        targets = self._point.values(point + _STANDOFF * normal) | self._facing.values(-normal)
+        solver = self._solvers[self._tried % len(self._solvers)]
+        self._tried += 1
+        known = {s: v for s, v in targets.items() if s in solver.inputs}
+        reached = solver.solve(dict(at) | known, starts=2, seed=int(random.integers(2**31)))
+        if not reached.solved:
+            (obstacle,) = [name for name, _ in reached.obstacles.most_common(1)] or ["out of reach"]
+            return obstacle
+        return at.updated({s: reached.best[s] for s in self._solvers[0].coordinates})
+
+    def _arm(self) -> dict[Symbol, float]:
+        """Return random values of the coordinates between base and pusher, in every other sample."""
+        if self._generator.random() < 0.5:
+            return {}
+        base = () if self._base is None else self._base.coordinates
+        model = self._pushing.model
+        values: dict[Symbol, float] = {}
+        for symbol in self._solvers[0].coordinates:
+            lower, upper = model.limits(symbol)
+            if symbol not in base and math.isfinite(lower) and math.isfinite(upper):
+                middle = (lower + upper) / 2
+                values[symbol] = middle + 0.6 * (self._generator.uniform(lower, upper) - middle)
+        return values

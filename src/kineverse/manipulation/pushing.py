@@ -1,0 +1,242 @@
+"""Pushing skill: an articulated object is pushed to a value of its coordinate in a world."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Iterable
+from typing import Any
+
+import numpy as np
+
+from kineverse.errors import KineverseError
+from kineverse.geometry import Rule
+from kineverse.grasping import find_gripper
+from kineverse.planning import Path
+from kineverse.symbols import Symbol
+
+from .outcome import Outcome
+from .push_approach import plan_push_approach
+from .push_controller import Pushing
+from .session import Session
+
+_SETTLED = 5
+"""Number of steps for which the estimate is within half of the tolerance when a push ends."""
+_PATIENCE = 25
+"""Number of steps for which it is within the tolerance when a push ends all the same."""
+_MOST_BLOCKED = 3
+"""Number of contact points given up before an approach is planned."""
+_MOST_JAMMED = 3
+"""Number of contact points at which the object does not move before it counts as jammed."""
+_MOST_APPROACHES = 2
+_RETREAT_STEPS = 100
+
+
+def push(
+    session: Session,
+    what: Symbol | str,
+    *,
+    target: float | None = None,
+    bodies: str | Iterable[str] | None = None,
+    object_frames: str | Iterable[str] | None = None,
+    seconds: float = 30.0,
+    tolerance: float = 0.02,
+    still: Iterable[Symbol | str] = (),
+    rules: Iterable[Rule] = (),
+    logic: str | None = "and",
+    plan: bool = True,
+    retreat: bool = False,
+    pushing: Pushing | None = None,
+    on_step: Callable[[Pushing], object] | None = None,
+) -> Outcome:
+    """Push an articulated object to a value of its coordinate.
+
+    The controller finds contact points and changes them where it is blocked. After some of them a path is
+    planned to another one. The result is judged by the world's truth.
+
+    Parameters
+    ----------
+    session
+        Robot in a world.
+    what
+        The coordinate of the object, as symbol or name.
+    target
+        Wanted value [m], [rad]; by default its lower limit, where doors and drawers are shut.
+    bodies
+        Bodies of the robot that may touch the object, names or patterns; by default those of its gripper.
+    object_frames
+        Bodies of the object that may be pushed, names or patterns; by default all that the coordinate moves.
+    seconds
+        Largest time in the world [s].
+    tolerance
+        Largest distance from the target [m], [rad].
+    still, rules, logic
+        As for :class:`.Pushing`.
+    plan
+        Whether approaches are planned where the way of the controller is blocked.
+    retreat
+        Whether the pusher is taken away from the object at the end.
+    pushing
+        A controller that was built before, for the same arguments.
+    on_step
+        Is called with the controller after each step, for drawings and recordings of its ``view``.
+
+    Returns
+    -------
+    Outcome
+        With ``measures``: ``losses``, ``blocked``, ``contacts``, ``jammed``, ``planned``, ``jitter`` (largest
+        mean change of a speed from step to step while touching, [m/s], [rad/s]).
+
+    Raises
+    ------
+    UnknownNameError, InvalidValueError
+        As :class:`.Pushing`.
+    """
+    model, world = session.world.model, session.world
+    coordinate = model.symbol(what) if isinstance(what, str) else what
+    if pushing is None:
+        if bodies is None:
+            bodies = find_gripper(model, world.robot).bodies
+        pushing = Pushing(
+            model,
+            coordinate,
+            bodies,
+            session.state,
+            target=model.limits(coordinate)[0] if target is None else target,
+            robot=world.robot,
+            object_frames=object_frames,
+            dt=session.dt,
+            still=still,
+            rules=rules,
+            logic=logic,
+        )
+        pushing.wait()
+    pushing.reset()
+    run = _Run(session, pushing, seconds, tolerance, plan, on_step)
+    try:
+        reason = run.push()
+        if retreat:
+            run.retreat()
+    except KineverseError as error:
+        reason = f"{type(error).__name__}: {error}"
+    session.stop()
+    value = world.state[coordinate]
+    done = abs(value - pushing.target) < tolerance
+    if done:
+        reason = f"'{coordinate}' is at {value:.3g}"
+    return Outcome(done, value, reason, world.name, run.time, run.steps, run.measures())
+
+
+class _Run:
+    """Steps of one push."""
+
+    def __init__(
+        self,
+        session: Session,
+        pushing: Pushing,
+        seconds: float,
+        tolerance: float,
+        plan: bool,
+        on_step: Callable[[Pushing], object] | None,
+    ) -> None:
+        self._session, self._pushing, self._on_step = session, pushing, on_step
+        self._seconds, self._tolerance, self._plan = seconds, tolerance, plan
+        self._first, self._begin = session.steps, session.world.time
+        self._approaches = 0
+        self._changes: list[np.ndarray[Any, np.dtype[np.float64]]] = []
+        self._last: np.ndarray[Any, np.dtype[np.float64]] | None = None
+
+    @property
+    def steps(self) -> int:
+        return self._session.steps - self._first
+
+    @property
+    def time(self) -> float:
+        return self._session.world.time - self._begin
+
+    def push(self) -> str:
+        """Push until the object is at its target, and return what prevented it."""
+        session, pushing = self._session, self._pushing
+        contact = pushing.first_contact(session.state)
+        if contact:
+            return f"The push begins with a {contact}."
+        settled = within = 0
+        blocked = 0
+        while self.time < self._seconds:
+            within = within + 1 if pushing.done(session.state, self._tolerance) else 0
+            settled = settled + 1 if pushing.done(session.state, self._tolerance / 2) else 0
+            if settled >= _SETTLED or within >= _PATIENCE:
+                return "The estimate is at the target, and the world is not."
+            if pushing.jammed >= _MOST_JAMMED:
+                return (
+                    f"The object does not move: pushed at {pushing.jammed} points, it stays at "
+                    f"{session.state[pushing.coordinate]:.3g}. It may be locked, jammed or blocked."
+                )
+            if pushing.blocked - blocked >= _MOST_BLOCKED and self._plan:
+                blocked = pushing.blocked
+                problem = self._approach()
+                if problem:
+                    return problem
+            self._step("push")
+        where = "touching" if pushing.touching else "on the way to a contact"
+        return f"Out of time at {session.state[pushing.coordinate]:.3g}, {where}."
+
+    def _step(self, phase: str) -> None:
+        session, pushing = self._session, self._pushing
+        session.phase = phase
+        with session.timed("push"):
+            command = pushing.step(session.state)
+        speeds = np.fromiter(command.speeds.values(), dtype=float)
+        if pushing.touching and self._last is not None:
+            self._changes.append(np.abs(speeds - self._last))
+        self._last = speeds if pushing.touching else None
+        session.act(command.speeds)
+        if self._on_step is not None:
+            self._on_step(pushing)
+
+    def _approach(self) -> str:
+        """Plan a way to another contact point and follow it; return what prevents it."""
+        if self._approaches >= _MOST_APPROACHES:
+            return f"No contact point was reached, of {self._pushing.contacts} and {self._approaches} plans."
+        self._approaches += 1
+        session, pushing = self._session, self._pushing
+        session.stop()
+        path, point = plan_push_approach(pushing, session.state)
+        if not path.found:
+            return f"Blocked, and no path leads to a contact point. {path.why}"
+        self._follow(path)
+        pushing.controller.reset()
+        pushing.choose(session.state, point)
+        return ""
+
+    def _follow(self, path: Path) -> None:
+        """Follow a path at the speeds of its trajectory."""
+        session, trajectory = self._session, path.trajectory()
+        session.phase = "approach"
+        dt = session.dt
+        times = np.arange(dt, trajectory.duration + dt, dt).clip(max=trajectory.duration)
+        for wanted in trajectory.positions_at(times):
+            here = session.state.vector(trajectory.symbols)
+            rates = (wanted - here) * (1 / dt)
+            session.act({s.derivative(): float(v) for s, v in zip(trajectory.symbols, rates, strict=True)})
+
+    def retreat(self) -> None:
+        """Take the pusher away from the object."""
+        self._pushing.retreating = True
+        for _ in range(_RETREAT_STEPS):
+            self._step("retreat")
+            view = self._pushing.view
+            if view is not None and math.isinf(view.distance):
+                break
+        self._pushing.retreating = False
+
+    def measures(self) -> dict[str, Any]:
+        """Return figures of the push."""
+        pushing = self._pushing
+        return {
+            "losses": pushing.losses,
+            "blocked": pushing.blocked,
+            "contacts": pushing.contacts,
+            "jammed": pushing.jammed,
+            "planned": self._approaches,
+            "jitter": float(np.mean(self._changes, axis=0).max()) if self._changes else 0.0,
+        }
