@@ -44,6 +44,8 @@ class PushTrial:
         CPU time of a step of the controller, scene queries included [s].
     wall
         Median wall time of a step [s].
+    cpu, walls
+        CPU and wall times of all steps [s].
     """
 
     robot: str
@@ -58,6 +60,8 @@ class PushTrial:
     p99: float
     worst: float
     wall: float
+    cpu: tuple[float, ...] = ()
+    walls: tuple[float, ...] = ()
 
     def __str__(self) -> str:
         outcome, m = self.outcome, self.outcome.measures
@@ -147,6 +151,8 @@ def try_push(
         float(np.percentile(cpu, 99)),
         float(cpu.max()),
         float(np.median(wall)),
+        tuple(cpu.tolist()),
+        tuple(wall.tolist()),
     )
 
 

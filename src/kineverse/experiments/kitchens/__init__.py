@@ -6,11 +6,11 @@ the aisle for each object, with all shut. It opens the object, and closes it aga
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
-from functools import partial
 
 from kineverse.experiments.manipulation.robots import RobotSource, find_robots
-from kineverse.experiments.manipulation.skills import make_world, open_in_world, run_trial
+from kineverse.experiments.manipulation.skills import open_then_close
 from kineverse.experiments.manipulation.tables import (
     make_failure_table,
     make_quality_table,
@@ -92,15 +92,10 @@ def run_kitchen(job: KitchenJob) -> list[Trial]:
     trials = []
     for what in job.objects or heights:
         lower, upper = model.limits(what)
-        world = make_world(WORLD, model, job.robot.prefix, start)
-        for skill, target in (("open", lower + OPEN_SHARE * (upper - lower)), ("close", lower)):
-            act = partial(open_in_world, world, what, target)
-            trial = run_trial(
-                str(job.seed), job.robot.name, what, skill, act, height=heights.get(what, float("nan"))
-            )
-            trials.append(trial)
-            if not trial.done:
-                break
+        targets = (lower + OPEN_SHARE * (upper - lower), lower)
+        trials += open_then_close(
+            str(job.seed), job.robot, model, what, start, targets, height=heights.get(what, math.nan)
+        )
     return trials
 
 
@@ -122,4 +117,4 @@ def find_handle_height(model: Model, what: str) -> float:
     for name in (f"{what}_handle", f"{what}/handle"):
         if name in model.frames:
             return float(model.fk(name)(model.default_state())[2, 3])
-    return float("nan")
+    return math.nan

@@ -4,16 +4,19 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Mapping
+from functools import partial
 from typing import Any
 
 from kineverse.errors import KineverseError
 from kineverse.manipulation.outcome import Outcome
+from kineverse.manipulation.push_trials import try_push
 from kineverse.manipulation.session import Session
 from kineverse.model.model import Model
 from kineverse.model.registry import import_entry
 from kineverse.state import StateLike
 from kineverse.worlds import World
 
+from .robots import RobotSource
 from .trials import Trial, find_failure
 
 DT = 0.02
@@ -27,7 +30,6 @@ _WORLDS: Mapping[str, str] = {
     "mujoco": "kineverse.worlds.mujoco_world:MujocoWorld",
 }
 _OPEN = "kineverse.manipulation.opening:open_object"
-_PUSH = "kineverse.manipulation.pushing:push"
 
 
 def make_world(kind: str, model: Model, robot: str, state: StateLike) -> World:
@@ -43,12 +45,99 @@ def open_in_world(world: World, what: str, target: float, **options: Any) -> tup
     return import_entry(_OPEN)(session, what, target=target, **options), session
 
 
-def push_in_world(
-    world: World, what: str, target: float = 0.0, *, dt: float = DT, **options: Any
-) -> tuple[Outcome, Session]:
-    """Push an object to a target, and return what came out and the session."""
-    session = Session(world, dt=dt)
-    return import_entry(_PUSH)(session, what, target=target, **options), session
+def run_push_trial(
+    case: str,
+    robot: RobotSource,
+    model: Model,
+    what: str,
+    start: StateLike,
+    skill: str,
+    *,
+    dt: float = DT,
+    steps: int = 1200,
+    seed: int = 0,
+    logic: str | None = "and",
+    kind: str = "kinematic",
+    **measures: Any,
+) -> Trial:
+    """Return the trial of a push in a world: from a start, or from one that base placement finds.
+
+    Parameters
+    ----------
+    case, robot, model, what, start, measures
+        As for :func:`open_then_close`.
+    skill
+        Name of the push in tables.
+    dt, steps
+        Control period [s], and largest number of steps.
+    seed, logic
+        As for :func:`.try_push`.
+    kind
+        Name of the world.
+    """
+    world = make_world(kind, model, robot.prefix, start)
+    try:
+        found = try_push(world, world.state, what, dt=dt, steps=steps, seed=seed, logic=logic)
+    except KineverseError as error:
+        return _failed_trial(case, robot.name, what, skill, error, measures)
+    outcome = found.outcome
+    own = {
+        "placed": found.placed,
+        "first": found.first,
+        "limits": found.violation,
+        "penetration": 1e3 * found.penetration[0],
+        "penetrating": found.penetration[1],
+        "contact_losses": outcome.measures.get("losses", 0),
+    }
+    return Trial(
+        case,
+        robot.name,
+        what,
+        skill,
+        outcome.done,
+        float(outcome.value),
+        find_failure(outcome),
+        outcome.reason,
+        float(outcome.seconds),
+        int(outcome.steps),
+        found.cpu,
+        found.walls,
+        {**measures, **outcome.measures, **own},
+    )
+
+
+def open_then_close(
+    case: str,
+    robot: RobotSource,
+    model: Model,
+    what: str,
+    start: StateLike,
+    targets: tuple[float, float],
+    **measures: Any,
+) -> list[Trial]:
+    """Return the trials of opening an object in the kinematic world and, if that was done, of closing it.
+
+    Parameters
+    ----------
+    case
+        Name of the case.
+    robot, model, what
+        The robot, the model that contains it, and the coordinate of the object.
+    start
+        State at the beginning.
+    targets
+        Value of the open and of the closed object [m], [rad].
+    measures
+        Further figures of the trials.
+    """
+    world = make_world("kinematic", model, robot.prefix, start)
+    trials: list[Trial] = []
+    for skill, target in zip(("open", "close"), targets, strict=True):
+        act = partial(open_in_world, world, what, target)
+        trials.append(run_trial(case, robot.name, what, skill, act, **measures))
+        if not trials[-1].done:
+            break
+    return trials
 
 
 def run_trial(
@@ -63,8 +152,7 @@ def run_trial(
     try:
         outcome, session = act()
     except KineverseError as error:
-        reason = f"{type(error).__name__}: {error}"
-        return Trial(case, robot, what, skill, False, math.nan, "other", reason, 0.0, 0, measures=measures)
+        return _failed_trial(case, robot, what, skill, error, measures)
     names = [name for name in session.cpu if not name.startswith(_PLANS)]
     return Trial(
         case,
@@ -81,3 +169,11 @@ def run_trial(
         tuple(t for name in names for t in session.wall[name]),
         {**measures, **outcome.measures},
     )
+
+
+def _failed_trial(
+    case: str, robot: str, what: str, skill: str, error: KineverseError, measures: Mapping[str, Any]
+) -> Trial:
+    """Return the trial of a skill that ended with an error."""
+    reason = f"{type(error).__name__}: {error}"
+    return Trial(case, robot, what, skill, False, math.nan, "other", reason, 0.0, 0, measures=measures)

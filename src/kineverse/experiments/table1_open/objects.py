@@ -7,6 +7,8 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from types import MappingProxyType
 
+import numpy as np
+
 from kineverse.control import Hold, InverseKinematics, same_pose
 from kineverse.errors import NoSolutionError
 from kineverse.experiments.manipulation.robots import RobotSource
@@ -24,6 +26,7 @@ OBJECT, GRASP = "object", "grasp"
 
 _STARTS, _SEEDS = 32, 8
 _MARGIN = 0.005
+_AREA = {"x": (-0.4, 0.5), "y": (-0.8, 0.4), "angle": (-0.8, 0.8)}
 
 
 @dataclass(frozen=True)
@@ -105,6 +108,8 @@ class OpeningSetup:
     def find_start(self, seed: int = 0) -> State:
         """Return a state with the hand at the grasp, the object shut and without contacts.
 
+        Inverse kinematics begins at the robot's start for the seed 0, else at random positions nearby.
+
         Raises
         ------
         NoSolutionError
@@ -115,14 +120,29 @@ class OpeningSetup:
         scene = self.scene()
         opened = {str(s): value for s, value in gripper.opened.items()}
         values = self.robot.start_state(self.model).updated(opened)
+        if seed:
+            values = values.updated(self._draw_configuration(np.random.default_rng(seed)))
         solver = InverseKinematics(self.model, [held], still=[self.what], scene=scene, margin=_MARGIN)
         for more in range(_SEEDS):
-            found = solver.solve(values, starts=_STARTS, seed=seed + more)
+            found = solver.solve(values, starts=_STARTS, seed=_SEEDS * seed + more)
             if found.solved:
                 return found.best
         raise NoSolutionError(
             f"{self.robot.name} has no configuration at the handle of the {self.thing.name}."
         )
+
+    def _draw_configuration(self, rng: np.random.Generator) -> dict[str, float]:
+        """Return random positions of the arm within its limits, and of the base in front of the object."""
+        base = {f"{self.robot.prefix}/base/{key}": area for key, area in _AREA.items()}
+        fingers = {str(s) for s in self.robot.gripper(self.model).joints}
+        drawn = {}
+        for symbol in self.model.degrees_of_freedom:
+            name = str(symbol)
+            if not name.startswith(f"{self.robot.prefix}/") or name in fingers:
+                continue
+            lower, upper = base.get(name, self.model.limits(symbol))
+            drawn[name] = float(rng.uniform(max(lower, -math.pi), min(upper, math.pi)))
+        return drawn
 
 
 def make_opening_setup(robot: RobotSource, thing: GraspedObject) -> OpeningSetup:

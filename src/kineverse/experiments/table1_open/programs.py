@@ -30,6 +30,10 @@ DONE = 0.99
 """Share of the upper limit from which an object counts as open. The gain of 1 reaches it after 4.6 s."""
 
 
+LOST = 0.01
+"""Grasp error from which the handle counts as lost [m]."""
+
+
 @dataclass(slots=True)
 class ProgramRun:
     """Opening of an object by a program.
@@ -37,11 +41,13 @@ class ProgramRun:
     Attributes
     ----------
     done, value, steps
-        Whether it is open; the value of its coordinate; the number of control steps.
+        Whether it is open and still grasped; the value of its coordinate; the number of control steps.
     solve, cpu
         Times of the solver's calls of each control step, and CPU times of the steps [s].
     position_error, rotation_error
         Largest grasp errors [m], [rad].
+    violation
+        Largest violation of a limit on positions [m], [rad].
     programs
         Number of quadratic programs solved.
     """
@@ -53,6 +59,7 @@ class ProgramRun:
     cpu: list[float] = field(default_factory=list)
     position_error: float = 0.0
     rotation_error: float = 0.0
+    violation: float = 0.0
     programs: int = 0
 
 
@@ -84,6 +91,11 @@ class LeaderFollower:
             posture=0.0,
         )
         self._limits = _SpeedScale(setup.model, self._follower.speeds)
+
+    @property
+    def controllers(self) -> tuple[Controller, ...]:
+        """The programs."""
+        return self._leader, self._follower
 
     def step(self, state: State) -> tuple[State, float, int]:
         """Return the next state, the time of the solver [s] and the number of programs solved."""
@@ -121,6 +133,11 @@ class OneProgram:
             dt=DT,
         )
 
+    @property
+    def controllers(self) -> tuple[Controller, ...]:
+        """The program."""
+        return (self._controller,)
+
     def step(self, state: State) -> tuple[State, float, int]:
         """Return the next state, the time of the solver [s] and the number of programs solved."""
         command = self._controller.step(state)
@@ -130,7 +147,11 @@ class OneProgram:
 def run_program(program: LeaderFollower | OneProgram, setup: OpeningSetup, state: State) -> ProgramRun:
     """Open an object from a state by a program."""
     run = ProgramRun()
+    for controller in program.controllers:
+        controller.reset()
     errors = compile(same_pose(setup.grasp, setup.hand))
+    limited = setup.model.degrees_of_freedom
+    lower, upper = np.array([setup.model.limits(q) for q in limited]).T
     for _ in range(MOST_STEPS):
         start = thread_time()
         state, solve, count = program.step(state)
@@ -141,9 +162,11 @@ def run_program(program: LeaderFollower | OneProgram, setup: OpeningSetup, state
         error = np.asarray(errors(state), dtype=float).ravel()
         run.position_error = max(run.position_error, float(np.linalg.norm(error[:3])))
         run.rotation_error = max(run.rotation_error, float(np.linalg.norm(error[3:])))
+        values = state.vector(limited)
+        run.violation = max(run.violation, float(np.maximum(lower - values, values - upper).max()))
         run.value = float(state[setup.what])
         if run.value >= DONE * setup.upper:
-            run.done = True
+            run.done = run.position_error <= LOST
             break
     return run
 
@@ -160,11 +183,8 @@ class _SpeedScale:
         self._function = compile(array([[c.lower, c.expression, c.upper] for c in found]), self._symbols)
 
     def __call__(self, state: State, speeds: dict[Symbol, float]) -> float:
-        values = {
-            **{s: speeds.get(s, 0.0) for s in self._symbols if s.order},
-        }
-        q = [values[s] if s.order else float(state[s]) for s in self._symbols]
-        lower, value, upper = np.asarray(self._function(q), dtype=float).T
+        values = [speeds.get(s, 0.0) if s.order else float(state[s]) for s in self._symbols]
+        lower, value, upper = np.asarray(self._function(values), dtype=float).T
         bound = np.where(value > 0, upper, lower)
         ratios = np.where(value != 0, bound / np.where(value != 0, value, 1.0), np.inf)
         return float(min(1.0, ratios.min(initial=1.0)))
