@@ -50,13 +50,17 @@ class Options:
         Raises
         ------
         InvalidValueError
-            If one is not supported, with those that are.
+            If one is not supported, with those that are; or for a number that is too small.
         """
         given = [field.name for field in fields(self) if getattr(self, field.name) != field.default]
         for option in given:
             if option not in supported:
                 takes = ", ".join(f"--{known}" for known in supported) or "none"
                 raise InvalidValueError(f"The experiment '{name}' takes no --{option}. It takes {takes}.")
+        for option, least in (("seed", 0), ("count", 1), ("processes", 1)):
+            value = getattr(self, option)
+            if value is not None and value < least:
+                raise InvalidValueError(f"--{option} is a whole number from {least} on, not {value}.")
 
 
 Progress: TypeAlias = Callable[[Iterable[Any], str, str], Iterable[Any]]

@@ -1,8 +1,8 @@
 """``ablations``: what augmented gradients are good for, in locks and in pushes.
 
 A lock is no slope for a controller: only the trend of its condition leads to the bolts that open it. The
-table has the lockbox of the thesis behind the 2020 paper, and random boxes. Pushes use the trend of "the point
-may be pushed here" to move a contact along the object.
+boxes are the lockbox of the thesis behind the 2020 paper, and random ones. Pushes use the trend of the
+condition of a push to move a contact along the object.
 """
 
 from __future__ import annotations
@@ -126,7 +126,7 @@ def _push_table(pushes: dict[Rule, list[Trial]]) -> ReportTable:
             f"{sum(t.done for t in own)} of {len(own)}",
             sum(t.done and not t.measures.get("placed", 0) for t in own),
             sum(int(t.measures.get("contact_losses", 0)) for t in own),
-            f"{np.median([t.steps for t in own if t.done] or [np.nan]):.0f}",
+            f"{np.median([t.steps for t in own if t.done] or [0]):.0f}",
         )
         for rule, own in pushes.items()
     )

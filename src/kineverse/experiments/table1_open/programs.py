@@ -90,7 +90,7 @@ class LeaderFollower:
             smooth=1e-4,
             posture=0.0,
         )
-        self._limits = _SpeedScale(setup.model, self._follower.speeds)
+        self._limits = SpeedScale(setup.model, self._follower.speeds)
 
     @property
     def controllers(self) -> tuple[Controller, ...]:
@@ -171,7 +171,7 @@ def run_program(program: LeaderFollower | OneProgram, setup: OpeningSetup, state
     return run
 
 
-class _SpeedScale:
+class SpeedScale:
     """Factor that brings speeds within the limits of a model: all by the same, so that the path stays."""
 
     def __init__(self, model: Model, speeds: tuple[Symbol, ...]) -> None:
@@ -183,6 +183,7 @@ class _SpeedScale:
         self._function = compile(array([[c.lower, c.expression, c.upper] for c in found]), self._symbols)
 
     def __call__(self, state: State, speeds: dict[Symbol, float]) -> float:
+        """Return the factor, at most 1, for speeds at a state."""
         values = [speeds.get(s, 0.0) if s.order else float(state[s]) for s in self._symbols]
         lower, value, upper = np.asarray(self._function(values), dtype=float).T
         bound = np.where(value > 0, upper, lower)
