@@ -8,7 +8,7 @@ BIN := $(VENV)/bin
 INSTALL := $(BIN)/python -m pip install --quiet --no-input --disable-pip-version-check --no-deps
 
 # What the demo and every command in the README need.
-DEMO := $(patsubst %,requirements/%.txt,build core view figures geometry control)
+DEMO := $(patsubst %,requirements/%.txt,build core view figures geometry control recording)
 
 .PHONY: help demo test fuzz format clean
 .NOTPARALLEL:

@@ -17,6 +17,7 @@ from kineverse.expressions.printing import format_number
 
 if TYPE_CHECKING:
     import kineverse as kv
+    from kineverse.model.model_view import ModelView
 
 _NUMBER_PATTERN = r"(?:[0-9]+\.?[0-9]*|\.[0-9]+)(?:[eE][-+]?[0-9]+)?"
 _VALUE_PATTERN = re.compile(
@@ -195,7 +196,7 @@ ALTERNATIVE_UNITS = {"rad": ("deg",), "m": ("cm", "mm")}
 """Units accepted on the command line, in radians and metres."""
 
 
-def find_limit_notes(model: kv.Model, values: Mapping[str, float], texts: Iterable[str]) -> list[str]:
+def find_limit_notes(model: ModelView, values: Mapping[str, float], texts: Iterable[str]) -> list[str]:
     """Return a line for each violated limit or constraint, and for each angle above 2π without a unit.
 
     Parameters

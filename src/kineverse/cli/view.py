@@ -7,6 +7,7 @@ import signal
 import sys
 from collections.abc import Iterator
 from contextlib import contextmanager
+from pathlib import Path
 from typing import TYPE_CHECKING, Any, Protocol
 
 from kineverse.cli.arguments import (
@@ -23,7 +24,9 @@ from kineverse.cli.output import show_progress
 from kineverse.errors import InvalidValueError
 
 if TYPE_CHECKING:
-    import kineverse as kv
+    from kineverse.model.model_view import ModelView
+    from kineverse.planning import Trajectory
+    from kineverse.worlds import RunRecording
 
 HELP = """show a model in the browser, with a slider for everything that moves
 
@@ -31,13 +34,20 @@ The page is served to this computer only, until Ctrl-C; with --host also to othe
 its token. With --picture, a picture of the state is written instead. This needs no browser, and no extra
 except for meshes and --near.
 
+A recording of a run (.mcap) is played with a slider for its time: the truth, as a ghost what the robot
+believes, and as arrows what its controller wants. With --play, MODEL moves along a saved trajectory.
+
 examples:
   kineverse view kitchen
   kineverse view articulations/folding_door      any articulation of the library
   kineverse view                                 list of all models and articulations
   kineverse view my_robot.urdf --set elbow=45deg --port 8090
   kineverse view kitchen --near 5cm              bodies within 5 cm of each other
-  kineverse view articulations/ratchet --near 0.1 --collisions --picture ratchet.png"""
+  kineverse view articulations/ratchet --near 0.1 --collisions --picture ratchet.png
+  kineverse view examples/arm.urdf --play arm.json   a trajectory of kineverse plan --save arm.json
+  kineverse view run.mcap                            a recording, with a slider for its time
+  kineverse view run.mcap --time 3.5 --picture run.png
+  kineverse view run.mcap --plot run.svg             speeds, coordinates and contacts over time"""
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -46,7 +56,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "model",
         metavar="MODEL",
         nargs="?",
-        help="name of a shipped model, or path of a file; without it, a list is printed",
+        help="name of a shipped model, path of a file, or a recording (.mcap); without it, a list is printed",
     )
     add_set_option(parser)
     parser.add_argument(
@@ -62,6 +72,14 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     )
     parser.add_argument("--degrees", action="store_true", help="show angles in degrees")
     parser.add_argument("--picture", metavar="PATH", help="write a picture (.png) instead of opening a page")
+    playback = parser.add_argument_group("recordings and trajectories")
+    playback.add_argument("--play", metavar="FILE", help="play a trajectory of kineverse plan --save")
+    playback.add_argument(
+        "--time", type=float, metavar="S", help="show this time [s] instead of playing (--picture: the end)"
+    )
+    playback.add_argument("--speed", type=float, default=1.0, metavar="X", help="play X times as fast (1)")
+    playback.add_argument("--loop", action="store_true", help="play again and again")
+    playback.add_argument("--plot", metavar="PATH", help="write plots of a recording (.png, .svg)")
     add_model_options(parser)
     add_page_options(parser)
 
@@ -99,13 +117,17 @@ def run(arguments: argparse.Namespace) -> int:
     from kineverse.view.viewer import Viewer
 
     label = read_title(arguments.model)
-    model = load_model(arguments, arguments.model)
+    recording = _read_recording(arguments)
+    model = load_model(arguments, arguments.model) if recording is None else recording.model
+    trajectory = _read_trajectory(arguments, model)
+    if arguments.plot is not None:
+        return _write_plot(arguments, recording)
     if assigned:
         print_notes(find_limit_notes(model, complete(model, assigned), arguments.assignments))
     for mesh in show_progress(meshes.list_visual_meshes(model), "reading meshes", "file"):
         meshes.load_mesh(mesh)  # cached for the drawing
     if arguments.picture is not None:
-        return _write_picture(arguments, model, assigned, near)
+        return _write_picture(arguments, model, assigned, near, recording or trajectory)
     options = page_options(arguments)
     with (
         handle_interrupts(),
@@ -121,20 +143,82 @@ def run(arguments: argparse.Namespace) -> int:
         if page.unplaced:
             names = ", ".join(page.unplaced)
             print(f"kineverse: note: not finite at this state, and hidden: {names}", file=sys.stderr)
+        speed = {"speed": arguments.speed, "loop": arguments.loop}
+        if recording is not None:
+            from kineverse.view.recording_playback import play_recording
+
+            play_recording(page, recording, time=arguments.time, **speed)
+        elif trajectory is not None:
+            page.play(trajectory, at=arguments.time, **speed)
         print_address(page, browser=not arguments.no_browser)
-        print(model, flush=True)
+        print(recording or model, flush=True)
         page.wait()
     return 0
 
 
+def _read_recording(arguments: argparse.Namespace) -> RunRecording | None:
+    """Return the recording that is to be shown; None for a model."""
+    if not arguments.model.lower().endswith(".mcap"):
+        return None
+    from kineverse.worlds import read_run_recording
+
+    for option in ("play", "assignments"):
+        if getattr(arguments, option):
+            name = "--set" if option == "assignments" else f"--{option}"
+            raise InvalidValueError(f"{name} is for a model; a recording has its own motion")
+    recording = read_run_recording(arguments.model, root=arguments.root)
+    if not recording.complete:
+        print(
+            f"kineverse: note: {arguments.model} was cut, and ends at {recording.duration:.4g} s",
+            file=sys.stderr,
+        )
+    return recording
+
+
+def _read_trajectory(arguments: argparse.Namespace, model: ModelView) -> Trajectory | None:
+    """Return the trajectory that is to be played, if there is one."""
+    if arguments.play is None:
+        return None
+    from kineverse.planning import Trajectory
+    from kineverse.view.poses import complete
+
+    trajectory = Trajectory.load(arguments.play)
+    complete(model, dict(trajectory.at(0.0)))  # raises for coordinates that the model does not have
+    return trajectory
+
+
+def _write_plot(arguments: argparse.Namespace, recording: RunRecording | None) -> int:
+    if recording is None:
+        raise InvalidValueError("--plot is for recordings (.mcap); a model does not change over time")
+    from kineverse.experiments.report import Figure
+    from kineverse.worlds.recording_plot import plot_recording
+
+    Figure(lambda canvas: plot_recording(recording, canvas), (11.0, 7.0)).save(Path(arguments.plot))
+    print(f"plot: {arguments.plot}")
+    return 0
+
+
 def _write_picture(
-    arguments: argparse.Namespace, model: kv.Model, state: dict[str, float], near: float | None
+    arguments: argparse.Namespace,
+    model: ModelView,
+    state: dict[str, float],
+    near: float | None,
+    motion: RunRecording | Trajectory | None,
 ) -> int:
     """Write a picture of the state, and print what it cannot show."""
     from kineverse.geometry.exclusions import find_unusable_shapes, label_unusable_shapes
     from kineverse.view import save_picture
+    from kineverse.view.recorded_scene import RecordedScene
+    from kineverse.worlds import RunRecording
 
     options = {"collisions": arguments.collisions, "near": near, "decomposed": arguments.decomposed}
+    if motion is not None:
+        time = motion.duration if arguments.time is None else arguments.time
+        if isinstance(motion, RunRecording):
+            scene = RecordedScene(motion)
+            state, options["overlay"] = scene.values_at(time), scene.drawables(time)
+        else:
+            state = state | {str(s): v for s, v in motion.at(time).items()}
     save_picture(arguments.picture, model, state, **options)
     print_mesh_problems(list_mesh_problems(model))
     left_out = label_unusable_shapes(model, find_unusable_shapes(model)) if near is not None else {}
@@ -160,7 +244,7 @@ def print_address(page: _Page, browser: bool) -> None:
         open_page(page.address)
 
 
-def list_mesh_problems(model: kv.Model) -> list[str]:
+def list_mesh_problems(model: ModelView) -> list[str]:
     """Return a line for each visual mesh that cannot be read."""
     from kineverse.view import meshes
 

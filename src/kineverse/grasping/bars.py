@@ -7,16 +7,17 @@ from __future__ import annotations
 
 import math
 from collections.abc import Collection, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
 from kineverse.geometry import Scene
+from kineverse.geometry.objects import CollisionObject
 from kineverse.geometry.rays import intersect_ray
 from kineverse.geometry.shapes import Solid, solid_from_geometry
 from kineverse.geometry.support import PlacedSolid, directional_gaps, find_widest_gap
 from kineverse.lie import Array, unit_vector
-from kineverse.model.body import Sphere
+from kineverse.model.body import Geometry, Mesh, Sphere
 
 MOST_THICK = 0.09
 """Largest thickness of a bar [m]: hardly a gripper opens further."""
@@ -37,14 +38,17 @@ class Part:
     ----------
     body, number
         Frame of the body, and index of the shape.
+    geometry
+        The shape of the model.
     solid, pose
-        The shape as collision scenes have it, and its pose (4, 4) in the world.
+        The shape as collision scenes have it, a mesh as its hull, and its pose (4, 4) in the world.
     axes, size, middle
         Box around it: axes (3, 3) in columns, the longest edge first, lengths (3,), middle (3,).
     """
 
     body: str
     number: int
+    geometry: Geometry
     solid: Solid
     pose: Array
     axes: Array
@@ -79,16 +83,17 @@ def find_parts(scene: Scene) -> list[Part]:
     for item in scene.collision_world.objects:
         solid = item.make_solid()
         pose = scene.pose(item.body) @ item.shape.origin.matrix
-        parts.append(_part(item.body, item.number, solid, pose))
+        parts.append(_make_part(item, solid, pose))
     return parts
 
 
-def _part(body: str, number: int, solid: Solid, pose: Array) -> Part:
+def _make_part(item: CollisionObject, solid: Solid, pose: Array) -> Part:
     boxes = [np.eye(3)]
     if solid.core is not None and solid.core.corners.size:  # the principal axes of a hull
         corners = solid.core.corners.T
         boxes.append(np.linalg.svd(corners - corners.mean(axis=0), full_matrices=False)[2].T)
-    local = Part(body, number, solid, np.eye(4), boxes[0], np.zeros(3), np.zeros(3))
+    geometry = item.shape.geometry
+    local = Part(item.body, item.number, geometry, solid, np.eye(4), boxes[0], np.zeros(3), np.zeros(3))
     spans = [(local.extent(axes.T), -local.extent(-axes.T)) for axes in boxes]
     volumes = [float(np.prod(high - low)) for high, low in spans]
     k = 1 if volumes[-1] < 0.99 * volumes[0] else 0
@@ -96,7 +101,8 @@ def _part(body: str, number: int, solid: Solid, pose: Array) -> Part:
     order = np.argsort(low - high, kind="stable")
     turned = pose[:3, :3] @ axes
     middle = turned @ ((high + low) / 2) + pose[:3, 3]
-    return Part(body, number, solid, pose, turned[:, order], (high - low)[order], middle)
+    axes, size = turned[:, order], (high - low)[order]
+    return replace(local, pose=pose, axes=axes, size=size, middle=middle)
 
 
 _POINT_RADIUS = 1e-7
@@ -117,12 +123,15 @@ class ProtrudingBar:
         (3, 3): z along the bar, x away from what the bar is fixed to.
     stands_out
         Length by which it stands out along x from what it is fixed to [m].
+    is_knob
+        True if it is short, or stands out along its length.
     """
 
     part: Part
     cluster: tuple[Part, ...]
     rotation: Array
     stands_out: float
+    is_knob: bool
 
 
 def find_bars(link: Sequence[Part], around: Sequence[Part]) -> list[ProtrudingBar]:
@@ -141,6 +150,8 @@ def find_bars(link: Sequence[Part], around: Sequence[Part]) -> list[ProtrudingBa
         rest = [part for part in link if id(part) not in inside]
         found = [bar for part in cluster if (bar := _bar(part, cluster, rest, around))]
         if found:
+            # The bar between its mounts, and not a mount, whichever stands out further.
+            found = [bar for bar in found if not bar.is_knob] or found
             furthest = max(bar.stands_out for bar in found)
             outer = [bar for bar in found if bar.stands_out > furthest - _STANDS_OUT]
             bars.append(max(outer, key=lambda bar: float(bar.part.size[0])))
@@ -163,29 +174,35 @@ def _clusters(parts: Sequence[Part]) -> list[tuple[Part, ...]]:
 def _bar(
     part: Part, cluster: tuple[Part, ...], rest: Sequence[Part], around: Sequence[Part]
 ) -> ProtrudingBar | None:
-    fixture = rest or _nearest(part, around)
-    if not fixture:
+    # A part that moves alone is fixed to something of another link, each of what it touches is tried.
+    fixtures = [rest] if rest else [[other] for other in _fixed_to(part, around)]
+    found = [_stand_out(part, fixture) for fixture in fixtures]
+    if not found:
         return None
-    is_long = part.size[0] > _LONG * part.size[1]
-    turns = np.linspace(0.0, 2 * np.pi, _STEPS, endpoint=False)
-    circle = np.outer(np.cos(turns), part.axes[:, 1]) + np.outer(np.sin(turns), part.axes[:, 2])
-    knob = np.concatenate([part.axes.T, -part.axes.T])
-    if is_long:
-        normals = np.concatenate([other.axes.T for other in fixture])
-        normals = normals - np.outer(normals @ part.axes[:, 0], part.axes[:, 0])
-        lengths = np.linalg.norm(normals, axis=1)
-        normals = normals[lengths > 0.5] / lengths[lengths > 0.5, None]
-        found = _most_outwards(part, fixture, np.concatenate([normals, -normals, circle]))
-    else:
-        found = _most_outwards(part, fixture, knob)
-    if is_long and found[0] < _STANDS_OUT and part.size[0] <= 2 * MOST_THICK:
-        found = _most_outwards(part, fixture, knob)  # a peg that stands out along its length
-    stands_out, x = found
+    stands_out, x, is_knob = max(found, key=lambda entry: entry[0])
     if stands_out < _STANDS_OUT:
         return None
     along = [axis - (axis @ x) * x for axis in part.axes.T if abs(axis @ x) < 0.5]
     z = unit_vector(along[0])
-    return ProtrudingBar(part, cluster, np.stack([x, np.cross(z, x), z], axis=1), stands_out)
+    return ProtrudingBar(part, cluster, np.stack([x, np.cross(z, x), z], axis=1), stands_out, is_knob)
+
+
+def _stand_out(part: Part, fixture: Sequence[Part]) -> tuple[float, Array, bool]:
+    """Return how far a part stands out from a fixture, in which direction (3,), and whether as a knob."""
+    is_knob = bool(part.size[0] <= _LONG * part.size[1])
+    turns = np.linspace(0.0, 2 * np.pi, _STEPS, endpoint=False)
+    circle = np.outer(np.cos(turns), part.axes[:, 1]) + np.outer(np.sin(turns), part.axes[:, 2])
+    knob = np.concatenate([part.axes.T, -part.axes.T])
+    stands_out, x = 0.0, part.axes[:, 0]
+    if not is_knob:
+        normals = np.concatenate([other.axes.T for other in fixture])
+        normals = normals - np.outer(normals @ part.axes[:, 0], part.axes[:, 0])
+        lengths = np.linalg.norm(normals, axis=1)
+        normals = normals[lengths > 0.5] / lengths[lengths > 0.5, None]
+        stands_out, x = _most_outwards(part, fixture, np.concatenate([normals, -normals, circle]))
+    if is_knob or (stands_out < _STANDS_OUT and part.size[0] <= 2 * MOST_THICK):
+        is_knob, (stands_out, x) = True, _most_outwards(part, fixture, knob)
+    return stands_out, x, is_knob
 
 
 def _most_outwards(part: Part, fixture: Sequence[Part], directions: Array) -> tuple[float, Array]:
@@ -198,10 +215,11 @@ def _most_outwards(part: Part, fixture: Sequence[Part], directions: Array) -> tu
     return float(beyond[best]), directions[best]
 
 
-def _nearest(part: Part, around: Sequence[Part]) -> list[Part]:
-    """Return the part of other links that a part without a fixture of its own is fixed to."""
-    near = sorted(around, key=lambda other: _gap_bound(part, other))[:8]
-    return sorted(near, key=lambda other: find_widest_gap(part.placed, other.placed, np.zeros((0, 3)))[0])[:1]
+def _fixed_to(part: Part, around: Sequence[Part]) -> list[Part]:
+    """Return the larger parts of other links that a part touches, or else the nearest one."""
+    larger = [other for other in around if other.size[1] >= part.size[1]]
+    near = sorted(larger, key=lambda other: _gap_bound(part, other))[:8]
+    return [other for other in near if part.touches(other)] or near[:1]
 
 
 def _gap_bound(a: Part, b: Part) -> float:
@@ -211,7 +229,13 @@ def _gap_bound(a: Part, b: Part) -> float:
 
 
 def free_length(
-    origin: Array, direction: Array, parts: Sequence[Part], but: Collection[Part], length: float = math.inf
+    origin: Array,
+    direction: Array,
+    parts: Sequence[Part],
+    *,
+    but: Collection[Part] = (),
+    length: float = math.inf,
+    hollow: bool = False,
 ) -> float:
     """Return the length of a ray to the first of some parts [m]; infinite if none is within a length.
 
@@ -223,6 +247,8 @@ def free_length(
         The parts, and those among them that are not looked at.
     length
         Length of the ray [m].
+    hollow
+        True to take meshes as they are, and not as their hulls, which fill cupboards.
     """
     nearest, skipped = math.inf, {id(part) for part in but}
     for part in parts:
@@ -234,7 +260,9 @@ def free_length(
         if float(to_middle @ to_middle) - along * along > radius * radius:
             continue
         rotation, position = part.pose[:3, :3], part.pose[:3, 3]
-        hit = intersect_ray(part.solid, rotation.T @ (origin - position), rotation.T @ direction)
+        is_mesh = hollow and isinstance(part.geometry, Mesh)
+        solid = solid_from_geometry(part.geometry, triangles=True) if is_mesh else part.solid
+        hit = intersect_ray(solid, rotation.T @ (origin - position), rotation.T @ direction)
         if hit is not None and hit[0] <= length:
             nearest = min(nearest, hit[0])
     return nearest

@@ -121,36 +121,34 @@ def _search(model: ModelView, coordinate: Symbol | str) -> tuple[tuple[Handle, .
     scene = Scene(model, leave_out=[f for f in model.bodies if path_to_root(model, f)[-1] not in tops])
     if not any(f in scene.bodies for f in moved):
         return (), f"It moves {_listed(moved)}, without shapes."
-    state, opening = _open_a_little(model, symbol)
+    state, opening, is_known = _open_a_little(model, symbol)
     scene.update(state)
     parts = find_parts(scene)
     poses = {name: scene.pose(name) for name in moved if name in scene.bodies}
     scene.update(opening)
     shifts = {name: scene.pose(name) for name in poses}
     links = {name: _link(model, name) for name in scene.bodies}
-    own = {links[name] for name in poses if motion.moving_ancestors(name)[-1] == links[name]}
+    own = [links[f] for f in poses if motion.moving_ancestors(f)[-1] == links[f]]
+    further = [links[f] for f in poses if links[f] not in own]  # such as the lever on a door
     still = [part for part in parts if part.body not in poses and not _moves(model, part.body)]
     rated = []
-    for link in sorted(own):
+    for link in dict.fromkeys((*own, *further)):
         body = [part for part in parts if links[part.body] == link]
-        others = [
-            part
-            for part in parts
-            if links[part.body] in own | _carriers(model, link) and links[part.body] != link
-        ]
-        around = [*still, *others]
+        carriers = {*own, *(_link(model, f) for f in path_to_root(model, link))} - {link}
+        around = [*still, *(part for part in parts if links[part.body] in carriers)]
         for bar in find_bars(body, around):
             before, after = poses[bar.part.body], shifts[bar.part.body]
             shift = (after @ lie.inverse(before) @ np.append(bar.part.middle, 1.0))[:3] - bar.part.middle
-            along = float(bar.rotation[:, 0] @ shift) / max(float(np.linalg.norm(shift)), 1e-6)
-            if along < -_WITHIN or not _is_free(bar, [*body, *around]):
+            way = float(np.linalg.norm(shift))
+            along = float(bar.rotation[:, 0] @ shift) / max(way, 1e-6) if is_known else 0.0
+            if along < -_WITHIN or not _is_free(bar, body, around):
                 continue
-            handle = _make_handle(model, symbol, bar, before, [*body, *around])
-            rated.append((along < _WITHIN, -round(float(np.linalg.norm(shift)), 4), handle.thickness, handle))
-    rated.sort(key=lambda row: row[:3])
+            handle = _make_handle(model, symbol, bar, before, body, around)
+            rated.append((link not in own, along < _WITHIN, -round(way, 4), handle.thickness, handle))
+    rated.sort(key=lambda row: row[:4])
     why = f"It moves {_listed([f for f in moved if f in scene.bodies])}: no slim shape of these stands out, "
     why += "with free space in front of it."
-    return tuple(row[3] for row in rated), why
+    return tuple(row[4] for row in rated), why
 
 
 def _link(model: ModelView, frame: str) -> str:
@@ -159,32 +157,47 @@ def _link(model: ModelView, frame: str) -> str:
     return next((f for f in path if model.speeds_of(f, model.frames[f].parent)), path[-1])
 
 
-def _carriers(model: ModelView, link: str) -> set[str]:
-    return {_link(model, f) for f in path_to_root(model, link)}
-
-
 def _moves(model: ModelView, frame: str) -> bool:
     return bool(model.speeds_of(frame))
 
 
-def _open_a_little(model: ModelView, symbol: Symbol) -> tuple[State, State]:
-    """Return the default state, and one in which a coordinate is on its way to the further limit."""
+def _open_a_little(model: ModelView, symbol: Symbol) -> tuple[State, State, bool]:
+    """Return the default state, one nearer to the further limit, and whether one limit is further."""
     state = model.default_state()
     start = state[symbol]
     low, high = model.limits(symbol)
     low, high = (start - 1.0 if math.isinf(low) else low), (start + 1.0 if math.isinf(high) else high)
     end = high if high - start >= start - low else low
-    return state, state.updated({symbol: start + _PART_OF_RANGE * (end - start)})
+    is_known = abs((high - start) - (start - low)) > 0.1 * (high - low)
+    return state, state.updated({symbol: start + _PART_OF_RANGE * (end - start)}), is_known
 
 
-def _is_free(bar: ProtrudingBar, parts: Sequence[Part]) -> bool:
+def _is_free(bar: ProtrudingBar, body: Sequence[Part], around: Sequence[Part]) -> bool:
     x = bar.rotation[:, 0]
     front = bar.part.middle + (float(bar.part.extent(x[None])[0]) - float(bar.part.middle @ x) + 1e-4) * x
-    return free_length(front, x, parts, bar.cluster, _FREE) > _FREE
+    return _free_length(front, x, bar, body, around, _FREE) > _FREE
+
+
+def _free_length(
+    origin: Array,
+    direction: Array,
+    bar: ProtrudingBar,
+    body: Sequence[Part],
+    around: Sequence[Part],
+    length: float = math.inf,
+) -> float:
+    """Return the length of a ray to the first part but the bar and its mounts [m]."""
+    own = free_length(origin, direction, body, but=bar.cluster, length=length)
+    return min(own, free_length(origin, direction, around, length=length, hollow=True))
 
 
 def _make_handle(
-    model: ModelView, symbol: Symbol, bar: ProtrudingBar, body: Array, parts: Sequence[Part]
+    model: ModelView,
+    symbol: Symbol,
+    bar: ProtrudingBar,
+    world_T_frame: Array,
+    body: Sequence[Part],
+    around: Sequence[Part],
 ) -> Handle:
     axes = bar.rotation.T
     high, low = bar.part.extent(axes), -bar.part.extent(-axes)
@@ -193,8 +206,8 @@ def _make_handle(
     x, z = axes[0], axes[2]
     places = np.linspace(-0.4, 0.4, _PLACES) * length
     back = [middle + place * z - (depth / 2 + 1e-5) * x for place in places]
-    clearance = float(np.median([free_length(origin, -x, parts, bar.cluster) for origin in back]))
-    pose = lie.round_exact(lie.inverse(body) @ lie.transform(bar.rotation, middle))
+    clearance = float(np.median([_free_length(origin, -x, bar, body, around) for origin in back]))
+    pose = lie.round_exact(lie.inverse(world_T_frame) @ lie.transform(bar.rotation, middle))
     frame = bar.part.body
     is_visual = not model.bodies[frame].collisions
     return Handle(frame, symbol, pose, length, thickness, depth, clearance, bar.part.number, is_visual)

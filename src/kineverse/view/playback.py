@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import Any
+from typing import Any, Protocol
 
 from kineverse._checks import check_flag, finite_number
 from kineverse.errors import InvalidValueError
@@ -17,6 +17,16 @@ _DIGITS = 3
 
 _SHORTEST = 1e-3
 """Shortest range of the slider [s], for a trajectory of no duration."""
+
+
+class PlaybackLayer(Protocol):
+    """Further things on the page that depend on the time of a playback."""
+
+    def show(self, time: float) -> None:
+        """Show a time of the trajectory [s]."""
+
+    def remove(self) -> None:
+        """Remove everything from the page."""
 
 
 class TrajectoryPlayback:
@@ -36,6 +46,8 @@ class TrajectoryPlayback:
         Called with a time of the trajectory [s] that a user chose.
     on_run
         Called with True or False when a user starts or stops the playback.
+    layer
+        Further things to show with the trajectory, see :meth:`draw`.
 
     Raises
     ------
@@ -52,6 +64,7 @@ class TrajectoryPlayback:
         loop: bool = False,
         on_seek: Callable[[float], None],
         on_run: Callable[[bool], None],
+        layer: PlaybackLayer | None = None,
     ) -> None:
         factor = finite_number(speed)
         if factor is None or factor <= 0:
@@ -60,6 +73,7 @@ class TrajectoryPlayback:
         self.trajectory = trajectory
         self._speed, self._loop = factor, loop
         self._time, self._begin = 0.0, 0.0
+        self._layer, self._layer_time = layer, -1.0
         longest = max(trajectory.duration, _SHORTEST)
         # Above everything else, where it is in view beside a robot with many sliders.
         self._folder = gui.add_folder("trajectory", order=-1.0)
@@ -119,6 +133,15 @@ class TrajectoryPlayback:
             time %= self.trajectory.duration
         return self.seek(time)
 
+    def draw(self) -> None:
+        """Show the layer at the present time, unless it is there."""
+        if self._layer is not None and self._layer_time != self._time:
+            self._layer_time = self._time
+            self._layer.show(self._time)
+
     def remove(self) -> None:
-        """Remove the controls from the page."""
+        """Remove the controls and the layer from the page."""
         self._folder.remove()
+        if self._layer is not None:
+            self._layer.remove()
+            self._layer = None

@@ -232,7 +232,9 @@ def create_marker_drawables(marks: ProximityMarkers, length: float) -> list[Draw
             surfaces.append(rod)
         found += [Drawable(WORLD, surface, rgba, "visual") for surface in surfaces]
     for ends in marks.arrows:
-        found += [Drawable(WORLD, surface, (*CONTACT, 1.0), "visual") for surface in _arrow(ends, length)]
+        found += [
+            Drawable(WORLD, surface, (*CONTACT, 1.0), "visual") for surface in build_arrow(ends, length)
+        ]
     return found
 
 
@@ -240,7 +242,8 @@ def _ends(pairs: Iterable[Sequence[Floats]]) -> Floats:
     return np.array([np.stack(list(ends)) for ends in pairs]).reshape(-1, 2, 3)
 
 
-def _arrow(ends: Floats, length: float) -> list[TriangleMesh]:
+def build_arrow(ends: Floats, length: float) -> list[TriangleMesh]:
+    """Return the surfaces of an arrow between two points (2, 3), as thick as one of a length [m]."""
     tip = mesh_geometry(Cone(length * HEAD, length * TIP))
     pose = _pose_along(ends)
     pose[:3, 3] = ends[0] + (1.0 - TIP / 2) * (ends[1] - ends[0])

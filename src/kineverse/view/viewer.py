@@ -7,6 +7,7 @@ import os
 import threading
 import time
 from collections.abc import Iterable, Mapping
+from typing import Any
 
 from kineverse.errors import InvalidValueError, KineverseError, UnknownNameError, suggest
 from kineverse.model.model import Model
@@ -20,7 +21,7 @@ from kineverse.view.drawables import Drawable
 from kineverse.view.drive import VelocityDrive
 from kineverse.view.hypertext import element
 from kineverse.view.panel import Panel
-from kineverse.view.playback import TrajectoryPlayback
+from kineverse.view.playback import PlaybackLayer, TrajectoryPlayback
 from kineverse.view.poses import complete, keep_known
 from kineverse.view.proximity_panel import ProximityPanel
 from kineverse.view.scene import ViewerScene
@@ -130,6 +131,11 @@ class Viewer:
         return str(self._server.address)
 
     @property
+    def server(self) -> Any:
+        """The viser server of the page."""
+        return self._server
+
+    @property
     def values(self) -> dict[str, float]:
         """The values of all symbols that the page shows or is about to show, by name."""
         with self._change:
@@ -201,7 +207,15 @@ class Viewer:
             self._request_update(self._values)
         self._panel.playing.value = False
 
-    def play(self, motion: bool | Trajectory = True, *, speed: float = 1.0, loop: bool = False) -> None:
+    def play(
+        self,
+        motion: bool | Trajectory = True,
+        *,
+        speed: float = 1.0,
+        loop: bool = False,
+        layer: PlaybackLayer | None = None,
+        at: float | None = None,
+    ) -> None:
         """Start or stop an animation.
 
         Parameters
@@ -213,6 +227,10 @@ class Viewer:
             Time of the trajectory per time of the clock.
         loop
             True to play the trajectory again and again; else it stops at its end.
+        layer
+            Further things to show with a trajectory.
+        at
+            Time of the trajectory to show, without playing [s]; None to play from the beginning.
 
         Raises
         ------
@@ -224,12 +242,18 @@ class Viewer:
         if isinstance(motion, Trajectory):
             complete(_freeze(self.model), dict(motion.at(0.0)))  # raises for unknown names
             playback = TrajectoryPlayback(
-                self._server.gui, motion, speed=speed, loop=loop, on_seek=self._seek, on_run=self._run
+                self._server.gui,
+                motion,
+                speed=speed,
+                loop=loop,
+                on_seek=self._seek,
+                on_run=self._run,
+                layer=layer,
             )
             if self._playback is not None:
                 self._playback.remove()
             self._playback = playback
-            self._run(True)
+            self._run(True) if at is None else self._seek(at)
             return
         with self._change:
             start = {**self._values, **self._quaternions.angles}
@@ -386,6 +410,7 @@ class Viewer:
                 asked, edited, self._edited = self._asked, self._edited, False
                 values, driven, self._driven = dict(self._values), self._driven, set()
             self._draw(values, driven, edited)
+            self._draw_layer()
             with self._change:
                 self._done = max(self._done, asked)
                 self._change.notify_all()
@@ -455,6 +480,16 @@ class Viewer:
             # The thread survives any error at one state, and reports it.
             logger.exception("the page could not be updated")
             self._panel.show(format_failure(f"{type(error).__name__}: {error}"))
+
+    def _draw_layer(self) -> None:
+        """Show what belongs to the trajectory that is played, at the time that was drawn."""
+        playback = self._playback
+        if playback is not None:
+            try:
+                playback.draw()
+            except Exception:
+                # The thread survives: the layer may be removed meanwhile.
+                logger.exception("the layer of the trajectory could not be updated")
 
 
 def _describe(thing: object) -> str:

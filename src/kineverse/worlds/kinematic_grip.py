@@ -1,0 +1,230 @@
+"""Grip of a robot's fingers in a world without forces.
+
+Closing fingers stop at a body of an object, unless it yields to the motion. The hold begins when bodies of
+both fingers touch the same object, or one touches and the other is near. From then on the fingers stay, and
+the object follows the hand: its coordinates minimise
+
+    |c_object - c_hand|² + (0.1 m)² |log(R_object R_handᵀ)|²,
+
+where c is the middle between the fingers and R the orientation, as they were relative to each other when the
+hold began.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+
+from kineverse.compile import compile  # noqa: A004
+from kineverse.errors import InvalidValueError
+from kineverse.grasping.gripper import Gripper
+from kineverse.lie import Array, inverse, log_so3
+from kineverse.symbols import Symbol
+
+from .object_motion import SKIN, Gaps, ObjectMotion
+
+TOUCH = 1e-4
+"""Gap below which bodies touch [m]."""
+
+ROTATION_ARM = 0.1
+"""Length that makes rotations comparable to distances [m]."""
+
+_ROUNDS = 6
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _Hold:
+    """Held body: its pose in the hand, and the middle between the fingers in the body."""
+
+    body: str
+    pose: Array
+    middle: Array
+
+
+class KinematicGrip:
+    """Fingers that close, hold and open.
+
+    Parameters
+    ----------
+    motion
+        Bodies at the present configuration.
+    gripper
+        The gripper, whose joints are the last columns of the motion.
+    near
+        Largest gap of the second finger when a hold begins [m].
+    slip
+        Largest distance [m] and angle [rad] of a held body from where it was in the hand.
+    report
+        Function that receives what happens.
+
+    Raises
+    ------
+    InvalidValueError
+        For joints that move by other speeds than their own.
+    """
+
+    def __init__(
+        self,
+        motion: ObjectMotion,
+        gripper: Gripper,
+        near: float,
+        slip: tuple[float, float],
+        report: Callable[[str], None],
+    ) -> None:
+        model = motion.scene.model
+        for s in gripper.joints:
+            if s in model.rates or s not in motion.symbols:
+                raise InvalidValueError(
+                    f"'{s}' of the gripper at '{gripper.hand}' is no free coordinate of the model, so no "
+                    "speed of its own moves it. Give a Gripper with the coordinates that open and close the "
+                    "fingers."
+                )
+        self.gripper, self._motion, self._near, self._slip = gripper, motion, near, slip
+        self._report = report
+        self._at = np.array([motion.symbols.index(s) for s in gripper.joints], dtype=np.intp)
+        self._closing = np.array([np.sign(gripper.closed[s] - gripper.opened[s]) for s in gripper.joints])
+        self._range = np.array([model.limits(s) for s in gripper.joints]).reshape(-1, 2)
+        self._hand_pose = compile(model.fk(gripper.hand))
+        place = {s: k for k, s in enumerate(motion.symbols)}
+        self._hand_inputs = np.array([place[s] for s in self._hand_pose.inputs], dtype=np.intp)
+        number = {b: k for k, b in enumerate(motion.scene.bodies)}
+        self._fingers = [
+            np.array([number[b] for b in names if b in number], dtype=np.intp) for names in gripper.fingers
+        ]
+        self.speeds: Array = np.zeros(len(self._at))
+        self._hold: _Hold | None = None
+        self._may_hold = True
+
+    @property
+    def joints(self) -> tuple[Symbol, ...]:
+        """Coordinates of the fingers."""
+        return self.gripper.joints
+
+    @property
+    def held(self) -> str | None:
+        """Frame of the held body."""
+        return None if self._hold is None else self._hold.body
+
+    def reset(self) -> None:
+        """Let go, and stop the fingers."""
+        self.speeds[:] = 0.0
+        self._may_hold = True
+        self._let_go()
+
+    def command(self, speeds: Array) -> None:
+        """Set the speeds of the fingers [m/s], [rad/s]; opening ones let go."""
+        self.speeds[:] = speeds
+        if (speeds * self._closing < 0.0).any():
+            self._may_hold = True
+            if self._hold is not None:
+                self._report(f"'{self._hold.body}' is released")
+                self._let_go()
+
+    def steps(self, h: float) -> Array:
+        """Return the motion of the fingers in a time h, within their limits (k,) [m], [rad]."""
+        if self._hold is not None:
+            return np.zeros(len(self._at))
+        q = self._motion.q[self._at]
+        low, high = np.minimum(self._range[:, 0], q), np.maximum(self._range[:, 1], q)
+        return np.clip(q + h * self.speeds, low, high) - q
+
+    def move(self, h: float, moved: float) -> None:
+        """Move fingers and objects in a time h [s], after the rest of the robot has moved.
+
+        Parameters
+        ----------
+        h
+            Time of the motion [s].
+        moved
+            Largest way of a shape of the robot without the fingers' own motion [m].
+        """
+        motion = self._motion
+        if self._hold is not None:
+            motion.resolve(h, moved, self._error)
+            self._check()
+            return
+        step, start = self.steps(h), motion.q.copy()
+        lever = np.sqrt(motion.weights[motion.count :])
+        reach = moved + float(np.abs(step) @ lever)
+        for _ in range(_ROUNDS):
+            target = start.copy()
+            target[self._at] += step
+            motion.place(target)
+            motion.resolve(h, reach)
+            back = self._excess(motion.measure_gaps(0.0), step)
+            if not back.any():
+                break
+            step = step - back
+        if self._may_hold and (self.speeds * self._closing > 0.0).any():
+            self._try_to_hold()
+
+    def _excess(self, gaps: Gaps, step: Array) -> Array:
+        """Return the part of the fingers' motion that objects do not yield to (k,)."""
+        back = np.zeros(len(step))
+        columns = gaps.rows[:, self._motion.count :]
+        for depth, row in zip(-gaps.distances, columns, strict=True):
+            # A finger goes back as far as the gap shrinks by its motion.
+            into = np.where(row * step < 0.0, np.abs(row), 0.0)
+            if depth > SKIN and into.any():
+                k = int(np.argmax(into * np.abs(step)))
+                back[k] = max(back[k], (depth + SKIN) / into[k])
+        return np.minimum(back, np.abs(step)) * np.sign(step)
+
+    def _try_to_hold(self) -> None:
+        """Begin the hold of an object that is between the fingers."""
+        motion = self._motion
+        pairs, index = motion.find_near(max(self._near, TOUCH))
+        touched: list[dict[int, tuple[float, int]]] = [{}, {}]
+        for k in index.tolist():
+            for one, other in (pairs.body_indices[k], pairs.body_indices[k][::-1]):
+                for finger, near in zip(self._fingers, touched, strict=True):
+                    if one in finger:
+                        near.setdefault(int(motion.group[other]), (float(pairs.distances[k]), int(other)))
+        common = touched[0].keys() & touched[1].keys()
+        best = min(common, key=lambda g: min(touched[0][g], touched[1][g]), default=None)
+        if best is None:
+            return
+        nearest = min(touched[0][best], touched[1][best])
+        if nearest[0] > TOUCH:
+            return
+        body = motion.scene.bodies[nearest[1]]
+        hand, world_T_body = self._hand(), motion.scene.pose(body)
+        middle = inverse(world_T_body) @ hand @ self.gripper.grasp_pose[:, 3]
+        self._hold = _Hold(body, inverse(hand) @ world_T_body, middle)
+        same = [b for k, b in enumerate(motion.scene.bodies) if motion.group[k] == best]
+        motion.ignore(self.gripper.bodies, same)
+        self._report(f"'{body}' is held")
+
+    def _error(self) -> tuple[Array, Array]:
+        """Return the error of the hold in axes of the world (6,) [m], and its Jacobian (6, n)."""
+        hold, scene = self._hold, self._motion.scene
+        assert hold is not None
+        hand, body = self._hand(), scene.pose(hold.body)
+        wanted = hand @ hold.pose
+        middle = (body @ hold.middle)[:3]
+        turn = log_so3(body[:3, :3] @ wanted[:3, :3].T)
+        twist = self._motion.twist(hold.body)
+        linear = twist[:3] + np.cross(twist[3:].T, middle).T
+        error = np.concatenate([middle - (wanted @ hold.middle)[:3], ROTATION_ARM * turn])
+        return error, np.concatenate([linear, ROTATION_ARM * twist[3:]])
+
+    def _check(self) -> None:
+        """Lose the held body if it is too far from its place in the hand."""
+        error, _ = self._error()
+        distance = float(np.linalg.norm(error[:3]))
+        angle = float(np.linalg.norm(error[3:])) / ROTATION_ARM
+        if distance > self._slip[0] or angle > self._slip[1]:
+            off = f"{1e3 * distance:.3g} mm and {angle:.3g} rad"
+            self._report(f"'{self.held}' is lost: it is {off} from its place in the hand")
+            self._may_hold = False
+            self._let_go()
+
+    def _let_go(self) -> None:
+        self._hold = None
+        self._motion.ignore()
+
+    def _hand(self) -> Array:
+        pose: Array = self._hand_pose(self._motion.q[self._hand_inputs])
+        return pose

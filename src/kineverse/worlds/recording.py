@@ -1,0 +1,371 @@
+"""Recordings of runs in a world: values over time, contacts, observations, phases and the outcome."""
+
+from __future__ import annotations
+
+import json
+import math
+import os
+from bisect import bisect_right
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any, NoReturn, TypeVar
+
+import numpy as np
+
+from kineverse.errors import ExpressionError, FormatError, KineverseError, UnknownNameError, suggest
+from kineverse.formats.document.reader import read_operations
+from kineverse.formats.root_folder import find_root
+from kineverse.lie import Array
+from kineverse.model.model import Model, Snapshot
+from kineverse.state import State
+from kineverse.symbols import Symbol, parse_symbol_name
+
+from .mcap_messages import McapFile, McapMessage
+from .recorder import TOPICS
+from .world import Contact, Observation
+
+MAX_VALUES = 1 << 26
+"""Most numbers of one table of values over time."""
+
+Entry = TypeVar("Entry")
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class ValuesOverTime:
+    """Values of symbols over time.
+
+    Attributes
+    ----------
+    times
+        (T,) increasing [s].
+    symbols
+        The n symbols, the columns.
+    values
+        (T, n) [m], [rad] and per second; NaN where a symbol had no value.
+    """
+
+    times: Array
+    symbols: tuple[Symbol, ...]
+    values: Array
+
+    def __len__(self) -> int:
+        return len(self.times)
+
+    def __getitem__(self, symbol: Symbol | str) -> Array:
+        """Return the values (T,) of a symbol, given itself or by name.
+
+        Raises
+        ------
+        UnknownNameError
+            If it has none, with similar names.
+        """
+        names = list(map(str, self.symbols))
+        if str(symbol) not in names:
+            raise UnknownNameError(
+                f"Nothing is recorded of '{symbol}'. {suggest(str(symbol), names, 'symbol')}"
+            )
+        return np.asarray(self.values[:, names.index(str(symbol))])
+
+    def at(self, time: float) -> State:
+        """Return the state at a time [s], linear between records; at the ends the first and the last one."""
+        if not len(self.times):
+            return State({}, stamp=float(time))
+        k = min(max(bisect_right(self.times, time) - 1, 0), len(self.times) - 1)
+        row = self.values[k]
+        if k + 1 < len(self.times) and time > self.times[k]:
+            share = (time - self.times[k]) / (self.times[k + 1] - self.times[k])
+            row = np.where(
+                np.isfinite(self.values[k + 1]), (1 - share) * row + share * self.values[k + 1], row
+            )
+        known = {s: v for s, v in zip(self.symbols, row.tolist(), strict=True) if math.isfinite(v)}
+        return State(known, stamp=float(time))
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Recorded:
+    """Things that were recorded at some times.
+
+    Attributes
+    ----------
+    times
+        (T,) not decreasing [s].
+    entries
+        The T things.
+    """
+
+    times: Array
+    entries: tuple[Any, ...]
+
+    def __len__(self) -> int:
+        return len(self.entries)
+
+    def last(self, time: float) -> Any:
+        """Return the last thing at or before a time [s]; None before the first."""
+        k = bisect_right(self.times, time + 1e-9) - 1
+        return self.entries[k] if k >= 0 else None
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class RunRecording:
+    """Run in a world.
+
+    Attributes
+    ----------
+    path
+        File that it was read from.
+    model
+        Model of the world.
+    states, beliefs, commands
+        True state, believed state, and commanded speeds over time.
+    belief_poses
+        World poses (4, 4) by frame that the believed values alone do not give.
+    contacts
+        At each time, a tuple of :class:`.Contact`.
+    observations
+        :class:`.Observation` at the times of their arrival.
+    phases
+        Names of phases, at the times at which they begin.
+    vectors
+        At each time, the vectors of the controller by name: pairs of origin (3,) and vector (3,).
+    outcome
+        Result of the skill; None if it was not recorded.
+    about
+        Texts about the run.
+    complete
+        False if the file was cut, as after the process that wrote it was killed.
+    """
+
+    path: Path
+    model: Snapshot
+    states: ValuesOverTime
+    beliefs: ValuesOverTime
+    commands: ValuesOverTime
+    belief_poses: Recorded
+    contacts: Recorded
+    observations: Recorded
+    phases: Recorded
+    vectors: Recorded
+    outcome: Mapping[str, Any] | None
+    about: Mapping[str, str] = field(default_factory=dict)
+    complete: bool = True
+
+    @property
+    def times(self) -> Array:
+        """Times (T,) of the true states [s]."""
+        return self.states.times
+
+    @property
+    def duration(self) -> float:
+        """Time of the last true state [s]."""
+        return float(self.times[-1]) if len(self.times) else 0.0
+
+    def __repr__(self) -> str:
+        cut = "" if self.complete else ", cut"
+        return f"<recording {self.path.name}: {self.duration:.4g} s, {len(self.times)} states{cut}>"
+
+
+def read_run_recording(
+    path: str | os.PathLike[str], *, root: str | os.PathLike[str] | None = None
+) -> RunRecording:
+    """Return the run in a file. Runs no code; a file that was cut is read up to there.
+
+    Parameters
+    ----------
+    path
+        Path of an MCAP file that :class:`.Recorder` wrote.
+    root
+        Folder below which the model may open meshes, as for :func:`kineverse.load`.
+
+    Raises
+    ------
+    FormatError
+        For a file that cannot be read, is damaged, or is no recording of a world.
+    MissingDependencyError
+        If the extra ``recording`` is not installed.
+    """
+    path = Path(path)
+    file = McapFile(path)
+    by_topic: dict[str, list[McapMessage]] = {topic: [] for topic in TOPICS}
+    for message in file.messages:
+        known = TOPICS.get(message.topic)
+        if known is not None and message.schema == f"kineverse.{known[0]}" and message.encoding == "json":
+            by_topic[message.topic].append(message)
+    if not by_topic["/model"]:
+        topics = sorted({message.topic for message in file.messages})
+        found = f"its topics are {', '.join(topics[:12])}" if topics else "it has no messages"
+        raise FormatError(
+            f"{path.name}: no recording of a world, which has a /model of the schema kineverse.Model; {found}"
+            f"{'' if file.complete else '; the file was cut'}."
+        )
+    model = _read_model(by_topic["/model"][0].data, path, root)
+    decoder = _Decoder(path.name, model)
+    beliefs = decoder.decode(by_topic["/belief"], decoder.belief)
+    outcomes = by_topic["/outcome"]
+    return RunRecording(
+        path,
+        model,
+        _tabulate(decoder.decode(by_topic["/state"], decoder.named_values("values")), path.name),
+        _tabulate([(time, values) for time, (values, _) in beliefs], path.name),
+        _tabulate(decoder.decode(by_topic["/command"], decoder.named_values("speeds")), path.name),
+        _as_recorded([(time, poses) for time, (_, poses) in beliefs]),
+        _as_recorded(decoder.decode(by_topic["/contacts"], decoder.contacts)),
+        _as_recorded(decoder.decode(by_topic["/observation"], decoder.observation)),
+        _as_recorded(decoder.decode(by_topic["/phase"], lambda content: decoder.text(content, "phase"))),
+        _as_recorded(decoder.decode(by_topic["/controller"], decoder.vectors)),
+        decoder.parse(outcomes[-1]) if outcomes else None,
+        file.metadata.get("run", {}),
+        file.complete,
+    )
+
+
+def _read_model(data: bytes, path: Path, root: str | os.PathLike[str] | None) -> Snapshot:
+    model = Model()
+    operations = read_operations(data, f"{path.name}, /model", root=find_root(path.parent, root))
+    try:
+        with model.edit() as edit:
+            for tag, operation in operations:
+                edit.apply(operation, tag)
+    except KineverseError as error:
+        raise FormatError(f"{path.name}: the model cannot be built: {error}") from error
+    return model.snapshot()
+
+
+def _tabulate(rows: Sequence[tuple[float, dict[Symbol, float]]], source: str) -> ValuesOverTime:
+    """Return rows as a table; of several at one time, the last."""
+    latest = dict(sorted(rows, key=lambda row: row[0]))
+    symbols = tuple(dict.fromkeys(symbol for row in latest.values() for symbol in row))
+    if len(latest) * len(symbols) > MAX_VALUES:
+        raise FormatError(
+            f"{source}: values of {len(symbols)} symbols at {len(latest)} times, more than the "
+            f"{MAX_VALUES} numbers that are read."
+        )
+    values = np.array([[row.get(s, math.nan) for s in symbols] for row in latest.values()])
+    return ValuesOverTime(
+        np.array(list(latest), dtype=float), symbols, values.reshape(len(latest), len(symbols))
+    )
+
+
+def _as_recorded(rows: Sequence[tuple[float, Any]]) -> Recorded:
+    ordered = sorted(rows, key=lambda row: row[0])
+    return Recorded(np.array([time for time, _ in ordered], dtype=float), tuple(one for _, one in ordered))
+
+
+class _Decoder:
+    """Decoder of the messages of one file, which checks all types, shapes and numbers."""
+
+    def __init__(self, source: str, model: Snapshot) -> None:
+        self._source, self._place = source, ""
+        self._symbols: dict[str, Symbol] = {str(s): s for s in (*model.speeds, *model.default_state())}
+
+    def decode(
+        self, messages: Sequence[McapMessage], read: Callable[[dict[str, Any]], Entry]
+    ) -> list[tuple[float, Entry]]:
+        """Return what is read of each message, with its log time [s]."""
+        return [(message.time, read(self.parse(message))) for message in messages]
+
+    def parse(self, message: McapMessage) -> dict[str, Any]:
+        self._place = f"{message.topic} at {message.time:.3f} s"
+        try:
+            content = json.loads(message.data, parse_constant=self._no_constant)
+        except (ValueError, RecursionError) as error:
+            if isinstance(error, FormatError):
+                raise
+            self._refuse(f"not JSON: {str(error)[:200]}")
+        if not isinstance(content, dict):
+            self._refuse("not an object")
+        return content
+
+    def _no_constant(self, text: str) -> NoReturn:
+        self._refuse(f"{text} is no number")
+
+    def _refuse(self, reason: str) -> NoReturn:
+        raise FormatError(f"{self._source}: {self._place}: {reason}.")
+
+    def _member(self, content: dict[str, Any], key: str, kind: type[Entry]) -> Entry:
+        value = content.get(key)
+        if not isinstance(value, kind):
+            noun = "an object" if issubclass(kind, dict) else "a list" if issubclass(kind, list) else "a text"
+            self._refuse(f"'{key}' is {noun}, not {value!r:.60}")
+        return value
+
+    def _number(self, value: object, key: str) -> float:
+        if isinstance(value, bool) or not isinstance(value, int | float):
+            self._refuse(f"'{key}' has {value!r:.60}, which is no number")
+        try:
+            number = float(value)
+        except OverflowError:
+            number = math.inf
+        if not math.isfinite(number):
+            self._refuse(f"'{key}' has a number that is not finite")
+        return number
+
+    def _array(self, value: object, key: str, shape: tuple[int, ...]) -> Array:
+        if not isinstance(value, list) or len(value) != shape[0]:
+            self._refuse(f"'{key}' has an array of another shape than {shape}")
+        if len(shape) > 1:
+            return np.array([self._array(row, key, shape[1:]) for row in value])
+        return np.array([self._number(number, key) for number in value])
+
+    def _symbol(self, name: str) -> Symbol:
+        """Return the symbol of a name; a belief may have others than the model."""
+        if name not in self._symbols:
+            try:
+                self._symbols[name] = Symbol(*parse_symbol_name(name))
+            except ExpressionError as error:
+                self._refuse(f"{name!r:.80} is no name of a symbol: {error}")
+        return self._symbols[name]
+
+    def named_values(self, key: str) -> Callable[[dict[str, Any]], dict[Symbol, float]]:
+        def read(content: dict[str, Any]) -> dict[Symbol, float]:
+            members = self._member(content, key, dict)
+            return {self._symbol(name): self._number(value, key) for name, value in members.items()}
+
+        return read
+
+    def belief(self, content: dict[str, Any]) -> tuple[dict[Symbol, float], dict[str, Array]]:
+        return self.named_values("values")(content), self.poses(content, "poses")
+
+    def text(self, content: dict[str, Any], key: str) -> str:
+        return self._member(content, key, str)
+
+    def poses(self, content: dict[str, Any], key: str) -> dict[str, Array]:
+        members = self._member(content, key, dict)
+        return {name: self._array(rows, key, (4, 4)) for name, rows in members.items()}
+
+    def contacts(self, content: dict[str, Any]) -> tuple[Contact, ...]:
+        found = []
+        for one in self._member(content, "contacts", list):
+            if not isinstance(one, dict):
+                self._refuse(f"{one!r:.60} is no contact")
+            force = one.get("force")
+            found.append(
+                Contact(
+                    self.text(one, "a"),
+                    self.text(one, "b"),
+                    self._array(one.get("point"), "point", (3,)),
+                    self._array(one.get("normal"), "normal", (3,)),
+                    self._number(one.get("distance"), "distance"),
+                    math.nan if force is None else self._number(force, "force"),
+                )
+            )
+        return tuple(found)
+
+    def observation(self, content: dict[str, Any]) -> Observation:
+        touching = self._member(content, "touching", list)
+        if not all(isinstance(name, str) for name in touching):
+            self._refuse("'touching' is a list of names")
+        return Observation(
+            self._number(content.get("stamp"), "stamp"),
+            self.named_values("joints")(content),
+            self.poses(content, "poses"),
+            frozenset(touching),
+        )
+
+    def vectors(self, content: dict[str, Any]) -> dict[str, tuple[Array, Array]]:
+        found = {}
+        for name, one in self._member(content, "vectors", dict).items():
+            if not isinstance(one, dict):
+                self._refuse(f"{one!r:.60} is no vector")
+            found[name] = tuple(self._array(one.get(key), key, (3,)) for key in ("origin", "vector"))
+        return found  # type: ignore[return-value]

@@ -1,0 +1,108 @@
+"""Plot of a recorded run: coordinates, speeds and contacts over time, with its phases as bands."""
+
+from __future__ import annotations
+
+import os
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from kineverse.lie import Array
+
+from .recording import RunRecording, ValuesOverTime, read_run_recording
+from .sensor_sampler import is_of_robot
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+    from matplotlib.figure import Figure as Canvas
+
+_BANDS = ("#e8eef7", "#ffffff", "#f7efe2", "#ffffff")
+_MOST = 10
+"""Most lines of one plot; those that change most are shown."""
+
+_STILL = 1e-6
+
+
+def plot_recording(recording: RunRecording | str | os.PathLike[str], figure: Canvas) -> None:
+    """Draw a recorded run on an empty figure.
+
+    The plots are: coordinates of the objects in truth, and dashed as they are believed; commanded speeds;
+    contacts between bodies. Bands are the phases. Without a robot's name in ``about``, a coordinate counts as
+    the robot's if a speed was commanded below the same prefix.
+
+    Parameters
+    ----------
+    recording
+        The run, or the path of its file.
+    figure
+        An empty matplotlib figure.
+    """
+    if not isinstance(recording, RunRecording):
+        recording = read_run_recording(recording)
+    above, middle, below = figure.subplots(3, 1, sharex=True, height_ratios=(3, 3, 2))
+    robots = _robots(recording)
+    objects = [
+        str(s)
+        for s in recording.states.symbols
+        if s.role == "dof" and not s.order and not any(is_of_robot(s.path, robot) for robot in robots)
+    ]
+    _draw_values(above, recording.states, objects, recording.beliefs)
+    above.set_ylabel("object [rad], [m]")
+    _draw_values(middle, recording.commands, list(map(str, recording.commands.symbols)))
+    middle.set_ylabel("speed [rad/s], [m/s]")
+    _draw_contacts(below, recording)
+    for axes in (above, middle, below):
+        _draw_phases(axes, recording, labels=axes is above)
+    below.set_xlabel("time [s]")
+    below.set_xlim(0.0, max(recording.duration, 1e-3))
+
+
+def _robots(recording: RunRecording) -> list[str]:
+    robot = recording.about.get("robot")
+    return [robot] if robot else sorted({s.path.partition("/")[0] for s in recording.commands.symbols})
+
+
+def _draw_values(
+    axes: Axes, values: ValuesOverTime, names: list[str], beliefs: ValuesOverTime | None = None
+) -> None:
+    """Draw those values that change, the ones that change most first."""
+    spans = {name: float(np.ptp(line[np.isfinite(line)])) for name in names if (line := values[name]).size}
+    moving = [name for name in spans if spans[name] > _STILL]
+    shown = sorted(moving, key=lambda name: -spans[name])[:_MOST]
+    believed = set(map(str, beliefs.symbols)) if beliefs is not None else set()
+    for name in shown:
+        (line,) = axes.plot(values.times, values[name], linewidth=1.2, label=name)
+        if beliefs is not None and name in believed:
+            axes.plot(beliefs.times, beliefs[name], "--", linewidth=0.8, color=line.get_color())
+    if shown:
+        axes.legend(fontsize="x-small", loc="center left", bbox_to_anchor=(1.0, 0.5), frameon=False)
+    if len(moving) > _MOST:
+        note = f"{_MOST} of {len(moving)}"
+        axes.text(1.0, 1.0, note, transform=axes.transAxes, fontsize="x-small", ha="right", va="bottom")
+
+
+def _draw_contacts(axes: Axes, recording: RunRecording) -> None:
+    """Draw a line for each pair of bodies, where they touch."""
+    pairs: dict[str, list[float]] = {}
+    for time, contacts in zip(recording.contacts.times, recording.contacts.entries, strict=True):
+        for label in {f"{one.a} – {one.b}" for one in contacts}:
+            pairs.setdefault(label, []).append(float(time))
+    lines = sorted(pairs, key=lambda label: -len(pairs[label]))[:_MOST]
+    for k, label in enumerate(lines):
+        axes.plot(pairs[label], np.full(len(pairs[label]), float(k)), "|", markersize=8)
+    axes.set_yticks(range(len(lines)), lines, fontsize="x-small")
+    axes.set_ylim(max(len(lines), 1) - 0.5, -0.5)
+    if not lines:
+        axes.text(0.5, 0.5, "no contacts", transform=axes.transAxes, ha="center", va="center")
+
+
+def _draw_phases(axes: Axes, recording: RunRecording, labels: bool) -> None:
+    times: Array = np.append(recording.phases.times, recording.duration)
+    phase: Any
+    for k, phase in enumerate(recording.phases.entries):
+        axes.axvspan(times[k], times[k + 1], color=_BANDS[k % len(_BANDS)], zorder=0, linewidth=0)
+        if labels and phase:
+            place = axes.get_xaxis_transform()
+            axes.text(
+                times[k], 1.01, f" {phase}", transform=place, fontsize="x-small", va="bottom", rotation=30
+            )

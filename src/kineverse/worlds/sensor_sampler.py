@@ -1,0 +1,268 @@
+"""Simulated sensor readings of a robot in a world: encoders, odometry, camera, touch."""
+
+from __future__ import annotations
+
+import math
+from collections import deque
+from collections.abc import Iterable, Iterator, Sequence
+from dataclasses import replace
+
+import numpy as np
+
+from kineverse._checks import finite_number
+from kineverse.compile import compile as compile_expressions
+from kineverse.errors import InvalidValueError, UnknownNameError, suggest
+from kineverse.lie import Array, inverse, quaternion, retract, rotation_z, transform
+from kineverse.model.body import is_empty_body
+from kineverse.model.frame import WORLD
+from kineverse.model.frame_dependence import FrameDependence
+from kineverse.model.model_view import ModelView
+from kineverse.state import State
+from kineverse.symbols import Symbol
+
+from .line_of_sight import LineOfSight
+from .sensors import Sensors
+from .world import Contact, Observation
+
+
+class SensorSampler:
+    """Source of a world's observations, at the times at which it is asked.
+
+    Everything is read when the world asks. A delay makes the readings arrive later, with the stamp of their
+    capture. The camera takes a picture if its period has passed since the one before, so at most one each
+    time. A robot knows by its own readings alone where its camera is. Hence a pose in the world is
+    world_T_camera as read, times camera_T_marker as seen: drift of the odometry moves all of them.
+
+    Parameters
+    ----------
+    sensors
+        Settings.
+    model
+        Model of the world.
+    robot
+        Prefix of the robot; empty for a model of a robot alone.
+    seed
+        Seed of the noise. Equal seeds and calls give equal readings.
+
+    Attributes
+    ----------
+    camera
+        Frame of the camera, from which distances are measured. Without any that is named like a head or a
+        camera, it is the robot's first frame.
+    marked
+        Frames with markers.
+
+    Raises
+    ------
+    UnknownNameError
+        For a prefix, camera or marked frame that the model does not have.
+    InvalidValueError
+        If a field of view or a line of sight is asked for, but the robot has no camera.
+    """
+
+    def __init__(self, sensors: Sensors, model: ModelView, robot: str, seed: int = 0) -> None:
+        self.sensors, self._seed = sensors, seed
+        own = [name for name in model.frames if is_of_robot(name, robot)]
+        if not own:
+            prefixes = {name.partition("/")[0] for name in model.frames}
+            raise UnknownNameError(f"No frame begins with '{robot}/'. {suggest(robot, prefixes, 'prefix')}")
+        self.marked = find_marked_frames(model, robot) if sensors.marked is None else sensors.marked
+        found = sensors.camera or find_camera(own)
+        if found is None and (sensors.field_of_view is not None or sensors.sight):
+            raise InvalidValueError(
+                f"What is visible depends on a camera, and no frame of '{robot}' is named like one. "
+                f"Name it by camera=. {suggest('head', own, 'frame')}"
+            )
+        self.camera = found or own[0]
+        for name in (self.camera, *self.marked):
+            if name not in model.frames:
+                raise UnknownNameError(f"There is no frame '{name}'. {suggest(name, model.frames, 'frame')}")
+        self._robot = robot
+        self._joints = tuple(s for s in model.symbols if is_of_robot(s.path, robot) and not s.order)
+        self._base, self._planar = _find_base(model, robot)
+        self._encoded = tuple(s for s in self._joints if s not in set(self._base))
+        self._poses = compile_expressions([model.fk(name) for name in (self.camera, *self.marked)])
+        self._camera_pose = compile_expressions(model.fk(self.camera))
+        self._sight = LineOfSight(model, self.camera, own, self.marked) if sensors.sight else None
+        self.reset()
+
+    def reset(self) -> None:
+        """Begin anew, with the noise of the same seed and nothing on its way."""
+        streams = np.random.SeedSequence(self._seed).spawn(3)
+        self._encoder_noise, self._odometry_noise, self._camera_noise = map(np.random.default_rng, streams)
+        self._coming: deque[Observation] = deque()
+        self._last: Observation | None = None
+        self._time, self._picture = -math.inf, -1
+        self._true_base = self._read_base = np.empty(0)
+
+    def observe(self, time: float, state: State, contacts: Iterable[Contact] = ()) -> Observation:
+        """Read the sensors, and return the newest readings that have arrived.
+
+        Poses are those of one picture that has arrived since the last call; of several, the last. Before any
+        delayed reading has arrived, the first ones are returned, as if the robot had stood still before.
+
+        Parameters
+        ----------
+        time
+            Time of the world [s], not before that of the last call.
+        state
+            True state.
+        contacts
+            Contacts of the world, for the touch sensors.
+
+        Raises
+        ------
+        InvalidValueError
+            For a time before the last one.
+        """
+        if (now := finite_number(time)) is None or now < self._time:
+            raise InvalidValueError(
+                f"Sensors were read at {self._time:.6g} s, and now at {time!r} s; reset() begins anew."
+            )
+        if now > self._time:
+            self._coming.append(self._capture(now, state, contacts))
+            self._time = now
+        if self._last is None:
+            self._last = self._coming.popleft()
+            return self._last
+        arrived = sum(1 for one in self._coming if one.stamp + self.sensors.delay <= now + 1e-9)
+        if not arrived:
+            self._last = replace(self._last, poses={})
+            return self._last
+        # Several arrive at once after a long step: a picture is not lost for later encoders.
+        chosen = next((k for k in reversed(range(arrived)) if self._coming[k].poses), arrived - 1)
+        for _ in range(chosen + 1):
+            self._last = self._coming.popleft()
+        return self._last
+
+    def _capture(self, now: float, state: State, contacts: Iterable[Contact]) -> Observation:
+        sensors = self.sensors
+        values = state.vector(self._encoded)
+        values = values + sensors.encoders * self._encoder_noise.standard_normal(len(values))
+        joints = dict(zip(self._encoded, values.tolist(), strict=True))
+        joints.update(zip(self._base, self._read_odometry(state.vector(self._base)).tolist(), strict=True))
+        picture = math.floor(now * sensors.rate + 1e-6)
+        poses = {}
+        if picture > self._picture:
+            self._picture = picture
+            poses = self._take_picture(state, joints)
+        touching = self._touched(contacts) if sensors.touch else ()
+        return Observation(now, joints, poses, frozenset(touching))
+
+    def _read_odometry(self, base: Array) -> Array:
+        """Return the readings of the base's coordinates, which drift with the way."""
+        if self._last is None and not self._coming:
+            self._true_base, self._read_base = base, base.copy()
+            return base
+        step = base - self._true_base
+        noise = self._odometry_noise.standard_normal(len(base))
+        if self._planar:
+            # In the base's own axes: a wrong heading leads the position astray.
+            step[:2] = rotation_z(-self._true_base[2])[:2, :2] @ step[:2]
+            way = math.sqrt(np.linalg.norm(step[:2]) + abs(step[2]))
+            step += way * noise * (self.sensors.odometry, self.sensors.odometry, self.sensors.turn)
+            step[:2] = rotation_z(self._read_base[2])[:2, :2] @ step[:2]
+        else:
+            step += self.sensors.odometry * noise * np.sqrt(np.abs(step))
+        exact = self.sensors.odometry == self.sensors.turn == 0.0
+        self._true_base = base
+        self._read_base = base.copy() if exact else self._read_base + step
+        return self._read_base
+
+    def _take_picture(self, state: State, joints: dict[Symbol, float]) -> dict[str, Array]:
+        """Return the poses of the markers that are seen."""
+        sensors, count = self.sensors, len(self.marked)
+        # As many numbers for each picture, whatever is visible: runs with other visibility can be compared.
+        normal = self._camera_noise.standard_normal((count, 10))
+        uniform = self._camera_noise.random((count, 5))
+        world_T_camera, *true = self._poses(state.vector(self._poses.inputs))
+        if not true:
+            return {}
+        world_T_markers = np.array(true)
+        apart = world_T_markers[:, :3, 3] - world_T_camera[:3, 3]
+        distances = np.linalg.norm(apart, axis=1)
+        deviations = np.full((count, 6), sensors.orientation)
+        deviations[:, :3] = sensors.position_noise(distances)[:, None]
+        observed = retract(world_T_markers, deviations * normal[:, :6])
+        strays = uniform[:, 1] < sensors.outliers
+        cube = world_T_markers[strays, :3, 3] + sensors.reach * (uniform[strays, 2:] - 0.5)
+        observed[strays] = transform(quaternion(normal[strays, 6:]), cube)
+        read_T_camera = self._camera_pose(
+            np.array([joints[s] if s in joints else state[s] for s in self._camera_pose.inputs])
+        )
+        observed = read_T_camera @ inverse(world_T_camera) @ observed
+        seen = uniform[:, 0] >= sensors.drop
+        if sensors.field_of_view is not None:
+            # The z axis of optical frames looks forward (REP 103).
+            forward = world_T_camera[:3, 2 if "optical" in self.camera else 0]
+            seen &= apart @ forward >= math.cos(0.5 * sensors.field_of_view) * distances
+        if self._sight is not None:
+            self._sight.update(state)
+            for k in np.flatnonzero(seen):
+                seen[k] = self._sight.sees(self.marked[k], world_T_camera[:3, 3])
+        return {self.marked[k]: observed[k] for k in np.flatnonzero(seen).tolist()}
+
+    def _touched(self, contacts: Iterable[Contact]) -> Iterator[str]:
+        """Yield the robot's bodies whose touch sensors report."""
+        sensors = self.sensors
+        for contact in contacts:
+            known = not math.isnan(contact.force)
+            if contact.force >= sensors.touch_force if known else contact.distance <= sensors.touch_gap:
+                yield from (name for name in (contact.a, contact.b) if is_of_robot(name, self._robot))
+
+
+def is_of_robot(name: str, robot: str) -> bool:
+    """Return whether a frame, or the path of a coordinate, is below the prefix of a robot."""
+    return not robot or name == robot or name.startswith(f"{robot}/")
+
+
+def find_marked_frames(model: ModelView, robot: str) -> tuple[str, ...]:
+    """Return the bodies of articulated objects, and the bodies that carry them, in the order of the model.
+
+    Bodies of the robot, and those that nothing moves and that carry nothing, are not among them.
+    """
+    objects = [s for s in model.degrees_of_freedom if not is_of_robot(s.path, robot)]
+    motion = FrameDependence(model, objects)
+    bodies = {name for name, body in model.bodies.items() if not is_empty_body(body)}
+    found = {name for name in bodies if motion.moves(name)}
+    for name, frame in model.frames.items():
+        if motion.moves_between(name, carrier := frame.parent):
+            while carrier != WORLD and carrier not in bodies:
+                carrier = model.frames[carrier].parent
+            found.add(carrier)
+    return tuple(name for name in model.frames if name in found and not is_of_robot(name, robot))
+
+
+_CAMERA_WORDS = (("head", "tilt"), ("camera",), ("head",))
+"""Words in the names of frames with a camera, the likeliest first."""
+
+
+def find_camera(frames: Sequence[str]) -> str | None:
+    """Return the frame that is named like a head that tilts, a camera or a head; None without any."""
+    for words in _CAMERA_WORDS:
+        for name in frames:
+            last = name.rpartition("/")[2].lower()
+            if all(word in last for word in words) and "optical" not in last:
+                return name
+    return None
+
+
+def _find_base(model: ModelView, robot: str) -> tuple[tuple[Symbol, ...], bool]:
+    """Return the coordinates that place the robot in the world, and whether they are x, y and a heading."""
+    for record in model.articulations.values():
+        outside = record.parent == WORLD or not is_of_robot(record.parent, robot)
+        if record.coordinates and outside and is_of_robot(record.child, robot):
+            return record.coordinates, _is_planar(model, record.parent, record.child, record.coordinates)
+    return (), False
+
+
+def _is_planar(model: ModelView, parent: str, child: str, coordinates: tuple[Symbol, ...]) -> bool:
+    """Return whether a pose is translation(x, y, 0) · rotation_z(θ) of three coordinates, after an offset."""
+    pose = model.fk(child, relative_to=parent)
+    if len(coordinates) != 3 or not set(pose.symbols) <= set(coordinates):
+        return False
+    x, y, angle = values = np.array([0.3, -0.7, 1.1])
+    function = compile_expressions([pose], coordinates, tier="interpreter")
+    (offset,), (placed,) = function(np.zeros(3)), function(values)
+    wanted = transform(rotation_z(angle), np.array([x, y, 0.0]))
+    return bool(np.allclose(placed, offset @ wanted, atol=1e-9))
