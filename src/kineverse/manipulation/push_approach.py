@@ -16,11 +16,10 @@ _STANDOFF = 0.03
 _TILT = math.radians(60.0)
 """Largest angle between the pusher's axis and the direction of the push."""
 _CONFIGURATIONS = 48
-_MARGIN = 3e-3
 
 
 def plan_push_approach(
-    pushing: Pushing, state: State, *, points: int = 6, seconds: float = 2.0, seed: int = 0
+    pushing: Pushing, state: State, *, points: int = 4, seconds: float = 0.5, seed: int = 0
 ) -> tuple[Path, int]:
     """Return a path of the robot to a contact point, and the index of the point.
 
@@ -43,19 +42,19 @@ def plan_push_approach(
     model, tool = pushing.model, pushing.tool
     moving = [s.position for s in pushing.speeds if s.position != pushing.coordinate]
     free = [s for s in moving if s in model.degrees_of_freedom and s not in model.rates]
-    planner = Planner(model, free, rules=pushing.scene.rules, margin=_MARGIN)
+    planner = Planner(model, free, rules=pushing.scene.rules, leave_out=pushing.leave_out)
     planner.place(state)
     world_T_hand = model.fk(tool.frame)
     tip = world_T_hand[:3, :3] @ tool.tip + world_T_hand[:3, 3]
     axis = world_T_hand[:3, :3] @ tool.axis
     at = pushing.surface.at(state)
-    path, chosen = None, -1
+    path: Path | None = None
+    chosen, goal = -1, None
     for chosen in pushing.rank(state)[:points]:
         point, normal = at.points[chosen], at.normals[chosen]
         goal = Goal(tip, point + _STANDOFF * normal, name="tip")
         found = planner.solutions(goal, _CONFIGURATIONS, seconds=seconds, seed=seed)
         if not len(found):
-            path = planner.plan(None, [goal], seconds=seconds, seed=seed)  # says why
             continue
         states = [state.updated(dict(zip(planner.symbols, q, strict=True))) for q in found.tolist()]
         facing = np.array([-normal @ axis(at_goal) for at_goal in states])
@@ -63,5 +62,6 @@ def plan_push_approach(
         path = planner.plan(None, good if len(good) else found, seconds=seconds, seed=seed)
         if path.found:
             break
-    assert path is not None
+    if path is None:
+        path = planner.plan(None, [goal] if goal else [], seconds=seconds, seed=seed)  # says why
     return path, chosen

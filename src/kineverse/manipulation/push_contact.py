@@ -18,6 +18,7 @@ from kineverse.compile import compile  # noqa: A004
 from kineverse.errors import InvalidValueError
 from kineverse.expressions.expression import array
 from kineverse.geometry import Scene
+from kineverse.geometry.objects import Exclusion
 from kineverse.geometry.shapes import Solid
 from kineverse.geometry.support import smoothed_support
 from kineverse.lie import Array
@@ -111,9 +112,9 @@ class PushSurface:
         model: ModelView,
         coordinate: Symbol,
         bodies: Sequence[str],
-        ignored: Iterable[str],
+        ignored: Iterable[Exclusion],
         state: State,
-        values: Sequence[float],
+        values: Sequence[float] | Array,
     ) -> None:
         self.bodies = tuple(bodies)
         self._coordinate = coordinate
@@ -257,7 +258,9 @@ class PushTool:
     bodies: tuple[str, ...]
 
 
-def find_push_tool(model: ModelView, bodies: Sequence[str], state: State) -> PushTool:
+def find_push_tool(
+    model: ModelView, bodies: Sequence[str], state: State, leave_out: Iterable[Exclusion] = ()
+) -> PushTool:
     """Return the foremost point of a group of bodies, away from what carries the group.
 
     Parameters
@@ -268,11 +271,13 @@ def find_push_tool(model: ModelView, bodies: Sequence[str], state: State) -> Pus
         Bodies that may touch what is pushed, such as those of a gripper.
     state
         A state of the whole model.
+    leave_out
+        Excluded bodies.
     """
     chains = [_ancestors(model, body) for body in bodies]
     common = [frame for frame in chains[0] if all(frame in chain for chain in chains)]
     frame = common[0]
-    scene = Scene(model)
+    scene = Scene(model, leave_out=leave_out)
     scene.update(state)
     world = scene.collision_world
     world.prepare()

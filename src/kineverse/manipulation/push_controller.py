@@ -32,7 +32,7 @@ from kineverse.errors import InvalidValueError, KineverseError, UnknownNameError
 from kineverse.expressions.expression import Expression, array, as_expression
 from kineverse.expressions.functions import sqrt
 from kineverse.geometry import Rule, Scene
-from kineverse.geometry.objects import matches_pattern
+from kineverse.geometry.objects import Exclusion, matches_pattern
 from kineverse.geometry.results import DistanceResults
 from kineverse.lie import Array
 from kineverse.logic import less
@@ -68,6 +68,8 @@ _RETREAT = 0.1
 _LOW = 0.03
 """Height of the tip above a contact point from which on the pusher may touch [m]."""
 _HOLD_WEIGHT = 10.0
+_SPIN_WEIGHT = 0.01
+"""Weight against turns of the pusher about its axis, which change nothing but the nearest points."""
 _DISTANCE_COST, _GIVEN_UP_COST = 0.5, 0.6
 """Cost of a contact point by its distance from the tip [1/m], and by the times that it was given up."""
 _SURROUNDINGS = 0.1
@@ -76,6 +78,7 @@ _JAMMED = 4e-4
 """Depth at which the object counts as not giving way [m]."""
 _RAMP = 0.02
 """Speed of the contact point beyond the measured one that is tried [m/s]."""
+_SAMPLES = 24
 _DEEPEST = 2e-4
 _BLOCKED_STEPS = 60
 _BLOCKED_WAY = 0.004
@@ -133,8 +136,8 @@ class Pushing:
         Time of a step [s].
     still
         Further coordinates that stay still.
-    rules
-        Rules of the collision filter.
+    rules, leave_out
+        Rules of the collision filter, and excluded bodies, as for :class:`.Scene`.
     logic
         ``"and"`` for the trend rule of :mod:`kineverse.logic`; for comparison ``"product"`` for the product
         rule, and None for no trends.
@@ -143,6 +146,9 @@ class Pushing:
     ----------
     controller
         The controller.
+    overlapping
+        Rules that except pairs of the robot's own bodies whose shapes overlap at the given state or at every
+        one of some random states: hulls of links around a joint.
     coordinate
         The coordinate.
     touching
@@ -179,6 +185,7 @@ class Pushing:
         dt: float = 0.02,
         still: Iterable[Symbol | str] = (),
         rules: Iterable[Rule] = (),
+        leave_out: Iterable[Exclusion] = (),
         logic: str | None = "and",
     ) -> None:
         if logic not in ("and", "product", None):
@@ -190,7 +197,8 @@ class Pushing:
             raise InvalidValueError(
                 f"'{coordinate}' is between {lower:g} and {upper:g}, so it cannot be pushed to {target:g}."
             )
-        plain = Scene(model)
+        self.rules, self.leave_out = tuple(rules), tuple(leave_out)
+        plain = Scene(model, rules=self.rules, leave_out=self.leave_out)
         self.pusher = _match(plain.bodies, bodies, "bodies=")
         self.robot = self.pusher[0].split("/")[0] if robot is None else robot
         own = tuple(b for b in plain.bodies if b.startswith(f"{self.robot}/"))
@@ -202,11 +210,20 @@ class Pushing:
         if object_frames is not None:
             pushed = _match(pushed, object_frames, "object_frames=")
         at = model.default_state().updated(dict(state))
-        self.tool = find_push_tool(model, self.pusher, at)
+        self.tool = find_push_tool(model, self.pusher, at, self.leave_out)
         self.surface = PushSurface(
-            model, coordinate, pushed, own, at, (at[coordinate], (at[coordinate] + target) / 2, target)
+            model,
+            coordinate,
+            pushed,
+            (*own, *self.leave_out),
+            at,
+            (at[coordinate], (at[coordinate] + target) / 2, target),
         )
-        self.scene = Scene(model, rules=(*_furniture_rules(plain.bodies, own), *rules))
+        furniture = _furniture_rules(plain.bodies, own)
+        self.overlapping = _find_overlapping(plain, own, at)
+        self.scene = Scene(
+            model, rules=(*furniture, *self.overlapping, *self.rules), leave_out=self.leave_out
+        )
         self._logic = logic
         self._build(dt, tuple(still))
         self._slots = slots = self.controller.contact_slots
@@ -215,6 +232,7 @@ class Pushing:
         self._is_pushed = np.array([b in self.object_bodies for b in index])
         self._body_names = tuple(index)
         self._hand = self.scene.bodies.index(self._hand_body())
+        self._all = self.scene.watch(f"{self.robot}/*", "*", radius=0.0, moving=self.speeds)
         slots.set_margin(self.pusher, self.object_bodies, _APART)
         self._pressing = False
         self.reset()
@@ -262,12 +280,15 @@ class Pushing:
         aligned = less(aside, _NEAR)
         v = as_expression(speed)
         ḋ = sum((relative[0, k] * s for k, s in enumerate(speeds)), as_expression(0.0))
+        twist = model.jacobian(self.tool.frame, form="world", symbols=speeds)
+        turn = twist[3:] @ array(speeds)
         most = engaged * less(gap, LOST) * less(-_JAMMED, gap) * 1e3
         far = 1e3 * (1 - engaged)
         tasks: list[Task] = [
             Goal(q, self.target, name="object", gain=4.0, speed=numbers("pace", 1)[0]),
             Goal(tip, target, name="reach", gain=3.0, speed=_REACH_SPEED, weight=w_reach),
             Goal(axis, facing, name="facing", gain=2.0, speed=1.0, weight=0.05),
+            Goal(axis @ turn, 0.0, name="no spin", weight=_SPIN_WEIGHT),
             Goal(slips, 0.0, name="no slip", gain=5.0, weight=w_hold),
             Goal(d, -_PRESS, name="press", gain=10.0, weight=w_hold),
             Keep(-most, v, most, name="still unless touched"),
@@ -291,7 +312,7 @@ class Pushing:
         self._values = np.array([s.value or 0.0 for s in self.controller.inputs])
         self._coordinates = tuple(s for s in self.controller.inputs if s.value is None)
         self._places = {
-            name: np.array([place[s] for s in symbols], dtype=np.intp)
+            name: np.array([place[s] for s in symbols if s in place], dtype=np.intp)
             for name, symbols in self._parameters.items()
         }
         self._tip_function = compile([tip])
@@ -330,7 +351,7 @@ class Pushing:
     def first_contact(self, state: State) -> str:
         """Return which body of the robot penetrates something at a state; empty if none does."""
         self.scene.update(state)
-        found = self._slots.scene.watch(f"{self.robot}/*", "*", radius=0.0)(0.0)
+        found = self._all()
         deep = [pair for pair in found if pair.distance < -_DEEPEST]
         return f"contact of {deep[0].a} and {deep[0].b}" if deep else ""
 
@@ -380,7 +401,9 @@ class Pushing:
         return np.array(self._tip.outputs[0])
 
     def _set(self, name: str, values: float | Array) -> None:
-        self._values[self._places[name]] = values
+        places = self._places[name]
+        if len(places):  # without trends some serve nothing
+            self._values[places] = values
 
     def _nearest(self, found: DistanceResults) -> _Contact | None:
         """Return the near pair of pusher and object that pushes best; see :data:`_Contact`."""
@@ -574,6 +597,24 @@ def _match(known: Iterable[str], names: str | Iterable[str], argument: str) -> t
     if not patterns:
         raise InvalidValueError(f"{argument} lists no body, so nothing may touch the object.")
     return tuple(b for b in known if matches_pattern(b, patterns))
+
+
+def _find_overlapping(scene: Scene, own: tuple[str, ...], state: State) -> tuple[Rule, ...]:
+    """Return rules for pairs of the robot that overlap at a state, or at all of some random ones."""
+    model = scene.model
+    watch = scene.watch(own, own, radius=0.0)
+    bounds = [
+        (s, *model.limits(s)) for b in own for s in model.fk(b).symbols if s in model.degrees_of_freedom
+    ]
+    free = {s: (a, b) for s, a, b in bounds if math.isfinite(a) and math.isfinite(b)}
+    generator = np.random.default_rng(0)
+    found: list[set[tuple[str, str]]] = []
+    for k in range(_SAMPLES):
+        values = {s: float(generator.uniform(a, b)) for s, (a, b) in free.items()}
+        scene.update(state.updated(values) if k else state)
+        found.append({(pair.a, pair.b) for pair in watch()})
+    pairs = found[0] | set.intersection(*found[1:])
+    return tuple(Rule(a, b, False, "overlapping") for a, b in sorted(pairs))
 
 
 def _furniture_rules(bodies: Iterable[str], robot: Iterable[str]) -> tuple[Rule, ...]:

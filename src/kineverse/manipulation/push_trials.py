@@ -8,6 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from kineverse.geometry import Rule, Scene
+from kineverse.geometry.objects import Exclusion
 from kineverse.grasping import find_gripper
 from kineverse.state import State
 from kineverse.symbols import Symbol
@@ -91,6 +92,7 @@ def try_push(
     samples: int = 200,
     seed: int = 0,
     rules: Iterable[Rule] = (),
+    leave_out: Iterable[Exclusion] = (),
     logic: str | None = "and",
 ) -> PushTrial:
     """Push in a world from a state; if that fails, from a start that base placement finds.
@@ -101,7 +103,7 @@ def try_push(
         The world; it is reset.
     state
         Start of the first attempt.
-    what, bodies, target, tolerance, rules, logic
+    what, bodies, target, tolerance, rules, leave_out, logic
         As for :func:`.push`.
     steps
         Largest number of control steps of an attempt.
@@ -116,13 +118,22 @@ def try_push(
     coordinate = model.symbol(what) if isinstance(what, str) else what
     bodies = find_gripper(model, world.robot).bodies if bodies is None else bodies
     pushing = Pushing(
-        model, coordinate, bodies, state, target=target, robot=world.robot, dt=dt, rules=rules, logic=logic
+        model,
+        coordinate,
+        bodies,
+        state,
+        target=target,
+        robot=world.robot,
+        dt=dt,
+        rules=rules,
+        leave_out=leave_out,
+        logic=logic,
     )
     pushing.wait()
 
     def attempt(start: State) -> tuple[Outcome, _Judge, Session]:
         world.reset(start)
-        judge = _Judge(pushing, rules)
+        judge = _Judge(pushing)
         session = Session(world, dt=dt, on_step=judge.look)
         outcome = push(
             session, coordinate, seconds=steps * dt, tolerance=tolerance, pushing=pushing, plan=not place
@@ -159,12 +170,12 @@ def try_push(
 class _Judge:
     """Judge of a push in a world's truth: penetration and limits."""
 
-    def __init__(self, pushing: Pushing, rules: Iterable[Rule]) -> None:
+    def __init__(self, pushing: Pushing) -> None:
         model, robot = pushing.model, f"{pushing.robot}/*"
         self._pushing = pushing
-        self._scene = Scene(model, rules=rules)
+        self._scene = Scene(model, rules=(*pushing.overlapping, *pushing.rules), leave_out=pushing.leave_out)
         allowed = [Rule(a, b, False, "pushed") for a in pushing.pusher for b in pushing.object_bodies]
-        self._others = self._scene.watch(robot, "*", radius=0.0, rules=allowed)
+        self._others = self._scene.watch(robot, "*", radius=0.0, moving=pushing.speeds, rules=allowed)
         self._pair = self._scene.watch(pushing.pusher, pushing.object_bodies, radius=0.0)
         self._limits = [(s, *model.limits(s)) for s in model.degrees_of_freedom]
         self.deepest: tuple[float, str] = (0.0, "")

@@ -10,6 +10,7 @@ import numpy as np
 
 from kineverse.errors import KineverseError
 from kineverse.geometry import Rule
+from kineverse.geometry.objects import Exclusion
 from kineverse.grasping import find_gripper
 from kineverse.planning import Path
 from kineverse.symbols import Symbol
@@ -42,6 +43,7 @@ def push(
     tolerance: float = 0.02,
     still: Iterable[Symbol | str] = (),
     rules: Iterable[Rule] = (),
+    leave_out: Iterable[Exclusion] = (),
     logic: str | None = "and",
     plan: bool = True,
     retreat: bool = False,
@@ -69,7 +71,7 @@ def push(
         Largest time in the world [s].
     tolerance
         Largest distance from the target [m], [rad].
-    still, rules, logic
+    still, rules, leave_out, logic
         As for :class:`.Pushing`.
     plan
         Whether approaches are planned where the way of the controller is blocked.
@@ -107,6 +109,7 @@ def push(
             dt=session.dt,
             still=still,
             rules=rules,
+            leave_out=leave_out,
             logic=logic,
         )
         pushing.wait()
