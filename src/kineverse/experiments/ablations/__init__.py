@@ -87,7 +87,7 @@ def make_ablation_report(
     return Report(
         "ablations",
         "With and without augmented gradients, and each rule of trends",
-        tuple(tables),
+        tuple(table for table in tables if table.rows),
         numbers,
         Figure(lambda canvas: draw_boxes(canvas, boxes), FIGURE_SIZE),
     )

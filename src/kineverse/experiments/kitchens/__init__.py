@@ -10,7 +10,7 @@ import math
 from dataclasses import dataclass
 
 from kineverse.experiments.manipulation.robots import RobotSource, find_robots
-from kineverse.experiments.manipulation.skills import open_then_close
+from kineverse.experiments.manipulation.skills import make_world, open_then_close
 from kineverse.experiments.manipulation.tables import (
     make_failure_table,
     make_quality_table,
@@ -70,15 +70,16 @@ def report_trials(trials: list[Trial], seeds: range) -> Report:
     title = (
         f"{len(seeds)} generated kitchens, seeds {seeds[0]} to {seeds[-1]}, opened and closed ({WORLD} world)"
     )
+    tables = (
+        make_success_table(trials, "Objects that were opened and closed"),
+        make_time_table(trials),
+        make_quality_table(trials),
+        make_failure_table(trials),
+    )
     return Report(
         name="kitchens",
         title=title,
-        tables=(
-            make_success_table(trials, "Objects that were opened and closed"),
-            make_time_table(trials),
-            make_quality_table(trials),
-            make_failure_table(trials),
-        ),
+        tables=tuple(table for table in tables if table.rows),
         numbers={"seeds": [seeds[0], seeds[-1]], "world": WORLD, **make_trial_numbers(trials)},
         figure=make_success_figure(trials, "height", "height of the handle [m]"),
     )
@@ -89,12 +90,13 @@ def run_kitchen(job: KitchenJob) -> list[Trial]:
     model = make_kitchen_with(job.robot, job.seed)
     start = job.robot.start_state(model)
     heights = {q: find_handle_height(model, q) for q in list_objects(model, KITCHEN)}
+    world = make_world(WORLD, model, job.robot.prefix, start)
     trials = []
     for what in job.objects or heights:
         lower, upper = model.limits(what)
         targets = (lower + OPEN_SHARE * (upper - lower), lower)
         trials += open_then_close(
-            str(job.seed), job.robot, model, what, start, targets, height=heights.get(what, math.nan)
+            str(job.seed), job.robot.name, world, what, start, targets, height=heights.get(what, math.nan)
         )
     return trials
 

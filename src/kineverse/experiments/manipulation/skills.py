@@ -64,8 +64,10 @@ def run_push_trial(
 
     Parameters
     ----------
-    case, robot, model, what, start, measures
+    case, what, start, measures
         As for :func:`open_then_close`.
+    robot, model
+        The robot, and the model that contains it.
     skill
         Name of the push in tables.
     dt, steps
@@ -108,21 +110,21 @@ def run_push_trial(
 
 def open_then_close(
     case: str,
-    robot: RobotSource,
-    model: Model,
+    robot: str,
+    world: World,
     what: str,
     start: StateLike,
     targets: tuple[float, float],
     **measures: Any,
 ) -> list[Trial]:
-    """Return the trials of opening an object in the kinematic world and, if that was done, of closing it.
+    """Return the trials of opening an object in a world and, if that was done, of closing it.
 
     Parameters
     ----------
     case
         Name of the case.
-    robot, model, what
-        The robot, the model that contains it, and the coordinate of the object.
+    robot, world, what
+        Name of the robot, its world, and the coordinate of the object.
     start
         State at the beginning.
     targets
@@ -130,11 +132,11 @@ def open_then_close(
     measures
         Further figures of the trials.
     """
-    world = make_world("kinematic", model, robot.prefix, start)
+    world.reset(start)
     trials: list[Trial] = []
     for skill, target in zip(("open", "close"), targets, strict=True):
         act = partial(open_in_world, world, what, target)
-        trials.append(run_trial(case, robot.name, what, skill, act, **measures))
+        trials.append(run_trial(case, robot, what, skill, act, **measures))
         if not trials[-1].done:
             break
     return trials

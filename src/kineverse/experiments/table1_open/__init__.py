@@ -13,20 +13,21 @@ import numpy as np
 
 from kineverse.errors import NoSolutionError
 from kineverse.experiments.manipulation.robots import RobotSource, find_robots
-from kineverse.experiments.manipulation.skills import open_then_close
+from kineverse.experiments.manipulation.skills import make_world, open_then_close
 from kineverse.experiments.manipulation.trial_pool import run_jobs
 from kineverse.experiments.manipulation.trials import Failure, Trial
 from kineverse.experiments.registry import Options, Progress
 from kineverse.experiments.report import Report
 
 from .objects import OBJECTS, OpeningSetup, make_opening_setup
-from .programs import DONE, DT, LOST, LeaderFollower, OneProgram, ProgramRun, run_program
-from .report import make_report
+from .programs import DONE, DT, LOST, LeaderFollower, OneProgram, ProgramRun, open_by_program
+from .report import make_opening_report
 
 OPTIONS = ("quick", "data", "seed", "count", "robot", "processes")
 
 STARTS, QUICK_STARTS = 10, 1
 """Number of starts of each robot at each object."""
+WORLD = "kinematic"
 _COMPILED = 30.0
 """Longest wait for compiled code [s]; times are those of compiled programs."""
 
@@ -47,7 +48,7 @@ def run(progress: Progress, options: Options) -> Report:
     robots = find_robots(options.robot, options.data)
     jobs = [OpeningJob(robot, thing, starts, options.seed) for robot in robots for thing in OBJECTS]
     trials = run_jobs(run_openings, jobs, progress, "table1-open", "object", options.processes)
-    return make_report(trials, starts, options.seed)
+    return make_opening_report(trials, starts, options.seed)
 
 
 def run_openings(job: OpeningJob) -> list[Trial]:
@@ -55,13 +56,12 @@ def run_openings(job: OpeningJob) -> list[Trial]:
     setup = make_opening_setup(job.robot, OBJECTS[job.thing])
     start = setup.robot.start_state(setup.model)
     lower, upper = setup.model.limits(setup.what)
-    acted = open_then_close(
-        setup.thing.name, setup.robot, setup.model, str(setup.what), start, (DONE * upper, lower)
-    )
-    return [*run_programs(setup, job), *acted]
+    world = make_world(WORLD, setup.model, job.robot.prefix, start)
+    acted = open_then_close(job.thing, job.robot.name, world, str(setup.what), start, (DONE * upper, lower))
+    return [*open_by_programs(setup, job), *acted]
 
 
-def run_programs(setup: OpeningSetup, job: OpeningJob) -> list[Trial]:
+def open_by_programs(setup: OpeningSetup, job: OpeningJob) -> list[Trial]:
     """Return the trials of the programs alone."""
     programs = (LeaderFollower(setup), OneProgram(setup))
     for program in programs:
@@ -75,7 +75,7 @@ def run_programs(setup: OpeningSetup, job: OpeningJob) -> list[Trial]:
             trials += [_trial(setup, one.name, ProgramRun(), "reach", str(error)) for one in programs]
             continue
         for program in programs:
-            found = run_program(program, setup, start)
+            found = open_by_program(program, setup, start)
             lost = found.position_error > LOST
             reason = "the handle is lost" if lost else "open" if found.done else "not open in time"
             trials.append(_trial(setup, program.name, found, "other" if lost else "time", reason))

@@ -144,7 +144,7 @@ class OneProgram:
         return self._model.integrate(state, command.speeds, DT), command.times.solve, 1
 
 
-def run_program(program: LeaderFollower | OneProgram, setup: OpeningSetup, state: State) -> ProgramRun:
+def open_by_program(program: LeaderFollower | OneProgram, setup: OpeningSetup, state: State) -> ProgramRun:
     """Open an object from a state by a program."""
     run = ProgramRun()
     for controller in program.controllers:

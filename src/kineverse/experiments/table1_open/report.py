@@ -30,7 +30,7 @@ PROGRAMS = (LeaderFollower.name, OneProgram.name)
 FIGURE_SIZE = (9.0, 4.0)
 
 
-def make_report(trials: Sequence[Trial], starts: int, seed: int) -> Report:
+def make_opening_report(trials: Sequence[Trial], starts: int, seed: int) -> Report:
     """Return the report on the trials of programs and of the skill."""
     alone = [t for t in trials if t.skill in PROGRAMS]
     skill = [t for t in trials if t.skill not in PROGRAMS]

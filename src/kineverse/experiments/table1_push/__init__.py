@@ -17,7 +17,7 @@ from kineverse.experiments.registry import Options, Progress
 from kineverse.experiments.report import Report
 
 from .objects import PushSetup, find_kitchens, make_push_setup
-from .report import make_report
+from .report import make_push_report
 
 OPTIONS = ("quick", "data", "seed", "robot", "processes")
 
@@ -66,7 +66,7 @@ def run(progress: Progress, options: Options) -> Report:
         if not options.quick or (thing in QUICK_OBJECTS and paper == "2022")
     ]
     trials = run_jobs(run_push, jobs, progress, "table1-push", "push", options.processes)
-    return make_report(trials, options.seed)
+    return make_push_report(trials, options.seed)
 
 
 def run_push(job: PushJob) -> list[Trial]:

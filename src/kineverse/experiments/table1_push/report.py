@@ -25,7 +25,7 @@ PENETRATION, LIMITS, LOSSES = 0.5, 1e-6, 1
 """Bars: deepest penetration [mm], largest violation of limits, and contact losses of one run."""
 
 
-def make_report(trials: Sequence[Trial], seed: int) -> Report:
+def make_push_report(trials: Sequence[Trial], seed: int) -> Report:
     """Return the report on pushes."""
     times = [_time_row(*group) for group in _groups(trials)]
     numbers = {
