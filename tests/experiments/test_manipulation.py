@@ -20,6 +20,7 @@ from kineverse.experiments.manipulation.trials import Trial, find_failure, summa
 from kineverse.experiments.table1_open.objects import OBJECTS, make_opening_setup
 from kineverse.experiments.table1_open.programs import LeaderFollower, SpeedScale, open_by_program
 from kineverse.experiments.table1_push.objects import find_kitchens, make_push_setup
+from kineverse.geometry import Rule, Scene
 from kineverse.manipulation.outcome import Outcome
 
 
@@ -216,3 +217,18 @@ def test_opening_report_without_skill_has_the_papers_figures():
     assert first["solve_sd_ms"] == pytest.approx(np.std([0.1, 0.3]))
     json.dumps(report.numbers, allow_nan=False)
     assert "3.3 / 2.2" in format_report(report)
+
+
+def test_start_in_aisle_is_free_where_the_middle_is_not():
+    """The elbow of the PR2 at its start is wider than the narrowest aisles."""
+    robot, model = SHIPPED["pr2"], kitchens.make_kitchen_with(SHIPPED["pr2"], 305)
+    start = kitchens.start_in_aisle(robot, model)
+    scene = Scene(model, rules=[Rule("*", "kitchen/floor")])
+
+    def near(state):
+        scene.update(state)
+        return [d for d in scene.pairs_within(0.015) if d.a.startswith("pr2") != d.b.startswith("pr2")]
+
+    middle = {"pr2/base/y": 0.0, "pr2/base/angle": math.pi / 2}
+    assert near(start.updated(middle))
+    assert not near(start)

@@ -1,14 +1,16 @@
 """``kitchens``: robots open and close everything in generated kitchens, in the kinematic world.
 
-Each kitchen is generated from a seed; see :mod:`kineverse.gallery.kitchens`. A robot begins in the middle of
-the aisle for each object, with all shut. It opens the object, and closes it again if that succeeded.
+Each kitchen is generated from a seed; see :mod:`kineverse.gallery.kitchens`. For each object, a robot begins
+in the aisle, and all is shut. It opens the object, and closes it again if that succeeded.
 """
 
 from __future__ import annotations
 
 import math
 from dataclasses import dataclass
+from itertools import product
 
+from kineverse.errors import NoSolutionError
 from kineverse.experiments.manipulation.robots import RobotSource, find_robots
 from kineverse.experiments.manipulation.skills import make_world, open_then_close
 from kineverse.experiments.manipulation.tables import (
@@ -23,13 +25,19 @@ from kineverse.experiments.manipulation.trial_pool import run_jobs
 from kineverse.experiments.manipulation.trials import Trial
 from kineverse.experiments.registry import Options, Progress
 from kineverse.experiments.report import Report
+from kineverse.geometry import Rule, Scene
 from kineverse.model.model import Model
+from kineverse.state import State
 
 OPTIONS = ("quick", "data", "seed", "count", "robot", "processes")
 
 COUNT, QUICK_COUNT = 50, 1
 WORLD = "kinematic"
 KITCHEN = "kitchen"
+_CLEARANCE = 0.02
+"""Least distance of the robot from the kitchen at the start [m]."""
+_OFFSETS = tuple(sign * k / 2 for k in range(11) for sign in ((1, -1) if k else (1,)))
+"""Places along the aisle that are tried for the start [m]."""
 OPEN_SHARE = 0.98
 """Share of the range at which an object is wanted open; the limit itself is no target with room to err."""
 
@@ -88,7 +96,7 @@ def report_trials(trials: list[Trial], seeds: range) -> Report:
 def run_kitchen(job: KitchenJob) -> list[Trial]:
     """Return the trials of one kitchen and one robot."""
     model = make_kitchen_with(job.robot, job.seed)
-    start = job.robot.start_state(model)
+    start = start_in_aisle(job.robot, model)
     heights = {q: find_handle_height(model, q) for q in list_objects(model, KITCHEN)}
     world = make_world(WORLD, model, job.robot.prefix, start)
     trials = []
@@ -107,6 +115,28 @@ def make_kitchen_with(robot: RobotSource, seed: int) -> Model:
     with model.edit() as edit:
         edit.include(f"kitchens/{seed}", KITCHEN)
     return model
+
+
+def start_in_aisle(robot: RobotSource, model: Model) -> State:
+    """Return a state with the robot in the aisle, as near to its middle as it stands free.
+
+    It looks along the aisle, where its arms fit. Where the aisle is too narrow, it stands before its end.
+
+    Raises
+    ------
+    NoSolutionError
+        If there is no such place.
+    """
+    scene = Scene(model)
+    rules = [Rule("*", f"{KITCHEN}/floor"), Rule(f"{robot.prefix}/*", f"{robot.prefix}/*")]
+    near = scene.watch(f"{robot.prefix}/*", "*", radius=_CLEARANCE, rules=rules)
+    for offset, angle in product(_OFFSETS, (math.pi / 2, -math.pi / 2)):
+        base = {f"{robot.prefix}/base/y": offset, f"{robot.prefix}/base/angle": angle}
+        state = robot.start_state(model).updated(base)
+        scene.update(state)
+        if not len(near()):
+            return state
+    raise NoSolutionError(f"The {robot.name} stands free nowhere along the aisle.")
 
 
 def list_objects(model: Model, prefix: str) -> tuple[str, ...]:

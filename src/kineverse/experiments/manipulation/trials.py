@@ -97,7 +97,7 @@ class Trial:
 
     @property
     def out_of_reach(self) -> bool:
-        """Whether so many placements were tried that the object counts as out of reach."""
+        """True if so many placements were tried that the object counts as out of reach."""
         return self.failure == "reach" and self.measures.get("placements", 0) >= PLACEMENTS
 
     def as_data(self) -> dict[str, Any]:
