@@ -10,9 +10,13 @@ from types import MappingProxyType
 from kineverse.articulations import DifferentialDrive, OmniBase
 from kineverse.errors import InvalidValueError, UnknownNameError, suggest
 from kineverse.formats import load
+from kineverse.geometry.exclusions import find_unusable_shapes, label_unusable_shapes
+from kineverse.geometry.objects import collision_shapes
 from kineverse.grasping.gripper import Gripper, find_gripper
+from kineverse.model.body import Body
 from kineverse.model.frame import WORLD
 from kineverse.model.model import Model
+from kineverse.model.operations import Override, SetBody
 from kineverse.spatial import translation
 from kineverse.state import State
 
@@ -77,6 +81,7 @@ class RobotSource:
                 )
             for root in roots:
                 edit.attach(root, carrier, translation(0.0, 0.0, 0.0))
+        remove_unusable_shapes(model)
         return model
 
     def start_state(self, model: Model) -> State:
@@ -132,6 +137,18 @@ _AUTHORS = {
     "fetch (authors)": ("fetch", "fetch/fetch_description/robots/fetch.urdf", "gripper_link"),
     "hsr (authors)": ("hsr", "hsrb/hsrb_description/robots/hsrb.urdf", "hand_palm_link"),
 }
+
+
+def remove_unusable_shapes(model: Model) -> tuple[str, ...]:
+    """Remove shapes whose files are missing, and return their labels with the reasons."""
+    unusable = find_unusable_shapes(model)
+    with model.edit() as edit:
+        for name in dict.fromkeys(name for name, _ in unusable):
+            body = model.bodies[name]
+            # The shapes that collide are those for the eye if there are no others.
+            left = tuple(s for k, s in enumerate(collision_shapes(body)) if (name, k) not in unusable)
+            edit.apply(Override(SetBody(name, Body(left, left, body.inertia))))
+    return tuple(f"{name}: {why}" for name, why in label_unusable_shapes(model, unusable).items())
 
 
 def find_robots(names: Iterable[str] = (), data: Path | None = None) -> tuple[RobotSource, ...]:

@@ -9,7 +9,7 @@ from types import MappingProxyType
 
 from kineverse.articulations.mechanisms import FoldingDoor
 from kineverse.errors import UnknownNameError, suggest
-from kineverse.experiments.manipulation.robots import RobotSource
+from kineverse.experiments.manipulation.robots import RobotSource, remove_unusable_shapes
 from kineverse.model.body import Pose
 from kineverse.model.frame import WORLD
 from kineverse.model.model import Model
@@ -103,6 +103,8 @@ def make_push_setup(robot: RobotSource, kitchen: str, thing: str, data: Path | N
         file = _FILES[kitchen]
         source = str(data / file) if data is not None and kitchen == AUTHORS_KITCHEN else file
         model.include(source, "kitchen")
+        if source != file:
+            remove_unusable_shapes(model)
         what = f"kitchen/{_COORDINATES[thing][kitchen == AUTHORS_KITCHEN]}"
     opened = min(OPENED, float(model.limits(what)[1]))
     return PushSetup(kitchen, model, what, robot.start_state(model).updated({what: opened}))
