@@ -205,7 +205,8 @@ def test_opening_report_without_skill_has_the_papers_figures():
             4.0,
             2,
             (1e-3, 1e-3),
-            measures={"solve": (1e-4, 3e-4), "programs": 2, "grasp_error": 0.5, "limits": 0.0},
+            series={"solve": (1e-4, 3e-4)},
+            measures={"programs": 2, "grasp_error": 0.5, "limits": 0.0},
         )
         for robot in ("hsr", "hsr (authors)")
         for program in table1_open.report.PROGRAMS
@@ -232,3 +233,22 @@ def test_start_in_aisle_is_free_where_the_middle_is_not():
     middle = {"pr2/base/y": 0.0, "pr2/base/angle": math.pi / 2}
     assert near(start.updated(middle))
     assert not near(start)
+
+
+def test_command_log_keeps_the_speeds_since_the_last_reset():
+    applied = []
+    world = SimpleNamespace(
+        time=0.5,
+        name="kinematic",
+        reset=lambda state: None,
+        apply=lambda *given, stamp: applied.append(given),
+    )
+    log = skills.CommandLog(world)
+    log.apply({"a": 9.0}, 0.02)
+    log.reset({})
+    log.apply({"a": 1.0}, 0.02)
+    log.apply({"b": 2.0}, 0.02)
+    log.apply({}, 0.02)
+    assert log.commands == {"time": [0.5] * 3, "a": [1.0, 0.0, 0.0], "b": [0.0, 2.0, 0.0]}
+    assert [speeds for speeds, _ in applied] == [{"a": 9.0}, {"a": 1.0}, {"b": 2.0}, {}]
+    assert log.name == "kinematic"

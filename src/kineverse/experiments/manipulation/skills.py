@@ -58,6 +58,7 @@ def run_push_trial(
     seed: int = 0,
     logic: str | None = "and",
     kind: str = "kinematic",
+    record: bool = False,
     **measures: Any,
 ) -> Trial:
     """Return the trial of a push in a world: from a start, or from one that base placement finds.
@@ -76,8 +77,10 @@ def run_push_trial(
         As for :func:`.try_push`.
     kind
         Name of the world.
+    record
+        Whether the trial has the commanded speeds as series.
     """
-    world = make_world(kind, model, robot.prefix, start)
+    world = CommandLog(make_world(kind, model, robot.prefix, start))
     try:
         found = try_push(world, world.state, what, dt=dt, steps=steps, seed=seed, logic=logic)
     except KineverseError as error:
@@ -105,7 +108,42 @@ def run_push_trial(
         found.cpu,
         found.walls,
         {**measures, **outcome.measures, **own},
+        world.commands if record else {},
     )
+
+
+class CommandLog:
+    """World that keeps the commanded speeds since the last reset.
+
+    Attributes
+    ----------
+    commands
+        Speeds by name, one for each command [m/s], [rad/s]; and ``time``, its time in the world [s].
+    """
+
+    def __init__(self, world: World) -> None:
+        self._world = world
+        self.commands: dict[str, list[float]] = {"time": []}
+
+    def __getattr__(self, name: str) -> Any:
+        return getattr(self._world, name)
+
+    def reset(self, state: StateLike) -> None:
+        """Start anew, and forget the commands."""
+        self.commands = {"time": []}
+        self._world.reset(state)
+
+    def apply(self, speeds: StateLike, duration: float, *, stamp: float | None = None) -> None:
+        """Advance the world, and keep the speeds."""
+        count = len(self.commands["time"])
+        self.commands["time"].append(self._world.time)
+        given = {str(symbol): float(value) for symbol, value in dict(speeds).items()}
+        for name in given:
+            self.commands.setdefault(name, [0.0] * count)
+        for name, values in self.commands.items():
+            if name != "time":
+                values.append(given.get(name, 0.0))
+        self._world.apply(speeds, duration, stamp=stamp)
 
 
 def open_then_close(

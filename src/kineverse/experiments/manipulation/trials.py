@@ -79,6 +79,8 @@ class Trial:
         Wall times of the steps [s].
     measures
         Further figures by name.
+    series
+        Series of numbers by name, for figures: they are no part of the JSON data.
     """
 
     case: str
@@ -94,6 +96,7 @@ class Trial:
     cpu: tuple[float, ...] = ()
     wall: tuple[float, ...] = ()
     measures: Mapping[str, Any] = field(default_factory=dict)
+    series: Mapping[str, Sequence[float]] = field(default_factory=dict)
 
     @property
     def out_of_reach(self) -> bool:
@@ -104,7 +107,7 @@ class Trial:
         """Return the trial as JSON data."""
         data = asdict(self)
         data.update(cpu=as_json(asdict(StepTimeStatistics.from_seconds(self.cpu, self.wall))))
-        del data["wall"]
+        del data["wall"], data["series"]
         return {key: as_json(value) for key, value in data.items()}
 
 

@@ -9,8 +9,6 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-import numpy as np
-
 from kineverse.errors import NoSolutionError
 from kineverse.experiments.manipulation.robots import RobotSource, find_robots
 from kineverse.experiments.manipulation.skills import make_world, open_then_close
@@ -96,11 +94,10 @@ def _trial(setup: OpeningSetup, program: str, found: ProgramRun, failure: Failur
         found.steps,
         tuple(found.cpu),
         measures={
-            "solve_mean": float(np.mean(found.solve)) if found.solve else float("nan"),
-            "solve": tuple(found.solve),
             "programs": found.programs,
             "grasp_error": 1e3 * found.position_error,
             "rotation_error": found.rotation_error,
             "limits": found.violation,
         },
+        series={"solve": tuple(found.solve)},
     )

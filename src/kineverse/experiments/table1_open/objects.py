@@ -134,12 +134,9 @@ class OpeningSetup:
     def _draw_configuration(self, rng: np.random.Generator) -> dict[str, float]:
         """Return random positions of the arm within its limits, and of the base in front of the object."""
         base = {f"{self.robot.prefix}/base/{key}": area for key, area in _AREA.items()}
-        fingers = {str(s) for s in self.robot.gripper(self.model).joints}
         drawn = {}
-        for symbol in self.model.degrees_of_freedom:
+        for symbol in self.hand.symbols:
             name = str(symbol)
-            if not name.startswith(f"{self.robot.prefix}/") or name in fingers:
-                continue
             lower, upper = base.get(name, self.model.limits(symbol))
             drawn[name] = float(rng.uniform(max(lower, -math.pi), min(upper, math.pi)))
         return drawn

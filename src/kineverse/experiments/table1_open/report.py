@@ -73,7 +73,7 @@ _KEYS = (
 
 
 def _program_row(robot: str, program: str, own: Sequence[Trial]) -> tuple[float | str, ...]:
-    solve = StepTimeStatistics.from_seconds([t for trial in own for t in trial.measures["solve"]])
+    solve = StepTimeStatistics.from_seconds([t for trial in own for t in trial.series["solve"]])
     cpu = StepTimeStatistics.from_seconds([t for trial in own for t in trial.cpu])
     steps = sum(t.steps for t in own)
     # The papers' figures are about two programs a step.
@@ -145,7 +145,7 @@ def _draw(canvas: Canvas, trials: Sequence[Trial]) -> None:
     """Draw the solver's times of a control step, by robot and program."""
     axes = canvas.add_subplot()
     groups = _groups(trials)
-    times = [[1e3 * t for trial in own for t in trial.measures["solve"]] or [math.nan] for _, own in groups]
+    times = [[1e3 * t for trial in own for t in trial.series["solve"]] or [math.nan] for _, own in groups]
     axes.boxplot(times, whis=(1, 99), showfliers=False, orientation="horizontal")
     axes.set_yticks(range(1, len(groups) + 1), [f"{robot}, {program}" for (robot, program), _ in groups])
     axes.set_xscale("log")

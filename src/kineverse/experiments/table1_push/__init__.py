@@ -17,7 +17,7 @@ from kineverse.experiments.registry import Options, Progress
 from kineverse.experiments.report import Report
 
 from .objects import PushSetup, find_kitchens, make_push_setup
-from .report import make_push_report
+from .report import SHOWN, make_push_report
 
 OPTIONS = ("quick", "data", "seed", "robot", "processes")
 
@@ -87,5 +87,6 @@ def run_push(job: PushJob) -> list[Trial]:
             seed=job.seed,
             logic=job.logic,
             thing=job.thing,
+            record=job.thing == SHOWN,
         )
     ]

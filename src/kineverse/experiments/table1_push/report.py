@@ -4,16 +4,21 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
+from typing import TYPE_CHECKING
+
+import numpy as np
 
 from kineverse.experiments.manipulation.tables import (
     make_failure_table,
     make_quality_table,
-    make_success_figure,
     make_success_table,
     make_trial_numbers,
 )
 from kineverse.experiments.manipulation.trials import StepTimeStatistics, Trial, as_json
-from kineverse.experiments.report import Report, ReportTable
+from kineverse.experiments.report import Figure, Report, ReportTable
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure as Canvas
 
 PUBLISHED = {
     "2022": {"hsr": (1.9, 0.02), "fetch": (2.3, 0.01), "pr2": (2.7, 0.02)},
@@ -50,10 +55,13 @@ def make_push_report(trials: Sequence[Trial], seed: int) -> Report:
         title,
         tuple(table for table in tables if table.rows),
         numbers,
-        make_success_figure(trials, "placed", "samples of the base placement"),
+        Figure(lambda canvas: _draw_commands(canvas, trials), FIGURE_SIZE),
     )
 
 
+SHOWN = "fridge door"
+"""Object of the figure: joint velocity commands, as in the 2020 paper, Fig. 7."""
+FIGURE_SIZE = (12.0, 3.8)
 _KEYS = (
     "kitchen",
     "robot",
@@ -108,3 +116,17 @@ def _groups(trials: Sequence[Trial]) -> list[tuple[str, str, str, list[Trial]]]:
 
 def _pair(mean: float | str, deviation: float | str) -> str:
     return "" if isinstance(mean, str) or math.isnan(mean) else f"{mean:g} / {deviation:g}"
+
+
+def _draw_commands(canvas: Canvas, trials: Sequence[Trial]) -> None:
+    """Draw the commanded speeds of each robot at one object of the first kitchen and period."""
+    shown = {t.robot: t for t in reversed(trials) if t.series.get("time")}
+    own = list(reversed(shown.values()))
+    panels = np.atleast_1d(canvas.subplots(1, max(1, len(own)), sharey=True))
+    for axes, trial in zip(panels, own, strict=False):
+        for name, values in trial.series.items():
+            if name != "time" and np.abs(values).max() > 1e-3:
+                axes.plot(trial.series["time"], values, linewidth=0.9)
+        axes.set_title(f"{trial.robot}, {trial.measures.get('thing', trial.what)}")
+        axes.set_xlabel("time [s]")
+    panels[0].set_ylabel("commanded speeds [rad/s], [m/s]")
