@@ -100,7 +100,22 @@ _LAZY = ("control", "estimation", "geometry", "planning", "reasoning")
 
 # Entries are texts: the packages are imported at first use.
 model.registry.register_collection(
-    "articulations", model.registry.ModelCollection("kineverse.gallery:names", "kineverse.gallery:operations")
+    "articulations",
+    model.registry.ModelCollection(
+        "kineverse.gallery:names",
+        "kineverse.gallery:operations",
+        summary="one for each articulation",
+    ),
+)
+model.registry.register_collection(
+    "kitchens",
+    model.registry.ModelCollection(
+        "kineverse.gallery.kitchens:example_seeds",
+        "kineverse.gallery.kitchens:kitchen_operations",
+        summary="one for each seed from 0 on",
+        accept="kineverse.gallery.kitchens:is_seed",
+        prefix="kitchen",
+    ),
 )
 model.registry.register_service("read_mesh", "kineverse.geometry.mesh_files:read_mesh")
 

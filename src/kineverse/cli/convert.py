@@ -159,7 +159,7 @@ def check_writable(target: str, source: str, force: bool = False) -> None:
     if not path.is_file():
         raise FormatError(f"{target} is no regular file.")
     found = locate_model(source)
-    if not found.scene and path.samefile(found.path):
+    if not found.collection and path.samefile(found.path):
         raise DuplicateNameError(f"{target} is what is read; give the result another name.")
     if not force:
         raise DuplicateNameError(f"{target} is there already; --force replaces it.")

@@ -140,8 +140,8 @@ def _frozen_operations(model: kv.Model) -> list[str]:
 
 def detect_format(source: Source) -> str:
     """Return the format of a model; empty if its suffix is unknown."""
-    if source.scene:
-        return "scene of the gallery"
+    if source.collection:
+        return f"model of the collection '{source.collection}'"
     if source.path.name.endswith(".xml"):
         return "MJCF" if read_root_tag(read_file(source.path)).startswith("mujoco") else "URDF"
     endings = (name for name in FORMATS if source.path.name.endswith(name))
@@ -150,7 +150,7 @@ def detect_format(source: Source) -> str:
 
 def _document_header(source: Source) -> dict[str, int | str]:
     """Return the version of a document, and its hash if it has one; the reader has checked both."""
-    if source.scene or not source.path.name.endswith(".kv.json"):
+    if source.collection or not source.path.name.endswith(".kv.json"):
         return {}
     head = json.loads(read_file(source.path))
     return {key: head[key] for key in ("version", "sha256") if key in head}

@@ -22,6 +22,7 @@ examples:
   kineverse reproduce fig3 --figure door.svg
   kineverse reproduce estimation-grid --quick
   kineverse reproduce sturm --data sturm_tracks
+  kineverse reproduce kitchens --seed 100 --count 50 --robot hsr
   kineverse reproduce fig3 --json"""
 
 
@@ -32,6 +33,16 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--quick", action="store_true", help="reduced experiment, in seconds")
     parser.add_argument("--data", metavar="FOLDER", type=Path, help="folder of the recordings that it needs")
     parser.add_argument("--model", metavar="MODEL", help="name or path of its model")
+    parser.add_argument("--seed", metavar="N", type=int, default=0, help="first seed (0)")
+    parser.add_argument("--count", metavar="N", type=int, help="number of seeds or repetitions")
+    parser.add_argument(
+        "--robot",
+        metavar="ROBOT",
+        action="append",
+        default=[],
+        help="name or path of a robot; may be given several times",
+    )
+    parser.add_argument("--processes", metavar="N", type=int, help="number of processes (cores)")
     figure = parser.add_mutually_exclusive_group()
     figure.add_argument(
         "--figure", metavar="FILE", type=Path, help="file of the figure (NAME.png; with --json: none)"
@@ -55,7 +66,15 @@ def run(arguments: argparse.Namespace) -> int:
         return 0
     if arguments.name is None:
         raise UnknownNameError(f"Name an experiment. There are: {', '.join(EXPERIMENTS)}.")
-    options = Options(quick=arguments.quick, data=arguments.data, model=arguments.model)
+    options = Options(
+        quick=arguments.quick,
+        data=arguments.data,
+        model=arguments.model,
+        seed=arguments.seed,
+        count=arguments.count,
+        robot=tuple(arguments.robot),
+        processes=arguments.processes,
+    )
     if arguments.figure is not None:
         check_drawing()  # before minutes of computation
     report = reproduce(arguments.name, show_progress, options)

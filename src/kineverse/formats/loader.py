@@ -20,7 +20,7 @@ from kineverse.model.registry import FileContent, FileFormat, LoopTreatment, che
 
 from .file_formats import DOCUMENT_SUFFIXES
 from .files import read_file
-from .locate import GALLERY, Source, locate_model
+from .locate import Source, locate_model
 from .loop_closures import LoopClosures
 from .names import check_prefix
 from .reader_warnings import collect_warnings, warn
@@ -208,7 +208,7 @@ def _applied(
 
 def _build(source: Source, prefix: str | None) -> Iterator[tuple[str, Operation]]:
     """Yield the operations of a model of a collection, each with its tag."""
-    collection = registry.find_collection(GALLERY)
+    collection = registry.find_collection(source.collection)
     assert collection is not None  # the source was found in it
     for operation in collection.operations(source.path.name, prefix):
         yield operation.default_tag(), operation
@@ -216,18 +216,18 @@ def _build(source: Source, prefix: str | None) -> Iterator[tuple[str, Operation]
 
 def _root(source: Source, root: str | os.PathLike[str] | None) -> str:
     """Return the folder below which a model may open files."""
-    if source.scene:
+    if source.collection:
         return NOWHERE if root is None else find_root(NOWHERE, root)
     return find_root(source.path.parent, root, source.folder)
 
 
 def _content(source: Source) -> bytes:
-    return b"" if source.scene else read_file(source.path)
+    return b"" if source.collection else read_file(source.path)
 
 
 def _format(source: Source, content: bytes) -> FileFormat | None:
     """Return the format of a file; None for a model of a collection, which has no file."""
-    if source.scene:
+    if source.collection:
         return None
     file_format = registry.find_format(source.path.name, content)
     if file_format is None:

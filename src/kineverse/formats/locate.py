@@ -29,11 +29,15 @@ GALLERY = "articulations"
 
 @dataclass(frozen=True, slots=True)
 class Source:
-    """File of a model, with its name if it ships; or a model of a collection, without a file."""
+    """File of a model, with its name if it ships; or a model of a collection, without a file.
+
+    ``shipped`` is its prefix by default.
+    """
 
     path: Path
     shipped: str | None = None
-    scene: bool = False
+    collection: str = ""
+    """Name of the collection."""
     folder: Path | None = field(default=None, compare=False)
     """Folder of models that was searched by name."""
 
@@ -72,9 +76,10 @@ def locate_model(name: str | os.PathLike[str]) -> Source:
     text = os.fspath(name)
     if text in shipped_models():
         return Source(shipped.FOLDER / f"{text}.urdf", text)
-    gallery, _, scene = text.partition("/")
-    if gallery == GALLERY and scene in _scenes():
-        return Source(Path(text), scene, scene=True)
+    group, _, member = text.partition("/")
+    collection = registry.find_collection(group)
+    if collection is not None and collection.has(member):
+        return Source(Path(text), collection.prefix or member, group)
     if text.lstrip().startswith("<"):
         raise UnknownNameError(
             "This looks like the text of a description, where the name or path of a model is expected. "
@@ -104,8 +109,8 @@ def locate_model(name: str | os.PathLike[str]) -> Source:
             return Source((folder / _only(found, text, folder)).resolve(), folder=folder)
         searched.append(f"{place} ({folder})")
         seen += files
-    if gallery == GALLERY:
-        raise UnknownNameError(_no_scene(scene))
+    if collection is not None:
+        raise UnknownNameError(_no_member(group, collection, member))
     raise UnknownNameError(
         f"There is no model {_shown(text)}.{_beside(path) if text else ''} {_similar(text, seen)} "
         f"Searched after the shipped ones: {'; '.join(searched) or 'nothing else'}.{_missing_places()} "
@@ -114,21 +119,14 @@ def locate_model(name: str | os.PathLike[str]) -> Source:
     )
 
 
-def _scenes() -> tuple[str, ...]:
-    collection = registry.find_collection(GALLERY)
-    return () if collection is None else collection.names()
-
-
-def _no_scene(name: str) -> str:
-    scenes = _scenes()
+def _no_member(group: str, collection: registry.ModelCollection, name: str) -> str:
+    names = collection.names()
+    shown = ", ".join(names) + (", …" if collection.accept else "")
     if not name:
-        return (
-            f"'{GALLERY}' is many models, one for each articulation: {', '.join(scenes)}. "
-            f"Load one as '{GALLERY}/{scenes[0]}'."
-        )
-    found = _alike(name, [])
-    meant = f"Did you mean {' or '.join(map(repr, found))}?" if found else f"Available: {', '.join(scenes)}."
-    return f"There is no model {_shown(f'{GALLERY}/{name}')}. {meant}"
+        return f"'{group}' is many models, {collection.summary}: {shown}. Load one as '{group}/{names[0]}'."
+    found = [] if collection.accept else _alike(name, [])
+    meant = f"Did you mean {' or '.join(map(repr, found))}?" if found else f"Available: {shown}."
+    return f"There is no model {_shown(f'{group}/{name}')}. {meant}"
 
 
 def model_folders() -> Iterator[tuple[str, Path]]:
@@ -193,7 +191,10 @@ def _alike(name: str, files: list[str]) -> list[str]:
     ends = Counter(_end(p) for p in paths)
     # Folders are left out if the last part of the path is unique.
     shown = {p: _end(p) if ends[_end(p)] == 1 else p for p in paths} | {s: s for s in shipped_models()}
-    shown |= {f"{GALLERY}/{scene}": f"{GALLERY}/{scene}" for scene in _scenes()}
+    for group in registry.list_collections():
+        collection = registry.find_collection(group)
+        if collection is not None and not collection.accept:
+            shown |= {f"{group}/{member}": f"{group}/{member}" for member in collection.names()}
     alike = difflib.get_close_matches(wanted, {_end(p).casefold() for p in shown}, n=_LISTED, cutoff=0.7)
     close = [n for end in alike for p, n in shown.items() if _end(p).casefold() == end]
     within = [n for p, n in shown.items() if wanted in p.casefold()]

@@ -45,6 +45,8 @@ class PushTrial:
         CPU time of a step of the controller, scene queries included [s].
     wall
         Median wall time of a step [s].
+    cpu, walls
+        CPU and wall times of all steps [s].
     """
 
     robot: str
@@ -59,6 +61,8 @@ class PushTrial:
     p99: float
     worst: float
     wall: float
+    cpu: tuple[float, ...] = ()
+    walls: tuple[float, ...] = ()
 
     def __str__(self) -> str:
         outcome, m = self.outcome, self.outcome.measures
@@ -158,6 +162,8 @@ def try_push(
         float(np.percentile(cpu, 99)),
         float(cpu.max()),
         float(np.median(wall)),
+        tuple(cpu.tolist()),
+        tuple(wall.tolist()),
     )
 
 

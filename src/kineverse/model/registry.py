@@ -124,13 +124,26 @@ class ModelCollection:
         Function that returns all names.
     build
         Function from a name and a prefix to an iterable of operations.
+    summary
+        Number of its models, for errors: "one for each ...".
+    accept
+        Predicate of names, if :attr:`list_names` has examples alone; empty if it has all names.
+    prefix
+        Prefix of a model by default; that of an empty text is the name of the model.
     """
 
     list_names: str
     build: str
+    summary: str
+    accept: str = ""
+    prefix: str = ""
+
+    def has(self, name: str) -> bool:
+        """Return whether there is a model of this name."""
+        return bool(import_entry(self.accept)(name)) if self.accept else name in self.names()
 
     def names(self) -> tuple[str, ...]:
-        """Return the names of the models."""
+        """Return the names of the models, or examples of them."""
         return tuple(import_entry(self.list_names)())
 
     def operations(self, name: str, prefix: str | None) -> Iterator[Operation]:
@@ -277,6 +290,11 @@ def find_writer(name: str) -> FileFormat | None:
 def find_collection(name: str) -> ModelCollection | None:
     """Return the collection of models of this name; None if there is none."""
     return _COLLECTIONS.get(name)
+
+
+def list_collections() -> tuple[str, ...]:
+    """Return the names of all collections of models."""
+    return tuple(_COLLECTIONS)
 
 
 def make_shorthand(name: str, /, **parameters: Any) -> Operation:

@@ -1,0 +1,1 @@
+"""Robots, trials and tables of the experiments about manipulation."""

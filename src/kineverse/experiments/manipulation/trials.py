@@ -1,0 +1,187 @@
+"""Trials of skills: what came out, why not, and how long a step took."""
+
+from __future__ import annotations
+
+import math
+import re
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import asdict, dataclass, field
+from typing import Any, Literal, TypeAlias, get_args
+
+import numpy as np
+
+from kineverse.manipulation.outcome import Outcome
+
+Failure: TypeAlias = Literal["", "collision", "reach", "time", "other"]
+FAILURES: tuple[Failure, ...] = get_args(Failure)
+
+PLACEMENTS = 200
+"""Number of placements that prove that an object is out of reach."""
+MOST_EXCUSED = 0.1
+"""Largest share of a robot's objects that may be out of reach without being failures."""
+
+# A reason says several things; the first class that it speaks of counts.
+_PATTERNS: Mapping[Failure, str] = {
+    "collision": r"collision|collides|touch|in the way|penetrat|blocked|jammed",
+    "reach": r"reach|no placement|placements|inverse kinematics|too far|too high|too low|no handle|too wide",
+    "time": r"time|steps|seconds|too slow|did not arrive|not open yet|stuck|no progress",
+}
+
+
+@dataclass(frozen=True, slots=True)
+class StepTimeStatistics:
+    """CPU and wall times of control steps [ms]."""
+
+    count: int = 0
+    mean: float = math.nan
+    deviation: float = math.nan
+    p99: float = math.nan
+    worst: float = math.nan
+    wall: float = math.nan
+
+    @staticmethod
+    def from_seconds(cpu: Sequence[float], wall: Sequence[float] = ()) -> StepTimeStatistics:
+        """Return the statistics of durations [s]; ``wall`` is the mean wall time."""
+        if not len(cpu):
+            return StepTimeStatistics()
+        ms = 1e3 * np.asarray(cpu, dtype=float)
+        return StepTimeStatistics(
+            len(ms),
+            float(ms.mean()),
+            float(ms.std()),
+            float(np.quantile(ms, 0.99)),
+            float(ms.max()),
+            1e3 * float(np.mean(wall)) if len(wall) else math.nan,
+        )
+
+
+@dataclass(frozen=True, slots=True)
+class Trial:
+    """One skill of one robot at one object.
+
+    Attributes
+    ----------
+    case
+        Kitchen, or name of the set-up.
+    robot, what, skill
+        Names of the robot, the coordinate and the skill.
+    done
+        Whether it was done.
+    value
+        Value of the coordinate at the end [m], [rad].
+    failure, reason
+        Class of the failure, empty if it was done; and the words of the skill.
+    seconds, steps
+        Time in the world [s], and number of control steps.
+    cpu
+        CPU times of the steps [s].
+    wall
+        Wall times of the steps [s].
+    measures
+        Further figures by name.
+    series
+        Series of numbers by name, for figures: they are no part of the JSON data.
+    """
+
+    case: str
+    robot: str
+    what: str
+    skill: str
+    done: bool
+    value: float
+    failure: Failure
+    reason: str
+    seconds: float
+    steps: int
+    cpu: tuple[float, ...] = ()
+    wall: tuple[float, ...] = ()
+    measures: Mapping[str, Any] = field(default_factory=dict)
+    series: Mapping[str, Sequence[float]] = field(default_factory=dict)
+
+    @property
+    def out_of_reach(self) -> bool:
+        """True if so many placements were tried that the object counts as out of reach."""
+        return self.failure == "reach" and self.measures.get("placements", 0) >= PLACEMENTS
+
+    def as_data(self) -> dict[str, Any]:
+        """Return the trial as JSON data."""
+        data = asdict(self)
+        data.update(cpu=as_json(asdict(StepTimeStatistics.from_seconds(self.cpu, self.wall))))
+        del data["wall"], data["series"]
+        return {key: as_json(value) for key, value in data.items()}
+
+
+def find_failure(outcome: Outcome) -> Failure:
+    """Return the class of a failure: the measure ``failure``, or what the reason's words say."""
+    if outcome.done:
+        return ""
+    stated = outcome.measures.get("failure")
+    if stated in FAILURES and stated:
+        return stated  # type: ignore[no-any-return]  # one of the literals
+    found = {k: m.start() for k, p in _PATTERNS.items() if (m := re.search(p, outcome.reason, re.IGNORECASE))}
+    return min(found, key=found.__getitem__) if found else "other"
+
+
+@dataclass(frozen=True, slots=True)
+class RobotSummary:
+    """Success of a robot: an object counts as done if all trials of it are.
+
+    Attributes
+    ----------
+    robot
+        Name.
+    objects, done
+        Number of objects, and of those that were done.
+    excused
+        Number of objects that :data:`PLACEMENTS` placements prove to be out of reach, at most the share
+        :data:`MOST_EXCUSED` of all; others beyond that are failures.
+    steps
+        Times of all steps.
+    """
+
+    robot: str
+    objects: int
+    done: int
+    excused: int
+    steps: StepTimeStatistics
+
+    @property
+    def rate(self) -> float:
+        """Share of the objects within reach that were done; NaN without objects."""
+        counted = self.objects - self.excused
+        return self.done / counted if counted else math.nan
+
+
+def summarize_robots(trials: Iterable[Trial]) -> tuple[RobotSummary, ...]:
+    """Return the success of each robot, in the order of the trials."""
+    by_robot: dict[str, list[Trial]] = {}
+    for trial in trials:
+        by_robot.setdefault(trial.robot, []).append(trial)
+    found = []
+    for robot, own in by_robot.items():
+        by_object: dict[tuple[str, str], list[Trial]] = {}
+        for trial in own:
+            by_object.setdefault((trial.case, trial.what), []).append(trial)
+        done = sum(all(t.done for t in group) for group in by_object.values())
+        far = sum(any(t.out_of_reach for t in group) for group in by_object.values())
+        excused = min(far, math.floor(MOST_EXCUSED * len(by_object) + 1e-9))
+        steps = StepTimeStatistics.from_seconds(
+            [t for trial in own for t in trial.cpu], [t for trial in own for t in trial.wall]
+        )
+        found.append(RobotSummary(robot, len(by_object), done, excused, steps))
+    return tuple(found)
+
+
+def as_json(value: Any) -> Any:
+    """Return a value as JSON data: numbers that are not finite are null, what is no data is its text."""
+    if isinstance(value, Mapping):
+        return {str(key): as_json(entry) for key, entry in value.items()}
+    if isinstance(value, (list, tuple, np.ndarray)):
+        return [as_json(entry) for entry in value]
+    if isinstance(value, (bool, np.bool_)):
+        return bool(value)
+    if isinstance(value, (int, np.integer)):
+        return int(value)
+    if isinstance(value, (float, np.floating)):
+        return float(value) if math.isfinite(value) else None
+    return value if value is None or isinstance(value, str) else str(value)

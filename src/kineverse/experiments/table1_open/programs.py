@@ -1,0 +1,195 @@
+"""Programs that open a grasped object: the papers' leader and follower, and one program over both.
+
+In the papers, a leader moves the object to its upper limits, and a follower moves the hand after the handle
+(2022 paper, IV-C1). Both are quadratic programs. Here they are run as published: the object goes where the
+leader says, whether the hand keeps up or not, and the grasp error is measured.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from time import thread_time
+
+import numpy as np
+
+from kineverse.compile import compile  # noqa: A004
+from kineverse.control import Controller, Goal, Hold, same_orientation, same_pose
+from kineverse.expressions import array
+from kineverse.model.model import Model
+from kineverse.state import State
+from kineverse.symbols import Symbol
+
+from .objects import OpeningSetup
+
+DT = 0.02
+MOST_STEPS = 500
+INNER_STEPS = 20
+TOLERANCE = 1e-3
+POSITION_WEIGHT, ROTATION_WEIGHT = 10.0, 1.0
+DONE = 0.99
+"""Share of the upper limit from which an object counts as open. The gain of 1 reaches it after 4.6 s."""
+
+
+LOST = 0.01
+"""Grasp error from which the handle counts as lost [m]."""
+
+
+@dataclass(slots=True)
+class ProgramRun:
+    """Opening of an object by a program.
+
+    Attributes
+    ----------
+    done, value, steps
+        Whether it is open and still grasped; the value of its coordinate; the number of control steps.
+    solve, cpu
+        Times of the solver's calls of each control step, and CPU times of the steps [s].
+    position_error, rotation_error
+        Largest grasp errors [m], [rad].
+    violation
+        Largest violation of a limit on positions [m], [rad].
+    programs
+        Number of quadratic programs solved.
+    """
+
+    done: bool = False
+    value: float = 0.0
+    steps: int = 0
+    solve: list[float] = field(default_factory=list)
+    cpu: list[float] = field(default_factory=list)
+    position_error: float = 0.0
+    rotation_error: float = 0.0
+    violation: float = 0.0
+    programs: int = 0
+
+
+class LeaderFollower:
+    """The papers' two quadratic programs."""
+
+    name = "leader and follower"
+
+    def __init__(self, setup: OpeningSetup) -> None:
+        self._setup, self._model = setup, setup.model
+        self._leader = Controller(
+            setup.model,
+            [Goal(setup.what, setup.upper, gain=1.0, name="open")],
+            dt=DT,
+            smooth=1e-4,
+            posture=0.0,
+        )
+        error = setup.hand[:3, 3] - setup.grasp[:3, 3]
+        turned = same_orientation(setup.grasp, setup.hand)
+        self._follower = Controller(
+            setup.model,
+            [
+                Goal(error, gain=1.0 / DT, weight=POSITION_WEIGHT, name="position"),
+                Goal(turned, gain=1.0 / DT, weight=ROTATION_WEIGHT, name="rotation"),
+            ],
+            dt=DT,
+            still=[setup.what],
+            smooth=1e-4,
+            posture=0.0,
+        )
+        self._limits = SpeedScale(setup.model, self._follower.speeds)
+
+    @property
+    def controllers(self) -> tuple[Controller, ...]:
+        """The programs."""
+        return self._leader, self._follower
+
+    def step(self, state: State) -> tuple[State, float, int]:
+        """Return the next state, the time of the solver [s] and the number of programs solved."""
+        lead = self._leader.step(state)
+        solve, count = lead.times.solve, 1
+        led = self._model.integrate(state, lead.speeds, DT)
+        total = dict.fromkeys(self._follower.speeds, 0.0)
+        moved = led
+        for _ in range(INNER_STEPS):
+            self._follower.reset()
+            command = self._follower.step(moved)
+            solve, count = solve + command.times.solve, count + 1
+            if max(command.residuals.values()) < TOLERANCE:
+                break
+            moved = self._model.integrate(moved, command.speeds, DT)
+            for speed, value in command.speeds.items():
+                total[speed] += value
+        scale = self._limits(led, total)
+        return self._model.integrate(led, {s: scale * v for s, v in total.items()}, DT), solve, count
+
+
+class OneProgram:
+    """One quadratic program over robot and object, the grasp a hold."""
+
+    name = "one program"
+
+    def __init__(self, setup: OpeningSetup) -> None:
+        self._model = setup.model
+        self._controller = Controller(
+            setup.model,
+            [
+                Hold(same_pose(setup.grasp, setup.hand), gain=0.5 / DT, name="grasp"),
+                Goal(setup.what, setup.upper, gain=1.0, name="open"),
+            ],
+            dt=DT,
+        )
+
+    @property
+    def controllers(self) -> tuple[Controller, ...]:
+        """The program."""
+        return (self._controller,)
+
+    def step(self, state: State) -> tuple[State, float, int]:
+        """Return the next state, the time of the solver [s] and the number of programs solved."""
+        command = self._controller.step(state)
+        return self._model.integrate(state, command.speeds, DT), command.times.solve, 1
+
+
+def open_by_program(program: LeaderFollower | OneProgram, setup: OpeningSetup, state: State) -> ProgramRun:
+    """Open an object from a state by a program."""
+    run = ProgramRun()
+    for controller in program.controllers:
+        controller.reset()
+    errors = compile(same_pose(setup.grasp, setup.hand))
+    limited = setup.model.degrees_of_freedom
+    lower, upper = np.array([setup.model.limits(q) for q in limited]).T
+    for _ in range(MOST_STEPS):
+        start = thread_time()
+        state, solve, count = program.step(state)
+        run.cpu.append(thread_time() - start)
+        run.solve.append(solve)
+        run.programs += count
+        run.steps += 1
+        error = np.asarray(errors(state), dtype=float).ravel()
+        run.position_error = max(run.position_error, float(np.linalg.norm(error[:3])))
+        run.rotation_error = max(run.rotation_error, float(np.linalg.norm(error[3:])))
+        values = state.vector(limited)
+        run.violation = max(run.violation, float(np.maximum(lower - values, values - upper).max()))
+        run.value = float(state[setup.what])
+        if run.value >= DONE * setup.upper:
+            run.done = run.position_error <= LOST
+            break
+    return run
+
+
+class SpeedScale:
+    """Factor that brings speeds within the limits of a model: all by the same, so that the path stays."""
+
+    def __init__(self, model: Model, speeds: tuple[Symbol, ...]) -> None:
+        known = frozenset(speeds)
+        found = [c for c in model.constraints.values() if known & frozenset(c.expression.symbols)]
+        self._symbols = sorted(
+            {s for c in found for part in (c.lower, c.expression, c.upper) for s in _symbols(part)}, key=str
+        )
+        self._function = compile(array([[c.lower, c.expression, c.upper] for c in found]), self._symbols)
+
+    def __call__(self, state: State, speeds: dict[Symbol, float]) -> float:
+        """Return the factor, at most 1, for speeds at a state."""
+        values = [speeds.get(s, 0.0) if s.order else float(state[s]) for s in self._symbols]
+        lower, value, upper = np.asarray(self._function(values), dtype=float).T
+        bound = np.where(value > 0, upper, lower)
+        ratios = np.where(value != 0, bound / np.where(value != 0, value, 1.0), np.inf)
+        return float(min(1.0, ratios.min(initial=1.0)))
+
+
+def _symbols(part: object) -> tuple[Symbol, ...]:
+    return tuple(getattr(part, "symbols", ()))

@@ -1,0 +1,92 @@
+"""``table1-push``: twelve objects of a kitchen and a folding door are pushed shut (both papers, Table I).
+
+The objects are open by .4 m or rad. A robot begins at the papers' start. Where that fails, base placement
+searches for another one, and the table says so. ``--data`` adds the authors' kitchen and robots.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+
+from kineverse.experiments.manipulation.robots import RobotSource, find_robots
+from kineverse.experiments.manipulation.skills import run_push_trial
+from kineverse.experiments.manipulation.trial_pool import run_jobs
+from kineverse.experiments.manipulation.trials import Trial
+from kineverse.experiments.registry import Options, Progress
+from kineverse.experiments.report import Report
+
+from .objects import PushSetup, find_kitchens, make_push_setup
+from .report import SHOWN, make_push_report
+
+OPTIONS = ("quick", "data", "seed", "robot", "processes")
+
+PERIODS = {"2022": (0.02, 1200), "2020": (0.1, 500)}
+"""Control period [s] and largest number of steps, by paper."""
+QUICK_OBJECTS = ("fridge door", "sink trash drawer")
+
+
+@dataclass(frozen=True)
+class PushJob:
+    """Push of one object by one robot.
+
+    Attributes
+    ----------
+    robot
+        The robot.
+    kitchen, data
+        Name of the kitchen, and the folder of the authors' files.
+    thing
+        Name of the object.
+    paper
+        Paper whose control period and steps count.
+    seed
+        Seed of the base placement.
+    logic
+        Rule of trends: ``"and"``, ``"product"``, or None for exact gradients alone.
+    """
+
+    robot: RobotSource
+    kitchen: str
+    data: Path | None
+    thing: str
+    paper: str = "2022"
+    seed: int = 0
+    logic: str | None = "and"
+
+
+def run(progress: Progress, options: Options) -> Report:
+    """Push all objects shut; the option ``quick`` takes two of them, and the period of the 2022 paper."""
+    jobs = [
+        PushJob(robot, kitchen, options.data, thing, paper, options.seed)
+        for kitchen, things in find_kitchens(options.data).items()
+        for robot in find_robots(options.robot, options.data)
+        for thing in things
+        for paper in PERIODS
+        if not options.quick or (thing in QUICK_OBJECTS and paper == "2022")
+    ]
+    trials = run_jobs(run_push, jobs, progress, "table1-push", "push", options.processes)
+    return make_push_report(trials, options.seed)
+
+
+def run_push(job: PushJob) -> list[Trial]:
+    """Return the trial of one push."""
+    setup: PushSetup = make_push_setup(job.robot, job.kitchen, job.thing, job.data)
+    dt, steps = PERIODS[job.paper]
+    skill = f"push ({job.paper})"
+    return [
+        run_push_trial(
+            setup.kitchen,
+            job.robot,
+            setup.model,
+            setup.what,
+            setup.start,
+            skill,
+            dt=dt,
+            steps=steps,
+            seed=job.seed,
+            logic=job.logic,
+            thing=job.thing,
+            record=job.thing == SHOWN,
+        )
+    ]
