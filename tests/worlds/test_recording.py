@@ -10,9 +10,9 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
-from cupboards import cupboard, state
 
 import kineverse as kv
+from cupboards import cupboard, state
 from kineverse.errors import FormatError, InvalidValueError, KineverseError, UnknownNameError
 from kineverse.worlds import Contact, Observation, Recorder, read_run_recording
 from kineverse.worlds.recorder import TOPICS
