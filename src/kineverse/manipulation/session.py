@@ -91,6 +91,11 @@ class Session:
         if self._on_step is not None:
             self._on_step(self)
 
+    def restart(self, state: State) -> None:
+        """Reset the world to a state, at time 0, and update the belief."""
+        self.world.reset(state)
+        self.state = self._belief.update(self.world)
+
     def stop(self) -> None:
         """Command zero speeds for one step."""
         self.act({})

@@ -1,0 +1,107 @@
+"""Batched inverse kinematics of a hand along sequences of poses."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+
+from kineverse.compile import compile  # noqa: A004
+from kineverse.lie import Array, log_so3
+from kineverse.model.model_view import ModelView
+from kineverse.symbols import Symbol
+
+_DAMPING = 1e-6
+_CENTERING = 0.1
+"""Share of the way to the middle of the limits that a step takes in the null space."""
+_LONGEST = 0.4
+"""Largest step of a coordinate [m], [rad]."""
+_JUMP = 0.6
+"""Largest change of a coordinate between neighbouring poses of a sequence [m], [rad]."""
+TOLERANCE = 1e-4
+"""Error of a pose that counts as reached [m], [rad]."""
+
+
+class HandPaths:
+    """Damped Newton steps of many configurations at once, within the limits of the coordinates.
+
+    A step is ``W Jᵀ (J W Jᵀ + λ)⁻¹ e`` with the error e of position and rotation vector, and a step to the
+    middle of limits in the null space (Nakamura 1991). Coordinates outside of their limits are clipped.
+
+    Parameters
+    ----------
+    model
+        The model.
+    hand
+        Frame of the hand.
+    moving
+        Coordinates (n,) that move.
+    still
+        Coordinates (m,) that have a value for each configuration, such as those of a base that stands.
+    ease
+        Weights W (n,): coordinates with small ones move less.
+    """
+
+    def __init__(
+        self, model: ModelView, hand: str, moving: Sequence[Symbol], still: Sequence[Symbol], ease: Array
+    ) -> None:
+        self.moving, self.still = tuple(moving), tuple(still)
+        pose = model.fk(hand)
+        jacobian = model.jacobian(hand, form="world_aligned", symbols=[s.derivative() for s in moving])
+        self._f = compile([pose, jacobian], [*self.moving, *self.still])
+        limits = np.array([model.limits(s) for s in moving], dtype=float).reshape(-1, 2)
+        self.lower, self.upper = limits.T
+        bounded = np.isfinite(limits).all(axis=1)
+        self._middle = np.where(bounded, np.where(bounded, limits.sum(axis=1), 0.0) / 2, np.nan)
+        self._weights = ease
+
+    def solve(self, Q: Array, base: Array, targets: Array, iterations: int) -> tuple[Array, Array]:
+        """Return configurations (N, n) near to given ones at which the hand is at poses, and errors (N,).
+
+        Parameters
+        ----------
+        Q
+            Configurations (N, n) to begin with.
+        base
+            Values (N, m) of the coordinates that stand still.
+        targets
+            Poses world_T_hand (N, 4, 4).
+        iterations
+            Number of steps.
+        """
+        Q = Q.copy()
+        for k in range(iterations + 1):
+            poses, J = self._f.batch(np.hstack([Q, base]))
+            turn = log_so3(targets[:, :3, :3] @ np.swapaxes(poses[:, :3, :3], 1, 2))
+            e = np.hstack([targets[:, :3, 3] - poses[:, :3, 3], turn])
+            error = np.abs(e).max(axis=1)
+            if k == iterations or (error < TOLERANCE / 10).all():
+                break
+            WJt = self._weights[:, None] * np.swapaxes(J, 1, 2)
+            damped = J @ WJt + (_DAMPING + 1e-3 * np.minimum(error, 0.5) ** 2)[:, None, None] * np.eye(6)
+            center = np.nan_to_num(_CENTERING * (self._middle - Q)) * self._weights
+            e = e - (J @ center[:, :, None])[:, :, 0]
+            step = center + (WJt @ np.linalg.solve(damped, e[:, :, None]))[:, :, 0]
+            step *= np.minimum(1.0, _LONGEST / np.maximum(np.abs(step).max(axis=1), 1e-9))[:, None]
+            Q = np.clip(Q + step, self.lower, self.upper)
+        return Q, error
+
+    def follow(self, Q: Array, base: Array, targets: Array) -> tuple[Array, Array]:
+        """Return configurations (N, K, n) along poses (N, K, 4, 4), and how many (N,) are reached.
+
+        A sequence ends where a pose is not reached, or where a coordinate jumps.
+        """
+        count = targets.shape[1]
+        paths = np.repeat(Q[:, None], count, axis=1)
+        reached = np.zeros(len(Q), dtype=int)
+        going = np.arange(len(Q))
+        for k in range(count):
+            if not len(going):
+                break
+            found, error = self.solve(paths[going, max(k - 1, 0)], base[going], targets[going, k], 6)
+            jump = np.abs(found - paths[going, max(k - 1, 0)]).max(axis=1, initial=0.0)
+            good = (error < TOLERANCE) & (jump < _JUMP)
+            going, found = going[good], found[good]
+            paths[going, k] = found
+            reached[going] = k + 1
+        return paths, reached
