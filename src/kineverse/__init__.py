@@ -35,7 +35,7 @@ from .state import State, StateLike
 from .symbols import Symbol, parameter, position, velocity
 
 if TYPE_CHECKING:
-    from . import control, estimation, geometry, planning, reasoning
+    from . import control, estimation, geometry, grasping, manipulation, planning, reasoning, worlds
     from .view.show import show
 
 __all__ = [
@@ -68,10 +68,12 @@ __all__ = [
     "expressions",
     "formats",
     "geometry",
+    "grasping",
     "inverse",
     "load",
     "logic",
     "loops",
+    "manipulation",
     "maximum",
     "minimum",
     "model",
@@ -94,9 +96,10 @@ __all__ = [
     "translation",
     "velocity",
     "where",
+    "worlds",
 ]
 
-_LAZY = ("control", "estimation", "geometry", "planning", "reasoning")
+_LAZY = ("control", "estimation", "geometry", "grasping", "manipulation", "planning", "reasoning", "worlds")
 
 # Entries are texts: the packages are imported at first use.
 model.registry.register_collection(

@@ -52,7 +52,7 @@ class HandPaths:
         limits = np.array([model.limits(s) for s in moving], dtype=float).reshape(-1, 2)
         self.lower, self.upper = limits.T
         bounded = np.isfinite(limits).all(axis=1)
-        self._middle = np.where(bounded, np.where(bounded, limits.sum(axis=1), 0.0) / 2, np.nan)
+        self._middle = np.where(bounded, np.where(bounded[:, None], limits, 0.0).mean(axis=1), np.nan)
         self._weights = ease
 
     def solve(self, Q: Array, base: Array, targets: Array, iterations: int) -> tuple[Array, Array]:

@@ -49,6 +49,9 @@ _STALLED, _PATIENCE = 1e-3, 4.0
 _SHARES = (1.0, 0.75, 0.5, 0.3)
 """Shares of the rest of a motion that are tried with one grasp."""
 _MOST_GRASPS = 4
+_LARGEST = ("limit_violation", "penetration", "grasp_error", "grasp_rotation", "jitter", "reversals")
+_SUMS = ("contact_losses", "distance", "hand_distance")
+"""Measures of the parts of a run: the largest, or the sum."""
 
 
 class SkillError(KineverseError):
@@ -138,7 +141,7 @@ def open_object(
             if done
             else (f"'{coordinate}' ended at {value:.3f}, not at {goal:.3f}.")
         )
-    measures: dict[str, Any] = {**run.judge.measures, "placements": run.placements, "grasps": run.grasps}
+    measures: dict[str, Any] = {**run.measures, "placements": run.placements, "grasps": run.grasps}
     if not done:
         measures["failure"] = kind or "other"
     return Outcome(
@@ -213,11 +216,28 @@ class _Run:
         self.model = opener.model
         self.gripper = opener.gripper
         self.first, self.begin = session.steps, session.world.time
-        self.seconds, self._end = seconds, self.begin + seconds
+        self.seconds = seconds
         self.placements = self.grasps = 0
+        self._earlier: list[Mapping[str, Any]] = []
         self.judge = Judge(self.model, session.world.robot, self.gripper, handle=handle.frame)
         self.judge.update(session.world.state)
         self._hand, self._bar = self.model.fk(self.gripper.hand), self.model.fk(handle.frame)
+
+    @property
+    def measures(self) -> dict[str, Any]:
+        """Measures of the judge, also of those parts that ended with a reset of the world."""
+        found = [*self._earlier, self.judge.measures]
+        last = dict(found[-1])
+        for name in _LARGEST:
+            last[name] = max((m[name] for m in found if not math.isnan(m[name])), default=math.nan)
+        for name in _SUMS:
+            last[name] = sum(m[name] for m in found)
+        return last
+
+    def _judge_afresh(self) -> None:
+        self._earlier.append(self.judge.measures)
+        self.judge.reset()
+        self.judge.update(self.session.world.state)
 
     def perform(self) -> None:
         """Move the object to the target with one grasp after the other, or raise SkillError."""
@@ -264,11 +284,10 @@ class _Run:
         wanted = dict(zip(placement.coordinates, placement.approach.tolist(), strict=True))
         if search.standing:
             stands = {s: wanted[s] for s in search.standing}
+            gone = session.world.time - self.begin
             session.restart(session.world.state.updated(stands))
-            self.judge.reset()
-            self.judge.update(session.world.state)
-            self.begin = 0.0
-            self._end = self.seconds
+            self.begin = -gone
+            self._judge_afresh()
         self._move_fingers(opened)
         planner = self.opener.planner
         with session.timed("plan"):
@@ -446,7 +465,7 @@ class _Run:
         self.judge.update(session.world.state, session.commands, held=session.world.held)
 
     def _check_time(self) -> None:
-        if self.session.world.time > self._end:
+        if self.session.world.time - self.begin > self.seconds:
             raise SkillError("time", f"The time of {self.seconds:g} s is up in '{self.session.phase}'.")
 
 

@@ -1,0 +1,93 @@
+import numpy as np
+import pytest
+
+import kineverse as kv
+from kineverse.errors import InvalidValueError, KineverseError, UnknownNameError
+from kineverse.grasping import find_gripper, find_handle, sample_grasps
+from kineverse.manipulation import PlacementSearch, Session, open_object
+from kineverse.worlds import KinematicWorld
+
+DRAWER, DOOR = "shelf_drawers/upper_drawer", "shelf_door/door"
+
+
+START = {"hsr/base/x": -1.5}
+
+
+def make_model(furniture):
+    model = kv.load("hsr")
+    with model.edit() as edit:
+        edit.include(furniture, furniture)
+        edit.attach(f"{furniture}/shelf", parent="world", transform=kv.translation(1, 0, 0.7))
+    return model
+
+
+@pytest.fixture(scope="module")
+def model():
+    return make_model("shelf_drawers")
+
+
+def start(model):
+    return model.default_state().updated(START)
+
+
+@pytest.fixture(scope="module")
+def session(model):
+    world = KinematicWorld(model, "hsr")
+    world.reset(start(model))
+    return Session(world)
+
+
+@pytest.fixture(scope="module")
+def opened(session):
+    return open_object(session, DRAWER)
+
+
+def test_drawer_opens_without_contact_or_slip(opened, session):
+    assert opened, opened.reason
+    assert session.world.state[DRAWER] > 0.2
+    assert session.world.held is None
+    assert opened.measures["penetration"] < 5e-4
+    assert opened.measures["limit_violation"] < 1e-6
+    assert opened.measures["grasp_error"] < 5e-4
+
+
+def test_drawer_closes_again(opened, session):
+    closed = open_object(session, DRAWER, target=0.0)
+    assert closed, closed.reason
+    assert session.world.state[DRAWER] < 0.02
+
+
+def test_placement_keeps_the_grasp_along_the_way():
+    model = make_model("shelf_door")
+    gripper, handle = find_gripper(model, "hsr"), find_handle(model, DOOR)
+    state = start(model)
+    grasps = sample_grasps(model, gripper, handle, 32)
+    found = PlacementSearch(model, gripper, state).find(state, grasps, 1.2)
+    assert found, found.why
+    hand, bar = model.fk(gripper.hand), model.fk(handle.frame)
+    for value, row in zip(found.values, found.way, strict=True):
+        at = state.updated(dict(zip(found.coordinates, row.tolist(), strict=True))).updated({DOOR: value})
+        np.testing.assert_allclose(hand(at), bar(at) @ found.grasp.pose, atol=1e-3)
+
+
+def test_locked_drawer_is_said_not_to_move():
+    copy = make_model("shelf_drawers")
+    with copy.edit() as edit:
+        edit.constrain("lock", 0, kv.position(DRAWER).derivative(), 0)
+    world = KinematicWorld(copy, "hsr")
+    world.reset(start(copy))
+    outcome = open_object(Session(world), DRAWER)
+    assert not outcome
+    assert "does not move on" in outcome.reason
+    assert outcome.measures["failure"] == "other"
+
+
+def test_wrong_arguments_are_refused(session):
+    with pytest.raises(UnknownNameError, match="upper_drawer"):
+        open_object(session, "shelf_drawers/uper_drawer")
+    with pytest.raises(InvalidValueError, match="of the robot"):
+        open_object(session, "hsr/arm_lift_joint")
+    with pytest.raises(InvalidValueError, match="moves from 0"):
+        open_object(session, DRAWER, target=3.0)
+    with pytest.raises(KineverseError):
+        open_object(session, DRAWER, handle="shelf_drawers/lower_drawer_handle")
