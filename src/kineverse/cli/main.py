@@ -34,7 +34,7 @@ from kineverse.cli.output import join_lines
 from kineverse.errors import KineverseError, UnknownNameError, suggest
 
 
-class Command(Protocol):
+class CommandModule(Protocol):
     """Module or object that is a command."""
 
     @property
@@ -52,7 +52,7 @@ def _by_name(*modules: ModuleType) -> dict[str, Any]:
     return {module.__name__.rpartition(".")[2]: module for module in modules}
 
 
-COMMANDS: dict[str, Command] = {
+COMMANDS: dict[str, CommandModule] = {
     **_by_name(info, fk, reach, plan),
     **manipulate.COMMANDS,
     **_by_name(

@@ -3,24 +3,22 @@
 from __future__ import annotations
 
 import argparse
-import json
 import math
 import sys
 import tempfile
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from contextlib import ExitStack, redirect_stdout
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal, NamedTuple
 
-import numpy as np
-
 from kineverse.cli.arguments import add_model_options, print_notes
-from kineverse.cli.manipulate_setup import ManipulationScene, is_shut, make_scene
-from kineverse.cli.output import format_cells, join_lines, show_activity
+from kineverse.cli.manipulate_output import PhaseLines, report_outcome
+from kineverse.cli.manipulate_setup import TOLERANCE, ManipulationScene, make_scene
+from kineverse.cli.output import join_lines, show_activity
 from kineverse.cli.view import (
     add_page_options,
     handle_interrupts,
-    list_mesh_problems,
     page_options,
     print_address,
     print_mesh_problems,
@@ -165,7 +163,7 @@ def _run(arguments: argparse.Namespace, skill: str) -> int:
             outcome = _view(arguments, skill, scene, world, stack)
         else:
             outcome = _act(arguments, skill, scene, world, [], arguments.record)
-            _report(arguments, skill, scene, world, outcome)
+            report_outcome(arguments, skill, scene, world, outcome)
     if outcome is None:
         raise KeyboardInterrupt  # before there was a result
     return DONE if outcome else NOT_DONE
@@ -216,7 +214,7 @@ def _act(
     from kineverse.worlds import Recorder
 
     with ExitStack() as stack:
-        watchers = [_Progress(scene), *watchers]
+        watchers = [PhaseLines(scene), *watchers]
         recorder = None
         if record is not None:
             about = {"skill": skill, "robot": scene.robot, "what": str(scene.coordinate), "world": world.name}
@@ -227,8 +225,11 @@ def _act(
             for watch in watchers:
                 watch(step)
 
-        act = _push if skill == "push" else _grasp
-        outcome = act(arguments, scene, world, look)
+        if scene.target is not None and abs(scene.start[scene.coordinate] - scene.target) < TOLERANCE:
+            outcome = _without_steps(scene, world, True, f"'{scene.coordinate}' is there from the start")
+        else:
+            act = _push if skill == "push" else _grasp
+            outcome = act(arguments, scene, world, look)
         if recorder is not None:
             recorder.write_outcome(outcome)
     return outcome
@@ -241,12 +242,13 @@ def _grasp(
     look: Callable[[RecordedStep], None],
 ) -> Outcome:
     """Open or close the object by its handle."""
+    if scene.gripper is None:
+        return _without_steps(scene, world, False, scene.why)
+
     from kineverse.grasping import find_handle, find_handles
     from kineverse.manipulation.opening import open_object  # type: ignore[import-not-found]
     from kineverse.manipulation.session import Session
 
-    if scene.gripper is None:
-        return _refuse(scene, world, scene.why)
     if arguments.handle is not None:
         print(find_handle(scene.model, scene.coordinate, arguments.handle), file=sys.stderr)
     elif handles := find_handles(scene.model, scene.coordinate):
@@ -276,7 +278,9 @@ def _push(
     from kineverse.manipulation.session import Session
 
     if not scene.pusher:
-        return _refuse(scene, world, f"{scene.why} --hand may name any body of the robot that is to push.")
+        return _without_steps(
+            scene, world, False, f"{scene.why} --hand may name any body of the robot that is to push."
+        )
     assert scene.target is not None
     with show_activity("compiling the controller; this is kept for the next time"):
         pushing = Pushing(
@@ -288,6 +292,7 @@ def _push(
             robot=scene.robot,
         )
         pushing.wait()
+    placed, where = 0, ""
     if not scene.stays:
         steps = round(arguments.seconds / 0.02)
         problem = pushing.first_contact(scene.start) or roll_out(pushing, scene.start, steps)[0]
@@ -296,14 +301,19 @@ def _push(
                 found = find_push_start(
                     pushing, scene.start, seconds=_PLACEMENT, steps=steps, seed=arguments.seed
                 )
-            print(f"place of the robot, as there is '{problem}' at the first: {found.why}", file=sys.stderr)
+            placed, where = found.samples, f"Another place of the robot: {found.why}"
+            print(f"not from where the robot stands: {problem}. {where}", file=sys.stderr)
             if found.state is not None:
                 world.reset(found.state)
+                where = ""
 
     def watch(session: Session) -> None:
         look(_PushStep(session, pushing))
 
-    return push(Session(world, on_step=watch), scene.coordinate, seconds=arguments.seconds, pushing=pushing)
+    session = Session(world, on_step=watch)
+    outcome = push(session, scene.coordinate, seconds=arguments.seconds, pushing=pushing)
+    reason = outcome.reason if outcome or not where else f"{outcome.reason} {where}"
+    return replace(outcome, reason=reason, measures={**outcome.measures, "placed": placed})
 
 
 class _PushStep:
@@ -319,24 +329,11 @@ class _PushStep:
             self.vectors = {name: (view.p, vector) for name, vector in vectors.items()}
 
 
-class _Progress:
-    """Lines on standard error, one when a phase begins."""
-
-    def __init__(self, scene: ManipulationScene) -> None:
-        self._scene, self._phase = scene, ""
-
-    def __call__(self, session: RecordedStep) -> None:
-        if session.phase != self._phase:
-            self._phase, scene = session.phase, self._scene
-            value = f"{session.world.state[scene.coordinate]:.3f} {scene.unit}".rstrip()
-            print(f"{session.world.time:7.2f} s  {self._phase:<12}  {value}", file=sys.stderr, flush=True)
-
-
-def _refuse(scene: ManipulationScene, world: World, reason: str) -> Outcome:
+def _without_steps(scene: ManipulationScene, world: World, done: bool, reason: str) -> Outcome:
     """Return the outcome of what was not begun."""
     from kineverse.manipulation.outcome import Outcome
 
-    return Outcome(False, world.state[scene.coordinate], join_lines(reason), world.name, 0.0, 0)
+    return Outcome(done, world.state[scene.coordinate], join_lines(reason), world.name, 0.0, 0)
 
 
 def _view(
@@ -374,71 +371,9 @@ def _view(
         live = LiveRun(page)
         outcome = _act(arguments, skill, scene, world, [live], record)
         live.remove()
-        _report(arguments, skill, scene, world, outcome)
+        report_outcome(arguments, skill, scene, world, outcome)
         sys.stdout.flush()
         if record is not None and outcome.steps:
             play_recording(page, read_run_recording(record), loop=True)
         page.wait()
     return outcome
-
-
-def _report(
-    arguments: argparse.Namespace, skill: str, scene: ManipulationScene, world: World, outcome: Outcome
-) -> None:
-    """Print the result, and write a picture if wanted."""
-    if arguments.picture is not None:
-        from kineverse.view import save_picture
-
-        save_picture(arguments.picture, scene.model, {str(s): v for s, v in world.state.items()})
-        print_mesh_problems(list_mesh_problems(scene.model))
-        print(f"picture: {arguments.picture}", file=sys.stderr)
-    if arguments.json:
-        answer = {
-            "done": outcome.done,
-            "value": outcome.value,
-            "reason": outcome.reason,
-            "world": outcome.world,
-            "seconds": outcome.seconds,
-            "steps": outcome.steps,
-            "skill": skill,
-            "robot": scene.robot,
-            "what": str(scene.coordinate),
-            "start": scene.start[scene.coordinate],
-            "target": scene.target,
-            "hand": None if scene.gripper is None else scene.gripper.hand,
-            "measures": outcome.measures,
-            "remarks": world.remarks,
-        }
-        print(json.dumps(_plain(answer), allow_nan=False))
-        return
-    at = f"{format_number(outcome.value, 4)} {scene.unit}".rstrip()
-    if not outcome:
-        verdict = f"not done, at {at}. {outcome.reason}"
-    else:
-        state = "shut" if is_shut(scene) else "done"
-        verdict = f"{state} at {at}, after {format_number(outcome.seconds, 4)} s in the {world.name} world"
-    print(f"{scene.coordinate}: {verdict}")
-    rows = [("steps", str(outcome.steps))]
-    rows += [(name, _format_measure(value)) for name, value in _plain(outcome.measures).items()]
-    print(format_cells(("measure", "value"), rows))
-    if arguments.record is not None:
-        print(f"recording: {arguments.record}")
-
-
-def _plain(value: Any) -> Any:
-    """Return a value as JSON has it: what is not finite is null, and what is unknown is its text."""
-    if isinstance(value, Mapping):
-        return {str(key): _plain(one) for key, one in value.items()}
-    if isinstance(value, (list, tuple)):
-        return [_plain(one) for one in value]
-    if isinstance(value, (np.ndarray, np.generic)):
-        return _plain(value.tolist())
-    if isinstance(value, float):
-        return value if math.isfinite(value) else None
-    return value if value is None or isinstance(value, (bool, int, str)) else str(value)
-
-
-def _format_measure(value: Any) -> str:
-    if isinstance(value, float):
-        return format_number(value, 4)
-    return "-" if value is None else str(value) if not isinstance(value, (dict, list)) else json.dumps(value)

@@ -20,7 +20,8 @@ if TYPE_CHECKING:
 
 OPENING = 0.4
 """Distance from shut at which closing and pushing begin [m], [rad]."""
-_CLOSED = 0.02
+TOLERANCE = 0.02
+"""Distance from the target within which an object is there [m], [rad]."""
 _MOST_NOTES = 3
 
 
@@ -126,7 +127,7 @@ def find_shut_value(model: kv.Model, coordinate: kv.Symbol) -> float:
 def is_shut(scene: ManipulationScene) -> bool:
     """Return whether the target of a scene is where its object is shut."""
     shut = find_shut_value(scene.model, scene.coordinate)
-    return scene.target is not None and abs(scene.target - shut) < _CLOSED
+    return scene.target is not None and abs(scene.target - shut) < TOLERANCE
 
 
 def _open_from(shut: float, lower: float, upper: float) -> float:
@@ -233,6 +234,7 @@ def _find_pusher(
         if hand is None:
             return None, str(error), ()
         if skill == "push" and hand in model.bodies and hand.startswith(f"{robot}/"):
+            print(f"pusher: {hand}", file=sys.stderr)
             return None, "", (hand,)
         raise
     print(f"gripper: {gripper}", file=sys.stderr)
