@@ -9,7 +9,8 @@ import re
 import sys
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
-from typing import TextIO
+from types import ModuleType
+from typing import Any, Protocol, TextIO
 
 from kineverse._version import __version__
 from kineverse.cli import (
@@ -21,6 +22,7 @@ from kineverse.cli import (
     fit,
     fk,
     info,
+    manipulate,
     plan,
     reach,
     reproduce,
@@ -31,13 +33,29 @@ from kineverse.cli import (
 from kineverse.cli.output import join_lines
 from kineverse.errors import KineverseError, UnknownNameError, suggest
 
-COMMANDS = {
-    module.__name__.rpartition(".")[2]: module
-    for module in (
-        info,
-        fk,
-        reach,
-        plan,
+
+class CommandModule(Protocol):
+    """Module or object that is a command."""
+
+    @property
+    def HELP(self) -> str:
+        """Summary, and after it the description."""
+
+    def add_arguments(self, parser: argparse.ArgumentParser) -> None:
+        """Declare the options."""
+
+    def run(self, arguments: argparse.Namespace) -> int:
+        """Run the command and return its exit status."""
+
+
+def _by_name(*modules: ModuleType) -> dict[str, Any]:
+    return {module.__name__.rpartition(".")[2]: module for module in modules}
+
+
+COMMANDS: dict[str, CommandModule] = {
+    **_by_name(info, fk, reach, plan),
+    **manipulate.COMMANDS,
+    **_by_name(
         view,
         convert,
         diff,
@@ -48,7 +66,7 @@ COMMANDS = {
         demo,
         bench,
         reproduce,
-    )
+    ),
 }
 
 ERROR, INTERRUPTED, PIPE_CLOSED = 2, 130, 141
@@ -67,6 +85,7 @@ examples:
   kineverse fk kitchen kitchen/fridge_door_handle --set kitchen/fridge_door=30deg
   kineverse reach fetch fetch/gripper_link --pose 0.7 0.2 0.9
   kineverse plan shelf_door --to shelf_door/door=80deg
+  kineverse push kitchen --robot hsr --what kitchen/fridge_door
   kineverse view kitchen                              move it in the browser
   kineverse convert kitchen kitchen.kv.json           write it in another format
   kineverse diff kitchen kitchen.kv.json              differences of two models

@@ -1,0 +1,379 @@
+"""``kineverse open``, ``close`` and ``push``: a robot moves a door or a drawer in a world."""
+
+from __future__ import annotations
+
+import argparse
+import math
+import sys
+import tempfile
+from collections.abc import Callable
+from contextlib import ExitStack, redirect_stdout
+from dataclasses import replace
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, Literal, NamedTuple
+
+from kineverse.cli.arguments import add_model_options, print_notes
+from kineverse.cli.manipulate_output import PhaseLines, report_outcome
+from kineverse.cli.manipulate_setup import TOLERANCE, ManipulationScene, make_scene
+from kineverse.cli.output import join_lines, show_activity
+from kineverse.cli.view import (
+    add_page_options,
+    handle_interrupts,
+    page_options,
+    print_address,
+    print_mesh_problems,
+)
+from kineverse.errors import InvalidValueError, MissingDependencyError
+from kineverse.expressions.printing import format_number
+
+if TYPE_CHECKING:
+    from kineverse.manipulation.outcome import Outcome
+    from kineverse.manipulation.push_controller import Pushing
+    from kineverse.manipulation.session import Session
+    from kineverse.worlds import World
+    from kineverse.worlds.recorder import RecordedStep
+
+DONE, NOT_DONE = 0, 1
+_PLACEMENT = 60.0
+"""Largest time of the search for a place of the base [s]."""
+
+_COMMON = """
+MODEL is any model or file, ROBOT any shipped robot or robot file; ROBOT@X,Y,ANGLE places its base. The world
+gets the speeds of the robot alone, and judges by its own truth: kinematic (the default), or mujoco with
+contacts, forces and friction. The exit status is 0 if it is done, 1 if not, 2 if the request is wrong. This
+needs the extras 'control' and 'geometry', the other world 'mjcf', and --record 'recording'.
+
+examples:
+"""
+
+
+class ManipulationCommand(NamedTuple):
+    """One of the three commands.
+
+    Attributes
+    ----------
+    skill
+        Its name.
+    HELP
+        Its help.
+    """
+
+    skill: str
+    HELP: str
+
+    def add_arguments(self, parser: argparse.ArgumentParser) -> None:
+        """Declare the options."""
+        _add_arguments(parser, self.skill)
+
+    def run(self, arguments: argparse.Namespace) -> int:
+        """Run the skill in a world, print its result, and return the status."""
+        return _run(arguments, self.skill)
+
+
+COMMANDS = {
+    "open": ManipulationCommand(
+        "open",
+        f"""open a door or drawer with a robot that grasps its handle
+
+The object is shut at first, unless --from says otherwise, and is opened to its limit or --to.
+{_COMMON}  kineverse open kitchen --robot fetch --what kitchen/fridge_door
+  kineverse open kitchens/17 --robot hsr --what kitchen/oven_door --world mujoco --json
+  kineverse open shelf.urdf --robot arm.urdf --base omni --what drawer --to 20cm""",
+    ),
+    "close": ManipulationCommand(
+        "close",
+        f"""close a door or drawer with a robot that grasps its handle
+
+The object is open by .4 (rad, m) or to its limit at first, unless --from says otherwise. It is shut at the
+limit nearest to its default value.
+{_COMMON}  kineverse close kitchen --robot fetch --what kitchen/fridge_door
+  kineverse close kitchen --robot hsr --what kitchen/oven_door --from 60deg --record run.mcap""",
+    ),
+    "push": ManipulationCommand(
+        "push",
+        f"""push a door or drawer shut with a robot
+
+The object is open by .4 (rad, m) or to its limit at first, unless --from says otherwise. It is shut at the
+limit nearest to its default value. A robot without a place starts where it stands, or from a place that is
+searched if the push does not go through from there. --hand may name any body of the robot, which then pushes.
+{_COMMON}  kineverse push kitchen --robot hsr --what kitchen/sink_left_upper_drawer
+  kineverse push kitchen --robot pr2@-0.6,-1.4,0 --what kitchen/fridge_door --view""",
+    ),
+}
+
+
+def _add_arguments(parser: argparse.ArgumentParser, skill: str) -> None:
+    parser.usage = "%(prog)s MODEL --robot ROBOT[@X,Y,ANGLE] --what COORDINATE [options]"
+    parser.add_argument("model", metavar="MODEL", help="name of a shipped model, or path of a file")
+    parser.add_argument(
+        "--robot",
+        metavar="ROBOT[@X,Y,ANGLE]",
+        required=True,
+        help="the robot, by name or file, and the place of its base",
+    )
+    parser.add_argument("--what", metavar="COORDINATE", required=True, help="coordinate of the object")
+    parser.add_argument(
+        "--world", choices=("kinematic", "mujoco"), default="kinematic", help="the world (kinematic)"
+    )
+    parser.add_argument("--from", metavar="VALUE", dest="start", help="value at the start (0.3, 30deg, 12cm)")
+    parser.add_argument("--to", metavar="VALUE", help="wanted value")
+    parser.add_argument(
+        "--hand", metavar="FRAME", help="hand of the robot, or one of its fingers; the likeliest gripper"
+    )
+    if skill != "push":
+        parser.add_argument("--handle", metavar="FRAME", help="handle of the object; the best one")
+    parser.add_argument(
+        "--grasp",
+        choices=("friction", "tie"),
+        help="what holds in MuJoCo: friction (the default), or a weld as soon as both fingers touch",
+    )
+    parser.add_argument(
+        "--base",
+        choices=("omni",),
+        help="put a robot file without a base on one that moves in all directions",
+    )
+    parser.add_argument(
+        "--seconds", type=float, default=60.0, metavar="S", help="largest time in the world (60)"
+    )
+    parser.add_argument("--seed", type=int, default=0, metavar="N", help="seed of everything sampled (0)")
+    parser.add_argument("--record", metavar="FILE", help="record the run (.mcap), for kineverse view")
+    parser.add_argument("--view", action="store_true", help="show the run in the browser while it happens")
+    parser.add_argument("--picture", metavar="FILE", help="write a picture (.png) of the end")
+    parser.add_argument("--json", action="store_true", help="one JSON object on standard output")
+    add_model_options(parser)
+    add_page_options(parser)
+
+
+def _run(arguments: argparse.Namespace, skill: str) -> int:
+    _check(arguments)
+    with show_activity(f"reading {arguments.model} and {arguments.robot}"):
+        scene = make_scene(arguments, skill)
+    print_notes(
+        f"{violation.name} is violated at the start: {format_number(violation.value)} is not in "
+        f"[{format_number(violation.lower)}, {format_number(violation.upper)}]"
+        for violation in scene.model.violations(scene.start)[:3]
+    )
+    with show_activity("preparing the world"):
+        world = _make_world(arguments, scene)
+    if arguments.verbose:
+        print_notes(world.remarks)
+    outcome = None
+    with ExitStack() as stack:
+        if arguments.view:
+            outcome = _view(arguments, skill, scene, world, stack)
+        else:
+            outcome = _act(arguments, skill, scene, world, [], arguments.record)
+            report_outcome(arguments, skill, scene, world, outcome)
+    if outcome is None:
+        raise KeyboardInterrupt  # before there was a result
+    return DONE if outcome else NOT_DONE
+
+
+def _check(arguments: argparse.Namespace) -> None:
+    """Check options before anything is loaded."""
+    if not arguments.seconds > 0 or math.isinf(arguments.seconds):
+        raise InvalidValueError(f"--seconds is a positive number, not {arguments.seconds:g}.")
+    if arguments.seed < 0:
+        raise InvalidValueError(f"--seed is a number from 0 on, not {arguments.seed}.")
+    if arguments.grasp is not None and arguments.world != "mujoco":
+        raise InvalidValueError("--grasp is for --world mujoco; the kinematic world has no friction.")
+    if arguments.picture is not None:
+        from kineverse.view.pictures import check_png_name
+
+        check_png_name(arguments.picture)
+    if arguments.record is not None:
+        from kineverse.worlds.recorder import check_recording_name, import_mcap
+
+        check_recording_name(arguments.record)
+        import_mcap("mcap.writer")  # says at once which extra is missing
+
+
+def _make_world(arguments: argparse.Namespace, scene: ManipulationScene) -> World:
+    """Return the world, at the start."""
+    from kineverse.worlds import KinematicWorld, MujocoWorld
+
+    world: World
+    if arguments.world == "mujoco":
+        grasp: Literal["friction", "tie"] = arguments.grasp or "friction"
+        world = MujocoWorld(scene.model, scene.robot, scene.gripper, grasp=grasp, seed=arguments.seed)
+    else:
+        world = KinematicWorld(scene.model, scene.robot, scene.gripper, seed=arguments.seed)
+    world.reset(scene.start)
+    return world
+
+
+def _act(
+    arguments: argparse.Namespace,
+    skill: str,
+    scene: ManipulationScene,
+    world: World,
+    watchers: list[Callable[[RecordedStep], object]],
+    record: str | None,
+) -> Outcome:
+    """Run the skill, with a recording if wanted, and return its outcome."""
+    from kineverse.worlds import Recorder
+
+    with ExitStack() as stack:
+        watchers = [PhaseLines(scene), *watchers]
+        recorder = None
+        if record is not None:
+            about = {"skill": skill, "robot": scene.robot, "what": str(scene.coordinate), "world": world.name}
+            recorder = stack.enter_context(Recorder(record, scene.model, about))
+            watchers.append(recorder)
+
+        def look(step: RecordedStep) -> None:
+            for watch in watchers:
+                watch(step)
+
+        if scene.target is not None and abs(scene.start[scene.coordinate] - scene.target) < TOLERANCE:
+            outcome = _without_steps(scene, world, True, f"'{scene.coordinate}' is there from the start")
+        else:
+            act = _push if skill == "push" else _grasp
+            outcome = act(arguments, scene, world, look)
+        if recorder is not None:
+            recorder.write_outcome(outcome)
+    return outcome
+
+
+def _grasp(
+    arguments: argparse.Namespace,
+    scene: ManipulationScene,
+    world: World,
+    look: Callable[[RecordedStep], None],
+) -> Outcome:
+    """Open or close the object by its handle."""
+    if scene.gripper is None:
+        return _without_steps(scene, world, False, scene.why)
+
+    from kineverse.grasping import find_handle, find_handles
+    from kineverse.manipulation.opening import open_object  # type: ignore[import-not-found]
+    from kineverse.manipulation.session import Session
+
+    if arguments.handle is not None:
+        print(find_handle(scene.model, scene.coordinate, arguments.handle), file=sys.stderr)
+    elif handles := find_handles(scene.model, scene.coordinate):
+        print(handles[0], file=sys.stderr)
+    outcome: Outcome = open_object(
+        Session(world, on_step=look),
+        scene.coordinate,
+        target=scene.target,
+        hand=scene.gripper.hand,
+        handle=arguments.handle,
+        seconds=arguments.seconds,
+        seed=arguments.seed,
+    )
+    return outcome
+
+
+def _push(
+    arguments: argparse.Namespace,
+    scene: ManipulationScene,
+    world: World,
+    look: Callable[[RecordedStep], None],
+) -> Outcome:
+    """Push the object, from where the robot stands or from a place that is searched."""
+    from kineverse.manipulation.push_controller import Pushing
+    from kineverse.manipulation.push_placement import find_push_start, roll_out
+    from kineverse.manipulation.pushing import push
+    from kineverse.manipulation.session import Session
+
+    if not scene.pusher:
+        return _without_steps(
+            scene, world, False, f"{scene.why} --hand may name any body of the robot that is to push."
+        )
+    assert scene.target is not None
+    with show_activity("compiling the controller; this is kept for the next time"):
+        pushing = Pushing(
+            scene.model,
+            scene.coordinate,
+            scene.pusher,
+            scene.start,
+            target=scene.target,
+            robot=scene.robot,
+        )
+        pushing.wait()
+    placed, where = 0, ""
+    if not scene.stays:
+        steps = round(arguments.seconds / 0.02)
+        problem = pushing.first_contact(scene.start) or roll_out(pushing, scene.start, steps)[0]
+        if problem:
+            with show_activity("searching a place for the robot"):
+                found = find_push_start(
+                    pushing, scene.start, seconds=_PLACEMENT, steps=steps, seed=arguments.seed
+                )
+            placed, where = found.samples, f"Another place of the robot: {found.why}"
+            print(f"not from where the robot stands: {problem}. {where}", file=sys.stderr)
+            if found.state is not None:
+                world.reset(found.state)
+                where = ""
+
+    def watch(session: Session) -> None:
+        look(_PushStep(session, pushing))
+
+    session = Session(world, on_step=watch)
+    outcome = push(session, scene.coordinate, seconds=arguments.seconds, pushing=pushing)
+    reason = outcome.reason if outcome or not where else f"{outcome.reason} {where}"
+    return replace(outcome, reason=reason, measures={**outcome.measures, "placed": placed})
+
+
+class _PushStep:
+    """Step of a session, with the vectors of the controller for pages and recordings."""
+
+    def __init__(self, session: Session, pushing: Pushing) -> None:
+        self.world, self.state, self.commands = session.world, session.state, session.commands
+        self.phase = session.phase
+        self.vectors: dict[str, tuple[Any, Any]] = {}
+        view = pushing.view
+        if view is not None and math.isfinite(view.distance):
+            vectors = {"n": view.n, "push": view.push, "tangent": view.tangent}
+            self.vectors = {name: (view.p, vector) for name, vector in vectors.items()}
+
+
+def _without_steps(scene: ManipulationScene, world: World, done: bool, reason: str) -> Outcome:
+    """Return the outcome of what was not begun."""
+    from kineverse.manipulation.outcome import Outcome
+
+    return Outcome(done, world.state[scene.coordinate], join_lines(reason), world.name, 0.0, 0)
+
+
+def _view(
+    arguments: argparse.Namespace,
+    skill: str,
+    scene: ManipulationScene,
+    world: World,
+    stack: ExitStack,
+) -> Outcome | None:
+    """Run the skill on a page, then play it there until Ctrl-C; return None if it was interrupted before."""
+    from kineverse.view.live_run import LiveRun
+    from kineverse.view.recording_playback import play_recording
+    from kineverse.view.title import read_title
+    from kineverse.view.viewer import Viewer
+    from kineverse.worlds import read_run_recording
+    from kineverse.worlds.recorder import import_mcap
+
+    record = arguments.record
+    if record is None:
+        try:
+            import_mcap("mcap.writer")
+        except MissingDependencyError as error:
+            print(f"kineverse: note: the run is not played again. {error}", file=sys.stderr)
+        else:
+            record = str(Path(stack.enter_context(tempfile.TemporaryDirectory())) / "run.mcap")
+    label = f"{read_title(arguments.model)}, {scene.robot}"
+    outcome = None
+    with (
+        handle_interrupts(),
+        Viewer(scene.model, world.state, label=label, **page_options(arguments)) as page,
+    ):
+        print_mesh_problems(page.problems)
+        with redirect_stdout(sys.stderr if arguments.json else sys.stdout):
+            print_address(page, browser=not arguments.no_browser)
+        live = LiveRun(page)
+        outcome = _act(arguments, skill, scene, world, [live], record)
+        live.remove()
+        report_outcome(arguments, skill, scene, world, outcome)
+        sys.stdout.flush()
+        if record is not None and outcome.steps:
+            play_recording(page, read_run_recording(record), loop=True)
+        page.wait()
+    return outcome

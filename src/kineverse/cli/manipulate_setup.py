@@ -1,0 +1,241 @@
+"""Scenes of ``kineverse open``, ``close`` and ``push``: the model with the robot, the start, the target."""
+
+from __future__ import annotations
+
+import argparse
+import math
+import re
+import sys
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from kineverse.cli.arguments import load_model, parse_value, print_notes
+from kineverse.cli.plan_arguments import parse_robot, place_base
+from kineverse.errors import InvalidValueError, UnknownNameError, suggest
+
+if TYPE_CHECKING:
+    import kineverse as kv
+    from kineverse.grasping import Gripper
+
+OPENING = 0.4
+"""Distance from shut at which closing and pushing begin [m], [rad]."""
+TOLERANCE = 0.02
+"""Distance from the target within which an object is there [m], [rad]."""
+_MOST_NOTES = 3
+
+
+@dataclass(frozen=True)
+class ManipulationScene:
+    """Robot and furniture before a skill.
+
+    Attributes
+    ----------
+    model
+        Model of both.
+    robot
+        Prefix of the robot.
+    coordinate
+        Coordinate of the object.
+    unit
+        Its unit, ``rad``, ``m``, or nothing.
+    start
+        State of everything.
+    target
+        Wanted value [m], [rad]; None for the skill's own.
+    gripper
+        Gripper that is used; None if the robot has none.
+    why
+        Why there is no gripper.
+    pusher
+        Bodies that may push.
+    stays
+        Whether the start of the robot was given, so that it is not placed elsewhere.
+    """
+
+    model: kv.Model
+    robot: str
+    coordinate: kv.Symbol
+    unit: str
+    start: kv.State
+    target: float | None
+    gripper: Gripper | None
+    why: str
+    pusher: tuple[str, ...]
+    stays: bool
+
+
+def make_scene(arguments: argparse.Namespace, skill: str) -> ManipulationScene:
+    """Load the model, put the robot into it, and return everything before a skill begins.
+
+    Raises
+    ------
+    KineverseError
+        If something cannot be loaded; for unknown names, values out of limits, and a coordinate that is not
+        an object's.
+    """
+    from kineverse.experiments.manipulation.robots import SHIPPED, remove_unusable_shapes
+    from kineverse.view.sliders import infer_units
+
+    begin, end = (None if v is None else parse_value(v) for v in (arguments.start, arguments.to))
+    source, place = parse_robot(arguments.robot)
+    model = load_model(arguments, arguments.model)
+    prefix, named = _choose_prefix(arguments, source, model)
+    before = {*model.articulations}
+    model.include(source, prefix, root=arguments.root, strict=arguments.strict, loops=arguments.loops)
+    if arguments.base == "omni":
+        _add_base(model, named)
+    joints = [name for name in model.articulations if name not in before]
+    try:
+        standing = place_base(model, joints, place)
+    except InvalidValueError as error:
+        raise InvalidValueError(f"{error} --base omni gives it one.") from None
+    lost = remove_unusable_shapes(model)
+    more = [f"and {len(lost) - _MOST_NOTES} more"] if len(lost) > _MOST_NOTES else []
+    print_notes([f"without this shape: {line}" for line in lost[:_MOST_NOTES]] + more)
+
+    coordinate = _find_coordinate(model, arguments.what, named)
+    default = model.default_state()
+    shut = find_shut_value(model, coordinate)
+    lower, upper = model.limits(coordinate)
+    if begin is None:
+        begin = default[coordinate] if skill == "open" else _open_from(shut, lower, upper)
+    if end is None and skill != "open":
+        end = shut
+    for option, value in (("--from", begin), ("--to", end)):
+        if value is not None and not lower - 1e-9 <= value <= upper + 1e-9:
+            raise InvalidValueError(
+                f"{option} {value:.4g}: '{coordinate}' is between {lower:.4g} and {upper:.4g}."
+            )
+    state = SHIPPED[source].start_state(model) if source in SHIPPED else default
+    state = state.updated(standing).updated({coordinate: begin})
+    gripper, why, pusher = _find_pusher(model, named, arguments.hand, skill)
+    values = {str(s): state[s] for s in model.symbols if s in state}
+    unit = infer_units(model, values, [str(coordinate)]).get(str(coordinate)) or ""
+    return ManipulationScene(
+        model, named, coordinate, unit, state, end, gripper, why, pusher, place is not None
+    )
+
+
+def find_shut_value(model: kv.Model, coordinate: kv.Symbol) -> float:
+    """Return the limit of a coordinate nearest to its default value; the latter if there is none."""
+    default = model.default_state()[coordinate]
+    finite = [limit for limit in model.limits(coordinate) if math.isfinite(limit)]
+    return min(finite, key=lambda limit: abs(limit - default), default=default)
+
+
+def is_shut(scene: ManipulationScene) -> bool:
+    """Return whether the target of a scene is where its object is shut."""
+    shut = find_shut_value(scene.model, scene.coordinate)
+    return scene.target is not None and abs(scene.target - shut) < TOLERANCE
+
+
+def _open_from(shut: float, lower: float, upper: float) -> float:
+    """Return the value at a distance of :data:`OPENING` from shut, or the limit."""
+    if upper - shut >= shut - lower:
+        return min(shut + OPENING, upper)
+    return max(shut - OPENING, lower)
+
+
+def _choose_prefix(arguments: argparse.Namespace, source: str, model: kv.Model) -> tuple[str | None, str]:
+    """Return the prefix to include a robot with, None for its own, and the one that its names then have.
+
+    Raises
+    ------
+    InvalidValueError
+        If names of the model would count as the robot's.
+    """
+    from kineverse.model.frame import WORLD
+
+    alone = load_model(arguments, source)
+    names = [name for name in (*alone.frames, *map(str, alone.degrees_of_freedom)) if name != WORLD]
+    heads = {name.partition("/")[0] if "/" in name else "" for name in names}
+    if not alone.degrees_of_freedom and arguments.base is None:
+        raise InvalidValueError(f"--robot {source}: nothing of it moves, so it is no robot.")
+    if len(heads) == 1 and "" not in heads:
+        prefix, own = None, heads.pop()
+    else:
+        prefix = own = re.sub(r"[^\w-]+", "_", Path(source).name.partition(".")[0]) or "robot"
+    taken = next(
+        (n for n in (*model.frames, *map(str, model.degrees_of_freedom)) if n.startswith(f"{own}/")), None
+    )
+    if taken is not None:
+        raise InvalidValueError(
+            f"{arguments.model} has '{taken}', which would be of the robot '{own}' of --robot {source}. "
+            "Give the furniture alone as MODEL, or a robot with another name."
+        )
+    return prefix, own
+
+
+def _add_base(model: kv.Model, robot: str) -> None:
+    """Put a robot on an omnidirectional base.
+
+    Raises
+    ------
+    InvalidValueError
+        If it has a base.
+    """
+    import numpy as np
+
+    from kineverse.articulations import OmniBase
+    from kineverse.model.frame import WORLD
+
+    own = {name: placed for name, placed in model.frames.items() if name.startswith(f"{robot}/")}
+    roots = [name for name, placed in own.items() if placed.parent == WORLD]
+    if any(model.speeds_of(root) for root in roots):
+        raise InvalidValueError(f"--base: the robot '{robot}' has a base that moves already.")
+    name = f"{robot}/base" if f"{robot}/base" not in own else f"{robot}/omni_base"
+    carrier = f"{name}_carrier"
+    with model.edit() as edit:
+        edit.apply(OmniBase(name=name, parent=WORLD, child=carrier))
+        for root in roots:
+            edit.attach(root, carrier, np.asarray(model.fk(root)({})))
+
+
+def _find_coordinate(model: kv.Model, name: str, robot: str) -> kv.Symbol:
+    """Return the coordinate of a name, which is one of an object.
+
+    Raises
+    ------
+    UnknownNameError, InvalidValueError
+        If there is no such coordinate; if it is the robot's, or depends on others.
+    """
+    objects = [str(s) for s in model.degrees_of_freedom if not str(s).startswith(f"{robot}/")]
+    if name.startswith(f"{robot}/"):
+        raise InvalidValueError(
+            f"--what {name} is of the robot itself; it names what the robot moves. "
+            f"{suggest(name, objects, 'coordinate')}"
+        )
+    if name not in objects:
+        raise UnknownNameError(
+            f"--what {name}: the model has no such coordinate that is free to move. "
+            f"{suggest(name, objects, 'coordinate')}"
+        )
+    return model.symbol(name)
+
+
+def _find_pusher(
+    model: kv.Model, robot: str, hand: str | None, skill: str
+) -> tuple[Gripper | None, str, tuple[str, ...]]:
+    """Return the gripper, or why there is none, and the bodies that push.
+
+    Raises
+    ------
+    UnknownNameError
+        For a hand that does not exist, or cannot grasp what is to be grasped.
+    """
+    from kineverse.grasping import find_gripper
+
+    if hand is not None:
+        model.fk(hand)  # raises for an unknown frame
+    try:
+        gripper = find_gripper(model, robot, hand)
+    except UnknownNameError as error:
+        if hand is None:
+            return None, str(error), ()
+        if skill == "push" and hand in model.bodies and hand.startswith(f"{robot}/"):
+            print(f"pusher: {hand}", file=sys.stderr)
+            return None, "", (hand,)
+        raise
+    print(f"gripper: {gripper}", file=sys.stderr)
+    return gripper, "", gripper.bodies

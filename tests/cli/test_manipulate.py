@@ -1,0 +1,160 @@
+"""``kineverse open``, ``close`` and ``push``: start, target, result, and mistakes."""
+
+from __future__ import annotations
+
+import json
+import sys
+from types import SimpleNamespace
+
+import pytest
+
+import kineverse as kv
+from kineverse.manipulation.outcome import Outcome
+
+pytest.importorskip("coal")
+pytest.importorskip("daqp")
+
+ARM = """<robot name="arm">
+  <link name="root"/>
+  <link name="lift"/>
+  <link name="finger">
+    <collision><origin xyz="0.2 0 0"/><geometry><box size="0.4 0.03 0.03"/></geometry></collision>
+  </link>
+  <joint name="slide" type="prismatic">
+    <parent link="root"/><child link="lift"/><axis xyz="0 0 1"/>
+    <limit lower="0" upper="1.5" velocity="1" effort="9"/>
+  </joint>
+  <joint name="wrist" type="fixed"><parent link="lift"/><child link="finger"/></joint>
+</robot>"""
+
+DRAWER = """<robot name="box">
+  <link name="wall"/>
+  <link name="front">
+    <collision><geometry><box size="0.02 0.4 0.3"/></geometry></collision>
+  </link>
+  <joint name="drawer" type="prismatic">
+    <origin xyz="1.2 0 0.5"/><parent link="wall"/><child link="front"/><axis xyz="-1 0 0"/>
+    <limit lower="0" upper="0.2" velocity="1" effort="9"/>
+  </joint>
+</robot>"""
+
+HSR = ("--robot", "hsr", "--what", "shelf_drawers/upper_drawer")
+
+
+@pytest.fixture
+def files(tmp_path, monkeypatch):
+    """A robot of one joint and no gripper, and a drawer, in the working directory."""
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "arm.urdf").write_text(ARM)
+    (tmp_path / "box.urdf").write_text(DRAWER)
+    return tmp_path
+
+
+@pytest.fixture
+def asked(monkeypatch):
+    """Stand in for the skill: it holds still for two steps. Returns what it was asked for."""
+    calls = []
+
+    def open_object(session, what, *, target=None, **options):
+        calls.append(SimpleNamespace(session=session, what=what, target=target, options=options))
+        session.phase = "grasp"
+        session.stop()
+        session.stop()
+        done = not options["handle"]
+        return Outcome(done, 0.3, "it is over", session.world.name, 0.04, 2, {"grasp": float("nan")})
+
+    monkeypatch.setitem(
+        sys.modules, "kineverse.manipulation.opening", SimpleNamespace(open_object=open_object)
+    )
+    return calls
+
+
+def test_a_robot_file_pushes_with_a_named_body_and_the_run_is_recorded(run, files):
+    """The file's names get a prefix, it stands where @ says, and the world's truth is reported."""
+    pytest.importorskip("mcap")
+    from kineverse.worlds import read_run_recording
+
+    words = ["push", "box.urdf", "--robot", "arm.urdf@0.3,0,0", "--base", "omni", "--what", "drawer"]
+    words += ["--hand", "arm/finger", "--record", "run.mcap"]
+    status, out, err = run(*words, "--json")
+    answer = json.loads(out)
+    assert (status, answer["done"]) == (0, True), answer["reason"]
+    assert (answer["start"], answer["target"]) == (0.2, 0.0)
+    assert abs(answer["value"]) < 0.02
+    assert (answer["robot"], answer["hand"], answer["world"]) == ("arm", None, "kinematic")
+    assert "push" in err
+    recorded = read_run_recording("run.mcap")
+    assert recorded.outcome["value"] == answer["value"]
+    assert recorded.states[recorded.model.symbol("drawer")][-1] == pytest.approx(answer["value"])
+    assert recorded.states[recorded.model.symbol("arm/base/x")][0] == pytest.approx(0.3, abs=0.02)
+
+
+def test_without_a_gripper_it_is_not_done_and_says_why(run, files):
+    for skill in ("open", "push"):
+        status, out, _ = run(skill, "box.urdf", "--robot", "arm.urdf", "--what", "drawer", "--json")
+        answer = json.loads(out)
+        assert (status, answer["done"], answer["seconds"]) == (1, False, 0)
+        assert "no gripper" in answer["reason"]
+
+
+def test_what_is_there_from_the_start_is_done(run, files):
+    words = ["box.urdf", "--robot", "arm.urdf", "--what", "drawer", "--hand", "arm/finger", "--from", "1cm"]
+    status, out, _ = run("push", *words)
+    assert (status, out) == (0, "drawer: shut at 0.01 m, after 0 s in the kinematic world\n")
+
+
+def test_open_begins_shut_and_close_begins_open(run, asked, tmp_path):
+    status, out, err = run("open", "shelf_drawers", *HSR, "--json", "--seconds", 5)
+    answer = json.loads(out)
+    assert status == 0
+    assert {"done", "value", "reason", "world", "seconds"} <= answer.keys()
+    assert answer["measures"] == {"grasp": None}
+    assert "gripper of hsr/hand_palm_link" in err
+    assert "handle shelf_drawers/" in err
+    assert err.count("grasp") == 1
+    assert asked[0].target is None
+    assert asked[0].options == {"hand": "hsr/hand_palm_link", "handle": None, "seconds": 5.0, "seed": 0}
+
+    picture = tmp_path / "end.png"
+    words = ["close", "shelf_drawers", "--robot", "hsr@-1,0.5,90deg", *HSR[2:]]
+    handle = next(line.split()[1].strip(":") for line in err.splitlines() if line.startswith("handle"))
+    status, out, _ = run(*words, "--handle", handle, "--picture", picture)
+    assert status == 1
+    assert out.startswith("shelf_drawers/upper_drawer: not done, at 0.3 m. it is over\n")
+    assert "steps" in out
+    assert picture.read_bytes()[:4] == b"\x89PNG"
+    state, drawer = asked[1].session.world.state, asked[1].what
+    model = kv.load("shelf_drawers")
+    assert asked[1].target == model.limits(drawer)[0]
+    assert state[drawer] == min(0.4, model.limits(drawer)[1])
+    assert [state[f"hsr/base/{c}"] for c in ("x", "y", "angle")] == pytest.approx([-1, 0.5, 1.5708], abs=1e-4)
+
+
+@pytest.mark.parametrize(
+    ("words", "message"),
+    [
+        (
+            ["shelf_drawers", *HSR[:2], "--what", "shelf_drawers/uper_drawer"],
+            "Did you mean 'shelf_drawers/upper",
+        ),
+        (["shelf_drawers", *HSR[:2], "--what", "hsr/arm_lift_joint"], "of the robot itself"),
+        (["shelf_drawers", *HSR, "--from", "2m"], "--from 2: 'shelf_drawers/upper_drawer' is between 0 and"),
+        (["shelf_drawers", *HSR, "--to", "far"], "'far' is not a value"),
+        (["shelf_drawers", *HSR, "--hand", "hsr/hnd_palm_link"], "hsr/hand_palm_link"),
+        (["shelf_drawers", *HSR, "--handle", "shelf_drawers/frame"], "shelf_drawers/"),
+        (["shelf_drawers", *HSR, "--grasp", "tie"], "--world mujoco"),
+        (["shelf_drawers", *HSR, "--seconds", "-1"], "--seconds"),
+        (["shelf_drawers", *HSR, "--record", "run.bag"], ".mcap"),
+        (["shelf_drawers", "--robot", "hrs", *HSR[2:]], "hsr"),
+        (["hsr", "--robot", "hsr", "--what", "x"], "Give the furniture alone"),
+        (["hsr", "--robot", "hsr", "--base", "omni", "--what", "x"], "Give the furniture alone"),
+        (["box.urdf", "--robot", "arm.urdf@1,0,0", "--what", "drawer"], "--base omni"),
+        (["box.urdf", "--robot", "hsr", "--base", "omni", "--what", "drawer"], "moves already"),
+        (["arm.urdf", "--robot", "box.urdf", "--what", "box/drawer"], "of the robot itself"),
+    ],
+)
+def test_mistakes_are_reported_in_one_line(run, asked, files, words, message):
+    status, out, err = run("open", *words)
+    assert (status, out) == (2, "")
+    assert message in err.splitlines()[-1]
+    assert not asked
