@@ -11,6 +11,7 @@ import kineverse as kv
 from kineverse.bench import BENCHMARKS, DisagreementError, run_benchmarks, select_benchmarks
 from kineverse.bench.harness import ProgramError, has_peer, run_program
 from kineverse.bench.large_models import READERS, count_reruns, make_large_model
+from kineverse.bench.reaching import ARMS
 
 HAS_PEERS = all(importlib.util.find_spec(name) for name in ("pinocchio", "mujoco"))
 # One of those it compares is casadi's map in C.
@@ -24,7 +25,10 @@ LONG = ("control", "planning")
 @pytest.mark.parametrize(
     "name", [BATCH if name == "batch" else name for name in BENCHMARKS if name not in LONG]
 )
-def test_a_benchmark_measures_all_installed_peers(name, tiny):
+def test_a_benchmark_measures_all_installed_peers(name, tiny, monkeypatch):
+    for module in ("measure_inverse_kinematics", "reaching"):
+        arms = {arm: ARMS[arm] for arm in ("ur5", "fetch")}  # one without a base and one with
+        monkeypatch.setattr(f"kineverse.bench.{module}.ARMS", arms)
     (result,) = run_benchmarks([name], tiny)
     assert result.name == name
     assert result.work

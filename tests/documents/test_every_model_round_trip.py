@@ -22,11 +22,13 @@ FOLDERS = {
     "iai_kitchen": 1,
     "kineverse_shelf_objects": 1,
     "pr2": 1,
-    "sdf_joint_types": 40,
-    "urdf_conformance": 20,
-    "urdf_files_dataset_sample": 20,
+    "sdf_joint_types": 13,
+    "urdf_conformance": 7,
+    "urdf_files_dataset_sample": 7,
 }
 """How many of the files below load at least."""
+
+MANY = ("sdf_joint_types", "urdf_conformance", "urdf_files_dataset_sample")
 
 SUFFIXES = (".urdf", ".sdf", ".world", ".xml", ".mjcf")
 MOST = 3
@@ -97,7 +99,9 @@ def test_files_of_other_projects_survive_a_round_trip(folder: str) -> None:
     if not (SHARED / folder).is_dir():
         pytest.skip(f"no {SHARED / folder}")
     loaded = 0
-    for path in sorted(p for p in (SHARED / folder).rglob("*") if p.suffix in SUFFIXES and p.is_file()):
+    paths = sorted(p for p in (SHARED / folder).rglob("*") if p.suffix in SUFFIXES and p.is_file())
+    # Of many small files a part: the readers' tests load all.
+    for path in paths[:: 3 if folder in MANY else 1]:
         try:
             model = kv.load(path, prefix="")
         except kv.errors.FormatError:

@@ -286,7 +286,7 @@ def growing(question: Any, count: int) -> str:
     )
 
 
-@pytest.mark.parametrize("look", [0, 1, 2])
+@pytest.mark.parametrize("look", [0, 2])
 def test_edit_upstream_of_an_exploding_trace_is_refused(look: int, tmp_path: Any) -> None:
     path = tmp_path / "hostile.kv.json"
     path.write_text(growing(lambda e, at: ["substitute", look, e, 3, at], 60))

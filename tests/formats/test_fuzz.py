@@ -31,7 +31,7 @@ from fuzz.minimise import minimise  # noqa: E402
 from fuzz.targets import TARGETS, Target  # noqa: E402
 from fuzz.worker import make_input_folder  # noqa: E402
 
-COUNTS = {"urdf": 150, "sdf": 60, "mjcf": 40, "document": 150}
+COUNTS = {"urdf": 100, "sdf": 60, "mjcf": 30, "document": 100}
 
 
 @pytest.fixture

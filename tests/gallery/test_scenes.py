@@ -99,7 +99,10 @@ def test_commands_take_the_name_of_a_scene(name, capsys):
     assert np.shape(json.loads(capsys.readouterr().out)["transform"]) == (4, 4)
 
 
-@every
+# Closing the loops of the last three takes most of the time; they come from the same module as the other linkages.
+@pytest.mark.parametrize(
+    "name", [name for name in NAMES if name not in ("delta_robot", "jansen_leg", "scissor_linkage")]
+)
 def test_scene_names_are_below_a_prefix_and_it_can_be_included_twice(name):
     model = kv.Model()
     model.include(f"articulations/{name}", prefix="left")

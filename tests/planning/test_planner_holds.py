@@ -38,9 +38,7 @@ def flying():
     return Planner(model)
 
 
-@pytest.mark.parametrize(
-    "mask", ["rx", "ry", "z", "xz", "rx ry", "ry rz", "xyz rx rz", "rx ry rz", "xyz rx ry rz"]
-)
+@pytest.mark.parametrize("mask", ["rx", "z", "xz", "ry rz", "xyz rx rz", "rx ry rz", "xyz rx ry rz"])
 def test_solutions_of_holds_are_free_and_hold_what_the_mask_says(flying, mask):
     offset = kv.translation(0.01, 0.02, 0.03) @ kv.rotation_x(0.4)
     Q = flying.solutions(flying.hold("hand", "mark", mask, offset), 8, seconds=0.1)

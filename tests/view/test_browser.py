@@ -37,9 +37,9 @@ def browser(chromium):
         browser.close()
 
 
-@pytest.fixture
-def opened(browser):
-    """A viewer of the cabinet, and the page a browser has of it."""
+@pytest.fixture(scope="module")
+def cabinet_page(browser):
+    """A viewer of the cabinet, and the page a browser has of it: drawing the first picture takes seconds."""
     camera = Camera((-2.4, -1.6, 1.3), (0.0, 0.0, 0.5))
     with view(cabinet(), port=0, camera=camera) as viewer:
         page = browser.new_page(viewport={"width": 660, "height": 400})
@@ -50,11 +50,22 @@ def opened(browser):
         page.wait_for_selector(SLIDERS)
         # viser's warning of slow computers has a red bar, and slides in over the scene at some time.
         page.add_style_tag(content=".mantine-Notifications-root { display: none }")
-        # The picture is there once the red front of the drawer is.
-        until(page, lambda: reddish(shot(page)).sum() > 300)
-        yield viewer, page
+        yield viewer, page, errors
         page.close()
-        assert errors == []
+
+
+@pytest.fixture
+def opened(cabinet_page):
+    """The viewer and its page at the first state. A test leaves switches as it has found them."""
+    viewer, page, errors = cabinet_page
+    viewer.move({"cabinet/drawer": 0.0, "cabinet/door": 0.0})
+    page.get_by_role("tab", name="Move").click()
+    for name in ("cabinet/drawer", "cabinet/door"):
+        until(page, lambda name=name: slider(page, viewer, name).get_attribute("aria-valuenow") == "0")
+    # The picture is there once the red front of the drawer is.
+    until(page, lambda: reddish(shot(page)).sum() > 300)
+    yield viewer, page
+    assert errors == []
 
 
 def until(page, condition):
@@ -131,6 +142,7 @@ def test_violated_constraints_are_listed_on_the_page(opened):
     page.keyboard.press("End")
     page.get_by_text("cabinet/door/range").wait_for()
     assert viewer.values["cabinet/door"] == 1.8
+    page.get_by_label("beyond limits").uncheck()
 
 
 def test_frames_and_their_names_are_shown_on_demand(opened):
@@ -145,6 +157,9 @@ def test_frames_and_their_names_are_shown_on_demand(opened):
     until(page, lambda: (shot(page) != unnamed).any(axis=2).sum() > 200)
     page.get_by_label("bodies").uncheck()
     until(page, lambda: reddish(shot(page)).sum() < 0.2 * reddish(before).sum())
+    page.get_by_label("bodies").check()
+    page.get_by_label("frame names").uncheck()
+    page.get_by_label("frames", exact=True).uncheck()
 
 
 def test_sliders_are_filtered_by_name_and_follow_edits(opened):
@@ -157,6 +172,7 @@ def test_sliders_are_filtered_by_name_and_follow_edits(opened):
     with viewer.model.edit() as edit:
         edit.add_frame("lid", parent="world", transform=kv.translation(0, 0, kv.position("lid")))
     row(page, "lid [m]").wait_for()
+    page.get_by_role("textbox").first.fill("")
 
 
 def test_two_browsers_show_the_same_state(opened, browser):

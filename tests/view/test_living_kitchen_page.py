@@ -128,21 +128,7 @@ def test_the_browser_shows_the_simulation_and_the_identified_joint(browser, monk
         until(tab, lambda: simulation.readings.visible.sum() < 20)
         tab.get_by_role("button", name="Forget, and learn again").click()
         until(tab, lambda: len(simulation.learner.history) < 3)
-        # Who leaves in the midst and comes back misses nothing.
-        tab.close()
-        again = opened(browser, page, errors)
-        time = simulation.time
-        until(again, lambda: simulation.time > time)
-        again.close()
-    assert errors == []
-    assert "kineverse-living" not in threads()
-
-
-@pytest.mark.browser
-def test_a_second_browser_continues_after_the_first_has_left(browser):
-    errors = []
-    with SimulationPage(port=0) as page:
-        tab = opened(browser, page, errors)
+        # A second browser continues where the first leaves.
         came, left = threading.Event(), threading.Event()
         page._server.on_client_connect(lambda _: came.set())
         page._server.on_client_disconnect(lambda _: left.set())
@@ -152,8 +138,9 @@ def test_a_second_browser_continues_after_the_first_has_left(browser):
         assert came.wait(60.0)
         tab.close()
         assert left.wait(60.0)
-        time = page.simulation.time
+        time = simulation.time
         other.get_by_text("the track is off by").wait_for(timeout=PATIENCE)
-        until(other, lambda: page.simulation.time > time)
+        until(other, lambda: simulation.time > time)
         other.close()
     assert errors == []
+    assert "kineverse-living" not in threads()

@@ -145,9 +145,9 @@ NOTHING = {
     "equal poses": (None, EQUAL),
     "equal poses of both": (np.tile(ANYWHERE[1], (10, 1, 1)), EQUAL),
     "equal positions": (None, EQUAL[:, :3, 3]),
-    "outliers": (None, ANYWHERE[:12]),
-    "outliers of both": (ANYWHERE[12:], ANYWHERE[:12]),
-    "outliers among positions": (ANYWHERE[12:], ANYWHERE[:12, :3, 3]),
+    "outliers": (None, ANYWHERE[:8]),
+    "outliers of both": (ANYWHERE[8:16], ANYWHERE[:8]),
+    "outliers among positions": (ANYWHERE[8:16], ANYWHERE[:8, :3, 3]),
 }
 
 
