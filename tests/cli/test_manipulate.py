@@ -112,6 +112,7 @@ def test_open_begins_shut_and_close_begins_open(run, asked, tmp_path):
     assert "gripper of hsr/hand_palm_link" in err
     assert "handle shelf_drawers/" in err
     assert err.count("grasp") == 1
+    assert "touch, so the robot begins at" in err  # it would stand in the drawers
     assert asked[0].target is None
     assert asked[0].options == {"hand": "hsr/hand_palm_link", "handle": None, "seconds": 5.0, "seed": 0}
 
@@ -138,6 +139,7 @@ def test_open_begins_shut_and_close_begins_open(run, asked, tmp_path):
             "Did you mean 'shelf_drawers/upper",
         ),
         (["shelf_drawers", *HSR[:2], "--what", "hsr/arm_lift_joint"], "of the robot itself"),
+        (["shelf_drawers", "--robot", "hsr@0,0,0", *HSR[2:]], "begins in contact: shelf_drawers/"),
         (["shelf_drawers", *HSR, "--from", "2m"], "--from 2: 'shelf_drawers/upper_drawer' is between 0 and"),
         (["shelf_drawers", *HSR, "--to", "far"], "'far' is not a value"),
         (["shelf_drawers", *HSR, "--hand", "hsr/hnd_palm_link"], "hsr/hand_palm_link"),

@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from kineverse.cli.manipulate_setup import ManipulationScene, is_shut
-from kineverse.cli.output import format_cells, join_lines
+from kineverse.cli.output import format_table, join_lines
 from kineverse.cli.view import list_mesh_problems, print_mesh_problems
 from kineverse.expressions.printing import format_number
 
@@ -81,7 +81,7 @@ def report_outcome(
     if outcome.steps:
         rows = [("steps", str(outcome.steps))]
         rows += [(name, _format_measure(value)) for name, value in _plain(outcome.measures).items()]
-        print(format_cells(("measure", "value"), rows))
+        print(format_table(("measure", "value"), rows))
     if arguments.record is not None:
         print(f"recording: {arguments.record}")
 
@@ -102,4 +102,8 @@ def _plain(value: Any) -> Any:
 def _format_measure(value: Any) -> str:
     if isinstance(value, float):
         return format_number(value, 4)
-    return "-" if value is None else str(value) if not isinstance(value, (dict, list)) else json.dumps(value)
+    if isinstance(value, list) and all(isinstance(one, str) for one in value):
+        return ", ".join(value)
+    if isinstance(value, (list, dict)):
+        return f"{len(value)}, see --json"
+    return "-" if value is None else str(value)

@@ -7,6 +7,7 @@ import math
 import re
 import sys
 from dataclasses import dataclass
+from itertools import product
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -23,6 +24,9 @@ OPENING = 0.4
 TOLERANCE = 0.02
 """Distance from the target within which an object is there [m], [rad]."""
 _MOST_NOTES = 3
+_DEEPEST = 2e-4
+_RING, _RINGS, _DIRECTIONS = 0.25, 16, 12
+"""Distance of rings of places [m], their number, and that of places on each."""
 
 
 @dataclass(frozen=True)
@@ -109,6 +113,9 @@ def make_scene(arguments: argparse.Namespace, skill: str) -> ManipulationScene:
             )
     state = SHIPPED[source].start_state(model) if source in SHIPPED else default
     state = state.updated(standing).updated({coordinate: begin})
+    if skill != "push":  # pushes search a place for the whole push
+        free = {} if place is not None else _base_coordinates(model, joints)
+        state = _stand_free(model, named, state, free)
     gripper, why, pusher = _find_pusher(model, named, arguments.hand, skill)
     values = {str(s): state[s] for s in model.symbols if s in state}
     unit = infer_units(model, values, [str(coordinate)]).get(str(coordinate)) or ""
@@ -190,6 +197,54 @@ def _add_base(model: kv.Model, robot: str) -> None:
         edit.apply(OmniBase(name=name, parent=WORLD, child=carrier))
         for root in roots:
             edit.attach(root, carrier, np.asarray(model.fk(root)({})))
+
+
+def _base_coordinates(model: kv.Model, joints: list[str]) -> dict[kv.Symbol, float]:
+    """Return the coordinates of a mobile base among some articulations, in order; empty if there is none."""
+    try:
+        return place_base(model, joints, (0.0, 0.0, 0.0))
+    except InvalidValueError:
+        return {}
+
+
+def _stand_free(model: kv.Model, robot: str, state: kv.State, base: dict[kv.Symbol, float]) -> kv.State:
+    """Return the state with the base of a robot where it touches nothing, the nearest of some places.
+
+    Raises
+    ------
+    InvalidValueError
+        If it touches something everywhere, or has no base that could be placed.
+    """
+    from kineverse.geometry import Scene
+
+    scene = Scene(model)
+    others = [body for body in scene.bodies if not body.startswith(f"{robot}/")]
+    if not others or len(others) == len(scene.bodies):
+        return state
+    watch = scene.watch(f"{robot}/*", others, radius=0.0)
+
+    def contact(at: kv.State) -> str:
+        scene.update(at)
+        deepest = next(iter(watch()), None)
+        touches = deepest is not None and deepest.distance < -_DEEPEST
+        return f"{deepest.a} and {deepest.b}" if deepest is not None and touches else ""
+
+    problem = contact(state)
+    if not problem:
+        return state
+    x, y = [*base][:2] or (None, None)
+    if x is not None and y is not None:
+        for ring, turn in product(range(1, _RINGS + 1), range(_DIRECTIONS)):
+            angle, radius = math.tau * turn / _DIRECTIONS, _RING * ring
+            place = {x: state[x] + radius * math.cos(angle), y: state[y] + radius * math.sin(angle)}
+            if not contact(state.updated(place)):
+                where = ", ".join(f"{value:.2f}" for value in place.values())
+                print(f"start: {problem} touch, so the robot begins at {where}", file=sys.stderr)
+                return state.updated(place)
+    raise InvalidValueError(
+        f"The robot '{robot}' begins in contact: {problem}. Give its base another place: "
+        "--robot ROBOT@X,Y,ANGLE."
+    )
 
 
 def _find_coordinate(model: kv.Model, name: str, robot: str) -> kv.Symbol:
