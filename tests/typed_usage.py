@@ -98,6 +98,9 @@ found: kv.reasoning.Interlocks
 motion = kv.planning.time_parameterize([[0.0, 0.0], [1.0, 2.0]], 1.0, [2.0, 3.0], [a, b])
 assert_type(motion.at(0.5), kv.State)
 assert_type(motion.positions_at([0.0, 0.5]), Numbers)
+gripper: kv.grasping.Gripper
+world: kv.worlds.World
+outcome: kv.manipulation.Outcome
 shower = kv.show
 version: str = kv.__version__
 assert kv.loops.CloseLoop is kv.CloseLoop

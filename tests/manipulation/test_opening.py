@@ -82,6 +82,15 @@ def test_locked_drawer_is_said_not_to_move():
     assert outcome.measures["failure"] == "other"
 
 
+def test_start_in_contact_is_refused(model):
+    world = KinematicWorld(model, "hsr")
+    world.reset({**model.default_state(), "hsr/base/x": 0.9})
+    outcome = open_object(Session(world), DRAWER)
+    assert not outcome
+    assert "begins in contact" in outcome.reason
+    assert world.state[DRAWER] == 0.0
+
+
 def test_wrong_arguments_are_refused(session):
     with pytest.raises(UnknownNameError, match="upper_drawer"):
         open_object(session, "shelf_drawers/uper_drawer")

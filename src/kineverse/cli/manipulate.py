@@ -246,7 +246,7 @@ def _grasp(
         return _without_steps(scene, world, False, scene.why)
 
     from kineverse.grasping import find_handle, find_handles
-    from kineverse.manipulation.opening import open_object  # type: ignore[import-not-found]
+    from kineverse.manipulation.opening import open_object
     from kineverse.manipulation.session import Session
 
     if arguments.handle is not None:

@@ -3,14 +3,14 @@
 from .belief import Belief, TrueBelief
 from .opening import SkillError, open_object
 from .outcome import Outcome
-from .placement import Placement, PlacementSearch
+from .placement import BasePlacement, PlacementSearch
 from .pushing import push
 from .session import Session
 
 __all__ = [
+    "BasePlacement",
     "Belief",
     "Outcome",
-    "Placement",
     "PlacementSearch",
     "Session",
     "SkillError",

@@ -22,7 +22,7 @@ from kineverse.symbols import Symbol
 from kineverse.worlds import Judge
 
 from .outcome import Outcome
-from .placement import Placement, PlacementSearch
+from .placement import BasePlacement, PlacementSearch
 from .session import Session
 
 _GRASPS = 128
@@ -242,6 +242,7 @@ class _Run:
     def perform(self) -> None:
         """Move the object to the target with one grasp after the other, or raise SkillError."""
         coordinate = self.handle.coordinate
+        self._check_start()
         for _ in range(_MOST_GRASPS):
             if abs(self.session.state[coordinate] - self.target) <= self.tolerance / 2:
                 return
@@ -255,9 +256,20 @@ class _Run:
         if abs(self.session.state[coordinate] - self.target) > self.tolerance:
             raise SkillError("reach", f"After {self.grasps} grasps '{coordinate}' is not at the target.")
 
+    def _check_start(self) -> None:
+        """Raise SkillError if the robot touches something before anything is done."""
+        search = self.opener.search
+        if search.standing:
+            return  # the base is put elsewhere
+        search.scene.update(self.session.state)
+        touching = search.scene.watch(search.own, search.others, 0.0)()
+        if len(touching):
+            pair = touching[0]
+            raise SkillError("collision", f"The robot begins in contact: '{pair.a}' at '{pair.b}'.")
+
     # -- phases --------------------------------------------------------------------------------------------
 
-    def _place(self) -> Placement:
+    def _place(self) -> BasePlacement:
         """Return a placement that leads as far as possible."""
         session, here = self.session, self.session.state[self.handle.coordinate]
         session.phase = "place"
@@ -276,7 +288,7 @@ class _Run:
         contacts = any(" at " in reason for reason in found.reasons)
         raise SkillError("collision" if contacts else "reach", why)
 
-    def _approach(self, placement: Placement) -> None:
+    def _approach(self, placement: BasePlacement) -> None:
         """Bring the hand to the pose before the handle, on a planned path, and then straight to it."""
         session, search = self.session, self.opener.search
         session.phase = "approach"
@@ -364,7 +376,7 @@ class _Run:
         if missed:
             raise SkillError("other", "The fingers closed, and nothing was between them.")
 
-    def _move(self, placement: Placement) -> None:
+    def _move(self, placement: BasePlacement) -> None:
         """Move the held object along the planned way."""
         session, coordinate, grasp = self.session, self.handle.coordinate, placement.grasp
         assert grasp is not None

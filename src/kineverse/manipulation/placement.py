@@ -43,7 +43,7 @@ _STARTS = 4
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Placement:
+class BasePlacement:
     """Base, grasp and way of the arm, true if they were found.
 
     Attributes
@@ -151,7 +151,7 @@ class PlacementSearch:
         samples: int = 1000,
         batch: int = 100,
         seed: int = 0,
-    ) -> Placement:
+    ) -> BasePlacement:
         """Return a placement from which the object can be moved from its value to a target.
 
         Bases are sampled in front of the handle, arms at random. All of them follow the approach and the way
@@ -207,13 +207,13 @@ class PlacementSearch:
                 problem = self._check(state, grasps[choice[k]], values, base[k], back[k], way[k])
                 if not problem:
                     full = [np.hstack([a, np.tile(base[k], (len(a), 1))]) for a in (back[k][::-1], way[k])]
-                    return Placement(
+                    return BasePlacement(
                         grasps[choice[k]], self.coordinates, full[0][0], full[0], values, full[1],
                         tried, reasons, perf_counter() - begin,
                     )  # fmt: skip
                 reasons[problem] += 1
         nothing = np.zeros((0, len(self.coordinates)))
-        return Placement(
+        return BasePlacement(
             None, self.coordinates, nothing, nothing, values, nothing, tried, reasons, perf_counter() - begin
         )
 
