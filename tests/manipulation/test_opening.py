@@ -84,7 +84,7 @@ def test_locked_drawer_is_said_not_to_move():
 
 def test_start_in_contact_is_refused(model):
     world = KinematicWorld(model, "hsr")
-    world.reset({**model.default_state(), "hsr/base/x": 0.9})
+    world.reset(model.default_state().updated({"hsr/base/x": 0.9}))
     outcome = open_object(Session(world), DRAWER)
     assert not outcome
     assert "begins in contact" in outcome.reason
