@@ -42,6 +42,8 @@ _LATE = 0.1
 """Distance from the way at which the reference begins to wait [m], [rad]."""
 _MARGIN = 0.002
 """Least distance of bodies while the object moves [m]; placements keep more."""
+_BESIDE = 0.008
+"""Difference of the gap of closed fingers to the thickness of the bar that says that it is not there [m]."""
 _SLIPPED = 0.02
 """Distance of the hand from its grasp from which on the handle has slipped [m]."""
 _STALLED, _PATIENCE = 1e-3, 4.0
@@ -250,8 +252,8 @@ class _Run:
             assert placement.grasp is not None
             self.grasps += 1
             self._approach(placement)
-            self._close(placement.grasp)
-            self._move(placement)
+            if self._close(placement.grasp):
+                self._move(placement)
             self._release(placement.grasp)
         if abs(self.session.state[coordinate] - self.target) > self.tolerance:
             raise SkillError("reach", f"After {self.grasps} grasps '{coordinate}' is not at the target.")
@@ -363,18 +365,17 @@ class _Run:
         ]
         return posture, goals
 
-    def _close(self, grasp: Grasp) -> None:
-        """Close the fingers until both touch."""
+    def _close(self, grasp: Grasp) -> bool:
+        """Close the fingers until they stand still, and return True if they stand around the bar."""
         self.session.phase = "close"
         self._move_fingers(self.gripper.closed)
-        gap = self.gripper.values_at(0.25 * grasp.thickness)
-        state = self.session.state
-        missed = all(
-            abs(state[s] - self.gripper.closed[s]) < abs(gap[s] - self.gripper.closed[s]) + 1e-4
-            for s in self.gripper.joints
+        state, gripper = self.session.state, self.gripper
+        narrow = gripper.values_at(max(0.25 * grasp.thickness, grasp.thickness - _BESIDE))
+        wide = gripper.values_at(grasp.thickness + _BESIDE)
+        return all(
+            min(narrow[s], wide[s]) - 1e-4 <= state[s] <= max(narrow[s], wide[s]) + 1e-4
+            for s in gripper.joints
         )
-        if missed:
-            raise SkillError("other", "The fingers closed, and nothing was between them.")
 
     def _move(self, placement: BasePlacement) -> None:
         """Move the held object along the planned way."""
