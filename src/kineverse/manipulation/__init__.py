@@ -1,8 +1,8 @@
 """Manipulation: skills that open, close and push articulated objects with a robot (layer 5)."""
 
 from .belief import Belief, TrueBelief
-from .opening import SkillError, open_object
-from .outcome import Outcome
+from .opening import open_object
+from .outcome import Outcome, SkillError
 from .placement import BasePlacement, PlacementSearch
 from .pushing import push
 from .session import Session

@@ -5,6 +5,7 @@ from __future__ import annotations
 from typing import Protocol
 
 from kineverse.state import State
+from kineverse.symbols import Symbol
 from kineverse.worlds import World
 
 
@@ -22,6 +23,9 @@ class Belief(Protocol):
             The speeds that were commanded last.
         """
 
+    def deviation(self, coordinate: Symbol) -> float:
+        """Return the standard deviation of a coordinate [m], [rad]; 0 if it is known exactly."""
+
 
 class TrueBelief:
     """The truth of a world as the belief."""
@@ -29,3 +33,7 @@ class TrueBelief:
     def update(self, world: World, commands: State | None = None) -> State:
         """Return the true state."""
         return world.state
+
+    def deviation(self, coordinate: Symbol) -> float:
+        """Return 0."""
+        return 0.0

@@ -3,71 +3,35 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Mapping
+from collections.abc import Mapping
 from typing import Any
 from weakref import WeakKeyDictionary
 
 import numpy as np
 
-from kineverse.control import Controller, Goal, Hold, Target, same_pose
-from kineverse.control.tasks import Task
-from kineverse.errors import InfeasibleError, InvalidValueError, KineverseError, NotFiniteError
-from kineverse.geometry import Rule, Scene
+from kineverse.errors import InfeasibleError, InvalidValueError, NotFiniteError
 from kineverse.grasping import Grasp, Gripper, Handle, find_gripper, find_handle, sample_grasps
-from kineverse.lie import Array, inverse
 from kineverse.model.model_view import ModelView
-from kineverse.planning import Planner, TrajectoryFollower
+from kineverse.planning import Planner
 from kineverse.state import State
 from kineverse.symbols import Symbol
 from kineverse.worlds import Judge
 
-from .outcome import Outcome
+from .hand_motion import HandMotion
+from .held_motion import move_held
+from .outcome import Outcome, SkillError
 from .placement import BasePlacement, PlacementSearch
 from .session import Session
 
 _GRASPS = 128
-_CLOSING, _MOST_CLOSING = 1.5, 4.0
-"""Time in which fingers open or close fully, and the largest one [s]."""
-_LINE_SPEED = 0.1
-"""Speed of the hand on the straight way to the handle and from it [m/s]."""
-_SETTLED, _MOST_SETTLING = 5e-4, 150
-"""Error of the hand's pose at the end of a straight way [m], [rad], and the most steps until it is met."""
 _PLANNING = 2.0
 """Largest time to plan the way to the handle [s]."""
-_SPEED = 0.3
-"""Speed of an object along its planned way [m/s], [rad/s]."""
-_FOLLOWING, _POSTURE = 5.0, 0.5
-"""Gain of the goals along the way [1/s], and the weight of the arm beside the object."""
-_LATE = 0.1
-"""Distance from the way at which the reference begins to wait [m], [rad]."""
-_MARGIN = 0.002
-"""Least distance of bodies while the object moves [m]; placements keep more."""
-_BESIDE = 0.008
-"""Difference of the gap of closed fingers to the thickness of the bar that says that it is not there [m]."""
-_SLIPPED = 0.02
-"""Distance of the hand from its grasp from which on the handle has slipped [m]."""
-_STALLED, _PATIENCE = 1e-3, 4.0
-"""Least progress of the object [m], [rad] in a time [s]."""
 _SHARES = (1.0, 0.75, 0.5, 0.3)
 """Shares of the rest of a motion that are tried with one grasp."""
 _MOST_GRASPS = 4
 _LARGEST = ("limit_violation", "penetration", "grasp_error", "grasp_rotation", "jitter", "reversals")
 _SUMS = ("contact_losses", "distance", "hand_distance")
 """Measures of the parts of a run: the largest, or the sum."""
-
-
-class SkillError(KineverseError):
-    """End of a skill that is not done.
-
-    Attributes
-    ----------
-    kind
-        ``"collision"``, ``"reach"``, ``"time"`` or ``"other"``.
-    """
-
-    def __init__(self, kind: str, reason: str) -> None:
-        super().__init__(reason)
-        self.kind = kind
 
 
 def open_object(
@@ -214,16 +178,17 @@ class _Run:
     ) -> None:
         self.session, self.opener, self.handle = session, opener, handle
         self.target, self.tolerance = target, tolerance
-        self.samples, self.seed = placements, seed
+        self.samples, self.seed, self.seconds = placements, seed, seconds
         self.model = opener.model
         self.gripper = opener.gripper
         self.first, self.begin = session.steps, session.world.time
-        self.seconds = seconds
         self.placements = self.grasps = 0
         self._earlier: list[Mapping[str, Any]] = []
         self.judge = Judge(self.model, session.world.robot, self.gripper, handle=handle.frame)
         self.judge.update(session.world.state)
-        self._hand, self._bar = self.model.fk(self.gripper.hand), self.model.fk(handle.frame)
+        self.motion = HandMotion(
+            session, self.gripper, handle, opener.search, opener.planner, self.judge, self.begin + seconds
+        )
 
     @property
     def measures(self) -> dict[str, Any]:
@@ -252,9 +217,9 @@ class _Run:
             assert placement.grasp is not None
             self.grasps += 1
             self._approach(placement)
-            if self._close(placement.grasp):
-                self._move(placement)
-            self._release(placement.grasp)
+            if self.motion.close(placement.grasp):
+                move_held(self.motion, placement, self.tolerance)
+            self.motion.release(placement.grasp)
         if abs(self.session.state[coordinate] - self.target) > self.tolerance:
             raise SkillError("reach", f"After {self.grasps} grasps '{coordinate}' is not at the target.")
 
@@ -294,15 +259,16 @@ class _Run:
         """Bring the hand to the pose before the handle, on a planned path, and then straight to it."""
         session, search = self.session, self.opener.search
         session.phase = "approach"
-        opened = self.gripper.opened
         wanted = dict(zip(placement.coordinates, placement.approach.tolist(), strict=True))
         if search.standing:
             stands = {s: wanted[s] for s in search.standing}
             gone = session.world.time - self.begin
             session.restart(session.world.state.updated(stands))
             self.begin = -gone
+            self.motion.until = self.seconds - gone
             self._judge_afresh()
-        self._move_fingers(opened)
+        motion = self.motion
+        motion.move_fingers(self.gripper.opened)
         planner = self.opener.planner
         with session.timed("plan"):
             planner.place(session.state)
@@ -312,177 +278,8 @@ class _Run:
             if not path.found:
                 raise SkillError("collision", f"There is no way to the handle: {path.why}")
             trajectory = path.trajectory()
-        follower = TrajectoryFollower(trajectory)
-        controller = self._controller(follower.tasks, posture=0.0)
-        begin = session.world.time
-        while session.world.time - begin < trajectory.duration + 0.2:
-            self._check_time()
-            with session.timed("approach"):
-                follower.set(controller, session.world.time - begin)
-                command = controller.step(session.state)
-            self._act(command.speeds)
+        motion.follow(trajectory)
+        motion.count_turns(placement.line[0])
         assert placement.grasp is not None
-        self._turns = self._count_turns(placement.line[0])
-        rows = placement.line[:, : len(search.moving)] + self._turns
-        self._follow_line(placement.grasp.approach, placement.grasp.pose, rows)
-
-    def _follow_line(self, start: Array, end: Array, rows: Array | None = None) -> None:
-        """Move the hand straight from a pose relative to the handle to another one, near to arms (L, n)."""
-        session = self.session
-        wanted = Target("hand/pose", end)
-        posture, goals = (None, []) if rows is None else self._posture(rows[0])
-        error = same_pose(self._bar @ wanted.expression, self._hand)
-        controller = self._controller([Goal(error, gain=0.5 / session.dt, name="hand"), *goals])
-        length = float(np.linalg.norm(end[:3, 3] - start[:3, 3]))
-        steps = max(2, math.ceil(length / (_LINE_SPEED * session.dt)))
-        for k in range(1, steps + _MOST_SETTLING):
-            self._check_time()
-            pose = end.copy()
-            share = min(1.0, k / steps)
-            pose[:3, 3] = start[:3, 3] + share * (end[:3, 3] - start[:3, 3])
-            with session.timed("line"):
-                controller.set(wanted, pose)
-                if posture is not None and rows is not None:
-                    controller.set(posture, _row_at(rows, share))
-                command = controller.step(session.state)
-            if k > steps and command.residuals["hand"] < _SETTLED:
-                break
-            self._act(command.speeds)
-
-    def _count_turns(self, row: Array) -> Array:
-        """Return the whole turns (n,) [rad] by which joints without limits are away from a configuration."""
-        moving, planner = self.opener.search.moving, self.opener.planner
-        turning = np.array([planner.space.turning[planner.symbols.index(s)] for s in moving])
-        away = self.session.state.vector(moving) - row[: len(moving)]
-        return np.where(turning, 2 * math.pi * np.round(away / (2 * math.pi)), 0.0)
-
-    def _posture(self, row: Array) -> tuple[Target, list[Goal]]:
-        """Return a target for the arm (n,), and the goals that keep the arm near to it."""
-        posture = Target("arm/posture", row)
-        goals = [
-            Goal(s, posture.expression[k], gain=_FOLLOWING, weight=_POSTURE, name=f"posture {s}")
-            for k, s in enumerate(self.opener.search.moving)
-        ]
-        return posture, goals
-
-    def _close(self, grasp: Grasp) -> bool:
-        """Close the fingers until they stand still, and return True if they stand around the bar."""
-        self.session.phase = "close"
-        self._move_fingers(self.gripper.closed)
-        state, gripper = self.session.state, self.gripper
-        narrow = gripper.values_at(max(0.25 * grasp.thickness, grasp.thickness - _BESIDE))
-        wide = gripper.values_at(grasp.thickness + _BESIDE)
-        return all(
-            min(narrow[s], wide[s]) - 1e-4 <= state[s] <= max(narrow[s], wide[s]) + 1e-4
-            for s in gripper.joints
-        )
-
-    def _move(self, placement: BasePlacement) -> None:
-        """Move the held object along the planned way."""
-        session, coordinate, grasp = self.session, self.handle.coordinate, placement.grasp
-        assert grasp is not None
-        session.phase = "move"
-        state = session.state
-        held = inverse(self._bar(state)) @ self._hand(state)
-        hold = Hold(same_pose(self._bar @ held, self._hand), name="grasp")
-        target = float(placement.values[-1])
-        moving = self.opener.search.moving
-        rows = placement.way[:, : len(moving)] + self._turns
-        values = placement.values
-        posture, goals = self._posture(rows[0])
-        wanted = Target("opening/object", np.array([values[0]]))
-        tasks: list[Task] = [hold, Goal(coordinate, wanted.expression[0], gain=_FOLLOWING, name="object")]
-        tasks += goals
-        rules = [Rule(b, self.handle.frame, False, "grasped") for b in self.gripper.bodies]
-        scene = Scene(self.model, rules=[*self.opener.search.scene.rules, *rules])
-        controller = self._controller(tasks, scene=scene, margin=_MARGIN)
-        share, ends = 0.0, abs(target - values[0])
-        best, since = 0.0, session.world.time
-        while abs(session.state[coordinate] - target) > self.tolerance / 4:
-            self._check_time()
-            with session.timed("open"):
-                reference = _row_at(rows, share)
-                value = values[0] + share * (target - values[0])
-                controller.set(posture, reference)
-                controller.set(wanted, np.array([value]))
-                command = controller.step(session.state)
-                # The reference waits for the slowest joint.
-                late = max(
-                    float(np.abs(reference - session.state.vector(moving)).max(initial=0.0)),
-                    abs(value - session.state[coordinate]),
-                )
-                share += _SPEED * session.dt / ends * min(1.0, max(0.0, 1.5 - late / _LATE))
-                share = min(1.0, share)
-            self._act(command.speeds)
-            if command.residuals["grasp"] > _SLIPPED:
-                raise SkillError("other", "The handle slipped out of the hand.")
-            done = abs(session.state[coordinate] - values[0])
-            if done > best + _STALLED:
-                best, since = done, session.world.time
-            elif session.world.time - since > _PATIENCE:
-                stops = ", ".join(command.active[:3]) or "nothing that the controller knows; it may be locked"
-                raise SkillError(
-                    "collision" if "contact" in stops else "other",
-                    f"'{coordinate}' does not move on from {session.state[coordinate]:.3f}. "
-                    f"In the way: {stops}.",
-                )
-
-    def _release(self, grasp: Grasp) -> None:
-        """Open the fingers, and take the hand away."""
-        self.session.phase = "release"
-        state = self.session.state
-        self._move_fingers(self.gripper.opened)
-        pose = inverse(self._bar(state)) @ self._hand(state)
-        away = pose.copy()
-        away[:3, 3] += grasp.approach[:3, 3] - grasp.pose[:3, 3]
-        self.session.phase = "retract"
-        self._follow_line(pose, away)
-
-    # -- commands ------------------------------------------------------------------------------------------
-
-    def _controller(self, tasks: Iterable[Task], **options: Any) -> Controller:
-        """Return a controller of the robot's coordinates, and of the object's if tasks are about it."""
-        tasks = list(tasks)
-        still: list[Symbol | str] = [*self.opener.search.standing, *self.gripper.joints]
-        if not any(isinstance(task, Hold) for task in tasks):
-            still.append(self.handle.coordinate)
-        with self.session.timed("plan"):
-            controller = Controller(self.model, tasks, dt=self.session.dt, still=still, **options)
-            controller.wait()
-        return controller
-
-    def _move_fingers(self, values: Mapping[Symbol, float]) -> None:
-        """Move the fingers to values, or until they stand still."""
-        session, gripper = self.session, self.gripper
-        begin, idle = session.world.time, 0
-        while session.world.time - begin < _MOST_CLOSING:
-            state = session.state
-            speeds = {}
-            for s in gripper.joints:
-                most = abs(gripper.closed[s] - gripper.opened[s]) / _CLOSING
-                lower, upper = self.model.limits(s.derivative())
-                wanted = (values[s] - state[s]) / session.dt
-                speeds[s.derivative()] = float(np.clip(wanted, max(-most, lower), min(most, upper)))
-            if max((abs(values[s] - state[s]) for s in gripper.joints), default=0.0) < 1e-5:
-                break
-            self._act(speeds)
-            moved = max(abs(session.state[s] - state[s]) for s in gripper.joints)
-            asked = max(abs(v) for v in speeds.values()) * session.dt
-            idle = idle + 1 if moved < 0.1 * asked else 0
-            if idle >= 10:
-                break
-
-    def _act(self, speeds: Mapping[Symbol, float]) -> None:
-        session = self.session
-        session.act(speeds)
-        self.judge.update(session.world.state, session.commands, held=session.world.held)
-
-    def _check_time(self) -> None:
-        if self.session.world.time - self.begin > self.seconds:
-            raise SkillError("time", f"The time of {self.seconds:g} s is up in '{self.session.phase}'.")
-
-
-def _row_at(rows: Array, share: float) -> Array:
-    """Return the configuration (n,) at a share of the way along some (K, n)."""
-    place = share * (len(rows) - 1)
-    return np.array([np.interp(place, range(len(rows)), column) for column in rows.T])
+        rows = placement.line[:, : len(search.moving)] + motion.turns
+        motion.follow_line(placement.grasp.approach, placement.grasp.pose, rows)

@@ -6,6 +6,8 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import Any
 
+from kineverse.errors import KineverseError
+
 
 @dataclass(frozen=True, slots=True)
 class Outcome:
@@ -39,3 +41,17 @@ class Outcome:
 
     def __bool__(self) -> bool:
         return self.done
+
+
+class SkillError(KineverseError):
+    """End of a skill that is not done.
+
+    Attributes
+    ----------
+    kind
+        ``"collision"``, ``"reach"``, ``"time"`` or ``"other"``.
+    """
+
+    def __init__(self, kind: str, reason: str) -> None:
+        super().__init__(reason)
+        self.kind = kind

@@ -38,6 +38,8 @@ class Session:
 
     Attributes
     ----------
+    belief
+        Source of the state.
     state
         The believed state.
     commands
@@ -59,9 +61,9 @@ class Session:
         on_step: Callable[[Session], object] | None = None,
     ) -> None:
         self.world, self.dt = world, dt
-        self._belief = belief or TrueBelief()
+        self.belief = belief or TrueBelief()
         self._on_step = on_step
-        self.state: State = self._belief.update(world)
+        self.state: State = self.belief.update(world)
         self.commands: Speeds = {}
         self.phase, self.steps = "", 0
         self.cpu: dict[str, list[float]] = {}
@@ -86,7 +88,7 @@ class Session:
         robot = f"{self.world.robot}/"
         self.commands = {s: v for s, v in speeds.items() if s.path.startswith(robot)}
         self.world.apply(self.commands, self.dt, stamp=self.state.stamp)
-        self.state = self._belief.update(self.world, State(self.commands))
+        self.state = self.belief.update(self.world, State(self.commands))
         self.steps += 1
         if self._on_step is not None:
             self._on_step(self)
@@ -94,7 +96,7 @@ class Session:
     def restart(self, state: State) -> None:
         """Reset the world to a state, at time 0, and update the belief."""
         self.world.reset(state)
-        self.state = self._belief.update(self.world)
+        self.state = self.belief.update(self.world)
 
     def stop(self) -> None:
         """Command zero speeds for one step."""

@@ -1,0 +1,197 @@
+"""Motions of a hand to a handle, with it and away from it, step by step in a world."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterable, Mapping
+from typing import Any
+
+import numpy as np
+
+from kineverse.control import Controller, Goal, Hold, Target, same_pose
+from kineverse.control.tasks import Task
+from kineverse.grasping import Grasp, Gripper, Handle
+from kineverse.lie import Array, inverse
+from kineverse.planning import Planner, Trajectory, TrajectoryFollower
+from kineverse.symbols import Symbol
+from kineverse.worlds import Judge
+
+from .outcome import SkillError
+from .placement import PlacementSearch
+from .session import Session
+
+_CLOSING, _MOST_CLOSING = 1.5, 4.0
+"""Time in which fingers open or close fully, and the largest one [s]."""
+_LINE_SPEED = 0.1
+"""Speed of the hand on the straight way to the handle and from it [m/s]."""
+_SETTLED, _MOST_SETTLING = 5e-4, 150
+"""Error of the hand's pose at the end of a straight way [m], [rad], and the most steps until it is met."""
+_FOLLOWING, _POSTURE = 5.0, 0.5
+"""Gain of the goals along the way [1/s], and the weight of the arm beside the object."""
+_BESIDE = 0.008
+"""Difference of the gap of closed fingers to the thickness of the bar that says that it is not there [m]."""
+
+
+class HandMotion:
+    """Motions of the hand of a robot at a handle.
+
+    Parameters
+    ----------
+    session
+        Robot in a world.
+    gripper, handle
+        The gripper, and the handle that it takes.
+    search
+        Search of placements, which has the robot's coordinates and the scene.
+    planner
+        Planner of the robot's ways with the hand empty.
+    judge
+        Judge that measures all steps.
+    until
+        Time in the world at which SkillError is raised [s].
+
+    Attributes
+    ----------
+    turns
+        Whole turns (n,) [rad] by which the joints are away from the sampled arms.
+    """
+
+    def __init__(
+        self,
+        session: Session,
+        gripper: Gripper,
+        handle: Handle,
+        search: PlacementSearch,
+        planner: Planner,
+        judge: Judge,
+        until: float,
+    ) -> None:
+        self.session, self.gripper, self.handle = session, gripper, handle
+        self.search, self.planner, self.judge, self.until = search, planner, judge, until
+        self.model = search.model
+        self.turns: Array = np.zeros(len(search.moving))
+        self._hand, self._bar = self.model.fk(gripper.hand), self.model.fk(handle.frame)
+
+    def follow(self, trajectory: Trajectory) -> None:
+        """Follow a trajectory."""
+        session = self.session
+        follower = TrajectoryFollower(trajectory)
+        controller = self.controller(follower.tasks, posture=0.0)
+        begin = session.world.time
+        while session.world.time - begin < trajectory.duration + 0.2:
+            self.check_time()
+            with session.timed("approach"):
+                follower.set(controller, session.world.time - begin)
+                command = controller.step(session.state)
+            self.act(command.speeds)
+
+    def follow_line(self, start: Array, end: Array, rows: Array | None = None) -> None:
+        """Move the hand straight from a pose relative to the handle to another one, near to arms (L, n)."""
+        session = self.session
+        wanted = Target("hand/pose", end)
+        posture, goals = (None, []) if rows is None else self.posture(rows[0])
+        error = same_pose(self._bar @ wanted.expression, self._hand)
+        controller = self.controller([Goal(error, gain=0.5 / session.dt, name="hand"), *goals])
+        length = float(np.linalg.norm(end[:3, 3] - start[:3, 3]))
+        steps = max(2, math.ceil(length / (_LINE_SPEED * session.dt)))
+        for k in range(1, steps + _MOST_SETTLING):
+            self.check_time()
+            pose = end.copy()
+            share = min(1.0, k / steps)
+            pose[:3, 3] = start[:3, 3] + share * (end[:3, 3] - start[:3, 3])
+            with session.timed("line"):
+                controller.set(wanted, pose)
+                if posture is not None and rows is not None:
+                    controller.set(posture, row_at(rows, share))
+                command = controller.step(session.state)
+            if k > steps and command.residuals["hand"] < _SETTLED:
+                break
+            self.act(command.speeds)
+
+    def count_turns(self, row: Array) -> None:
+        """Find the whole turns by which joints without limits are away from a configuration (n,)."""
+        moving, planner = self.search.moving, self.planner
+        turning = np.array([planner.space.turning[planner.symbols.index(s)] for s in moving])
+        away = self.session.state.vector(moving) - row[: len(moving)]
+        self.turns = np.where(turning, 2 * math.pi * np.round(away / (2 * math.pi)), 0.0)
+
+    def posture(self, row: Array) -> tuple[Target, list[Goal]]:
+        """Return a target for the arm (n,), and the goals that keep the arm near to it."""
+        posture = Target("arm/posture", row)
+        goals = [
+            Goal(s, posture.expression[k], gain=_FOLLOWING, weight=_POSTURE, name=f"posture {s}")
+            for k, s in enumerate(self.search.moving)
+        ]
+        return posture, goals
+
+    def close(self, grasp: Grasp) -> bool:
+        """Close the fingers until they stand still, and return True if they stand around the bar."""
+        self.session.phase = "close"
+        self.move_fingers(self.gripper.closed)
+        state, gripper = self.session.state, self.gripper
+        narrow = gripper.values_at(max(0.25 * grasp.thickness, grasp.thickness - _BESIDE))
+        wide = gripper.values_at(grasp.thickness + _BESIDE)
+        return all(
+            min(narrow[s], wide[s]) - 1e-4 <= state[s] <= max(narrow[s], wide[s]) + 1e-4
+            for s in gripper.joints
+        )
+
+    def release(self, grasp: Grasp) -> None:
+        """Open the fingers, and take the hand away."""
+        self.session.phase = "release"
+        state = self.session.state
+        self.move_fingers(self.gripper.opened)
+        pose = inverse(self._bar(state)) @ self._hand(state)
+        away = pose.copy()
+        away[:3, 3] += grasp.approach[:3, 3] - grasp.pose[:3, 3]
+        self.session.phase = "retract"
+        self.follow_line(pose, away)
+
+    def controller(self, tasks: Iterable[Task], **options: Any) -> Controller:
+        """Return a controller of the robot's coordinates, and of the object's if tasks are about it."""
+        tasks = list(tasks)
+        still: list[Symbol | str] = [*self.search.standing, *self.gripper.joints]
+        if not any(isinstance(task, Hold) for task in tasks):
+            still.append(self.handle.coordinate)
+        with self.session.timed("plan"):
+            controller = Controller(self.model, tasks, dt=self.session.dt, still=still, **options)
+            controller.wait()
+        return controller
+
+    def move_fingers(self, values: Mapping[Symbol, float]) -> None:
+        """Move the fingers to values, or until they stand still."""
+        session, gripper = self.session, self.gripper
+        begin, idle = session.world.time, 0
+        while session.world.time - begin < _MOST_CLOSING:
+            state = session.state
+            speeds = {}
+            for s in gripper.joints:
+                most = abs(gripper.closed[s] - gripper.opened[s]) / _CLOSING
+                lower, upper = self.model.limits(s.derivative())
+                wanted = (values[s] - state[s]) / session.dt
+                speeds[s.derivative()] = float(np.clip(wanted, max(-most, lower), min(most, upper)))
+            if max((abs(values[s] - state[s]) for s in gripper.joints), default=0.0) < 1e-5:
+                break
+            self.act(speeds)
+            moved = max(abs(session.state[s] - state[s]) for s in gripper.joints)
+            asked = max(abs(v) for v in speeds.values()) * session.dt
+            idle = idle + 1 if moved < 0.1 * asked else 0
+            if idle >= 10:
+                break
+
+    def act(self, speeds: Mapping[Symbol, float]) -> None:
+        """Command speeds for one step, and judge it."""
+        session = self.session
+        session.act(speeds)
+        self.judge.update(session.world.state, session.commands, held=session.world.held)
+
+    def check_time(self) -> None:
+        """Raise SkillError if the time is up."""
+        if self.session.world.time > self.until:
+            raise SkillError("time", f"The time is up in '{self.session.phase}'.")
+
+
+def row_at(rows: Array, share: float) -> Array:
+    """Return the configuration (n,) at a share of the way along some (K, n)."""
+    place = share * (len(rows) - 1)
+    return np.array([np.interp(place, range(len(rows)), column) for column in rows.T])
