@@ -28,6 +28,9 @@ _SETTLED, _MOST_SETTLING = 5e-4, 150
 """Error of the hand's pose at the end of a straight way [m], [rad], and the most steps until it is met."""
 _FOLLOWING, _POSTURE = 5.0, 0.5
 """Gain of the goals along the way [1/s], and the weight of the arm beside the object."""
+_KNOWN, _MOST_LOOKING, _UNKNOWN = 1.5e-3, 1.0, 0.02
+"""Deviation of a handle's position that is small [m], longest time to look until it is [s], and the deviation
+from which on nothing is done [m]."""
 _BESIDE = 0.008
 """Difference of the gap of closed fingers to the thickness of the bar that says that it is not there [m]."""
 
@@ -71,6 +74,31 @@ class HandMotion:
         self.model = search.model
         self.turns: Array = np.zeros(len(search.moving))
         self._hand, self._bar = self.model.fk(gripper.hand), self.model.fk(handle.frame)
+        self._slope = self._bar[:3, 3].partial([handle.coordinate])
+
+    @property
+    def deviation(self) -> float:
+        """Standard deviation of the position of the handle [m]; 0 if it is known exactly."""
+        session, coordinate = self.session, self.handle.coordinate
+        if not (deviation := session.deviation(coordinate)):
+            return 0.0
+        slope = self._slope(session.state)
+        return deviation * float(np.linalg.norm(slope))
+
+    def look(self) -> None:
+        """Stand until the handle is known well, or raise SkillError if it is not seen."""
+        session = self.session
+        session.phase = "look"
+        begin = session.world.time
+        while self.deviation > _KNOWN and session.world.time - begin < _MOST_LOOKING:
+            self.act({})
+        if (deviation := self.deviation) > _UNKNOWN:
+            coordinate = self.handle.coordinate
+            raise SkillError(
+                "other",
+                f"'{coordinate}' is not seen: believed at {session.state[coordinate]:.3f}, with a standard "
+                f"deviation of {session.deviation(coordinate):.2g}, or {deviation:.2g} m at the handle.",
+            )
 
     def follow(self, trajectory: Trajectory) -> None:
         """Follow a trajectory."""
