@@ -37,8 +37,8 @@ _MOVING, _RESTING = 0.04, 4e-4
 """Shares of the tracker's default process noise: .02 rad/√s and .013 m/√s for a door and a drawer in motion,
 and .002 rad/√s and .0013 m/√s at rest."""
 _MOVED, _REFUTED = 1.0, 0.3
-"""Times for which a part counts as moving after it was commanded to, and after its prediction was refuted [s].
-In the latter all of the tracker's process noise counts."""
+"""Times for which a part counts as moving after it was commanded to, and after its prediction was refuted
+[s]. In the latter all of the tracker's process noise counts."""
 _STILL = 1e-3
 """Largest speed of a part that rests [m/s], [rad/s]."""
 _JOINT_SHARE, _JOINT_DRIFT = 0.2, 0.002
@@ -71,6 +71,8 @@ class TrackedBelief:
         The readings of the last update; None before the first.
     camera
         Frame from which distances to markers count; the robot's first frame if none is named like a camera.
+    remarks
+        Texts on what limits the estimates: a robot without a camera, odometry that nothing corrects.
     seen
         Time [s] at which a marker of a coordinate was seen last, by coordinate.
 
@@ -89,7 +91,14 @@ class TrackedBelief:
         if not own:
             prefixes = {name.partition("/")[0] for name in model.frames}
             raise UnknownNameError(f"No frame begins with '{robot}/'. {suggest(robot, prefixes, 'prefix')}")
-        self.camera = sensors.camera or find_camera(own) or own[0]
+        remarks = []
+        found = sensors.camera or find_camera(own)
+        if found is None:
+            remarks.append(
+                f"No frame of '{robot}' is named like a camera, so markers are seen from '{own[0]}'; "
+                "camera= names another one."
+            )
+        self.camera = found or own[0]
         marked = find_marked_frames(model, robot) if sensors.marked is None else sensors.marked
         for name in (self.camera, *marked):
             if name not in model.frames:
@@ -124,6 +133,9 @@ class TrackedBelief:
                 "is no filter for it. Give sensors without odometry= and turn=."
             )
         self._base = base if drifts and base.coordinates else None
+        if self._base is not None and not self._landmarks:
+            remarks.append("No marked frame stands still, so nothing corrects the drift of the odometry.")
+        self.remarks = tuple(remarks)
         self._exact = base.coordinates
         self._filter = BaseFilter(sensors.odometry, sensors.turn, sensors.outliers > 0.0)
         if self._base is not None:
