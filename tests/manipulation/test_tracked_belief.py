@@ -173,10 +173,10 @@ def test_landmarks_correct_the_drift_of_odometry(model):
     base = [model.symbol(f"rover/base/{name}") for name in ("x", "y", "angle")]
     squares, read, errors, doors = [], [], [], []
     _, belief = start(model, f"{NOISE},odometry=30mm/m,turn=3deg")
-    for seed in range(8):
+    for seed in range(6):
         world = HiddenWorld(model, belief.sensors, seed, door=0.7)
         belief.update(world)
-        state = run(world, belief, 120, drive)
+        state = run(world, belief, 100, drive)
         error = state.vector(base) - world.truth.vector(base)
         squares.append((error / [belief.deviation(s) for s in base]) ** 2)
         errors.append(error)
