@@ -97,6 +97,7 @@ class ContactSlots:
         self.margin, self.radius, self.gain = margin, radius, gain
         motion = FrameDependence(model, speeds)
         self._query = scene.watch(radius=radius, moving=speeds, rules=rules, per_shape=True)
+        self._query.prepare()
         watched = set(self._query.pairs.ravel().tolist())
         moved = [motion.moving_ancestors(b) if k in watched else () for k, b in enumerate(scene.bodies)]
         groups = {group: k for k, group in enumerate(dict.fromkeys(((), *moved)))}

@@ -260,7 +260,8 @@ class _TableBinding:
         self.results = self.pairs.ctypes.data, self.lows.ctypes.data, count
         objects, bodies = np.empty((2, count, 2), dtype=np.int32)
         self.nearest = objects, bodies, np.empty(count), np.empty((count, 9))
-        arrays = self.pairs, self.lows, self.distances, self.witnesses, self.order, *self.nearest
+        measured: tuple[npt.NDArray[Any], ...] = self.pairs, self.lows, self.distances, self.witnesses
+        arrays = *measured, self.order, *self.nearest
         names = ("pairs", "lows", "distances", "witnesses", "order", *_GATHERED)
         for name, array in zip(names, arrays, strict=True):
             setattr(self.query, name, array.ctypes.data)
