@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import gc
 import math
 from collections.abc import Callable, Iterable, Mapping
 from time import perf_counter
@@ -10,7 +11,6 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from kineverse._gc import no_collection
 from kineverse.compile import CompiledFunction
 from kineverse.errors import (
     InvalidValueError,
@@ -173,6 +173,10 @@ class Controller:
         if self._contacts is not None:
             self._functions.append(self._contacts.function)
         self._evaluate = self._program.function.bind()
+        if self._contacts is not None:
+            H, f, A, lower, *_ = self._evaluate.outputs
+            rows, first = self._program.contact_rows, self._program.columns
+            self._contacts.bind(H, f, A[rows], lower[first + rows.start : first + rows.stop])
         n, first = len(self.speeds), len(self._program.inputs)
         program_values = self._evaluate.input[:first]
         self._values = np.zeros(len(self.inputs)) if self._contacts else program_values
@@ -321,8 +325,13 @@ class Controller:
             For a state that lacks a value, or has another length, or a NaN.
         """
         # A collection of the whole program takes many times as long as a step; it has time between steps.
-        with no_collection():
+        collecting = gc.isenabled()
+        gc.disable()
+        try:
             return self._step(state)
+        finally:
+            if collecting:
+                gc.enable()
 
     def _step(self, state: StateLike | npt.ArrayLike) -> Command:
         start = perf_counter()
@@ -336,17 +345,7 @@ class Controller:
         self._evaluate()
         H, f, A, lower, upper, residuals, check, largest, *_ = self._evaluate.outputs
         if self._contacts is not None:
-            rows, first = self._program.contact_rows, self._program.columns
-            ends = slice(first + rows.start, first + rows.stop)
-            self._contacts.write(
-                H,
-                f,
-                A[rows],
-                lower[ends],
-                upper[ends],
-                self._costs.recovery,
-                RECOVERY_WEIGHT * float(largest[()]),
-            )
+            self._contacts.write(self._costs.recovery, RECOVERY_WEIGHT * float(largest[()]))
         if not math.isfinite(check[()]):
             raise self._diagnosis.not_finite()
         evaluated = perf_counter()

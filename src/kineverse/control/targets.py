@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import math
+
 import numpy as np
 import numpy.typing as npt
 
@@ -75,13 +77,14 @@ class Target:
     def _check(self, value: npt.NDArray[np.float64], shape: tuple[int, ...]) -> npt.NDArray[np.float64]:
         if value.shape != shape:
             raise ShapeError(f"The target '{self.name}' has shape {shape}, not {value.shape}.")
-        if not np.isfinite(value).all():
+        flat = value.ravel()
+        if not math.isfinite(flat.dot(flat)) and not np.isfinite(flat).all():
             raise InvalidValueError(f"The target '{self.name}' has to be finite.")
         if self._transform:
             if not _is_transform(value):
                 raise InvalidValueError(f"The target '{self.name}' is a transform, and this matrix is none.")
-            value = value[:3]
-        return value.ravel()
+            return flat[:12]
+        return flat
 
     def __repr__(self) -> str:
         return f"Target({self.name!r}, {self.expression.shape})"
@@ -92,7 +95,7 @@ def _is_transform(matrix: npt.NDArray[np.float64]) -> bool:
     (a, b, c, _), (d, e, f, _), (g, h, i, _), last = matrix.tolist()
     lengths = a * a + b * b + c * c, d * d + e * e + f * f, g * g + h * h + i * i
     products = a * d + b * e + c * f, a * g + b * h + c * i, d * g + e * h + f * i
-    return (
+    return bool(
         last == _LAST_ROW
         and max(abs(length - 1.0) for length in lengths) <= _LENGTH_TOLERANCE
         and max(map(abs, products)) <= _ANGLE_TOLERANCE
