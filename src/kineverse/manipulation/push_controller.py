@@ -387,7 +387,9 @@ class Pushing:
                 slots.point_jacobian(self._hand, tip) - slots.point_jacobian(thing, tip)
             )
             program.set("relative", relative[:, program.columns].ravel())
-            program.set("gap", distance)
+            # A press that is late enough is not increased by the goal about the gap either.
+            most = -PRESS * (1.0 - min(max(press.reserve, 0.0), 1.0))
+            program.set("gap", most if press.touched and self.touching else distance)
             program.set("pushed", float(normal @ J[:, program.object_column]))
             program.set("slip", tangents @ self._drift(thing, tip))
         program.set("free", float(free))
@@ -410,7 +412,10 @@ class Pushing:
             return np.zeros(3)
         if self._anchor is None or self._anchor[0] != thing:
             self._anchor = (thing, pose[:3, :3].T @ (tip - pose[:3, 3]))
-        return np.asarray(tip - pose[:3, :3] @ self._anchor[1] - pose[:3, 3])
+            self._drifted = np.zeros(3)
+        drift = tip - pose[:3, :3] @ self._anchor[1] - pose[:3, 3]
+        self._drifted = self._drifted + self.press.weight * (drift - self._drifted)
+        return self._drifted
 
     def _keep_apart(self, contact: PushPair | None, pressing: bool) -> None:
         """Set the distance of pusher and object: of both apart, or of a pusher that feels for the object."""

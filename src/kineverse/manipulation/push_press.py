@@ -24,7 +24,7 @@ RAMP = 0.02
 """Speed of the contact point beyond the measured one that is tried [m/s]."""
 SPEED = 0.25
 """Largest speed of the contact point [m/s]."""
-_MOST_LAG = 4e-3
+_MOST_LAG = 8e-4
 """Lag at which the press grows no more [m]."""
 _FORGET = 1.0
 """Time after which a lag is forgotten: that of acceleration and delays is none of the press [s]."""
@@ -85,7 +85,12 @@ class PushPress:
     @property
     def presses(self) -> bool:
         """True if the pusher is late by half of the largest lag."""
-        return self.lag > 0.5 * _MOST_LAG
+        return self.reserve < 0.5
+
+    @property
+    def weight(self) -> float:
+        """Weight of the latest estimate in a filter that makes noise of speeds as small as the ramp."""
+        return self._dt / (self._dt + self.deviation / RAMP)
 
     def report(self, touched: bool) -> None:
         """Take the report of touch sensors for a step."""
@@ -108,12 +113,10 @@ class PushPress:
         along = self._velocity / max(leverage, 1e-9)
         way = float(along @ moved)
         shift = self._sign * (estimate - self._estimate) if math.isfinite(self._estimate) else 0.0
-        # The filter is as slow as makes noise of speeds as small as the ramp.
-        part = self._dt / (self._dt + self.deviation / RAMP)
         if touching and self.touched:
             self.speed = max(way / self._dt, 0.0)
         else:
-            self.speed = max(self.speed + part * (shift * leverage / self._dt - self.speed), 0.0)
+            self.speed = max(self.speed + self.weight * (shift * leverage / self._dt - self.speed), 0.0)
         if touching:
             kept = self.lag * (1.0 - self._dt / _FORGET) if self.lag > 0.0 else 0.0
             self.lag = max(kept + float(along @ self._planned) - way, 0.0)
@@ -151,7 +154,11 @@ class PushPress:
         """Take the velocity of the contact point per unit of the push, and of the tip by a command (3,)."""
         self._velocity, self._planned = velocity, self._dt * tip_velocity
 
+    @property
+    def reserve(self) -> float:
+        """Part of the largest lag that is left; negative beyond it."""
+        return 1.0 - self.lag / _MOST_LAG
+
     def pace(self) -> float:
         """Return the speed of the contact point that may be tried [m/s]."""
-        more = RAMP * (1.0 - self.lag / _MOST_LAG)
-        return min(max(self.speed + more, 0.0), SPEED)
+        return min(max(self.speed + RAMP * self.reserve, 0.0), SPEED)

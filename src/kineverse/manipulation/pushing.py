@@ -30,6 +30,8 @@ _AVERAGED = 0.1
 _STILL, _NEARLY = 5e-3, 2.0
 """Speed of a contact point that counts as none [m/s], and the number of tolerances within which an object
 that gives way no more is at its target."""
+_PRESSED = 3
+"""Number of steps for which it gives way no more."""
 _MOST_BLOCKED = 3
 """Number of contact points given up before an approach is planned."""
 _MOST_JAMMED = 3
@@ -160,7 +162,7 @@ class _End:
         still = pushing.touching and press.presses and press.speed < _STILL
         self._pressed = self._pressed + 1 if still and rest < _NEARLY * self._tolerance else 0
         long = _SETTLED_ESTIMATE if press.deviation > 0.0 else _SETTLED
-        return self._settled >= long or self._within >= long + _PATIENCE or self._pressed >= _SETTLED
+        return self._settled >= long or self._within >= long + _PATIENCE or self._pressed >= _PRESSED
 
 
 class _Run:
