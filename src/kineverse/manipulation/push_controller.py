@@ -250,11 +250,10 @@ class Pushing:
         if self.choice.chosen is not None:
             point = self.surface.point_at(state, self.choice.chosen)
             normal, velocity = point.normal, point.velocity
-        parts = [float(normal @ velocity) * deviation(self.coordinate)]
-        parts += [
-            float(normal @ column) * deviation(s) for s, column in zip(symbols, jacobian.T, strict=True)
-        ]
-        return math.hypot(*parts)
+        rates = dict(zip(symbols, (normal @ jacobian).tolist(), strict=True))
+        rates[self.coordinate] = float(normal @ velocity)
+        # The deviation of what was never seen is infinite, and counts only where it changes the gap.
+        return math.hypot(*(rate * deviation(s) for s, rate in rates.items() if rate))
 
     def step(self, state: State, observation: Observation | None = None, deviation: float = 0.0) -> Command:
         """Return the command for one time step at a state.

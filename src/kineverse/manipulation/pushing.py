@@ -227,7 +227,7 @@ class _Run:
                 deviation = pushing.find_deviation(session.state, session.belief.deviation)
             else:
                 deviation = self._deviation
-            command = pushing.step(session.state, session.world.observe() if deviation else None, deviation)
+            command = pushing.step(session.state, session.observation if deviation else None, deviation)
         speeds = np.fromiter(command.speeds.values(), dtype=float)
         if pushing.touching and self._last is not None:
             self._changes.append(np.abs(speeds - self._last))
