@@ -42,7 +42,7 @@ class Column:
 
 
 def worst(key: str, scale: float = 1.0) -> Callable[[Sequence[Trial]], float]:
-    """Return the function that finds the largest value of a measure, times a scale; NaN if no trial has it."""
+    """Return the function that finds the largest value of a measure, times a scale; NaN without any."""
 
     def largest(trials: Sequence[Trial]) -> float:
         found = (t.measures.get(key) for t in trials)

@@ -17,8 +17,9 @@ from kineverse.experiments.manipulation.trials import Trial
 from kineverse.experiments.registry import Options, Progress
 from kineverse.experiments.report import Report
 
+from .figures import FILMED
 from .objects import PushSetup, find_kitchens, make_push_setup
-from .report import SHOWN, make_push_report
+from .report import make_push_report
 
 OPTIONS = ("quick", "data", "seed", "robot", "processes", *SettingOptions)
 
@@ -85,7 +86,7 @@ def run_push(job: PushJob) -> list[Trial]:
         setup.what,
         job.setting,
         job.seed,
-        film=job.thing == SHOWN and job.paper == "2022",
+        film=job.thing in FILMED and job.paper == "2022",
         measures=(("thing", job.thing),),
     )
     world = job.setting.make_world(setup.model, job.robot.prefix, setup.start)

@@ -12,8 +12,9 @@ from kineverse.experiments.manipulation.columns import ROW, TIMES, Column, step_
 from kineverse.experiments.manipulation.tables import make_group_table, make_tables, make_trial_numbers
 from kineverse.experiments.manipulation.trials import StepTimeStatistics, Trial, as_json, group_trials
 from kineverse.experiments.report import Figure, Report
+from kineverse.worlds.judge import CONTACT_GAP
 
-from .figures import make_pictures
+from .figures import FILMED, make_pictures
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure as Canvas
@@ -56,9 +57,10 @@ def make_push_report(trials: Sequence[Trial], seed: int) -> Report:
     )
 
 
-SHOWN = "fridge door"
-"""Object of the figures: joint velocity commands, as in the 2020 paper, Fig. 7, and its Fig. 6."""
-FIGURE_SIZE = (12.0, 3.8)
+FIGURE_SIZE = (13.0, 4.2)
+_NAMED = 6
+"""Number of the fastest joints that have their names in the figure."""
+_NONE = (np.zeros(3), np.full(3, np.inf))
 
 
 def meets_bars(trial: Trial) -> bool:
@@ -106,17 +108,24 @@ PAPER_COLUMNS = (
 
 
 def _draw_commands(canvas: Canvas, trials: Sequence[Trial]) -> None:
-    """Draw the commanded speeds of each robot at one object of the first kitchen and world."""
-    own = list({t.robot: t for t in reversed(trials) if t.series.get("time")}.values())[::-1]
-    panels = np.atleast_1d(canvas.subplots(1, max(1, len(own)), sharey=True))
+    """Draw the commanded speeds of each robot at the first filmed object (2020 paper, Fig. 7)."""
+    shown = [t for t in trials if t.series.get("time") and t.measures["thing"] == FILMED[0]]
+    own = list({t.robot: t for t in reversed(shown)}.values())[::-1]
+    panels = np.atleast_1d(canvas.subplots(1, max(1, len(own))))
     for axes, trial in zip(panels, own, strict=False):
         time = np.asarray(trial.series["time"])
-        for name, values in trial.series.items():
-            if name != "time" and np.abs(values).max() > 1e-3:
-                axes.plot(time, values, linewidth=0.9)
-        pushing = [m.time for m in trial.film if "n" in m.vectors]
-        if pushing:
-            axes.axvline(pushing[0], color="0.6", linewidth=0.8, linestyle=":")
-        axes.set_title(f"{trial.robot}, {trial.measures.get('thing', trial.what)}")
+        speeds = {name: np.asarray(v) for name, v in trial.series.items() if name != "time"}
+        fastest = sorted(speeds, key=lambda name: -float(np.abs(speeds[name]).max(initial=0.0)))
+        for name in reversed(fastest):
+            label = name.partition("/")[2].removesuffix(":velocity")
+            style = {"label": label} if name in fastest[:_NAMED] else {"color": "0.75"}
+            axes.plot(time, speeds[name], linewidth=0.9, **style)
+        touches = (
+            m.time for m in trial.film if np.linalg.norm(m.vectors.get("r - p", _NONE)[1]) < CONTACT_GAP
+        )
+        if (touch := next(touches, None)) is not None:
+            axes.axvline(touch, color="0.5", linewidth=0.8, linestyle=":")
+        axes.legend(fontsize="x-small", frameon=False)
+        axes.set_title(f"{trial.robot}, {trial.measures['thing']} (dotted: first contact)", fontsize="medium")
         axes.set_xlabel("time [s]")
     panels[0].set_ylabel("commanded speeds [rad/s], [m/s]")
