@@ -27,7 +27,7 @@ from .trials import Moment
 if TYPE_CHECKING:
     from matplotlib.figure import Figure as Canvas
 
-_DIRECTIONS, _ELEVATIONS = 16, (0.35, 0.7)
+_DIRECTIONS, _ELEVATIONS = 16, (0.3, 0.55)
 _TRIAL_HEIGHT = 60
 _NEAREST = 0.035
 """Distance within which a push has nearest points [m]."""

@@ -60,7 +60,6 @@ def make_push_report(trials: Sequence[Trial], seed: int) -> Report:
 FIGURE_SIZE = (13.0, 4.2)
 _NAMED = 6
 """Number of the fastest joints that have their names in the figure."""
-_NONE = (np.zeros(3), np.full(3, np.inf))
 
 
 def meets_bars(trial: Trial) -> bool:
