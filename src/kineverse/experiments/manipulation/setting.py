@@ -12,7 +12,7 @@ from typing import Any
 
 from kineverse.errors import FormatError
 from kineverse.experiments.registry import BOTH, WORLDS, Options
-from kineverse.manipulation import Belief, Outcome, Session, TrueBelief
+from kineverse.manipulation import Belief, Outcome, Session, TrackedBelief, TrueBelief
 from kineverse.manipulation.push_controller import PushView
 from kineverse.model.model import Model
 from kineverse.state import StateLike
@@ -55,8 +55,10 @@ class TrialSetting:
         return world
 
     def make_belief(self, world: World) -> Belief:
-        """Return the belief on which a skill acts."""
-        return TrueBelief()
+        """Return the belief on which a skill acts: the truth without noise, else an estimate."""
+        if not self.noise:
+            return TrueBelief()
+        return TrackedBelief(world.model, world.robot, Sensors.parse(self.noise))
 
 
 def make_settings(options: Options) -> tuple[TrialSetting, ...]:

@@ -119,9 +119,8 @@ def _draw_commands(canvas: Canvas, trials: Sequence[Trial]) -> None:
             label = name.partition("/")[2].removesuffix(":velocity")
             style = {"label": label} if name in fastest[:_NAMED] else {"color": "0.75"}
             axes.plot(time, speeds[name], linewidth=0.9, **style)
-        touches = (
-            m.time for m in trial.film if np.linalg.norm(m.vectors.get("r - p", _NONE)[1]) < CONTACT_GAP
-        )
+        gaps = ((m.time, np.linalg.norm(m.vectors["r - p"][1])) for m in trial.film if m.vectors)
+        touches = (at for at, gap in gaps if gap < CONTACT_GAP)
         if (touch := next(touches, None)) is not None:
             axes.axvline(touch, color="0.5", linewidth=0.8, linestyle=":")
         axes.legend(fontsize="x-small", frameon=False)
