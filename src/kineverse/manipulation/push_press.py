@@ -30,8 +30,9 @@ _MOST_LAG = 8e-4
 """Lag at which the press grows no more [m]."""
 _CREEP = 0.02
 """Speed at which a pusher feels for an object that may be nearer or farther than estimated [m/s]."""
-_FORGET = 1.0
-"""Time after which a lag is forgotten: that of acceleration and delays is none of the press [s]."""
+_FORGET, _FORGET_WAY = 1.0, 0.01
+"""Time [s] and way [m] after which a lag is forgotten: that of acceleration and delays is none of the press,
+and what moves on gives way."""
 _REMEMBER = 0.1
 """Time for which a touch counts after the last report [s]."""
 _RETURN = 0.3
@@ -122,7 +123,7 @@ class PushPress:
         else:
             self.speed = max(self.speed + self.weight * (shift * leverage / self._dt - self.speed), 0.0)
         if touching:
-            kept = self.lag * (1.0 - self._dt / _FORGET) if self.lag > 0.0 else 0.0
+            kept = self.lag * math.exp(-self._dt / _FORGET - max(way, 0.0) / _FORGET_WAY)
             self.lag = max(kept + float(along @ self._planned) - way, 0.0)
         else:
             self.lag = 0.0
