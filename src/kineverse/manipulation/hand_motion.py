@@ -27,6 +27,9 @@ _LINE_SPEED = 0.1
 """Speed of the hand on the straight way to the handle and from it [m/s]."""
 _SETTLED, _MOST_SETTLING = 5e-4, 150
 """Error of the hand's pose at the end of a straight way [m], [rad], and the most steps until it is met."""
+_KNOWN, _MOST_LOOKING, _UNKNOWN = 1.5e-3, 1.0, 0.02
+"""Deviation of a handle's position that is small [m], longest time to look until it is [s], and the deviation
+from which on nothing is done [m]."""
 _SIGMAS = 2.0
 """Standard deviations of the believed handle by which the hand may be off instead."""
 FOLLOWING = 5.0
@@ -79,9 +82,34 @@ class HandMotion:
         self.model = search.model
         self.turns: Array = np.zeros(len(search.moving))
         self._hand, self._bar = self.model.fk(gripper.hand), self.model.fk(handle.frame)
+        self._slope = self._bar[:3, 3].partial([handle.coordinate])
         limits = {s: self.model.limits(s) for s in (*search.moving, handle.coordinate)}
         self._limits = {s: (float(a), float(b)) for s, (a, b) in limits.items()}
         self._closed_at: dict[Symbol, float] = {}
+
+    @property
+    def deviation(self) -> float:
+        """Standard deviation of the position of the handle [m]; 0 if it is known exactly."""
+        session, coordinate = self.session, self.handle.coordinate
+        if not (deviation := session.deviation(coordinate)):
+            return 0.0
+        slope = self._slope(session.state)
+        return deviation * float(np.linalg.norm(slope))
+
+    def look(self) -> None:
+        """Stand until the handle is known well, or raise SkillError if it is not seen."""
+        session = self.session
+        session.phase = "look"
+        begin = session.world.time
+        while self.deviation > _KNOWN and session.world.time - begin < _MOST_LOOKING:
+            self.act({})
+        if (deviation := self.deviation) > _UNKNOWN:
+            coordinate = self.handle.coordinate
+            raise SkillError(
+                "other",
+                f"'{coordinate}' is not seen: believed at {session.state[coordinate]:.3f}, with a standard "
+                f"deviation of {session.deviation(coordinate):.2g}, or {deviation:.2g} m at the handle.",
+            )
 
     @property
     def state(self) -> State:
@@ -231,4 +259,7 @@ class HandMotion:
 def row_at(rows: Array, share: float) -> Array:
     """Return the configuration (n,) at a share of the way along some (K, n)."""
     place = share * (len(rows) - 1)
-    return np.array([np.interp(place, range(len(rows)), column) for column in rows.T])
+    k = min(max(int(place), 0), max(len(rows) - 2, 0))
+    rest = min(max(place - k, 0.0), 1.0)
+    found = (1.0 - rest) * rows[k] + rest * rows[min(k + 1, len(rows) - 1)]
+    return np.asarray(found)

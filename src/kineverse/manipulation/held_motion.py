@@ -26,6 +26,9 @@ deviations of its estimate that are added."""
 _STALLED, _PATIENCE, _RESTING = 1e-3, 4.0, 0.5
 """Least progress of the object [m], [rad] in a time [s], and in one at the end of the way."""
 
+_SETTLED = 10
+"""Number of steps for which an estimate is at the target when a motion ends."""
+
 
 def move_held(motion: HandMotion, placement: BasePlacement, tolerance: float) -> None:
     """Move a held object along the way of a placement.
@@ -71,7 +74,12 @@ def move_held(motion: HandMotion, placement: BasePlacement, tolerance: float) ->
     controller = motion.controller(tasks, scene=scene, margin=_MARGIN)
     share, speed, length = 0.0, 0.0, abs(target - values[0])
     best, since = 0.0, session.world.time
-    while (rest := abs(session.state[coordinate] - target)) > tolerance / 4:
+    within, enough = 0, _SETTLED if session.deviation(coordinate) else 1
+    while True:
+        rest = abs(session.state[coordinate] - target)
+        within = within + 1 if rest <= tolerance / 4 else 0
+        if within >= enough:
+            return
         motion.check_time()
         with session.timed("open"):
             state = motion.state

@@ -216,6 +216,7 @@ class _Run:
     def perform(self) -> None:
         """Move the object to the target with one grasp after the other, or raise SkillError."""
         coordinate = self.handle.coordinate
+        self.motion.look()
         self._check_start()
         for _ in range(_MOST_GRASPS):
             if abs(self.session.state[coordinate] - self.target) <= self.tolerance / 2:
@@ -282,10 +283,11 @@ class _Run:
         if search.standing:
             stands = {s: wanted[s] for s in search.standing}
             gone = session.world.time - self.begin
-            session.restart(session.world.state.updated(stands))
+            session.restart(session.world.state.updated(stands))  # everything else stays where it is
             self.begin = -gone
             self.motion.until = self.seconds - gone
             self._judge_afresh()
+            self.motion.look()
         motion = self.motion
         motion.move_fingers(self.gripper.opened)
         planner = self.opener.planner
