@@ -29,6 +29,8 @@ _PLANNING = 2.0
 _SHARES = (1.0, 0.75, 0.5, 0.3)
 """Shares of the rest of a motion that are tried with one grasp."""
 _MOST_GRASPS = 4
+_MOST_SLIPS, _LEAST_PROGRESS = 2, 0.1
+"""Number of slips from which on a grasp has to take an object further, by a share of the rest."""
 _LARGEST = ("limit_violation", "penetration", "grasp_error", "grasp_rotation", "jitter", "reversals")
 _SUMS = ("contact_losses", "distance", "hand_distance")
 """Measures of the parts of a run: the largest, or the sum."""
@@ -187,6 +189,7 @@ class _Run:
         self.first, self.begin = session.steps, session.world.time
         self.placements = self.grasps = 0
         self.slips: list[str] = []
+        self._rest = math.inf
         self._earlier: list[Mapping[str, Any]] = []
         self.judge = Judge(self.model, session.world.robot, self.gripper, handle=handle.frame)
         self.judge.update(session.world.state)
@@ -228,8 +231,17 @@ class _Run:
             except SlipError as slip:
                 self.slips.append(str(slip))
             self.motion.release(placement.grasp)
+            self._check_progress()
         if abs(self.session.state[coordinate] - self.target) > self.tolerance:
             raise SkillError("reach", f"After {self.grasps} grasps '{coordinate}' is not at the target.")
+
+    def _check_progress(self) -> None:
+        """Raise SkillError if the handle slips time and again and the object hardly moves."""
+        rest = abs(self.session.state[self.handle.coordinate] - self.target)
+        if len(self.slips) < _MOST_SLIPS:
+            self._rest = rest
+        elif rest > (1.0 - _LEAST_PROGRESS) * self._rest:
+            raise SkillError("other", "It moves too hard for the force of the fingers.")
 
     def _check_start(self) -> None:
         """Raise SkillError if the robot touches something before anything is done."""
