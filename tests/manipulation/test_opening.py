@@ -4,8 +4,9 @@ import pytest
 import kineverse as kv
 from kineverse.errors import InvalidValueError, KineverseError, UnknownNameError
 from kineverse.grasping import find_gripper, find_handle, sample_grasps
-from kineverse.manipulation import PlacementSearch, Session, open_object
-from kineverse.worlds import KinematicWorld
+from kineverse.manipulation import PlacementSearch, Session, TrackedBelief, open_object
+from kineverse.manipulation.belief import EstimateError
+from kineverse.worlds import KinematicWorld, Sensors
 
 DRAWER, DOOR = "shelf_drawers/upper_drawer", "shelf_door/door"
 
@@ -100,3 +101,26 @@ def test_wrong_arguments_are_refused(session):
         open_object(session, DRAWER, target=3.0)
     with pytest.raises(KineverseError):
         open_object(session, DRAWER, handle="shelf_drawers/lower_drawer_handle")
+
+
+def test_an_object_that_is_never_seen_is_not_opened(model):
+    sensors = Sensors.parse("3mm,0.5deg,drop=1")
+    world = KinematicWorld(model, "hsr", sensors=sensors)
+    world.reset(start(model).updated({DRAWER: 0.1}))
+    outcome = open_object(Session(world, belief=TrackedBelief(model, "hsr", sensors)), DRAWER)
+    assert not outcome
+    assert "not seen" in outcome.reason
+    assert world.state[DRAWER] == 0.1
+
+
+def test_drawer_opens_by_estimates_from_noisy_poses(model):
+    sensors = Sensors.parse("3mm+3mm/m,0.5deg,30Hz,drop=0.1,encoders=0.0002")
+    world = KinematicWorld(model, "hsr", sensors=sensors)
+    world.reset(start(model))
+    error = EstimateError(model.symbol(DRAWER))
+    session = Session(world, belief=TrackedBelief(model, "hsr", sensors), on_step=error)
+    outcome = open_object(session, DRAWER)
+    assert outcome, outcome.reason
+    assert outcome.measures["penetration"] < 5e-4
+    assert error.measures["estimate_mean"] < 0.003
+    assert outcome.measures["grasp_error"] < max(5e-4, 1.5 * error.measures["estimate_largest"])
