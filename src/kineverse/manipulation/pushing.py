@@ -248,6 +248,7 @@ class _Run:
             return f"No contact point was reached, of {tried} and {self._approaches} plans."
         self._approaches += 1
         session, pushing = self._session, self._pushing
+        self.retreat()  # a way that begins with a contact cannot be planned
         session.stop()
         path, point = plan_push_approach(pushing, session.state)
         if not path.found:
