@@ -95,8 +95,9 @@ class Session:
             return self.belief.deviation(what)
         if what.shape != ():
             raise ShapeError(f"A deviation is one of a number, not of an expression of shape {what.shape}.")
-        slopes = {s: float(what.partial([s])(self.state)[0]) for s in what.symbols}
-        return math.hypot(*(k * self.belief.deviation(s) for s, k in slopes.items() if k))
+        own = {s: self.belief.deviation(s) for s in what.symbols}
+        slopes = {s: float(what.partial([s])(self.state)[0]) for s, deviation in own.items() if deviation}
+        return math.hypot(*(k * own[s] for s, k in slopes.items() if k))
 
     @contextmanager
     def timed(self, name: str) -> Iterator[None]:
