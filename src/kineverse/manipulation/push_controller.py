@@ -24,6 +24,7 @@ from typing import TypeAlias
 
 import numpy as np
 
+from kineverse._gc import no_collection
 from kineverse.control import Command
 from kineverse.errors import InvalidValueError, KineverseError
 from kineverse.geometry import Rule, Scene
@@ -302,6 +303,10 @@ class Pushing:
         InfeasibleError, NotFiniteError
             As :meth:`.Controller.step`.
         """
+        with no_collection():
+            return self._step(state)
+
+    def _step(self, state: State) -> Command:
         value = state[self.coordinate]
         self._moved = max(self.surface.sign * (value - self._value), 0.0) if self._value is not None else 0.0
         self._value = value
