@@ -53,7 +53,7 @@ def move_held(motion: HandMotion, placement: BasePlacement, tolerance: float) ->
     hold = Hold(same_pose(bar @ held, hand), name="grasp")
     target = float(placement.values[-1])
     moving = motion.search.moving
-    rows = placement.way[:, : len(moving)] + motion.turns
+    rows = motion.rows(placement.way)
     values = placement.values
     posture, goals = motion.posture(rows[0])
     wanted = Target("opening/object", np.array([values[0]]))
