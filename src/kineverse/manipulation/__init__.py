@@ -6,6 +6,7 @@ from .outcome import Outcome, SkillError
 from .placement import BasePlacement, PlacementSearch
 from .pushing import push
 from .session import Session
+from .tracked_belief import TrackedBelief
 
 __all__ = [
     "BasePlacement",
@@ -14,6 +15,7 @@ __all__ = [
     "PlacementSearch",
     "Session",
     "SkillError",
+    "TrackedBelief",
     "TrueBelief",
     "open_object",
     "push",

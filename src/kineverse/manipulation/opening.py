@@ -19,7 +19,7 @@ from kineverse.worlds import Judge
 
 from .hand_motion import HandMotion
 from .held_motion import move_held
-from .outcome import Outcome, SkillError
+from .outcome import Outcome, SkillError, SlipError
 from .placement import BasePlacement, PlacementSearch
 from .push_fallback import PushFallback
 from .session import Session
@@ -76,8 +76,9 @@ def open_object(
     Returns
     -------
     Outcome
-        With ``measures``: those of :class:`.Judge`, ``placements``, ``grasps`` (number of grasps), and
-        ``failure``: ``"collision"``, ``"reach"``, ``"time"`` or ``"other"`` if it was not done.
+        With ``measures``: those of :class:`.Judge`, ``placements``, ``grasps`` and ``slips`` (number of
+        grasps, and of those that the handle slipped out of), and ``failure``: ``"collision"``, ``"reach"``,
+        ``"time"`` or ``"other"`` if it was not done.
 
     Raises
     ------
@@ -108,8 +109,9 @@ def open_object(
             if done
             else (f"'{coordinate}' ended at {value:.3f}, not at {goal:.3f}.")
         )
+    reason = " ".join([*run.slips, reason])
     measures: dict[str, Any] = {**run.measures, "placements": run.placements, "grasps": run.grasps}
-    measures |= {"pushed": run.pushed_from is not None, "resets": run.resets}
+    measures |= {"pushed": run.pushed_from is not None, "resets": run.resets, "slips": len(run.slips)}
     if not done:
         measures["failure"] = kind or "other"
     return Outcome(
@@ -189,6 +191,7 @@ class _Run:
         self.first, self.begin = session.steps, session.world.time
         self.placements = self.grasps = self.resets = 0
         self.pushed_from: float | None = None
+        self.slips: list[str] = []
         self._earlier: list[Mapping[str, Any]] = []
         self._barrier = ""
         self._trajectory: Trajectory
@@ -218,6 +221,7 @@ class _Run:
 
     def perform(self) -> None:
         """Move the object to the target with one grasp after the other, or raise SkillError."""
+        self.motion.look()
         self._check_start()
         for _ in range(_MOST_GRASPS):
             if self.left <= self.tolerance / 2:
@@ -232,8 +236,11 @@ class _Run:
             assert placement.grasp is not None
             self.grasps += 1
             self._approach(placement)
-            if self.motion.close(placement.grasp):
-                move_held(self.motion, placement, self.tolerance)
+            try:
+                if self.motion.close(placement.grasp):
+                    move_held(self.motion, placement, self.tolerance)
+            except SlipError as slip:
+                self.slips.append(str(slip))
             self.motion.release(placement)
         if self.left > self.tolerance:
             what = self.handle.coordinate
@@ -268,6 +275,7 @@ class _Run:
         self._earlier.append(self.judge.measures)
         self.judge.reset()
         self.judge.update(session.world.state)
+        self.motion.look()
 
     def _check_start(self) -> None:
         """Raise SkillError if the robot touches something before anything is done."""

@@ -90,6 +90,7 @@ class PushFallback:
         """Go to the start that was found, push, and take the hand away, or raise SkillError."""
         motion, session = self.motion, self.motion.session
         assert self._trajectory is not None
+        motion.judge.allow(self.pushing.object_bodies)
         session.phase = "approach"
         motion.follow(self._trajectory)
 
