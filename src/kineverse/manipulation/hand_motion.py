@@ -7,8 +7,9 @@ from collections.abc import Iterable, Mapping
 from typing import Any
 
 import numpy as np
+import numpy.typing as npt
 
-from kineverse.control import Controller, Goal, Hold, Target, same_pose
+from kineverse.control import Command, Controller, Goal, Hold, Target, same_pose
 from kineverse.control.tasks import Task
 from kineverse.grasping import Grasp, Gripper, Handle
 from kineverse.lie import Array, inverse
@@ -18,7 +19,7 @@ from kineverse.worlds import Judge
 
 from .outcome import SkillError
 from .placement import PlacementSearch
-from .session import Session
+from .session import HandReference, Session
 
 _CLOSING, _MOST_CLOSING = 1.5, 4.0
 """Time in which fingers open or close fully, and the largest one [s]."""
@@ -28,6 +29,8 @@ _SETTLED, _MOST_SETTLING = 5e-4, 150
 """Error of the hand's pose at the end of a straight way [m], [rad], and the most steps until it is met."""
 _FOLLOWING, _POSTURE = 5.0, 0.5
 """Gain of the goals along the way [1/s], and the weight of the arm beside the object."""
+_REFERENCES = 24
+"""Number of poses that pages show of a way."""
 _BESIDE = 0.008
 """Difference of the gap of closed fingers to the thickness of the bar that says that it is not there [m]."""
 
@@ -78,12 +81,16 @@ class HandMotion:
         follower = TrajectoryFollower(trajectory)
         controller = self.controller(follower.tasks, posture=0.0)
         begin = session.world.time
+        times = np.linspace(0.0, trajectory.duration, _REFERENCES)
+        self.refer([self._hand(session.state.updated(trajectory.at(t))) for t in times.tolist()])
         while session.world.time - begin < trajectory.duration + 0.2:
             self.check_time()
+            self.refer_to((session.world.time - begin) / max(trajectory.duration, session.dt))
             with session.timed("approach"):
                 follower.set(controller, session.world.time - begin)
                 command = controller.step(session.state)
-            self.act(command.speeds)
+            self.act(command.speeds, command)
+        session.reference = None
 
     def follow_line(self, start: Array, end: Array, rows: Array | None = None) -> None:
         """Move the hand straight from a pose relative to the handle to another one, near to arms (L, n)."""
@@ -94,10 +101,12 @@ class HandMotion:
         controller = self.controller([Goal(error, gain=0.5 / session.dt, name="hand"), *goals])
         length = float(np.linalg.norm(end[:3, 3] - start[:3, 3]))
         steps = max(2, math.ceil(length / (_LINE_SPEED * session.dt)))
+        self.refer(self._bar(session.state) @ np.array([start, end]))
         for k in range(1, steps + _MOST_SETTLING):
             self.check_time()
             pose = end.copy()
             share = min(1.0, k / steps)
+            self.refer_to(share)
             pose[:3, 3] = start[:3, 3] + share * (end[:3, 3] - start[:3, 3])
             with session.timed("line"):
                 controller.set(wanted, pose)
@@ -106,7 +115,8 @@ class HandMotion:
                 command = controller.step(session.state)
             if k > steps and command.residuals["hand"] < _SETTLED:
                 break
-            self.act(command.speeds)
+            self.act(command.speeds, command)
+        session.reference = None
 
     def count_turns(self, row: Array) -> None:
         """Find the whole turns by which joints without limits are away from a configuration (n,)."""
@@ -179,11 +189,20 @@ class HandMotion:
             if idle >= 10:
                 break
 
-    def act(self, speeds: Mapping[Symbol, float]) -> None:
-        """Command speeds for one step, and judge it."""
+    def act(self, speeds: Mapping[Symbol, float], command: Command | None = None) -> None:
+        """Command speeds for one step, those of a controller's command if given, and judge it."""
         session = self.session
-        session.act(speeds)
+        session.act(speeds, command)
         self.judge.update(session.world.state, session.commands, held=session.world.held)
+
+    def refer(self, poses: npt.ArrayLike) -> None:
+        """State the world poses (K, 4, 4) of the hand along the way that begins."""
+        self.session.reference = HandReference(np.asarray(poses, dtype=float))
+
+    def refer_to(self, share: float) -> None:
+        """State the share of the way that lies behind, in [0, 1]."""
+        if self.session.reference is not None:
+            self.session.reference.share = share
 
     def check_time(self) -> None:
         """Raise SkillError if the time is up."""

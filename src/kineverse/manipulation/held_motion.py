@@ -64,6 +64,10 @@ def move_held(motion: HandMotion, placement: BasePlacement, tolerance: float) ->
     controller = motion.controller(tasks, scene=scene, margin=_MARGIN)
     share, ends = 0.0, abs(target - values[0])
     best, since = 0.0, session.world.time
+    states = [
+        session.state.updated({coordinate: v}) for v in np.linspace(values[0], target, len(values)).tolist()
+    ]
+    motion.refer([bar(state) @ held for state in states])
     while abs(session.state[coordinate] - target) > tolerance / 4:
         motion.check_time()
         with session.timed("open"):
@@ -79,7 +83,8 @@ def move_held(motion: HandMotion, placement: BasePlacement, tolerance: float) ->
             )
             share += _SPEED * session.dt / ends * min(1.0, max(0.0, 1.5 - late / _LATE))
             share = min(1.0, share)
-        motion.act(command.speeds)
+        motion.refer_to(share)
+        motion.act(command.speeds, command)
         if command.residuals["grasp"] > _SLIPPED:
             raise SkillError("other", "The handle slipped out of the hand.")
         done = abs(session.state[coordinate] - values[0])
@@ -91,3 +96,4 @@ def move_held(motion: HandMotion, placement: BasePlacement, tolerance: float) ->
                 "collision" if "contact" in stops else "other",
                 f"'{coordinate}' does not move on from {session.state[coordinate]:.3f}. In the way: {stops}.",
             )
+    session.reference = None

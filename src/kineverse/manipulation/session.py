@@ -4,8 +4,13 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
+from dataclasses import dataclass
 from time import perf_counter, thread_time
 
+import numpy as np
+
+from kineverse.control import Command
+from kineverse.lie import Array
 from kineverse.state import State
 from kineverse.symbols import Symbol
 from kineverse.worlds import World
@@ -13,6 +18,43 @@ from kineverse.worlds import World
 from .belief import Belief, TrueBelief
 
 Speeds = Mapping[Symbol, float]
+
+
+@dataclass(slots=True, eq=False)
+class HandReference:
+    """Way of a hand that a controller follows.
+
+    Attributes
+    ----------
+    poses
+        World poses (K, 4, 4) along the way [m].
+    share
+        Share of the way that lies behind, in [0, 1].
+    """
+
+    poses: Array
+    share: float = 0.0
+
+    @property
+    def pose(self) -> Array:
+        """Pose (4, 4) of the way that is wanted now."""
+        pose: Array = self.poses[round(self._place)].copy()
+        pose[:3, 3] = self.ahead[0]
+        return pose
+
+    @property
+    def ahead(self) -> Array:
+        """Points (k, 3) of the rest of the way [m], the present one first."""
+        points, place = self.poses[:, :3, 3], self._place
+        before = int(place)
+        after = min(before + 1, len(points) - 1)
+        here = points[before] + (place - before) * (points[after] - points[before])
+        rest: Array = np.concatenate([here[None], points[after:]])
+        return rest
+
+    @property
+    def _place(self) -> float:
+        return float(np.clip(self.share, 0.0, 1.0)) * (len(self.poses) - 1)
 
 
 class Session:
@@ -44,6 +86,12 @@ class Session:
         The believed state.
     commands
         The speeds of the last step.
+    command
+        The controller's command from which they come; None if there is none.
+    reference
+        The way of the hand that a controller follows; None if there is none.
+    vectors
+        Vectors of the controller by name, each with its origin in the world [m], for pages and recordings.
     phase
         Name of the present phase of the skill, for recordings and messages.
     steps
@@ -65,6 +113,9 @@ class Session:
         self._on_step = on_step
         self.state: State = self.belief.update(world)
         self.commands: Speeds = {}
+        self.command: Command | None = None
+        self.reference: HandReference | None = None
+        self.vectors: Mapping[str, tuple[Array, Array]] = {}
         self.phase, self.steps = "", 0
         self.cpu: dict[str, list[float]] = {}
         self.wall: dict[str, list[float]] = {}
@@ -77,15 +128,17 @@ class Session:
         self.cpu.setdefault(name, []).append(thread_time() - cpu)
         self.wall.setdefault(name, []).append(perf_counter() - wall)
 
-    def act(self, speeds: Speeds) -> None:
+    def act(self, speeds: Speeds, command: Command | None = None) -> None:
         """Command speeds for one step, and update the belief. Speeds of objects are not sent.
 
         Parameters
         ----------
         speeds
             Speeds of the robot, and possibly of objects [m/s], [rad/s]; none to stop.
+        command
+            The controller's command that has these speeds, for pages.
         """
-        robot = f"{self.world.robot}/"
+        robot, self.command = f"{self.world.robot}/", command
         self.commands = {s: v for s, v in speeds.items() if s.path.startswith(robot)}
         self.world.apply(self.commands, self.dt, stamp=self.state.stamp)
         self.state = self.belief.update(self.world, State(self.commands))
