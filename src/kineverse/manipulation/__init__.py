@@ -8,6 +8,7 @@ from .outcome import Outcome, SkillError
 from .placement import BasePlacement, PlacementSearch
 from .pushing import push
 from .session import Session
+from .tracked_belief import TrackedBelief
 
 __all__ = [
     "ArticulatedObject",
@@ -19,6 +20,7 @@ __all__ = [
     "PlacementSearch",
     "Session",
     "SkillError",
+    "TrackedBelief",
     "TrueBelief",
     "find_articulated_objects",
     "open_object",

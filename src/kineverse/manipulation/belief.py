@@ -6,11 +6,21 @@ from typing import Protocol
 
 from kineverse.state import State
 from kineverse.symbols import Symbol
-from kineverse.worlds import World
+from kineverse.worlds import Observation, World
 
 
 class Belief(Protocol):
-    """Source of the state that a controller uses."""
+    """Source of the state that a controller uses.
+
+    Attributes
+    ----------
+    observation
+        The readings of the last update; None if it took none.
+    """
+
+    @property
+    def observation(self) -> Observation | None:
+        """The readings of the last update; None if it took none."""
 
     def update(self, world: World, commands: State | None = None) -> State:
         """Return the believed state of all coordinates after a step; its stamp is a time of the world [s].
@@ -20,7 +30,7 @@ class Belief(Protocol):
         world
             The world, of which only observations may be read by an estimate.
         commands
-            The speeds that were commanded last.
+            The speeds since the last update: commanded ones of the robot, and planned ones of objects.
         """
 
     def deviation(self, coordinate: Symbol) -> float:
@@ -29,6 +39,8 @@ class Belief(Protocol):
 
 class TrueBelief:
     """The truth of a world as the belief."""
+
+    observation = None
 
     def update(self, world: World, commands: State | None = None) -> State:
         """Return the true state."""

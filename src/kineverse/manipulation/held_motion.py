@@ -50,7 +50,8 @@ def move_held(motion: HandMotion, placement: BasePlacement, tolerance: float) ->
     session.phase = "move"
     state = session.state
     held = inverse(bar(state)) @ hand(state)
-    hold = Hold(same_pose(bar @ held, hand), name="grasp")
+    # A parameter: as a constant it would have every grasp compile a controller of its own.
+    hold = Hold(same_pose(bar @ Target("grasp/pose", held).expression, hand), name="grasp")
     target = float(placement.values[-1])
     moving = motion.search.moving
     rows = placement.way[:, : len(moving)] + motion.turns

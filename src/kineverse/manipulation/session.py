@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass
@@ -10,10 +11,12 @@ from time import perf_counter, thread_time
 import numpy as np
 
 from kineverse.control import Command
+from kineverse.errors import ShapeError
+from kineverse.expressions import Expression
 from kineverse.lie import Array
 from kineverse.state import State
 from kineverse.symbols import Symbol
-from kineverse.worlds import World
+from kineverse.worlds import Observation, World
 
 from .belief import Belief, TrueBelief
 
@@ -112,6 +115,7 @@ class Session:
         self.belief = belief or TrueBelief()
         self._on_step = on_step
         self.state: State = self.belief.update(world)
+        self._observation: Observation | None = None
         self.commands: Speeds = {}
         self.command: Command | None = None
         self.reference: HandReference | None = None
@@ -119,6 +123,34 @@ class Session:
         self.phase, self.steps = "", 0
         self.cpu: dict[str, list[float]] = {}
         self.wall: dict[str, list[float]] = {}
+
+    @property
+    def observation(self) -> Observation:
+        """The sensor readings after the last step; poses are handed out once, here and to the belief."""
+        if (found := self.belief.observation or self._observation) is None:
+            found = self._observation = self.world.observe()
+        return found
+
+    def deviation(self, what: Symbol | str | Expression) -> float:
+        """Return the standard deviation of a coordinate, or of an expression of coordinates [m], [rad].
+
+        That of an expression is to first order, and takes the errors of coordinates as independent.
+
+        Raises
+        ------
+        UnknownNameError
+            For a name that the model does not have.
+        ShapeError
+            For an expression that is no number.
+        """
+        if isinstance(what, str):
+            what = self.world.model.symbol(what)
+        if isinstance(what, Symbol):
+            return self.belief.deviation(what)
+        if what.shape != ():
+            raise ShapeError(f"A deviation is one of a number, not of an expression of shape {what.shape}.")
+        slopes = {s: float(what.partial([s])(self.state)[0]) for s in what.symbols}
+        return math.hypot(*(k * self.belief.deviation(s) for s, k in slopes.items() if k))
 
     @contextmanager
     def timed(self, name: str) -> Iterator[None]:
@@ -131,17 +163,19 @@ class Session:
     def act(self, speeds: Speeds, command: Command | None = None) -> None:
         """Command speeds for one step, and update the belief. Speeds of objects are not sent.
 
+        The belief gets them all.
+
         Parameters
         ----------
         speeds
-            Speeds of the robot, and possibly of objects [m/s], [rad/s]; none to stop.
+            Speeds of the robot, and possibly those planned for objects [m/s], [rad/s]; none to stop.
         command
             The controller's command that has these speeds, for pages.
         """
         robot, self.command = f"{self.world.robot}/", command
         self.commands = {s: v for s, v in speeds.items() if s.path.startswith(robot)}
         self.world.apply(self.commands, self.dt, stamp=self.state.stamp)
-        self.state = self.belief.update(self.world, State(self.commands))
+        self._update(speeds)
         self.steps += 1
         if self._on_step is not None:
             self._on_step(self)
@@ -149,7 +183,11 @@ class Session:
     def restart(self, state: State) -> None:
         """Reset the world to a state, at time 0, and update the belief."""
         self.world.reset(state)
-        self.state = self.belief.update(self.world)
+        self._update({})
+
+    def _update(self, speeds: Speeds) -> None:
+        self._observation = None
+        self.state = self.belief.update(self.world, State(speeds))
 
     def stop(self) -> None:
         """Command zero speeds for one step."""

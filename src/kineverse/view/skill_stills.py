@@ -24,7 +24,7 @@ from kineverse.worlds.recorder import RecordedStep
 
 SIZE = (400, 300)
 """Size of a still [pixels]."""
-_AZIMUTHS, _ELEVATIONS = 12, (0.35, 0.65)
+_AZIMUTHS, _ELEVATION = 8, 0.45
 _FIELD_OF_VIEW = 0.6
 _MOVED, _ROBOT = 2.0, 1.0
 """Weights of the object and of the robot in the choice of a camera."""
@@ -108,22 +108,21 @@ class SkillStills:
 def _choose_camera(
     items: list[Drawable], places: list[dict[str, Floats]], weights: npt.NDArray[np.float64]
 ) -> Camera:
-    """Return the camera that shows most of the parts with weights in all states."""
-    scenes = [TriangleSoup.from_drawables(items, place) for place in places]
+    """Return the camera that shows most of the parts with weights in the first two states."""
+    scenes = [TriangleSoup.from_drawables(items, place) for place in places[:2]]
     corners = [scene.corners.astype(np.float32) for scene in scenes]
     points = np.concatenate([scene.corners[weights[scene.source] > 0.0].reshape(-1, 3) for scene in scenes])
     extreme, aspect = find_extreme_points(points), SIZE[0] / SIZE[1]
     best, chosen = -1.0, None
     for azimuth in np.linspace(0.0, 2 * np.pi, _AZIMUTHS, endpoint=False).tolist():
-        for elevation in _ELEVATIONS:
-            camera = fit_camera(extreme, azimuth, elevation, aspect, _FIELD_OF_VIEW)
-            projection = Projection.from_camera(camera, int(TRIAL_HEIGHT * aspect), TRIAL_HEIGHT)
-            score = 0.0
-            for scene, triangles in zip(scenes, corners, strict=True):
-                seen, _ = rasterize(projection, triangles, scene.closed)
-                area = np.bincount(scene.source[seen[seen >= 0]], minlength=len(weights))
-                score += float(weights @ np.log1p(area))
-            if score > best:
-                best, chosen = score, camera
+        camera = fit_camera(extreme, azimuth, _ELEVATION, aspect, _FIELD_OF_VIEW)
+        projection = Projection.from_camera(camera, int(TRIAL_HEIGHT * aspect), TRIAL_HEIGHT)
+        score = 0.0
+        for scene, triangles in zip(scenes, corners, strict=True):
+            seen, _ = rasterize(projection, triangles, scene.closed)
+            area = np.bincount(scene.source[seen[seen >= 0]], minlength=len(weights))
+            score += float(weights @ np.log1p(area))
+        if score > best:
+            best, chosen = score, camera
     assert chosen is not None
     return chosen

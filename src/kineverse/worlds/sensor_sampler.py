@@ -6,6 +6,7 @@ import math
 from collections import deque
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import replace
+from typing import NamedTuple
 
 import numpy as np
 
@@ -79,7 +80,8 @@ class SensorSampler:
                 raise UnknownNameError(f"There is no frame '{name}'. {suggest(name, model.frames, 'frame')}")
         self._robot = robot
         self._joints = tuple(s for s in model.symbols if is_of_robot(s.path, robot) and not s.order)
-        self._base, self._planar = _find_base(model, robot)
+        base = find_robot_base(model, robot)
+        self._base, self._planar = base.coordinates, base.is_planar
         self._encoded = tuple(s for s in self._joints if s not in set(self._base))
         self._poses = compile_expressions([model.fk(name) for name in (self.camera, *self.marked)])
         self._camera_pose = compile_expressions(model.fk(self.camera))
@@ -247,13 +249,33 @@ def find_camera(frames: Sequence[str]) -> str | None:
     return None
 
 
-def _find_base(model: ModelView, robot: str) -> tuple[tuple[Symbol, ...], bool]:
-    """Return the coordinates that place the robot in the world, and whether they are x, y and a heading."""
+class RobotBase(NamedTuple):
+    """Joint that places a robot in the world.
+
+    Attributes
+    ----------
+    coordinates
+        Its coordinates; none if the robot stands still.
+    is_planar
+        Whether they are x, y and a heading.
+    parent, child
+        Its frames; empty if the robot stands still.
+    """
+
+    coordinates: tuple[Symbol, ...] = ()
+    is_planar: bool = False
+    parent: str = ""
+    child: str = ""
+
+
+def find_robot_base(model: ModelView, robot: str) -> RobotBase:
+    """Return the joint that places a robot in the world, the first one from the world to the robot."""
     for record in model.articulations.values():
         outside = record.parent == WORLD or not is_of_robot(record.parent, robot)
         if record.coordinates and outside and is_of_robot(record.child, robot):
-            return record.coordinates, _is_planar(model, record.parent, record.child, record.coordinates)
-    return (), False
+            is_planar = _is_planar(model, record.parent, record.child, record.coordinates)
+            return RobotBase(record.coordinates, is_planar, record.parent, record.child)
+    return RobotBase()
 
 
 def _is_planar(model: ModelView, parent: str, child: str, coordinates: tuple[Symbol, ...]) -> bool:

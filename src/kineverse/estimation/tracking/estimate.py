@@ -114,8 +114,19 @@ class Estimate:
     @property
     def lost_groups(self) -> tuple[tuple[Symbol, ...], ...]:
         """Groups of coordinates that are lost."""
-        pairs = zip(self._layout.groups, self._loss.is_lost.tolist(), strict=True)
-        return tuple(group.coordinates for group, is_lost in pairs if is_lost)
+        return self._groups_where(self._loss.is_lost.tolist())
+
+    @property
+    def refuted_groups(self) -> tuple[tuple[Symbol, ...], ...]:
+        """Groups of coordinates whose prediction the last update refuted, be it a move or an error.
+
+        After ten such updates in a row, or as many as the tracker was told, the group is lost.
+        """
+        return self._groups_where((self._loss.refuted > 0).tolist())
+
+    def _groups_where(self, mask: list[bool]) -> tuple[tuple[Symbol, ...], ...]:
+        pairs = zip(self._layout.groups, mask, strict=True)
+        return tuple(group.coordinates for group, holds in pairs if holds)
 
     @property
     def outliers(self) -> tuple[str, ...]:

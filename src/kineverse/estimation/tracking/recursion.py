@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
+from types import MappingProxyType
 
 import numpy as np
 
@@ -20,6 +21,9 @@ from .initial_belief import InitialBelief
 from .residuals import Measurements
 from .step import StepResult, UpdateStep
 from .track_loss import TrackLoss, find_measured, find_refuted
+
+NO_NOISE: Mapping[Symbol, float] = MappingProxyType({})
+"""Process noise of no speed."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -56,19 +60,29 @@ class Recursion:
         result = StepResult(mixture, np.zeros(count), np.zeros(count), (), 0)
         return TrackerState(mixture, result, TrackLoss.none(count), inputs, stamp)
 
-    def predict(self, state: TrackerState, dt: float, speeds: Mapping[Symbol, float]) -> TrackerState:
-        """Return the state after a time step [s] with commanded speeds."""
+    def predict(
+        self,
+        state: TrackerState,
+        dt: float,
+        speeds: Mapping[Symbol, float],
+        noise_now: Mapping[Symbol, float] = NO_NOISE,
+    ) -> TrackerState:
+        """Return the state after a time step [s] with commanded speeds.
+
+        Speeds that ``noise_now`` has get its process noise, and others the usual one.
+        """
         if dt == 0.0:
             return state
         state = replace(state, stamp=None if state.stamp is None else state.stamp + dt, reading=None)
-        if not (speeds or self.noise):
+        usual = {**self.noise, **noise_now}
+        if not (speeds or usual):
             return state
 
         def moved(belief: InformationState) -> InformationState:
-            moving, noise = speeds, self.noise
+            moving, noise = speeds, usual
             if self.locks:
                 free = self.locks.free(belief, state.inputs)
-                held = {v: 0.0 for v in self.noise if v not in free}
+                held = {v: 0.0 for v in usual if v not in free}
                 noise = {v: q for v, q in noise.items() if v in free}
                 moving = {v: speed for v, speed in speeds.items() if v in free} | held
             return self.update_step.predict(belief, state.inputs, dt, moving, noise)
@@ -81,6 +95,7 @@ class Recursion:
         stamp: float,
         speeds: Mapping[Symbol, float],
         inputs: StateLike | None = None,
+        noise_now: Mapping[Symbol, float] = NO_NOISE,
     ) -> TrackerState:
         """Return the state predicted to a time, with other values of inputs if these are given.
 
@@ -90,7 +105,7 @@ class Recursion:
             state = replace(state, inputs=self.read_inputs(state.inputs, inputs))
         if state.stamp is None:
             return replace(state, stamp=stamp)
-        return replace(self.predict(state, stamp - state.stamp, speeds), stamp=stamp)
+        return replace(self.predict(state, stamp - state.stamp, speeds, noise_now), stamp=stamp)
 
     def update(
         self,
@@ -99,6 +114,7 @@ class Recursion:
         stamp: float | None,
         speeds: Mapping[Symbol, float],
         inputs: StateLike | None,
+        noise_now: Mapping[Symbol, float] = NO_NOISE,
     ) -> TrackerState:
         """Return the state after a reading at a time, or at the present one.
 
@@ -114,6 +130,8 @@ class Recursion:
             Commanded speeds until then.
         inputs
             Values of the inputs.
+        noise_now
+            Process noise until then by speed; others have the usual one.
         """
         values = self.read_inputs(state.inputs, inputs)
         # The prediction uses the previous values of the inputs, if there are any.
@@ -121,7 +139,7 @@ class Recursion:
             state = replace(state, inputs=values)
         seen = None
         if stamp is not None:
-            state, seen = self.advance(state, stamp, speeds), reading
+            state, seen = self.advance(state, stamp, speeds, noise_now=noise_now), reading
             if state.reading is not None:
                 seen = self.update_step.reader.combine(state.reading, reading, stamp)
         step = self.update_step

@@ -107,15 +107,20 @@ class MeasurementReader:
             observed[i] = True
         return Measurements(values, observed, whitenings, scales)
 
-    def read_poses(self, poses: npt.ArrayLike, mask: npt.ArrayLike | None) -> Measurements:
-        """Convert an array of poses in the order of the observations.
+    def read_poses(
+        self,
+        poses: npt.ArrayLike,
+        mask: npt.ArrayLike | None,
+        covariances: npt.ArrayLike | None = None,
+    ) -> Measurements:
+        """Convert an array of poses in the order of the observations, and their covariances (m, 6, 6).
 
         Rigidity is checked separately, see :meth:`check_poses`.
 
         Raises
         ------
         ShapeError, InvalidValueError
-            For wrong shapes, or if some observations are not poses.
+            For wrong shapes, if some observations are not poses, and for covariances that are not positive.
         """
         if self._vectors:
             raise InvalidValueError(
@@ -129,7 +134,29 @@ class MeasurementReader:
         if observed.dtype != bool or observed.shape != (count,):
             raise ShapeError(f"seen= is a mask of {count} booleans, not {mask!r:.80}.")
         values = np.ascontiguousarray(given).reshape(-1)
-        return Measurements(values, observed, self._whitening, self._log_scale)
+        if covariances is None:
+            return Measurements(values, observed, self._whitening, self._log_scale)
+        return Measurements(values, observed, *self._whiten_all(covariances, observed))
+
+    def _whiten_all(self, covariances: npt.ArrayLike, observed: npt.NDArray[np.bool_]) -> tuple[Array, Array]:
+        """Return whitening matrices and scales for covariances (m, 6, 6) of all poses."""
+        given = _numbers(covariances, "The covariances")
+        count = len(observed)
+        if given.shape != (count, 6, 6):
+            raise ShapeError(f"The covariances are an array of shape {(count, 6, 6)}, not {given.shape}.")
+        R = np.where(observed[:, None, None], given, np.eye(6))
+        try:
+            if not np.isfinite(R).all() or np.abs(R - np.swapaxes(R, 1, 2)).max() > 1e-9 * np.abs(R).max():
+                raise np.linalg.LinAlgError
+            roots = np.linalg.cholesky(R)
+        except np.linalg.LinAlgError:
+            for i in np.flatnonzero(observed).tolist():
+                require_covariance(given[i], 6, self._layout.observations[i].label)
+            raise InvalidValueError(
+                "The covariances are too small or too large for floating point."
+            ) from None
+        scales = np.log(np.diagonal(roots, axis1=1, axis2=2)).sum(axis=1) + 3.0 * np.log(2.0 * np.pi)
+        return np.tril(np.linalg.inv(roots)).reshape(-1), scales
 
     def combine(self, before: Measurements, reading: Measurements, stamp: float) -> Measurements:
         """Return two readings of one time as one, with the latest of each observation.

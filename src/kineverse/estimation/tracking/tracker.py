@@ -138,9 +138,7 @@ class Tracker:
         self._update_step = UpdateStep(
             layout, limits, as_outliers(outliers, has_gate=True), process == "velocity"
         )
-        process_model = self._update_step.process_model
-        given_noise = require_mapping({} if process_noise is None else process_noise, "process_noise=")
-        noise = {process_model.speed(k): require_noise(k, v) for k, v in given_noise.items()}
+        noise = self._read_noise(process_noise)
         values = np.array([np.nan if s.value is None else s.value for s in layout.inputs])
         known = np.nan_to_num(values)
         given_values = GivenValues.read(
@@ -156,7 +154,7 @@ class Tracker:
             self._update_step,
             first,
             noise,
-            SpeedLocks(model, layout, process_model) if locks else None,
+            SpeedLocks(model, layout, self._update_step.process_model) if locks else None,
             lost_after,
             restart,
         )
@@ -311,7 +309,11 @@ class Tracker:
         return self.estimate
 
     def predict(
-        self, dt: float, commands: StateLike | None = None, inputs: StateLike | None = None
+        self,
+        dt: float,
+        commands: StateLike | None = None,
+        inputs: StateLike | None = None,
+        process_noise: StateLike | None = None,
     ) -> Estimate:
         """Predict the state with commanded speeds and process noise.
 
@@ -323,6 +325,9 @@ class Tracker:
             Commanded speeds by symbol or name [m/s], [rad/s]; others are 0, or their estimates.
         inputs
             Values of the inputs; the last ones if None.
+        process_noise
+            Process noise of this step by speed or coordinate, where it is another one than that of the
+            tracker: that of what rests, or is pushed just now.
 
         Raises
         ------
@@ -336,12 +341,14 @@ class Tracker:
             raise InvalidValueError(
                 f"Time goes on: a step of {dt!r} s is none. Steps are finite and not negative."
             )
-        speeds = self._read_commands(commands)
+        speeds, noise = self._read_commands(commands), self._read_noise(process_noise)
         before = self._now
         known = self._recursion.read_inputs(before.inputs, inputs)
-        self._now = self._recursion.predict(replace(before, inputs=known), dt, speeds)
+        self._now = self._recursion.predict(replace(before, inputs=known), dt, speeds, noise)
         if self._now.stamp is not None:
-            advance = partial(self._recursion.advance, speeds=speeds, inputs=copy.copy(inputs))
+            advance = partial(
+                self._recursion.advance, speeds=speeds, inputs=copy.copy(inputs), noise_now=noise
+            )
             self._remember(before, self._now.stamp, partial(advance, stamp=self._now.stamp), advance)
         return self.estimate
 
@@ -354,6 +361,10 @@ class Tracker:
             speeds[self._update_step.process_model.speed(key)] = speed
         return speeds
 
+    def _read_noise(self, process_noise: StateLike | None) -> dict[Symbol, float]:
+        given = require_mapping({} if process_noise is None else process_noise, "process_noise=")
+        return {self._update_step.process_model.speed(k): require_noise(k, v) for k, v in given.items()}
+
     def update(
         self,
         seen: Mapping[str, Any],
@@ -361,6 +372,7 @@ class Tracker:
         at: float | None = None,
         commands: StateLike | None = None,
         inputs: StateLike | None = None,
+        process_noise: StateLike | None = None,
     ) -> Estimate:
         """Update the state with measurements.
 
@@ -376,6 +388,8 @@ class Tracker:
             Speeds during this prediction.
         inputs
             Values of the inputs.
+        process_noise
+            Process noise during this prediction, as for :meth:`predict`.
 
         Raises
         ------
@@ -383,16 +397,18 @@ class Tracker:
             For an invalid measurement, naming it, or if time goes backwards by more than the lag. The belief
             does not change then.
         """
-        return self._update(self._update_step.reader.read(seen), at, commands, inputs)
+        return self._update(self._update_step.reader.read(seen), at, commands, inputs, process_noise)
 
     def update_poses(
         self,
         poses: npt.ArrayLike,
         seen: npt.ArrayLike | None = None,
         *,
+        covariances: npt.ArrayLike | None = None,
         at: float | None = None,
         commands: StateLike | None = None,
         inputs: StateLike | None = None,
+        process_noise: StateLike | None = None,
     ) -> Estimate:
         """Update with poses in an array (m, 4, 4), in the order of the observations; see :meth:`update`.
 
@@ -402,10 +418,14 @@ class Tracker:
             Poses of all frames; entries of missing ones are ignored.
         seen
             True for each measured pose (m,); all if None.
-        at, commands, inputs
+        covariances
+            Covariances (m, 6, 6) of these poses; entries of missing ones are ignored. Those of the
+            observations if None.
+        at, commands, inputs, process_noise
             As in :meth:`update`.
         """
-        return self._update(self._update_step.reader.read_poses(poses, seen), at, commands, inputs)
+        reading = self._update_step.reader.read_poses(poses, seen, covariances)
+        return self._update(reading, at, commands, inputs, process_noise)
 
     def wait(self, timeout: float | None = None) -> bool:
         """Wait for compiled code; return whether updates use it.
@@ -428,21 +448,29 @@ class Tracker:
         at: float | None,
         commands: StateLike | None,
         inputs: StateLike | None,
+        process_noise: StateLike | None = None,
     ) -> Estimate:
         # The caller may use the arrays again, while late measurements repeat the update.
         reading = reading._replace(values=reading.values.copy(), mask=reading.mask.copy())
         native = self._update_step.native
         if native is None or not native.are_rigid(reading):
             self._update_step.reader.check_poses(reading)
-        if at is None and commands:
-            raise InvalidValueError("Commands need the time they lasted: give at=, or call predict.")
+        if at is None and (commands or process_noise):
+            what = "Commands" if commands else "process_noise="
+            raise InvalidValueError(f"{what} need the time they lasted: give at=, or call predict.")
+        noise = self._read_noise(process_noise)
         stamp, speeds, before = (
             None if at is None else _require_time(at),
             self._read_commands(commands),
             self._now,
         )
         apply = partial(
-            self._recursion.update, reading=reading, stamp=stamp, speeds=speeds, inputs=copy.copy(inputs)
+            self._recursion.update,
+            reading=reading,
+            stamp=stamp,
+            speeds=speeds,
+            inputs=copy.copy(inputs),
+            noise_now=noise,
         )
         if stamp is not None and before.stamp is not None and stamp < before.stamp:
             if not self._buffer.lag:
@@ -454,9 +482,8 @@ class Tracker:
         else:
             self._now = apply(before)
             if self._now.stamp is not None:
-                self._remember(
-                    before, self._now.stamp, apply, partial(self._recursion.advance, speeds=speeds)
-                )
+                advance = partial(self._recursion.advance, speeds=speeds, noise_now=noise)
+                self._remember(before, self._now.stamp, apply, advance)
         self._recent.append((stamp, reading, self._now.inputs))
         return self.estimate
 

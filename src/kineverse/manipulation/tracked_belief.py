@@ -1,0 +1,372 @@
+"""Belief from sensor readings: encoders, odometry, and poses that a camera sees at its rate.
+
+Coordinates of objects are estimated by a :class:`.Tracker` of all marked frames, at the times of pictures.
+Their process noise is that of a part in motion while it is commanded to move or its prediction is refuted,
+and for a second afterwards; else that of a part at rest, so that pictures average. From the last picture to
+the present the state is predicted with the commanded speeds, those that a controller plans for objects among
+them. If the odometry drifts, a :class:`.BaseFilter` corrects it by marked frames that never move.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterable, Mapping
+
+import numpy as np
+
+from kineverse.compile import compile  # noqa: A004
+from kineverse.errors import InvalidValueError, UnknownNameError, suggest
+from kineverse.estimation import ObservedPose, Outliers, Tracker, pose_covariance
+from kineverse.lie import Array, inverse
+from kineverse.model.model_view import ModelView
+from kineverse.state import State
+from kineverse.symbols import Symbol
+from kineverse.worlds import Observation, Sensors, World
+from kineverse.worlds.sensor_sampler import (
+    find_camera,
+    find_marked_frames,
+    find_robot_base,
+    is_of_robot,
+)
+
+from .base_filter import BaseFilter, motion_of, place
+
+_LEAST_POSITION, _LEAST_ORIENTATION = 1e-4, 1e-4
+"""Smallest stated noise of poses [m], [rad], for sensors without any."""
+_MOVING, _RESTING = 0.25, 4e-4
+"""Shares of the tracker's default process noise: .05 rad/√s and .03 m/√s for a door and a drawer in motion,
+and .002 rad/√s and .0013 m/√s at rest."""
+_MOVED = 1.0
+"""Time for which a part counts as moving after it was [s]."""
+_STILL = 1e-3
+"""Largest speed of a part that rests [m/s], [rad/s]."""
+_JOINT_SHARE, _JOINT_DRIFT = 0.2, 0.002
+"""Error of the motion of joints relative to the commanded one, and beside it [rad/√s], [m/√s]."""
+_HORIZON = 0.15
+"""Longest prediction beyond the delay of the sensors [s]; then the stamp of the state stays."""
+
+
+class TrackedBelief:
+    """Belief that reads observations and commands, and never the truth.
+
+    Coordinates that were never seen have their default value, and half the width of their limits as
+    deviation. If the time of the world goes back, as by a reset, all begins anew: objects are believed where
+    they were, with that same deviation until they are seen.
+
+    Parameters
+    ----------
+    model
+        Model of the robot and of everything that moves.
+    robot
+        Prefix of the robot.
+    sensors
+        The noise to expect, with the frames of camera and markers; the settings of the world's own sensors.
+
+    Attributes
+    ----------
+    tracker
+        Tracker of the coordinates of objects.
+    observation
+        The readings of the last update; None before the first.
+    camera
+        Frame from which distances to markers count; the robot's first frame if none is named like a camera.
+    seen
+        Time [s] at which a marker of a coordinate was seen last, by coordinate.
+
+    Raises
+    ------
+    UnknownNameError
+        For a prefix, camera or marked frame that the model does not have.
+    InvalidValueError
+        If no marked frame moves with an object, or odometry drifts under a base that is not planar.
+    """
+
+    def __init__(self, model: ModelView, robot: str, sensors: Sensors | None = None) -> None:
+        self.sensors = sensors = Sensors() if sensors is None else sensors
+        self._model = model
+        own = [name for name in model.frames if is_of_robot(name, robot)]
+        if not own:
+            prefixes = {name.partition("/")[0] for name in model.frames}
+            raise UnknownNameError(f"No frame begins with '{robot}/'. {suggest(robot, prefixes, 'prefix')}")
+        self.camera = sensors.camera or find_camera(own) or own[0]
+        marked = find_marked_frames(model, robot) if sensors.marked is None else sensors.marked
+        for name in (self.camera, *marked):
+            if name not in model.frames:
+                raise UnknownNameError(f"There is no frame '{name}'. {suggest(name, model.frames, 'frame')}")
+        coordinates = {*model.degrees_of_freedom}
+        moving = {name: coordinates.intersection(model.fk(name).symbols) for name in marked}
+        self._landmarks = {name: np.asarray(model.fk(name)({})) for name in marked if not moving[name]}
+        self._frames = tuple(
+            name
+            for name in marked
+            if moving[name] and not any(is_of_robot(s.path, robot) for s in moving[name])
+        )
+        if not self._frames:
+            raise InvalidValueError(
+                "No marked frame moves with an object, so nothing can be tracked. Sensors(marked=) are "
+                f"{', '.join(marked) or 'none'}."
+            )
+        self._index = {name: k for k, name in enumerate(self._frames)}
+        self.tracker = self._make_tracker()
+        speeds = {*self.tracker.process_noise}
+        self._speeds_of = {
+            s: tuple(speeds.intersection(model.rates[s] if s in model.rates else (s.derivative(),)))
+            for s in self.tracker.symbols
+        }
+        self._groups = {s: group for group in self.tracker.groups for s in group}
+        self._coordinates_of = {name: self._coordinates_seen(moving[name]) for name in self._frames}
+        base = find_robot_base(model, robot)
+        drifts = sensors.odometry > 0.0 or sensors.turn > 0.0
+        if drifts and base.coordinates and not base.is_planar:
+            raise InvalidValueError(
+                f"The odometry of '{base.child}' drifts, and its joint is none of x, y and a heading: there "
+                "is no filter for it. Give sensors without odometry= and turn=."
+            )
+        self._base = base if drifts and base.coordinates else None
+        self._exact = base.coordinates
+        self._filter = BaseFilter(sensors.odometry, sensors.turn, sensors.outliers > 0.0)
+        if self._base is not None:
+            offset = model.fk(base.child, relative_to=base.parent)(dict.fromkeys(base.coordinates, 0.0))
+            self._plane = np.asarray(model.fk(base.parent)({}) @ offset)
+        self._encoded = tuple(
+            s
+            for s in model.symbols
+            if is_of_robot(s.path, robot) and not s.order and s not in base.coordinates
+        )
+        self._spread: Array = np.zeros(len(self._encoded))
+        start = model.default_state()
+        self._values = np.array([start[s] for s in start])
+        self._symbols = tuple(start)
+        self._place = {s: k for k, s in enumerate(self._symbols)}
+        self._integrate = model.integrator(symbols=self._symbols)
+        self._column = {v: k for k, v in enumerate(self._integrate.speeds)}
+        of_robot = np.array([is_of_robot(v.path, robot) for v in self._integrate.speeds])
+        self._of_robot = of_robot.astype(float)
+        limits = np.array([model.limits(s) for s in self._symbols])
+        bounded = np.array([sensors.encoders > 0.0 or not is_of_robot(s.path, robot) for s in self._symbols])
+        self._lower = np.where(bounded, limits[:, 0], -np.inf)
+        self._upper = np.where(bounded, limits[:, 1], np.inf)
+        self._camera_pose = compile([model.fk(self.camera)])
+        self.observation: Observation | None = None
+        self.seen: dict[Symbol, float] = {}
+        self._history: list[tuple[float, float, Array]] = []
+        self._moved: dict[Symbol, float] = {}
+        self._now = self._picture = self._read = -math.inf
+
+    def _make_tracker(self) -> Tracker:
+        sensors = self.sensors
+        covariance = pose_covariance(
+            max(sensors.position, _LEAST_POSITION), max(sensors.orientation, _LEAST_ORIENTATION)
+        )
+        outliers = Outliers(min(sensors.outliers, 0.5), sensors.reach) if sensors.outliers > 0.0 else None
+        observed = [ObservedPose(name, covariance=covariance) for name in self._frames]
+        tracker = Tracker(self._model, observed, outliers=outliers)
+        start = self._model.default_state()
+        tracker.reset({s: start[s] for s in tracker.symbols})
+        return tracker
+
+    def _coordinates_seen(self, symbols: Iterable[Symbol]) -> tuple[Symbol, ...]:
+        return tuple(s for s in symbols if s in self._groups)
+
+    # -- the step ------------------------------------------------------------------------------------------
+
+    def update(self, world: World, commands: State | None = None) -> State:
+        """Return the believed state of all coordinates at the present time.
+
+        Parameters
+        ----------
+        world
+            The world, of which the time and the observation are read.
+        commands
+            Speeds since the last update: commanded ones of the robot, and planned ones of objects.
+        """
+        observation, now = world.observe(), world.time
+        if now < self._now or (now == self._now and observation.poses) or math.isinf(self._now):
+            self._begin(observation.stamp)
+        elif now > self._now:
+            self._history.append((self._now, now, self._speeds(commands)))
+        self.observation, self._now = observation, now
+        self._read_robot(observation)
+        if observation.poses:
+            self._look(observation)
+        oldest = min(self._read, self._picture)
+        self._history = [one for one in self._history if one[1] > oldest]
+        horizon = min(now, observation.stamp + self.sensors.delay + _HORIZON)
+        return self._predict(horizon)
+
+    def _begin(self, stamp: float) -> None:
+        """Begin anew at a time, with objects where they were believed."""
+        if not math.isinf(self._now):
+            self.tracker.reset(dict(self.tracker.estimate.state), at=stamp)
+        self._history.clear()
+        self._moved.clear()
+        self.seen.clear()
+        self._now = self._read = -math.inf
+        self._picture = stamp
+
+    def _speeds(self, commands: Mapping[Symbol, float] | None) -> Array:
+        vector = np.zeros(len(self._column))
+        for speed, value in ({} if commands is None else commands).items():
+            if (column := self._column.get(speed)) is not None:
+                vector[column] = value
+        return vector
+
+    def _displacement(self, begin: float, end: float) -> Array:
+        """Return the integral of all speeds from a time to another one (m,) [m], [rad]."""
+        total = np.zeros(len(self._column))
+        for start, stop, speeds in self._history:
+            overlap = min(stop, end) - max(start, begin)
+            if overlap > 0.0:
+                total += overlap * speeds
+        return total
+
+    def _read_robot(self, observation: Observation) -> None:
+        """Take the readings of encoders and odometry."""
+        stamp, joints = observation.stamp, observation.joints
+        known = [s for s in joints if s in self._place]
+        if stamp == self._read:
+            return  # the same readings again
+        before = self._values.copy()
+        self._values[[self._place[s] for s in known]] = [joints[s] for s in known]
+        if self.sensors.encoders > 0.0:
+            self._filter_joints(before, stamp)
+        if self._base is not None:
+            read = np.array([joints[s] for s in self._base.coordinates])
+            if math.isinf(self._read):
+                self._filter.reset(read)
+            else:
+                self._filter.move(read)
+        self._read = stamp
+
+    def _filter_joints(self, before: Array, stamp: float) -> None:
+        """Mix readings of the encoders with the prediction by commands."""
+        columns = [self._place[s] for s in self._encoded]
+        variance = self.sensors.encoders**2
+        if math.isinf(self._read):
+            self._spread[:] = variance
+            return
+        motion = self._of_robot * self._displacement(self._read, stamp)
+        expected = np.asarray(self._integrate(before, motion, 1.0))[columns]
+        moved = expected - before[columns]
+        drift = _JOINT_DRIFT**2 * (stamp - self._read)
+        spread = self._spread + (_JOINT_SHARE * moved) ** 2 + drift
+        gain = spread / (spread + variance)
+        self._values[columns] = expected + gain * (self._values[columns] - expected)
+        self._spread = (1.0 - gain) * spread
+
+    def _look(self, observation: Observation) -> None:
+        """Update the tracker with the poses of a picture."""
+        names = [name for name in observation.poses if name in self._index]
+        stamp = observation.stamp
+        poses = np.tile(np.eye(4), (len(self._index), 1, 1))
+        mask = np.zeros(len(poses), dtype=bool)
+        rows = [self._index[name] for name in names]
+        poses[rows] = [observation.poses[name] for name in names]
+        mask[rows] = True
+        state = dict(zip(self._symbols, self._values.tolist(), strict=True)) | dict(observation.joints)
+        eye = self._camera_pose(np.array([state[s] for s in self._camera_pose.inputs]))[0][:3, 3]
+        more: Array | float = 0.0
+        if self._base is not None:
+            poses, more = self._correct(observation, poses, eye)
+        covariances = self._covariances(poses, eye) + more
+        travel = self._displacement(self._picture, stamp)
+        duration = stamp - self._picture
+        commands: dict[Symbol, float] = {}
+        noise: dict[Symbol, float] = {}
+        for s, speeds in self._speeds_of.items():
+            for v in speeds:
+                if duration > 0.0 and abs(travel[self._column[v]]) > _STILL * duration:
+                    commands[v] = travel[self._column[v]] / duration
+                    self._moved[s] = stamp
+            noise |= dict.fromkeys(speeds, self._noise_share(s, stamp))
+        usual = self.tracker.process_noise
+        noise = {v: share * usual[v] for v, share in noise.items()}
+        estimate = self.tracker.update_poses(
+            poses, mask, covariances=covariances, at=stamp, commands=commands, process_noise=noise
+        )
+        for group in estimate.refuted_groups:
+            self._moved |= dict.fromkeys(group, stamp)
+        for name in names:
+            self.seen |= dict.fromkeys(self._coordinates_of[name], stamp)
+        self._picture = stamp
+        for s in self.tracker.symbols:
+            self._values[self._place[s]] = estimate.state[s]
+
+    def _noise_share(self, coordinate: Symbol, now: float) -> float:
+        return _MOVING if now - self._moved.get(coordinate, -math.inf) <= _MOVED else _RESTING
+
+    def _deviations(self, poses: Array, eye: Array) -> Array:
+        """Return the stated deviations (m, 2) of positions and rotations of poses (m, 4, 4) [m], [rad]."""
+        position = self.sensors.position_noise(np.linalg.norm(poses[:, :3, 3] - eye, axis=1))
+        result = np.full((len(poses), 2), max(self.sensors.orientation, _LEAST_ORIENTATION))
+        result[:, 0] = np.maximum(position, _LEAST_POSITION)
+        return result
+
+    def _covariances(self, poses: Array, eye: Array) -> Array:
+        """Return the stated covariances (m, 6, 6) of poses (m, 4, 4) seen from a point."""
+        variances = np.repeat(self._deviations(poses, eye), 3, axis=1) ** 2
+        return np.asarray(variances[:, :, None] * np.eye(6))
+
+    def _correct(self, observation: Observation, poses: Array, eye: Array) -> tuple[Array, Array]:
+        """Correct the base by landmarks; return poses that it carries, and the covariance it adds to them.
+
+        An error of the base is the same for all poses and pictures, and counts as if it was another for each.
+        """
+        assert self._base is not None
+        read = np.array([observation.joints[s] for s in self._base.coordinates])
+        base_T_world = inverse(place(read)) @ inverse(self._plane)
+        names = [name for name in observation.poses if name in self._landmarks]
+        if names:
+            seen = np.array([observation.poses[name] for name in names])
+            known = inverse(self._plane) @ np.array([self._landmarks[name] for name in names])
+            self._filter.correct(base_T_world @ seen, known, self._deviations(seen, eye))
+        carried = base_T_world @ poses
+        world_T_base = self._plane @ place(self._filter.pose)
+        motion = motion_of(carried)
+        for rows in slice(3), slice(3, 6):
+            motion[:, rows] = world_T_base[:3, :3] @ motion[:, rows]
+        return world_T_base @ carried, motion @ self._filter.covariance @ np.swapaxes(motion, 1, 2)
+
+    def _predict(self, now: float) -> State:
+        """Return the state predicted from the last readings to a time."""
+        values = self._values
+        if self._base is not None:
+            values = values.copy()
+            values[[self._place[s] for s in self._base.coordinates]] = self._filter.pose
+        motion = (1.0 - self._of_robot) * self._displacement(self._picture, now)
+        if now > self._read:
+            motion += self._of_robot * self._displacement(self._read, now)
+        if motion.any():
+            values = np.asarray(self._integrate(values, motion, 1.0))
+        values = np.clip(values, self._lower, self._upper)
+        return State(dict(zip(self._symbols, values.tolist(), strict=True)), stamp=now, source="tracker")
+
+    # -- uncertainty ---------------------------------------------------------------------------------------
+
+    def deviation(self, coordinate: Symbol) -> float:
+        """Return the standard deviation of a coordinate at the present time [m], [rad].
+
+        It is infinite for one that no marker shows, and one whose track is lost.
+
+        Raises
+        ------
+        UnknownNameError
+            For a coordinate that the state does not have.
+        """
+        if coordinate in self._groups:
+            estimate = self.tracker.estimate
+            if self._groups[coordinate] in estimate.lost_groups:
+                return math.inf
+            usual, share = self.tracker.process_noise, self._noise_share(coordinate, self._now)
+            rate = sum(share * usual[v] for v in self._speeds_of[coordinate])
+            return math.sqrt(estimate.deviation[coordinate] ** 2 + rate * max(self._now - self._picture, 0.0))
+        if coordinate in self._encoded:
+            return math.sqrt(float(self._spread[self._encoded.index(coordinate)]))
+        if self._base is not None and coordinate in self._base.coordinates:
+            return float(self._filter.deviations[self._base.coordinates.index(coordinate)])
+        if coordinate not in self._place:
+            raise UnknownNameError(
+                f"The belief says nothing about '{coordinate}'. "
+                f"{suggest(str(coordinate), map(str, self._place), 'coordinate')}"
+            )
+        return 0.0 if coordinate in self._exact else math.inf
