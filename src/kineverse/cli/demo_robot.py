@@ -133,14 +133,17 @@ class RobotDemo:
 
     def act(self, page: Viewer | None) -> None:
         """Open and close all objects, on a page if there is one, with a line for each."""
-        from kineverse.experiments.manipulation.skills import make_world
-        from kineverse.manipulation import OpenCloseRunner
+        from kineverse.manipulation import OpenCloseRunner, TrackedBelief
+        from kineverse.worlds import KinematicWorld, MujocoWorld
 
         self._show_on(page)
         with show_activity("preparing the world"):
+            make_world = MujocoWorld if self._arguments.world == "mujoco" else KinematicWorld
+            prefix, sensors = self._robot.prefix, self._sensors
+            world = make_world(self.model, prefix, self.gripper, sensors=sensors, seed=self._seed)
+            belief = None if sensors is None else TrackedBelief(self.model, prefix, sensors)
             start = self._robot.start_state(self.model)
-            world = make_world(self._arguments.world or WORLD, self.model, self._robot.prefix, start)
-            runner = OpenCloseRunner(world, start, on_step=self._look, seed=self._seed)
+            runner = OpenCloseRunner(world, start, belief=belief, on_step=self._look, seed=self._seed)
         self._runner = runner
         if page is not None and self._speed:
             self._say("begins when a browser shows this page")

@@ -17,9 +17,10 @@ from kineverse.planning import Planner, Trajectory, TrajectoryFollower
 from kineverse.symbols import Symbol
 from kineverse.worlds import Judge
 
+from .hand_reference import HandReference
 from .outcome import SkillError
 from .placement import PlacementSearch
-from .session import HandReference, Session
+from .session import Session
 
 _CLOSING, _MOST_CLOSING = 1.5, 4.0
 """Time in which fingers open or close fully, and the largest one [s]."""
