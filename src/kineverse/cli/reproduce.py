@@ -43,6 +43,13 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         help="name or path of a robot; may be given several times",
     )
     parser.add_argument("--processes", metavar="N", type=int, help="number of processes (cores)")
+    parser.add_argument("--world", default="kinematic", help="kinematic (the default), mujoco, or both")
+    parser.add_argument(
+        "--noise",
+        metavar="NOISE",
+        help="noise of the sensors, such as 3mm+3mm/m,0.5deg,30Hz (none: the truth)",
+    )
+    parser.add_argument("--record", metavar="FOLDER", type=Path, help="folder for a recording of each trial")
     figure = parser.add_mutually_exclusive_group()
     figure.add_argument(
         "--figure", metavar="FILE", type=Path, help="file of the figure (NAME.png; with --json: none)"
@@ -74,13 +81,16 @@ def run(arguments: argparse.Namespace) -> int:
         count=arguments.count,
         robot=tuple(arguments.robot),
         processes=arguments.processes,
+        world=arguments.world,
+        noise=arguments.noise,
+        record=arguments.record,
     )
     if arguments.figure is not None:
         check_drawing()  # before minutes of computation
     report = reproduce(arguments.name, show_progress, options)
     if arguments.json:
         if arguments.figure is not None:
-            report.figure.save(arguments.figure)
+            _save_figures(report, arguments.figure)
         answer = {
             "name": report.name,
             "title": report.title,
@@ -90,22 +100,28 @@ def run(arguments: argparse.Namespace) -> int:
         print(json.dumps(answer, indent=2, allow_nan=False))
         return 0
     print(format_report(report), flush=True)
-    if not arguments.no_figure:
-        _save_figure(report, arguments.figure)
-    return 0
-
-
-def _save_figure(report: Report, requested: Path | None) -> None:
-    """Write the figure; if no path is requested, only if the drawing library is installed."""
-    path = requested or Path(f"{report.name}.png")
+    if arguments.no_figure:
+        return 0
     try:
-        report.figure.save(path)
+        paths = _save_figures(report, arguments.figure or Path(f"{report.name}.png"))
     except MissingDependencyError as error:
-        if requested:
+        if arguments.figure:
             raise
         print(f"\nThere is no figure. {error}")
     else:
-        print(f"\nThe figure is in {path}.")
+        names = ", ".join(map(str, paths))
+        print(f"\nThe figures are in {names}." if len(paths) > 1 else f"\nThe figure is in {names}.")
+    return 0
+
+
+def _save_figures(report: Report, requested: Path) -> list[Path]:
+    """Write the figure, and the further pictures beside it; return their paths."""
+    paths = {requested: report.figure}
+    for name, picture in report.pictures.items():
+        paths[requested.with_name(f"{requested.stem}-{name}{requested.suffix}")] = picture
+    for path, figure in paths.items():
+        figure.save(path)
+    return list(paths)
 
 
 def format_report(report: Report) -> str:

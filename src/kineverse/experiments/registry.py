@@ -13,6 +13,9 @@ from kineverse.errors import InvalidValueError, UnknownNameError, suggest
 
 from .report import Report
 
+WORLDS, BOTH = ("kinematic", "mujoco"), "both"
+"""Worlds of trials, and the option for all of them."""
+
 
 @dataclass(frozen=True)
 class Options:
@@ -34,6 +37,12 @@ class Options:
         Robots by name or path; empty for the default.
     processes
         Number of processes; None for the number of cores.
+    world
+        ``"kinematic"``, ``"mujoco"``, or ``"both"``.
+    noise
+        Noise of the sensors, as :meth:`kineverse.worlds.Sensors.parse` reads it; None to act on the truth.
+    record
+        Folder of recordings; None for none.
     """
 
     quick: bool = False
@@ -43,6 +52,9 @@ class Options:
     count: int | None = None
     robot: tuple[str, ...] = ()
     processes: int | None = None
+    world: str = WORLDS[0]
+    noise: str | None = None
+    record: Path | None = None
 
     def check(self, name: str, supported: Sequence[str]) -> None:
         """Check that an experiment supports the options that are set.
@@ -61,6 +73,8 @@ class Options:
             value = getattr(self, option)
             if value is not None and value < least:
                 raise InvalidValueError(f"--{option} is a whole number from {least} on, not {value}.")
+        if self.world not in (*WORLDS, BOTH):
+            raise UnknownNameError(f"--world {self.world}: {suggest(self.world, (*WORLDS, BOTH), 'world')}")
 
 
 Progress: TypeAlias = Callable[[Iterable[Any], str, str], Iterable[Any]]

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from types import ModuleType
 from typing import TYPE_CHECKING, Any
@@ -82,6 +82,8 @@ class Report:
         Results as JSON data.
     figure
         Picture of the results.
+    pictures
+        Further pictures by name.
     """
 
     name: str
@@ -89,6 +91,7 @@ class Report:
     tables: tuple[ReportTable, ...]
     numbers: Mapping[str, Any]
     figure: Figure
+    pictures: Mapping[str, Figure] = field(default_factory=dict)
 
 
 def check_drawing() -> None:

@@ -18,9 +18,7 @@ from __future__ import annotations
 
 import contextlib
 import math
-from collections.abc import Iterable
-from dataclasses import dataclass
-from typing import TypeAlias
+from collections.abc import Callable, Iterable
 
 import numpy as np
 
@@ -28,72 +26,37 @@ from kineverse.control import Command
 from kineverse.errors import InvalidValueError, KineverseError
 from kineverse.geometry import Rule, Scene
 from kineverse.geometry.objects import Exclusion
-from kineverse.geometry.results import DistanceResults
 from kineverse.lie import Array
 from kineverse.model.frame_dependence import FrameDependence
 from kineverse.model.model_view import ModelView
 from kineverse.state import State, StateLike
 from kineverse.symbols import Symbol
+from kineverse.worlds import Observation
 
-from .push_contact import PushContacts, PushPoint, PushSurface, cross_product, find_alignment, find_push_tool
+from .push_choice import CONE, CONE_END, ContactChoice
+from .push_contact import PushPoint, PushSurface, find_push_tool
+from .push_pair import PairFinder, PushPair, PushView, make_view
+from .push_press import PushPress, TipAnchor
 from .push_program import LOST, NEAR, PRESS, TOUCHING, PushProgram
 from .push_scene import find_overlapping_links, furniture_rules, match_bodies
 
-_Contact: TypeAlias = tuple[int, int, Array, Array, Array, float, Array, float]
-"""Bodies of robot and object, r, p, normal, gap, velocity of p, alignment."""
-_CONE, _CONE_END = math.cos(math.radians(25.0)), math.cos(math.radians(40.0))
 _APART = 4e-3
 """Gap between pusher and object away from the contact [m]."""
 _FUNNEL = 0.08
 """Largest height of the way to a contact above the surface [m]."""
 _STANDOFF = 2e-3
 _FAR = 0.05
-_SPEED = 0.25
-"""Largest speed of the contact point [m/s]."""
 _RETREAT = 0.1
 """Distance from the object at which a retreat ends [m]."""
 _LOW = 0.03
 """Height of the tip above a contact point from which on the pusher may touch [m]."""
 _HOLD_WEIGHT = 10.0
-_DISTANCE_COST, _GIVEN_UP_COST = 0.5, 0.6
-"""Cost of a contact point by its distance from the tip [1/m], and by the times that it was given up."""
-_SURROUNDINGS = 0.1
-"""Distance within which other points count as given up, too [m]."""
 _LARGEST_DEVIATION = 0.01
-_RAMP = 0.02
-"""Speed of the contact point beyond the measured one that is tried [m/s]."""
+_LEAST_DEVIATION = 1e-5
+"""Deviation below which gaps count as exact [m]."""
+_JAMMED = 4e-4
+"""Depth at which the object counts as not giving way [m]."""
 _DEEPEST = 2e-4
-_BLOCKED_STEPS = 60
-_BLOCKED_WAY = 0.004
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class PushView:
-    """Points and vectors of a push in the world, for drawings (2022 paper, Fig. 6).
-
-    Attributes
-    ----------
-    p, r
-        Nearest points on the object and on the robot (3,) [m].
-    n
-        Contact normal from p to r.
-    push
-        Direction -∇p in which p has to move.
-    tangent
-        Active tangent v, towards places where n opposes the push more.
-    target
-        Contact point that was chosen (3,) [m].
-    distance
-        Gap [m]; infinite beyond the radius of queries.
-    """
-
-    p: Array
-    r: Array
-    n: Array
-    push: Array
-    tangent: Array
-    target: Array
-    distance: float
 
 
 class Pushing:
@@ -124,9 +87,6 @@ class Pushing:
     logic
         ``"and"`` for the trend rule of :mod:`kineverse.logic`; for comparison ``"product"`` for the product
         rule, and None for no trends.
-    deviation
-        Standard deviation of the gap if the states are estimates [m]. A contact is then a gap of 1 mm and
-        three deviations, or a touch that is reported, and rows give way by as much.
 
     Attributes
     ----------
@@ -139,18 +99,14 @@ class Pushing:
         The coordinate.
     touching
         Whether the pusher touches where it should.
-    touched
-        Whether a touch sensor of the pusher reports a touch; set it before each step, if there is one.
     losses
         Number of contacts that were lost.
-    blocked
-        Number of contact points given up.
-    jammed
-        Number of those at which the pusher touched, and the object did not move.
     retreating
         Set it to True to take the pusher away from the object.
-    contacts
-        Number of contact points chosen.
+    choice
+        The present contact point, and those that were given up.
+    press
+        Touch, lag and speed of the press.
     view
         Points and vectors of the last step.
 
@@ -175,19 +131,12 @@ class Pushing:
         rules: Iterable[Rule] = (),
         leave_out: Iterable[Exclusion] = (),
         logic: str | None = "and",
-        deviation: float = 0.0,
     ) -> None:
         if logic not in ("and", "product", None):
             raise InvalidValueError(f"logic= is 'and', 'product' or None, not {logic!r}.")
-        if not 0.0 <= deviation < _LARGEST_DEVIATION:
-            raise InvalidValueError(
-                f"deviation= is from 0 to {_LARGEST_DEVIATION:g} m, not {deviation!r}: with a larger one the "
-                "pusher cannot tell whether it touches."
-            )
         self.model, self.target = model, float(target)
-        self.deviation, self._slack = float(deviation), 3.0 * float(deviation)
         self.coordinate = coordinate = model.symbol(what) if isinstance(what, str) else what
-        lower, upper = model.limits(coordinate)
+        self._limits = lower, upper = model.limits(coordinate)
         if not lower - 1e-9 <= target <= upper + 1e-9:
             raise InvalidValueError(
                 f"'{coordinate}' is between {lower:g} and {upper:g}, so it cannot be pushed to {target:g}."
@@ -220,30 +169,23 @@ class Pushing:
             model, rules=(*furniture, *self.overlapping, *self.rules), leave_out=self.leave_out
         )
         self._program = PushProgram(
-            model,
-            coordinate,
-            self.target,
-            self.tool,
-            self.scene,
-            dt=dt,
-            still=still,
-            logic=logic,
-            slack=self._slack,
+            model, coordinate, self.target, self.tool, self.scene, dt=dt, still=still, logic=logic
         )
         self.controller = self._program.controller
         self.speeds = self.controller.speeds
         self._slots = slots = self.controller.contact_slots
-        index = {b: k for k, b in enumerate(self.scene.bodies)}
-        pushers = np.array([b in self.pusher for b in index])
-        pushed_ones = np.array([b in self.object_bodies for b in index])
-        forward = np.outer(pushers, pushed_ones)
-        # 1 for pairs of pusher and object, -1 for the other order, 0 for all others.
-        self._kinds = forward.astype(np.int8) - forward.T.astype(np.int8)
-        self._body_names = tuple(index)
+        self._pairs = PairFinder(
+            self.scene.bodies,
+            self.pusher,
+            self.object_bodies,
+            slots,
+            self._program.object_column,
+            self.surface.sign,
+        )
         self._hand = self.scene.bodies.index(self._hand_body())
         self._all = self.scene.watch(f"{self.robot}/*", "*", radius=0.0, moving=self.speeds)
-        slots.set_margin(self.pusher, self.object_bodies, _APART)
-        self._pressing = False
+        self.choice = ContactChoice(self.surface)
+        self.press = PushPress(dt, self.surface.sign)
         self.reset()
         with contextlib.suppress(KineverseError):
             self.step(at)  # what is computed once is computed now
@@ -262,16 +204,14 @@ class Pushing:
     def reset(self) -> None:
         """Forget all contacts."""
         self.controller.reset()
-        self.touching, self.losses, self.blocked, self.contacts, self.jammed = False, 0, 0, 0, 0
-        self.retreating = self.touched = False
-        self._chosen: int | None = None
-        self._given_up: dict[int, int] = {}
-        self._anchor: tuple[int, Array] | None = None
+        self.choice.reset()
+        self.press.reset()
+        self.press.deviation = 0.0
+        self.touching, self.losses, self.retreating = False, 0, False
+        self._anchor = TipAnchor()
         self._aside = math.inf
-        self._moved = 0.0
-        self._value: float | None = None
-        self._best, self._since = math.inf, 0
-        self._view: tuple[Array, Array, Array, Array, Array, float] | None = None
+        self._margin = math.nan
+        self._seen: tuple[PushPair | None, PushPoint, Array] | None = None
 
     # -- the step ------------------------------------------------------------------------------------------
 
@@ -289,215 +229,178 @@ class Pushing:
     @property
     def penetration(self) -> float:
         """Deepest penetration at the last step of pairs that may not touch [m], 0 if there is none."""
-        found = self._slots.found
-        a, b = found.body_indices.T
-        distances = found.distances[self._kinds[a, b] == 0]
-        return max(0.0, -float(distances[0])) if len(distances) else 0.0
+        return self._pairs.penetration(self._slots.found)
 
-    def step(self, state: State) -> Command:
+    def find_deviation(self, state: State, deviation: Callable[[Symbol], float]) -> float:
+        """Return the standard deviation of gaps [m] at a state whose coordinates have deviations.
+
+        Parameters
+        ----------
+        state
+            The state.
+        deviation
+            Standard deviation by coordinate [m], [rad], such as that of a :class:`.Belief`.
+        """
+        symbols, jacobian = self._program.tip_jacobian(state)
+        normal, velocity = np.zeros(3), np.zeros(3)
+        if self.choice.chosen is not None:
+            point = self.surface.point_at(state, self.choice.chosen)
+            normal, velocity = point.normal, point.velocity
+        rates = dict(zip(symbols, (normal @ jacobian).tolist(), strict=True))
+        rates[self.coordinate] = float(normal @ velocity)
+        # The deviation of what was never seen is infinite, and counts only where it changes the gap.
+        return math.hypot(*(rate * deviation(s) for s, rate in rates.items() if rate))
+
+    def step(self, state: State, observation: Observation | None = None, deviation: float = 0.0) -> Command:
         """Return the command for one time step at a state.
+
+        Parameters
+        ----------
+        state
+            The state, or an estimate.
+        observation
+            Readings of encoders and touch sensors, where the state is an estimate.
+        deviation
+            Standard deviation of gaps in the estimate [m].
 
         Raises
         ------
         InfeasibleError, NotFiniteError
             As :meth:`.Controller.step`.
         """
-        value = state[self.coordinate]
-        self._moved = max(self.surface.sign * (value - self._value), 0.0) if self._value is not None else 0.0
-        self._value = value
+        press, choice = self.press, self.choice
+        press.deviation = min(deviation, _LARGEST_DEVIATION) if deviation > _LEAST_DEVIATION else 0.0
+        senses = press.deviation > 0.0
+        read = None if observation is None else observation.joints
+        press.report(senses and observation is not None and not observation.touching.isdisjoint(self.pusher))
+        value = press.advance(state[self.coordinate], self._program.tip(state, read), self.touching)
+        if senses:
+            state = state.updated({self.coordinate: min(max(value, self._limits[0]), self._limits[1])})
         found = self._program.load(state)
         tip = self._program.tip(state)
-        point = None if self._chosen is None else self.surface.point_at(state, self._chosen)
+        point = None if choice.chosen is None else self.surface.point_at(state, choice.chosen)
         if point is not None and not self.retreating and self._is_stuck(state, tip, point):
             self._give_up()
             point = None
         if point is None:
-            point = self.choose(state)
+            point = choice.choose(state, tip)
         offset = tip - point.point
         offset = offset - point.normal * float(point.normal @ offset)
         self._aside = math.sqrt(float(offset @ offset))
-        contact = self._nearest(found)
+        contact = self._pairs.nearest(found)
         if not self.retreating:
             self._update_touching(contact)
         self._write(tip, point, contact)
-        return self._program.step()
+        command = self._program.step()
+        speeds = np.fromiter(command.speeds.values(), dtype=float)
+        press.plan(point.velocity, self._slots.point_jacobian(self._hand, tip) @ speeds)
+        return command
 
-    def _nearest(self, found: DistanceResults) -> _Contact | None:
-        """Return the near pair of pusher and object that pushes best; see :data:`_Contact`."""
-        if not len(found):
-            return None
-        a, b = found.body_indices.T
-        kinds = self._kinds[a, b]
-        rows = np.flatnonzero(kinds)
-        if not len(rows):
-            return None
-        least = found.distances[rows[0]]
-        best = None
-        for row in rows[:6].tolist():
-            gap = float(found.distances[row])
-            if gap > max(least + TOUCHING, PRESS):
-                break
-            if kinds[row] > 0:
-                robot, thing = int(a[row]), int(b[row])
-                r, p, normal = found.points_a[row], found.points_b[row], -found.normals[row]
-            else:
-                robot, thing = int(b[row]), int(a[row])
-                r, p, normal = found.points_b[row], found.points_a[row], found.normals[row]
-            velocity = self._velocity(thing, p)
-            alignment = find_alignment(normal, velocity)
-            if best is None or alignment > best[-1]:
-                best = (robot, thing, r, p, normal, gap, velocity, alignment)
-        return best
-
-    def _velocity(self, body: int, point: Array) -> Array:
-        """Return the velocity (3,) of a point of the object per unit of its motion to the target."""
-        column = self._slots.point_jacobian(body, point)[:, self._program.object_column]
-        return np.asarray(self.surface.sign * column)
-
-    def _update_touching(self, contact: _Contact | None) -> None:
+    def _update_touching(self, contact: PushPair | None) -> None:
         """Note that the pusher has come to touch, or has lost its contact."""
+        press = self.press
         if self.touching:
-            if contact is None or (contact[5] > LOST + self._slack and not self.touched):
+            if contact is None or (contact.gap > LOST + press.slack and not press.touched):
                 self.losses += 1
                 self._release()
-            elif contact[7] < _CONE_END:
+            elif contact.alignment < CONE_END:
                 self._give_up()
-        elif self._aside < 2 * NEAR and contact is not None and contact[5] < TOUCHING and contact[7] > _CONE:
-            self.touching = True
-            self._best, self._since = math.inf, 0
-            self._anchor = None
+        elif self._aside < 2 * NEAR and contact is not None and contact.alignment > CONE:
+            certain = press.deviation == 0.0 or press.certain(contact.velocity)
+            if contact.gap < (TOUCHING if certain else TOUCHING + press.slack) and (certain or press.touched):
+                self.touching = True
+                self.choice.restart()
+                self._anchor = TipAnchor()
+        if contact is not None:
+            rate = -float(contact.normal @ contact.velocity) * self.surface.sign
+            press.correct(contact.gap, rate, self.touching)
 
     def _release(self) -> None:
-        self.touching, self._anchor = False, None
-        self._best, self._since = math.inf, 0
+        self.touching = False
+        self.choice.restart()
 
     def _give_up(self) -> None:
         """Leave the present contact point for another one."""
-        self.jammed += self.touching
-        if self._chosen is not None:
-            self._given_up[self._chosen] = self._given_up.get(self._chosen, 0) + 1
-            self.blocked += 1
-        self._chosen = None
+        self.choice.give_up(self.touching)
         self._release()
 
     def rank(self, state: State, limit: float = 0.1) -> list[int]:
         """Return contact points at a state, the best first, each some distance from better ones [m]."""
-        points = self.surface.at(state)
-        tip = self._program.tip(state)
-        score = self.score(points) - _DISTANCE_COST * np.sqrt(((points.points - tip) ** 2).sum(axis=1))
-        for k, times in self._given_up.items():
-            near = ((points.points - points.points[k]) ** 2).sum(axis=1) < _SURROUNDINGS**2
-            score = score - np.where(near, _GIVEN_UP_COST * times, 0.0)
-        ranked: list[int] = []
-        while score.max() > -math.inf:
-            best = int(np.argmax(score))
-            ranked.append(best)
-            near = ((points.points - points.points[best]) ** 2).sum(axis=1) < limit**2
-            score = np.where(near, -math.inf, score)
-        return ranked
+        return self.choice.rank(state, self._program.tip(state), limit)
 
     def choose(self, state: State, index: int | None = None) -> PushPoint:
         """Choose a contact point, by default the best, and return it."""
-        self._chosen = self.rank(state, math.inf)[0] if index is None else index
-        self.contacts += 1
-        self._best, self._since = math.inf, 0
-        return self.surface.point_at(state, self._chosen)
-
-    def score(self, points: PushContacts) -> Array:
-        """Return how well the object can be pushed at each point (N,)."""
-        inside = points.alignment > _CONE
-        return np.asarray(
-            np.where(inside, 0.0, -3.0)
-            + points.alignment
-            + np.minimum(points.leverage, 0.8)
-            + 0.7 * self.surface.room
-        )
+        return self.choice.choose(state, self._program.tip(state), index)
 
     def _is_stuck(self, state: State, tip: Array, point: PushPoint) -> bool:
         """Return True without progress for a while, or if the push has left the cone of the contact point."""
         if self.touching:
             rest = abs(state[self.coordinate] - self.target)
         else:
-            if point.alignment < _CONE_END:
+            if point.alignment < CONE_END:
                 return True
             offset = point.point - tip
             rest = math.sqrt(float(offset @ offset))
-        if rest < self._best - _BLOCKED_WAY:
-            self._best, self._since = rest, 0
-        else:
-            self._since += 1
-        return self._since > _BLOCKED_STEPS
+        return self.choice.is_stuck(rest)
 
-    def _write(self, tip: Array, point: PushPoint, contact: _Contact | None) -> None:
+    def _write(self, tip: Array, point: PushPoint, contact: PushPair | None) -> None:
         """Set the parameters of the program."""
         c, m, velocity = point.point, point.normal, point.velocity
+        press, program = self.press, self._program
         near, height = self._aside < NEAR and not self.retreating, float((tip - c) @ m)
-        standoff = _STANDOFF if near else min(_FUNNEL, _STANDOFF + 1.5 * max(self._aside - NEAR, 0.0))
+        standoff = _STANDOFF
+        if not near:
+            standoff = min(_FUNNEL, _STANDOFF + press.slack + 1.5 * max(self._aside - NEAR, 0.0))
         if self.retreating:
             self.touching, standoff = False, _RETREAT
-        self._program.set("target", c + standoff * m)
-        self._program.set("normal", m)
-        self._program.set("facing", -m)
+        program.set("target", c + standoff * m)
+        program.set("normal", m)
+        program.set("facing", -m)
         leverage = max(math.sqrt(float(velocity @ velocity)), 1e-3)
-        # An object that does not give way is not pushed further than a ramp of speed leads in a step.
-        self._program.set("pace", min(_SPEED, self._moved * leverage / self.controller.dt + _RAMP) / leverage)
-        self._press(self.touching or (near and height < _LOW))
-        self._program.set("reach", 0.0 if self.touching else 1.0)
-        self._program.set("touch", 0.0 if self.touching or self.retreating else 1.0)
-        self._program.set("hold", _HOLD_WEIGHT if self.touching else 0.0)
-        self._program.set("engaged", float(self.touching))
-        distance, r, p, normal = math.inf, tip, c, m
+        program.set("pace", press.pace() / leverage)
+        self._keep_apart(contact, self.touching or (near and height < _LOW + press.slack))
+        # The pusher goes on until it touches: where the object is believed to be, there may be none.
+        program.set("near", TOUCHING if press.deviation == 0.0 else -1.0)
+        program.set("reach", 0.0 if self.touching else 1.0)
+        program.set("touch", 0.0 if self.touching or self.retreating else 1.0)
+        program.set("hold", _HOLD_WEIGHT if self.touching else 0.0)
+        program.set("engaged", float(self.touching))
+        free = False
         if contact is None:
             for name in ("relative", "slip", "pushed"):
-                self._program.set(name, 0.0)
-            self._program.set("gap", _FAR)
+                program.set(name, 0.0)
+            program.set("gap", _FAR)
         else:
-            robot, thing, r, p, normal, distance, velocity, _ = contact
-            across, up = _tangents(normal)
-            slots = self._slots
-            J = slots.point_jacobian(thing, p)
+            distance, normal, thing = contact.gap, contact.normal, contact.thing
+            free = self.touching and -_JAMMED - press.slack < distance < LOST + press.slack
+            slots, tangents = self._slots, contact.tangents
+            J = slots.point_jacobian(thing, contact.p)
             relative = np.empty((3, len(self.speeds)))
-            relative[0] = normal @ (slots.point_jacobian(robot, r) - J)
-            tangents = np.array([across, up])
+            relative[0] = normal @ (slots.point_jacobian(contact.robot, contact.r) - J)
             relative[1:] = tangents @ (
                 slots.point_jacobian(self._hand, tip) - slots.point_jacobian(thing, tip)
             )
-            self._program.set("relative", relative[:, self._program.columns].ravel())
-            self._program.set("gap", distance)
-            self._program.set("pushed", float(normal @ J[:, self._program.object_column]))
-            self._program.set("slip", tangents @ self._drift(thing, tip))
-        self._view = (r, p, normal, velocity, c, distance)
+            program.set("relative", relative[:, program.columns].ravel())
+            # A press that is late enough is not increased by the goal about the gap either.
+            most = -PRESS * (1.0 - min(max(press.reserve, 0.0), 1.0))
+            program.set("gap", most if press.touched and self.touching else distance)
+            program.set("pushed", float(normal @ J[:, program.object_column]))
+            pose = self.scene.pose(self.scene.bodies[thing])
+            program.set("slip", tangents @ self._anchor.drift(thing, pose, tip, press.weight))
+        program.set("free", float(free))
+        self._seen = (contact, point, tip)
 
     @property
     def view(self) -> PushView | None:
         """Points and vectors of the last step; None before the first."""
-        if self._view is None:
-            return None
-        r, p, normal, velocity, c, distance = self._view
-        push = velocity / max(math.sqrt(float(velocity @ velocity)), 1e-9)
-        return PushView(p, r, normal, push, cross_product(cross_product(push, normal), normal), c, distance)
+        return None if self._seen is None else make_view(*self._seen)
 
-    def _drift(self, thing: int, tip: Array) -> Array:
-        """Return how far the tip has moved on the object since the first touch, (3,) [m]."""
-        pose = self.scene.pose(self._body_names[thing])
-        if not self.touching:
-            self._anchor = None
-            return np.zeros(3)
-        if self._anchor is None or self._anchor[0] != thing:
-            self._anchor = (thing, pose[:3, :3].T @ (tip - pose[:3, 3]))
-        return np.asarray(tip - pose[:3, :3] @ self._anchor[1] - pose[:3, 3])
-
-    def _press(self, pressing: bool) -> None:
-        """Let the pusher touch the object, or keep it away."""
-        if pressing != self._pressing:
-            self._pressing = pressing
-            self._slots.set_margin(
-                self.pusher, self.object_bodies, -PRESS - self._slack if pressing else _APART
-            )
-
-
-def _tangents(normal: Array) -> tuple[Array, Array]:
-    """Return two unit vectors that are orthogonal to a normal and to each other."""
-    across = cross_product(normal, np.eye(3)[int(np.argmin(np.abs(normal)))])
-    across /= math.sqrt(float(across @ across))
-    return across, cross_product(normal, across)
+    def _keep_apart(self, contact: PushPair | None, pressing: bool) -> None:
+        """Set the distance of pusher and object: of both apart, or of a pusher that feels for the object."""
+        margin = _APART + self.press.slack
+        if pressing:
+            gap = math.inf if contact is None else contact.gap
+            margin = self.press.margin(gap, self.touching, self._slots.gain)
+        if margin != self._margin:
+            self._margin = margin
+            self._slots.set_margin(self.pusher, self.object_bodies, margin)

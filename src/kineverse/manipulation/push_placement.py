@@ -130,7 +130,7 @@ def roll_out(pushing: Pushing, start: State, steps: int, tolerance: float = 0.01
             command = pushing.step(state)
             if pushing.losses:
                 return "lost the contact", k
-            if pushing.blocked:
+            if pushing.choice.blocked:
                 return f"blocked at {state[pushing.coordinate]:.2f}", k
             if pushing.penetration > _DEEPEST:
                 return "penetration", k
@@ -178,7 +178,7 @@ class _Sampler:
             planar = array([pose[0, 3], pose[1, 3], pose[0, 0], pose[1, 0]])
             self._base = InverseKinematics(model, [Goal(planar, self._planar.expression, name="base")])
         self._points = pushing.surface.at(state)
-        score = pushing.score(self._points)
+        score = pushing.choice.score(self._points)
         good = np.flatnonzero(score > score.max() - _CANDIDATES)
         weights = np.exp(2.0 * (score[good] - score.max()))
         self._candidates, self._weights = good, weights / weights.sum()

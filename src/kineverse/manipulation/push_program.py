@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
 from itertools import pairwise
 
 import numpy as np
@@ -32,8 +32,6 @@ PRESS = 2e-4
 """Depth that rows of touching bodies allow, so that contact is kept [m]."""
 NEAR = 0.012
 """Distance of the tip from the axis of a contact within which it approaches the surface [m]."""
-_JAMMED = 4e-4
-"""Depth at which the object counts as not giving way [m]."""
 _REACH_SPEED = 0.5
 """Largest speed of the tip on its way to a contact [m/s]."""
 _TOUCH_SPEED = 0.15
@@ -60,8 +58,6 @@ class PushProgram:
         Collision scene of the controller.
     dt, still, logic
         As for :class:`.Pushing`.
-    slack
-        Error of gaps that is allowed for [m].
 
     Attributes
     ----------
@@ -84,7 +80,6 @@ class PushProgram:
         dt: float,
         still: Iterable[Symbol | str],
         logic: str | None,
-        slack: float,
     ) -> None:
         still = tuple(still)
         speed = coordinate.derivative()
@@ -118,19 +113,19 @@ class PushProgram:
         offset = tip - target
         lateral = offset - normal * (normal @ offset)
         aside = sqrt(lateral @ lateral + 1e-8)
-        touched = less(d, TOUCHING + slack)
+        touched = less(d, numbers("near", 1)[0])
         aligned = less(aside, NEAR)
         v = as_expression(speed)
         ḋ = sum((relative[0, k] * s for k, s in enumerate(speeds)), as_expression(0.0))
         twist = model.jacobian(tool.frame, form="world", symbols=speeds)
         turn = twist[3:] @ array(speeds)
-        most = engaged * less(gap, LOST + slack) * less(-_JAMMED - slack, gap) * _ANY
+        most = _ANY * numbers("free", 1)[0]
         far = _ANY * (1 - engaged)
         tasks: list[Task] = [
             Goal(coordinate, target_value, name="object", gain=4.0, speed=numbers("pace", 1)[0]),
             Goal(tip, target, name="reach", gain=3.0, speed=_REACH_SPEED, weight=w_reach),
             Goal(slips, 0.0, name="no slip", gain=5.0, weight=w_hold),
-            Goal(d, -PRESS - slack, name="press", gain=10.0, weight=w_hold),
+            Goal(d, -PRESS, name="press", gain=10.0, weight=w_hold),
             Keep(-most, v, most, name="still unless touched"),
             Keep(-math.inf, pushed * v, far, name="push, never pull"),
             Keep(-math.inf, ḋ, far, name="object does not run away"),
@@ -152,9 +147,9 @@ class PushProgram:
             dt=dt,
             still=still,
             scene=scene,
-            margin=0.005,
-            radius=0.035,
-            smooth=0.02,
+            margin=_MARGIN,
+            radius=_RADIUS,
+            smooth=_SMOOTH,
             contacts=24,
         )
         order = self.controller.speeds
@@ -170,7 +165,8 @@ class PushProgram:
         self._numbers = np.zeros(len(every))
         self._used = np.array([k for k, s in enumerate(every) if s in place], dtype=np.intp)
         self._places = np.array([place[every[k]] for k in self._used], dtype=np.intp)
-        self._tip_function = compile([tip])
+        self._tip_symbols = tuple(s for s in tip.symbols if not s.order)
+        self._tip_function = compile([tip, tip.jacobian(self._tip_symbols)])
         self._tip = self._tip_function.bind()
 
     def load(self, state: State) -> DistanceResults:
@@ -187,8 +183,18 @@ class PushProgram:
         self._values[self._places] = self._numbers[self._used]
         return self.controller.step(self._values)
 
-    def tip(self, state: State) -> Array:
-        """Return the foremost point of the pusher (3,) at a state [m]."""
-        self._tip.input[:] = state.vector(self._tip_function.inputs)
+    def tip(self, state: State, read: Mapping[Symbol, float] | None = None) -> Array:
+        """Return the foremost point of the pusher (3,) at a state, or at readings of encoders [m]."""
+        inputs = self._tip_function.inputs
+        if read is None:
+            self._tip.input[:] = state.vector(inputs)
+        else:
+            self._tip.input[:] = [read[s] if s in read else state[s] for s in inputs]
         self._tip()
         return np.array(self._tip.outputs[0])
+
+    def tip_jacobian(self, state: State) -> tuple[tuple[Symbol, ...], Array]:
+        """Return the coordinates of the tip, and its derivatives (3, n) over them."""
+        self._tip.input[:] = state.vector(self._tip_function.inputs)
+        self._tip()
+        return self._tip_symbols, np.array(self._tip.outputs[1])

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 
 import numpy as np
@@ -94,6 +94,8 @@ def try_push(
     rules: Iterable[Rule] = (),
     leave_out: Iterable[Exclusion] = (),
     logic: str | None = "and",
+    open_session: Callable[[World, Callable[[Session], object]], Session] | None = None,
+    on_step: Callable[[Pushing], object] | None = None,
 ) -> PushTrial:
     """Push in a world from a state; if that fails, from a start that base placement finds.
 
@@ -113,6 +115,11 @@ def try_push(
         Whether base placement is tried.
     samples, seed
         As for :func:`.find_push_start`.
+    open_session
+        Function from the world and a function to call after each step to a session, for another belief, and
+        for recordings.
+    on_step
+        As for :func:`.push`.
     """
     model = world.model
     coordinate = model.symbol(what) if isinstance(what, str) else what
@@ -134,9 +141,18 @@ def try_push(
     def attempt(start: State) -> tuple[Outcome, _Judge, Session]:
         world.reset(start)
         judge = _Judge(pushing)
-        session = Session(world, dt=dt, on_step=judge.look)
+        if open_session is None:
+            session = Session(world, dt=dt, on_step=judge.look)
+        else:
+            session = open_session(world, judge.look)
         outcome = push(
-            session, coordinate, seconds=steps * dt, tolerance=tolerance, pushing=pushing, plan=not place
+            session,
+            coordinate,
+            seconds=steps * dt,
+            tolerance=tolerance,
+            pushing=pushing,
+            plan=not place,
+            on_step=on_step,
         )
         return outcome, judge, session
 

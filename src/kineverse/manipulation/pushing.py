@@ -13,6 +13,7 @@ from kineverse.geometry import Rule
 from kineverse.geometry.objects import Exclusion
 from kineverse.grasping import find_gripper
 from kineverse.planning import Path
+from kineverse.state import State
 from kineverse.symbols import Symbol
 
 from .outcome import Outcome
@@ -20,15 +21,23 @@ from .push_approach import plan_push_approach
 from .push_controller import Pushing
 from .session import Session
 
-_SETTLED = 5
-"""Number of steps for which the estimate is within half of the tolerance when a push ends."""
+_SETTLED, _SETTLED_ESTIMATE = 5, 25
+"""Number of steps for which the value, or its estimate, is within half of the tolerance when a push ends."""
 _PATIENCE = 25
-"""Number of steps for which it is within the tolerance when a push ends all the same."""
+"""Number of steps for which it is within the tolerance in addition when a push ends all the same."""
+_AVERAGED = 0.1
+"""Weight of the latest estimate in the mean that counts at the end."""
+_STILL = 5e-3
+"""Speed of a contact point that counts as none [m/s]."""
+_PRESSED = 3
+"""Number of steps for which an object within the tolerance gives way no more when a push ends."""
 _MOST_BLOCKED = 3
 """Number of contact points given up before an approach is planned."""
 _MOST_JAMMED = 3
 """Number of contact points at which the object does not move before it counts as jammed."""
 _MOST_APPROACHES = 2
+_UNKNOWN, _LOOK = 0.05, 2.0
+"""Deviation of a coordinate that is not known yet [m], [rad], and the time to wait until it is [s]."""
 _RETREAT_STEPS = 100
 
 
@@ -45,7 +54,6 @@ def push(
     rules: Iterable[Rule] = (),
     leave_out: Iterable[Exclusion] = (),
     logic: str | None = "and",
-    deviation: float = 0.0,
     plan: bool = True,
     retreat: bool = False,
     pushing: Pushing | None = None,
@@ -54,7 +62,8 @@ def push(
     """Push an articulated object to a value of its coordinate.
 
     The controller finds contact points and changes them where it is blocked. After some of them a path is
-    planned to another one. The result is judged by the world's truth.
+    planned to another one. Where the session's belief is an estimate, the robot first looks until it knows
+    the coordinate, and then feels for the object. The result is judged by the world's truth.
 
     Parameters
     ----------
@@ -72,7 +81,7 @@ def push(
         Largest time in the world [s].
     tolerance
         Largest distance from the target [m], [rad].
-    still, rules, leave_out, logic, deviation
+    still, rules, leave_out, logic
         As for :class:`.Pushing`.
     plan
         Whether approaches are planned where the way of the controller is blocked.
@@ -96,6 +105,17 @@ def push(
     """
     model, world = session.world.model, session.world
     coordinate = model.symbol(what) if isinstance(what, str) else what
+    first, begin = session.steps, world.time
+    while session.deviation(coordinate) > _UNKNOWN:
+        if world.time - begin > _LOOK:
+            reason = (
+                f"'{coordinate}' is not known: its deviation is {session.deviation(coordinate):.2g} after "
+                f"{_LOOK:g} s. No camera sees a marker that it moves, or its track is lost."
+            )
+            value, seconds = world.state[coordinate], world.time - begin
+            return Outcome(False, value, reason, world.name, seconds, session.steps - first)
+        session.phase = "look"
+        session.stop()
     if pushing is None:
         if bodies is None:
             bodies = find_gripper(model, world.robot).bodies
@@ -112,7 +132,6 @@ def push(
             rules=rules,
             leave_out=leave_out,
             logic=logic,
-            deviation=deviation,
         )
         pushing.wait()
     pushing.reset()
@@ -131,6 +150,31 @@ def push(
     return Outcome(done, value, reason, world.name, run.time, run.steps, run.measures())
 
 
+class _End:
+    """End of a push: the estimate is at the target for some steps, or the object gives way no more there."""
+
+    def __init__(self, pushing: Pushing, tolerance: float) -> None:
+        self._pushing, self._tolerance = pushing, tolerance
+        self._mean: float | None = None
+        self._settled = self._within = self._pressed = 0
+
+    def reached(self, state: State) -> bool:
+        """Return whether the push ends at a state."""
+        pushing, press = self._pushing, self._pushing.press
+        rest = state[pushing.coordinate] - pushing.target
+        if press.deviation > 0.0:
+            # Noise passes by the target now and then, and its mean over a while does not.
+            rest = rest if self._mean is None else self._mean + _AVERAGED * (rest - self._mean)
+            self._mean = rest
+        rest = abs(rest)
+        self._within = self._within + 1 if rest < self._tolerance else 0
+        self._settled = self._settled + 1 if rest < self._tolerance / 2 else 0
+        still = pushing.touching and press.presses and press.speed < _STILL
+        self._pressed = self._pressed + 1 if still and rest < self._tolerance else 0
+        long = _SETTLED_ESTIMATE if press.deviation > 0.0 else _SETTLED
+        return self._settled >= long or self._within >= long + _PATIENCE or self._pressed >= _PRESSED
+
+
 class _Run:
     """Steps of one push."""
 
@@ -147,7 +191,6 @@ class _Run:
         self._seconds, self._tolerance, self._plan = seconds, tolerance, plan
         self._first, self._begin = session.steps, session.world.time
         self._approaches = 0
-        self._senses = pushing.deviation > 0.0
         self._changes: list[np.ndarray[Any, np.dtype[np.float64]]] = []
         self._last: np.ndarray[Any, np.dtype[np.float64]] | None = None
 
@@ -165,20 +208,18 @@ class _Run:
         contact = pushing.first_contact(session.state)
         if contact:
             return f"The push begins with a {contact}."
-        settled = within = 0
         blocked = 0
+        end = _End(pushing, self._tolerance)
         while self.time < self._seconds:
-            within = within + 1 if pushing.done(session.state, self._tolerance) else 0
-            settled = settled + 1 if pushing.done(session.state, self._tolerance / 2) else 0
-            if settled >= _SETTLED or within >= _PATIENCE:
+            if end.reached(session.state):
                 return "The estimate is at the target, and the world is not."
-            if pushing.jammed >= _MOST_JAMMED:
+            if pushing.choice.jammed >= _MOST_JAMMED:
                 return (
-                    f"The object does not move: pushed at {pushing.jammed} points, it stays at "
+                    f"The object does not move: pushed at {pushing.choice.jammed} points, it stays at "
                     f"{session.state[pushing.coordinate]:.3g}. It may be locked, jammed or blocked."
                 )
-            if pushing.blocked - blocked >= _MOST_BLOCKED and self._plan:
-                blocked = pushing.blocked
+            if pushing.choice.blocked - blocked >= _MOST_BLOCKED and self._plan:
+                blocked = pushing.choice.blocked
                 problem = self._approach()
                 if problem:
                     return problem
@@ -189,10 +230,9 @@ class _Run:
     def _step(self, phase: str) -> None:
         session, pushing = self._session, self._pushing
         session.phase = phase
-        if self._senses:
-            pushing.touched = not session.world.observe().touching.isdisjoint(pushing.pusher)
         with session.timed("push"):
-            command = pushing.step(session.state)
+            deviation = pushing.find_deviation(session.state, session.belief.deviation)
+            command = pushing.step(session.state, session.observation if deviation else None, deviation)
         speeds = np.fromiter(command.speeds.values(), dtype=float)
         if pushing.touching and self._last is not None:
             self._changes.append(np.abs(speeds - self._last))
@@ -204,7 +244,8 @@ class _Run:
     def _approach(self) -> str:
         """Plan a way to another contact point and follow it; return what prevents it."""
         if self._approaches >= _MOST_APPROACHES:
-            return f"No contact point was reached, of {self._pushing.contacts} and {self._approaches} plans."
+            tried = self._pushing.choice.contacts
+            return f"No contact point was reached, of {tried} and {self._approaches} plans."
         self._approaches += 1
         session, pushing = self._session, self._pushing
         session.stop()
@@ -242,9 +283,9 @@ class _Run:
         pushing = self._pushing
         return {
             "losses": pushing.losses,
-            "blocked": pushing.blocked,
-            "contacts": pushing.contacts,
-            "jammed": pushing.jammed,
+            "blocked": pushing.choice.blocked,
+            "contacts": pushing.choice.contacts,
+            "jammed": pushing.choice.jammed,
             "planned": self._approaches,
             "jitter": float(np.mean(self._changes, axis=0).max()) if self._changes else 0.0,
         }

@@ -7,23 +7,33 @@ condition of a push to move a contact along the object.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
+from dataclasses import replace
 
 import numpy as np
 
-from kineverse.experiments.manipulation.robots import find_robots
-from kineverse.experiments.manipulation.tables import make_failure_table, make_trial_numbers
+from kineverse.experiments.manipulation.columns import QUALITY, ROW, TIMES, Column
+from kineverse.experiments.manipulation.robots import find_data, find_robots
+from kineverse.experiments.manipulation.setting import SettingOptions, make_settings
+from kineverse.experiments.manipulation.tables import (
+    make_exception_table,
+    make_failure_table,
+    make_group_table,
+    make_trial_numbers,
+)
 from kineverse.experiments.manipulation.trial_pool import run_jobs
 from kineverse.experiments.manipulation.trials import StepTimeStatistics, Trial
 from kineverse.experiments.registry import Options, Progress
 from kineverse.experiments.report import Figure, Report, ReportTable
 from kineverse.experiments.table1_push import PushJob, run_push
 from kineverse.experiments.table1_push.objects import OBJECTS, SHIPPED_KITCHEN
+from kineverse.experiments.table1_push.report import OBJECT_COLUMNS
 
 from .figure import FIGURE_SIZE, draw_boxes
 from .locks import RULES, THESIS, UPPER, Rule, UnlockingRun, draw_box, unlock
 
-OPTIONS = ("quick", "data", "seed", "count", "robot", "processes")
+OPTIONS = ("quick", "data", "seed", "count", "robot", "processes", *SettingOptions)
 
 BOXES, QUICK_BOXES = 20, 3
 PARTS = (10, 40)
@@ -34,21 +44,28 @@ _PUSH_LOGIC: dict[Rule, str | None] = {"and": "and", "product": "product", "none
 
 def run(progress: Progress, options: Options) -> Report:
     """Open boxes and push objects with each rule; ``quick`` takes few boxes, one robot and one object."""
+    settings = make_settings(options)
     boxes = options.count or (QUICK_BOXES if options.quick else BOXES)
     thesis = {rule: unlock(THESIS, "a", UPPER, rule) for rule in RULES}
     runs = run_boxes(boxes, options.seed, progress)
-    robots = find_robots(options.robot, options.data)
+    robots = find_robots(options.robot, find_data(options.data, options.quick))
     if options.quick and not options.robot:
         robots = robots[:1]
     jobs = [
-        PushJob(robot, SHIPPED_KITCHEN, None, thing, seed=options.seed, logic=_PUSH_LOGIC[rule])
+        PushJob(
+            robot, SHIPPED_KITCHEN, None, thing, setting=setting, seed=options.seed, logic=_PUSH_LOGIC[rule]
+        )
         for rule in RULES
+        for setting in settings
         for robot in robots
         for thing in (QUICK_OBJECTS if options.quick else OBJECTS)
     ]
     pushes = run_jobs(run_push, jobs, progress, "ablations", "push", options.processes)
     of_rule = len(jobs) // len(RULES)
-    by_rule = {rule: pushes[k * of_rule : (k + 1) * of_rule] for k, rule in enumerate(RULES)}
+    by_rule = {
+        rule: [replace(trial, skill=name) for trial in pushes[k * of_rule : (k + 1) * of_rule]]
+        for k, (rule, name) in enumerate(RULES.items())
+    }
     return make_ablation_report(thesis, runs, by_rule, options.seed)
 
 
@@ -70,8 +87,12 @@ def make_ablation_report(
 ) -> Report:
     """Return the report on locks and pushes."""
     tables = [_thesis_table(thesis), _box_table(boxes)]
-    if any(pushes.values()):
-        tables += [_push_table(pushes), make_failure_table([t for own in pushes.values() for t in own])]
+    trials = [t for own in pushes.values() for t in own]
+    tables += [
+        make_group_table("Objects pushed shut", trials, PUSH_COLUMNS, ("skill",)),
+        make_exception_table(trials),
+        make_failure_table(trials),
+    ]
     numbers = {
         "seed": seed,
         "thesis": {
@@ -119,19 +140,18 @@ def _box_table(runs: dict[tuple[Rule, int], list[UnlockingRun]]) -> ReportTable:
     )
 
 
-def _push_table(pushes: dict[Rule, list[Trial]]) -> ReportTable:
-    rows = tuple(
-        (
-            RULES[rule],
-            f"{sum(t.done for t in own)} of {len(own)}",
-            sum(t.done and not t.measures.get("placed", 0) for t in own),
-            sum(int(t.measures.get("contact_losses", 0)) for t in own),
-            f"{np.median([t.steps for t in own if t.done] or [0]):.0f}",
-        )
-        for rule, own in pushes.items()
-    )
-    head = ("trends", "shut", "from the papers' start", "contact losses", "steps")
-    return ReportTable("Objects pushed shut", head, rows)
+def _median_steps(trials: Sequence[Trial]) -> float:
+    steps = [t.steps for t in trials if t.done]
+    return float(np.median(steps)) if steps else math.nan
+
+
+PUSH_COLUMNS = (
+    *ROW,
+    *OBJECT_COLUMNS[:3],
+    Column("steps", "steps (median)", _median_steps, 6),
+    *TIMES[1:],
+    *QUALITY,
+)
 
 
 def _microseconds(cpu: Sequence[float]) -> float:

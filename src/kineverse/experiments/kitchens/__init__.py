@@ -1,4 +1,4 @@
-"""``kitchens``: robots open and close everything in generated kitchens, in the kinematic world.
+"""``kitchens``: robots open and close everything in generated kitchens.
 
 Each kitchen is generated from a seed; see :mod:`kineverse.gallery.kitchens`. For each object, a robot begins
 in the aisle, and all is shut. It opens the object, and closes it again if that succeeded.
@@ -7,20 +7,14 @@ in the aisle, and all is shut. It opens the object, and closes it again if that 
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from itertools import product
 
 from kineverse.errors import NoSolutionError
-from kineverse.experiments.manipulation.robots import RobotSource, find_robots
-from kineverse.experiments.manipulation.skills import make_world, open_then_close
-from kineverse.experiments.manipulation.tables import (
-    make_failure_table,
-    make_quality_table,
-    make_success_figure,
-    make_success_table,
-    make_time_table,
-    make_trial_numbers,
-)
+from kineverse.experiments.manipulation.robots import RobotSource, find_data, find_robots
+from kineverse.experiments.manipulation.setting import SettingOptions, TrialSetting, make_settings
+from kineverse.experiments.manipulation.skills import TrialCase, open_then_close
+from kineverse.experiments.manipulation.tables import make_success_figure, make_tables, make_trial_numbers
 from kineverse.experiments.manipulation.trial_pool import run_jobs
 from kineverse.experiments.manipulation.trials import Trial
 from kineverse.experiments.registry import Options, Progress
@@ -29,10 +23,10 @@ from kineverse.geometry import Rule, Scene
 from kineverse.model.model import Model
 from kineverse.state import State
 
-OPTIONS = ("quick", "data", "seed", "count", "robot", "processes")
+OPTIONS = ("quick", "data", "seed", "count", "robot", "processes", *SettingOptions)
 
 COUNT, QUICK_COUNT = 50, 1
-WORLD = "kinematic"
+QUICK_OBJECTS = 2
 KITCHEN = "kitchen"
 _CLEARANCE = 0.02
 """Least distance of the robot from the kitchen at the start [m]."""
@@ -44,7 +38,7 @@ OPEN_SHARE = 0.98
 
 @dataclass(frozen=True)
 class KitchenJob:
-    """All objects of one kitchen, with one robot.
+    """All objects of one kitchen, with one robot in one world.
 
     Attributes
     ----------
@@ -52,43 +46,42 @@ class KitchenJob:
         Seed of the kitchen.
     robot
         The robot.
-    objects
-        Names of the coordinates; empty for all.
+    setting
+        World, noise and recordings.
+    most
+        Largest number of objects; None for all.
     """
 
     seed: int
     robot: RobotSource
-    objects: tuple[str, ...] = ()
+    setting: TrialSetting = field(default_factory=TrialSetting)
+    most: int | None = None
 
 
 def run(progress: Progress, options: Options) -> Report:
-    """Open and close everything; the option ``quick`` takes one kitchen, and one robot."""
+    """Open and close everything; the option ``quick`` takes two objects of one kitchen, and one robot."""
     count = options.count or (QUICK_COUNT if options.quick else COUNT)
-    robots = find_robots(options.robot, options.data)
+    robots = find_robots(options.robot, options.data and find_data(options.data))
     if options.quick and not options.robot:
-        robots = robots[:1]
+        robots = robots[-1:]
     seeds = range(options.seed, options.seed + count)
-    jobs = [KitchenJob(seed, robot) for seed in seeds for robot in robots]
+    jobs = [
+        KitchenJob(seed, robot, setting, QUICK_OBJECTS if options.quick else None)
+        for seed in seeds
+        for setting in make_settings(options)
+        for robot in robots
+    ]
     trials = run_jobs(run_kitchen, jobs, progress, "kitchens", "kitchen", options.processes)
     return report_trials(trials, seeds)
 
 
 def report_trials(trials: list[Trial], seeds: range) -> Report:
     """Return the report on the trials."""
-    title = (
-        f"{len(seeds)} generated kitchens, seeds {seeds[0]} to {seeds[-1]}, opened and closed ({WORLD} world)"
-    )
-    tables = (
-        make_success_table(trials, "Objects that were opened and closed"),
-        make_time_table(trials),
-        make_quality_table(trials),
-        make_failure_table(trials),
-    )
     return Report(
         name="kitchens",
-        title=title,
-        tables=tuple(table for table in tables if table.rows),
-        numbers={"seeds": [seeds[0], seeds[-1]], "world": WORLD, **make_trial_numbers(trials)},
+        title=f"{len(seeds)} generated kitchens, seeds {seeds[0]} to {seeds[-1]}, opened and closed",
+        tables=make_tables(trials, "Objects that were opened and closed"),
+        numbers={"seeds": [seeds[0], seeds[-1]], **make_trial_numbers(trials)},
         figure=make_success_figure(trials, "height", "height of the handle [m]"),
     )
 
@@ -96,16 +89,26 @@ def report_trials(trials: list[Trial], seeds: range) -> Report:
 def run_kitchen(job: KitchenJob) -> list[Trial]:
     """Return the trials of one kitchen and one robot."""
     model = make_kitchen_with(job.robot, job.seed)
-    start = start_in_aisle(job.robot, model)
-    heights = {q: find_handle_height(model, q) for q in list_objects(model, KITCHEN)}
-    world = make_world(WORLD, model, job.robot.prefix, start)
-    trials = []
-    for what in job.objects or heights:
-        lower, upper = model.limits(what)
-        targets = (lower + OPEN_SHARE * (upper - lower), lower)
-        trials += open_then_close(
-            str(job.seed), job.robot.name, world, what, start, targets, height=heights.get(what, math.nan)
+    cases = [
+        TrialCase(
+            str(job.seed),
+            job.robot,
+            what,
+            job.setting,
+            measures=(("height", find_handle_height(model, what)),),
         )
+        for what in list_objects(model, KITCHEN)[: job.most]
+    ]
+    try:
+        start = start_in_aisle(job.robot, model)
+    except NoSolutionError as error:
+        return [case.fail("open", model, "collision", str(error)) for case in cases]
+    world = job.setting.make_world(model, job.robot.prefix, start)
+    trials = []
+    for case in cases:
+        lower, upper = model.limits(case.what)
+        targets = (lower + OPEN_SHARE * (upper - lower), lower)
+        trials += open_then_close(case, model, world, start, targets)
     return trials
 
 

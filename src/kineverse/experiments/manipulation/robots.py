@@ -90,6 +90,10 @@ class RobotSource:
         values = {f"{self.prefix}/{joint}": value for joint, value in self.start.items()}
         return model.default_state().updated({k: v for k, v in values.items() if k in known})
 
+    def count_freedom(self, model: Model) -> int:
+        """Return the number of degrees of freedom of the robot in a model, its base included."""
+        return sum(str(s).startswith(f"{self.prefix}/") for s in model.degrees_of_freedom)
+
     def gripper(self, model: Model) -> Gripper:
         """Return the gripper at the robot's hand in a model."""
         return find_gripper(model, self.prefix, f"{self.prefix}/{self.hand}")
@@ -139,6 +143,10 @@ _AUTHORS = {
 }
 
 
+DEFAULT_DATA = Path("../shared/data")
+"""Folder of the authors' files, relative to the current one."""
+
+
 def remove_unusable_shapes(model: Model) -> tuple[str, ...]:
     """Remove shapes whose files are missing, and return their labels with the reasons."""
     unusable = find_unusable_shapes(model)
@@ -151,6 +159,25 @@ def remove_unusable_shapes(model: Model) -> tuple[str, ...]:
     return tuple(f"{name}: {why}" for name, why in label_unusable_shapes(model, unusable).items())
 
 
+def find_data(data: Path | None, quick: bool = False) -> Path | None:
+    """Return the folder of the authors' files; without a given one :data:`DEFAULT_DATA`, or None if missing.
+
+    A quick experiment takes what ships, unless a folder is given.
+
+    Raises
+    ------
+    InvalidValueError
+        If a given folder does not exist.
+    """
+    if data is None:
+        return DEFAULT_DATA if DEFAULT_DATA.is_dir() and not quick else None
+    if not data.is_dir():
+        raise InvalidValueError(
+            f"There is no folder {data} with robots. Leave --data out for the shipped ones."
+        )
+    return data
+
+
 def find_robots(names: Iterable[str] = (), data: Path | None = None) -> tuple[RobotSource, ...]:
     """Return robots by name.
 
@@ -159,21 +186,16 @@ def find_robots(names: Iterable[str] = (), data: Path | None = None) -> tuple[Ro
     names
         Names of robots; by default the three that ship, and those of the authors where their files are.
     data
-        Folder with the folders ``pr2``, ``fetch`` and ``hsrb`` of the authors' robots; None for none.
+        Folder with the folders ``pr2``, ``fetch`` and ``hsrb`` of the authors' robots, see :func:`find_data`;
+        None for none.
 
     Raises
     ------
     UnknownNameError
         For a name that is none of these, with similar names.
-    InvalidValueError
-        If the folder does not exist.
     """
     known = dict(SHIPPED)
     if data is not None:
-        if not data.is_dir():
-            raise InvalidValueError(
-                f"There is no folder {data} with robots. Leave --data out for the shipped ones."
-            )
         for name, (like, file, hand) in _AUTHORS.items():
             if (data / file).is_file():
                 ours = SHIPPED[like]

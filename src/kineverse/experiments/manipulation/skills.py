@@ -1,219 +1,221 @@
-"""Skills as the experiments call them: one module that knows the packages of worlds and skills."""
+"""Skills as the experiments call them: trials of openings and of pushes in a world."""
 
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Mapping
-from functools import partial
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from time import process_time
 from typing import Any
 
 from kineverse.errors import KineverseError
-from kineverse.manipulation.outcome import Outcome
+from kineverse.grasping import find_gripper, find_handle
+from kineverse.manipulation import Outcome, Session, open_object
+from kineverse.manipulation.push_controller import Pushing
 from kineverse.manipulation.push_trials import try_push
-from kineverse.manipulation.session import Session
 from kineverse.model.model import Model
-from kineverse.model.registry import import_entry
-from kineverse.state import StateLike
-from kineverse.worlds import World
+from kineverse.state import State
+from kineverse.worlds import Judge, World
 
 from .robots import RobotSource
-from .trials import Trial, find_failure
+from .setting import TrialSetting, TrialWatch, list_series
+from .trials import Failure, Trial, find_failure
 
 DT = 0.02
 """Control period [s]."""
 _PLANS = ("plan", "place", "placement")
 """Computations that are no control steps, by the first word of their names in a session."""
 
-# Entries are texts until all of them exist, as in the registry of models.
-_WORLDS: Mapping[str, str] = {
-    "kinematic": "kineverse.worlds.kinematic_world:KinematicWorld",
-    "mujoco": "kineverse.worlds.mujoco_world:MujocoWorld",
-}
-_OPEN = "kineverse.manipulation.opening:open_object"
 
-
-def make_world(kind: str, model: Model, robot: str, state: StateLike) -> World:
-    """Return a world at a state, in which nothing is held."""
-    world: World = import_entry(_WORLDS[kind])(model, robot)
-    world.reset(state)
-    return world
-
-
-def open_in_world(world: World, what: str, target: float, **options: Any) -> tuple[Outcome, Session]:
-    """Grasp an object and move it to a target, and return what came out and the session."""
-    session = Session(world, dt=DT)
-    return import_entry(_OPEN)(session, what, target=target, **options), session
-
-
-def run_push_trial(
-    case: str,
-    robot: RobotSource,
-    model: Model,
-    what: str,
-    start: StateLike,
-    skill: str,
-    *,
-    dt: float = DT,
-    steps: int = 1200,
-    seed: int = 0,
-    logic: str | None = "and",
-    kind: str = "kinematic",
-    record: bool = False,
-    **measures: Any,
-) -> Trial:
-    """Return the trial of a push in a world: from a start, or from one that base placement finds.
-
-    Parameters
-    ----------
-    case, what, start, measures
-        As for :func:`open_then_close`.
-    robot, model
-        The robot, and the model that contains it.
-    skill
-        Name of the push in tables.
-    dt, steps
-        Control period [s], and largest number of steps.
-    seed, logic
-        As for :func:`.try_push`.
-    kind
-        Name of the world.
-    record
-        Whether the trial has the commanded speeds as series.
-    """
-    world = CommandLog(make_world(kind, model, robot.prefix, start))
-    try:
-        found = try_push(world, world.state, what, dt=dt, steps=steps, seed=seed, logic=logic)
-    except KineverseError as error:
-        return _failed_trial(case, robot.name, what, skill, error, measures)
-    outcome = found.outcome
-    own = {
-        "placed": found.placed,
-        "first": found.first,
-        "limits": found.violation,
-        "penetration": 1e3 * found.penetration[0],
-        "penetrating": found.penetration[1],
-        "contact_losses": outcome.measures.get("losses", 0),
-    }
-    return Trial(
-        case,
-        robot.name,
-        what,
-        skill,
-        outcome.done,
-        float(outcome.value),
-        find_failure(outcome),
-        outcome.reason,
-        float(outcome.seconds),
-        int(outcome.steps),
-        found.cpu,
-        found.walls,
-        {**measures, **outcome.measures, **own},
-        world.commands if record else {},
-    )
-
-
-class CommandLog:
-    """World that keeps the commanded speeds since the last reset.
+@dataclass(frozen=True)
+class TrialCase:
+    """What is tried.
 
     Attributes
     ----------
-    commands
-        Speeds by name, one for each command [m/s], [rad/s]; and ``time``, its time in the world [s].
+    case
+        Kitchen, or name of the set-up.
+    robot
+        The robot.
+    what
+        Coordinate of the object.
+    setting
+        The setting.
+    seed
+        Seed of the skill's searches.
+    film
+        Whether the trial has commanded speeds as series, and a film.
+    measures
+        Further figures of the trial.
     """
 
-    def __init__(self, world: World) -> None:
-        self._world = world
-        self.commands: dict[str, list[float]] = {"time": []}
+    case: str
+    robot: RobotSource
+    what: str
+    setting: TrialSetting
+    seed: int = 0
+    film: bool = False
+    measures: tuple[tuple[str, Any], ...] = ()
 
-    def __getattr__(self, name: str) -> Any:
-        return getattr(self._world, name)
+    def run(self, skill: str, model: Model, act: Callable[[TrialWatch], Outcome]) -> Trial:
+        """Return the trial of a skill. Any error is a failure of the class ``other``, and is named."""
+        setting, begin = self.setting, process_time()
+        about = {
+            "case": self.case,
+            "robot": self.robot.name,
+            "what": self.what.rpartition("/")[2],
+            "skill": skill,
+            "world": setting.world,
+        }
+        with TrialWatch(setting, model, about, film=self.film) as watch:
+            try:
+                outcome = act(watch)
+            except Exception as error:  # one of many trials must not end the others
+                reason = f"{type(error).__name__}: {error}"
+                outcome = Outcome(False, math.nan, reason, setting.world, 0.0, 0, {"failure": "other"})
+            watch.write_outcome(outcome)
+        session = watch.session
+        cpu, wall = ({}, {}) if session is None else (session.cpu, session.wall)
+        names = [name for name in cpu if not name.startswith(_PLANS)]
+        return Trial(
+            self.case,
+            self.robot.name,
+            self.what,
+            skill,
+            outcome.done,
+            float(outcome.value),
+            find_failure(outcome),
+            outcome.reason,
+            float(outcome.seconds),
+            int(outcome.steps),
+            tuple(t for name in names for t in cpu[name]),
+            tuple(t for name in names for t in wall[name]),
+            {**dict(self.measures), **outcome.measures, "cpu_seconds": process_time() - begin},
+            setting.world,
+            setting.noise,
+            self.robot.count_freedom(model),
+            list_series(watch.commands) if self.film else {},
+            tuple(watch.moments),
+        )
 
-    def reset(self, state: StateLike) -> None:
-        """Start anew, and forget the commands."""
-        self.commands = {"time": []}
-        self._world.reset(state)
-
-    def apply(self, speeds: StateLike, duration: float, *, stamp: float | None = None) -> None:
-        """Advance the world, and keep the speeds."""
-        count = len(self.commands["time"])
-        self.commands["time"].append(self._world.time)
-        given = {str(symbol): float(value) for symbol, value in dict(speeds).items()}
-        for name in given:
-            self.commands.setdefault(name, [0.0] * count)
-        for name, values in self.commands.items():
-            if name != "time":
-                values.append(given.get(name, 0.0))
-        self._world.apply(speeds, duration, stamp=stamp)
+    def fail(self, skill: str, model: Model, failure: Failure, reason: str) -> Trial:
+        """Return the trial of a skill that was not begun."""
+        outcome = Outcome(False, math.nan, reason, self.setting.world, 0.0, 0, {"failure": failure})
+        return self.run(skill, model, lambda watch: outcome)
 
 
 def open_then_close(
-    case: str,
-    robot: str,
-    world: World,
-    what: str,
-    start: StateLike,
-    targets: tuple[float, float],
-    **measures: Any,
+    case: TrialCase, model: Model, world: World, start: State, targets: tuple[float, float]
 ) -> list[Trial]:
     """Return the trials of opening an object in a world and, if that was done, of closing it.
 
     Parameters
     ----------
     case
-        Name of the case.
-    robot, world, what
-        Name of the robot, its world, and the coordinate of the object.
+        What is tried.
+    model, world
+        The model, and its world.
     start
         State at the beginning.
     targets
         Value of the open and of the closed object [m], [rad].
-    measures
-        Further figures of the trials.
     """
     world.reset(start)
     trials: list[Trial] = []
     for skill, target in zip(("open", "close"), targets, strict=True):
-        act = partial(open_in_world, world, what, target)
-        trials.append(run_trial(case, robot, what, skill, act, **measures))
+
+        def act(watch: TrialWatch, target: float = target) -> Outcome:
+            session = watch.open_session(world, DT)
+            return open_object(session, case.what, target=target, seed=case.seed)
+
+        trials.append(case.run(skill, model, act))
         if not trials[-1].done:
             break
     return trials
 
 
-def run_trial(
-    case: str,
-    robot: str,
-    what: str,
+def run_push_trial(
+    case: TrialCase,
+    model: Model,
+    world: World,
+    start: State,
     skill: str,
-    act: Callable[[], tuple[Outcome, Session]],
-    **measures: Any,
+    *,
+    dt: float = DT,
+    steps: int = 1200,
+    logic: str | None = "and",
 ) -> Trial:
-    """Return the trial of a skill. An error of the library is a failure of the class ``other``."""
-    try:
-        outcome, session = act()
-    except KineverseError as error:
-        return _failed_trial(case, robot, what, skill, error, measures)
-    names = [name for name in session.cpu if not name.startswith(_PLANS)]
-    return Trial(
-        case,
-        robot,
-        what,
-        skill,
-        outcome.done,
-        float(outcome.value),
-        find_failure(outcome),
-        outcome.reason,
-        float(outcome.seconds),
-        int(outcome.steps),
-        tuple(t for name in names for t in session.cpu[name]),
-        tuple(t for name in names for t in session.wall[name]),
-        {**measures, **outcome.measures},
-    )
+    """Return the trial of a push in a world: from a start, or from one that base placement finds.
+
+    Parameters
+    ----------
+    case
+        What is tried.
+    model, world, start
+        As for :func:`open_then_close`.
+    skill
+        Name of the push in tables.
+    dt, steps
+        Control period [s], and largest number of steps.
+    logic
+        As for :func:`.try_push`.
+    """
+
+    def act(watch: TrialWatch) -> Outcome:
+        judge = PushJudge(model, world, case.what, watch)
+        found = try_push(
+            world,
+            start,
+            case.what,
+            dt=dt,
+            steps=steps,
+            seed=case.seed,
+            logic=logic,
+            open_session=lambda world, look: watch.open_session(world, dt, look, judge),
+            on_step=judge.watch_controller,
+        )
+        own = {"placed": found.placed, "first": found.first, "pressed": found.pressed}
+        return replace(found.outcome, measures={**found.outcome.measures, **judge.measures, **own})
+
+    return case.run(skill, model, act)
 
 
-def _failed_trial(
-    case: str, robot: str, what: str, skill: str, error: KineverseError, measures: Mapping[str, Any]
-) -> Trial:
-    """Return the trial of a skill that ended with an error."""
-    reason = f"{type(error).__name__}: {error}"
-    return Trial(case, robot, what, skill, False, math.nan, "other", reason, 0.0, 0, measures=measures)
+class PushJudge:
+    """Judge of a push, which is called after each step of its session.
+
+    Parameters
+    ----------
+    model, world
+        The model, and its world.
+    what
+        The coordinate of the object.
+    watch
+        The watch of the trial.
+    """
+
+    def __init__(self, model: Model, world: World, what: str, watch: TrialWatch) -> None:
+        try:
+            handle = find_handle(model, what).frame
+        except KineverseError:
+            handle = None
+        self._judge = Judge(model, world.robot, find_gripper(model, world.robot), handle)
+        self._watch, self._pushing, self._force = watch, False, 0.0
+        self._session: Session | None = None
+
+    def watch_controller(self, pushing: Pushing) -> None:
+        """Note whether the controller pushes, and what it sees."""
+        self._pushing, self._watch.view = pushing.touching, pushing.view
+
+    def __call__(self, session: Session) -> None:
+        """Judge a step."""
+        if session is not self._session:
+            self._session, self._pushing, self._force = session, False, 0.0
+            self._judge.reset()
+        world = session.world
+        self._judge.update(world.state, session.commands, held=world.held, pushing=self._pushing)
+        self._force = max(self._force, getattr(world, "peak_force", math.nan))
+
+    @property
+    def measures(self) -> dict[str, Any]:
+        """Measures of the judge; ``peak_force`` [N] in a world that has it."""
+        return {**self._judge.measures, "peak_force": self._force or math.nan}

@@ -2,90 +2,107 @@
 
 from __future__ import annotations
 
-import math
-from collections import Counter
 from collections.abc import Iterable, Sequence
 from typing import TYPE_CHECKING, Any
 
 from kineverse.experiments.report import Figure, ReportTable
 
-from .trials import FAILURES, RobotSummary, Trial, as_json, summarize_robots
+from .columns import COLUMNS, QUALITY, ROW, SUCCESS, TIMES, Column
+from .trials import Trial, as_json, group_trials
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure as Canvas
 
-Rows = tuple[tuple[float | str, ...], ...]
-
 _LONGEST_REASON = 90
-_MEASURES = (
-    ("limits", "limits violated"),
-    ("penetration", "penetration [mm]"),
-    ("grasp_error", "grasp error [mm]"),
-    ("contact_losses", "contact losses"),
+_TIMED = (
+    "Control steps [ms]: everything from the state to the command, distance queries included, "
+    "without the world, planning and base placement"
 )
 
 
-def make_success_table(trials: Sequence[Trial], title: str = "Success") -> ReportTable:
-    """Return the table of success by robot."""
-    rows: list[tuple[float | str, ...]] = []
-    for one in summarize_robots(trials):
-        failed = Counter(t.failure for t in trials if t.robot == one.robot and not t.done)
-        rows.append(
-            (
-                one.robot,
-                one.objects,
-                one.done,
-                one.excused,
-                f"{100 * one.rate:.1f} %",
-                *(failed[name] for name in FAILURES if name),
-            )
-        )
-    head = ("robot", "objects", "done", "out of reach", "of those in reach", *(f for f in FAILURES if f))
-    return ReportTable(title, head, tuple(rows))
+def make_tables(
+    trials: Sequence[Trial], title: str, more: Iterable[ReportTable] = ()
+) -> tuple[ReportTable, ...]:
+    """Return the tables of trials: success, times, quality, excepted pairs and failures.
+
+    Parameters
+    ----------
+    trials
+        The trials.
+    title
+        Title of the table of success.
+    more
+        Further tables, which follow that of success.
+    """
+    tables = (
+        make_group_table(title, trials, (*ROW, *SUCCESS)),
+        *more,
+        make_group_table(_TIMED, trials, (*ROW[:3], *TIMES)),
+        make_group_table("Worst of all trials", trials, (*ROW[:3], *QUALITY)),
+        make_exception_table(trials),
+        make_failure_table(trials),
+    )
+    return tuple(table for table in tables if table.rows)
 
 
-def make_time_table(trials: Sequence[Trial], title: str = "Times of a control step, CPU [ms]") -> ReportTable:
-    """Return the table of the times of control steps by robot."""
-    rows: Rows = tuple((one.robot, one.steps.count, *_milliseconds(one)) for one in summarize_robots(trials))
-    return ReportTable(title, ("robot", "steps", "mean", "sd", "p99", "worst", "wall mean"), rows)
+def make_group_table(
+    title: str, trials: Sequence[Trial], columns: Sequence[Column], by: Sequence[str] = ()
+) -> ReportTable:
+    """Return a table with a row for each robot, world and noise, and value of further attributes.
+
+    Columns that are empty in all rows, and that of the noise if there is none, are left out.
+    """
+    groups = group_trials(trials, *by, *(column.key for column in ROW))
+    columns = [c for c in columns if c.key != "noise" or any(t.noise for t in trials)]
+    rows = [
+        (*map(str, key[: len(by)]), *(column.cell(own) for column in columns)) for key, own in groups.items()
+    ]
+    head = (*by, *(column.title for column in columns))
+    kept = [k for k in range(len(head)) if any(row[k] for row in rows)]
+    return ReportTable(
+        title, tuple(head[k] for k in kept), tuple(tuple(row[k] for k in kept) for row in rows)
+    )
 
 
-def make_quality_table(trials: Sequence[Trial]) -> ReportTable:
-    """Return the table of the worst measures by robot, of those that the trials have."""
-    shown = [(key, title) for key, title in _MEASURES if any(key in t.measures for t in trials)]
-    rows: list[tuple[float | str, ...]] = []
-    for robot in dict.fromkeys(t.robot for t in trials):
-        own = [t.measures for t in trials if t.robot == robot]
-        worst = (max((float(m[key]) for m in own if key in m), default=math.nan) for key, _ in shown)
-        rows.append((robot, *(f"{number:.3g}" for number in worst)))
-    return ReportTable("Worst of all trials", ("robot", *(title for _, title in shown)), tuple(rows))
+def make_exception_table(trials: Iterable[Trial]) -> ReportTable:
+    """Return the table of the pairs of bodies whose penetration does not count.
+
+    Bodies of one robot or of one piece of furniture are listed with those that they always overlap; those of
+    a gripper with the object that it grasps or pushes.
+    """
+    rows = []
+    for (robot,), own in group_trials(trials, "robot").items():
+        pairs: dict[str, dict[str, None]] = {}
+        for pair in (pair for t in own for pair in t.measures.get("excepted", ())):
+            (head, a), (other, b) = (name.partition("/")[::2] for name in pair)
+            if head == other:
+                pairs.setdefault(f"{head}: {a}", {})[b] = None
+            else:
+                pairs.setdefault("handle that is grasped or pushed", {})[f"{head}: {a}"] = None
+        rows += [(robot, body, ", ".join(others)) for body, others in pairs.items()]
+    return ReportTable("Pairs whose penetration does not count", ("robot", "body", "with"), tuple(rows))
 
 
 def make_failure_table(trials: Iterable[Trial]) -> ReportTable:
     """Return the table of all failures."""
     rows = tuple(
-        (t.case, t.robot, t.what, t.skill, t.failure, shorten_reason(t.reason)) for t in trials if not t.done
+        (t.case, t.robot, t.world, t.what, t.skill, t.failure, shorten_reason(t.reason))
+        for t in trials
+        if not t.done
     )
-    return ReportTable("Failures", ("case", "robot", "object", "skill", "class", "reason"), rows)
+    head = ("case", "robot", "world", "object", "skill", "class", "reason")
+    return ReportTable("Failures", head, rows)
 
 
 def make_trial_numbers(trials: Sequence[Trial]) -> dict[str, Any]:
-    """Return success, failures and all trials as JSON data."""
+    """Return the columns of all robots and worlds, failures, and all trials as JSON data."""
+    groups = group_trials(trials, *(column.key for column in ROW))
+    data = [t.as_data() for t in trials]
     return {
-        "robots": {
-            one.robot: {
-                "objects": one.objects,
-                "done": one.done,
-                "out_of_reach": one.excused,
-                "rate": as_json(one.rate),
-                "step_ms": as_json(
-                    dict(zip(("mean", "sd", "p99", "worst", "wall"), _milliseconds(one), strict=True))
-                ),
-            }
-            for one in summarize_robots(trials)
-        },
-        "failures": [t.as_data() for t in trials if not t.done],
-        "trials": [t.as_data() for t in trials],
+        "cpu_seconds": sum(float(t.measures.get("cpu_seconds", 0.0)) for t in trials),
+        "robots": [{c.key: as_json(c.of(own)) for c in COLUMNS} for own in groups.values()],
+        "failures": [one for one in data if not one["done"]],
+        "trials": data,
     }
 
 
@@ -115,8 +132,3 @@ def shorten_reason(reason: str) -> str:
     """Return a reason on one line of limited length."""
     line = " ".join(reason.split())
     return line if len(line) <= _LONGEST_REASON else f"{line[: _LONGEST_REASON - 1]}…"
-
-
-def _milliseconds(one: RobotSummary) -> tuple[float, ...]:
-    steps = one.steps
-    return tuple(round(v, 4) for v in (steps.mean, steps.deviation, steps.p99, steps.worst, steps.wall))

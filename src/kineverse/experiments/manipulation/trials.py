@@ -5,8 +5,8 @@ from __future__ import annotations
 import math
 import re
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import asdict, dataclass, field
-from typing import Any, Literal, TypeAlias, get_args
+from dataclasses import asdict, dataclass, field, fields
+from typing import Any, Literal, NamedTuple, TypeAlias, get_args
 
 import numpy as np
 
@@ -14,6 +14,8 @@ from kineverse.manipulation.outcome import Outcome
 
 Failure: TypeAlias = Literal["", "collision", "reach", "time", "other"]
 FAILURES: tuple[Failure, ...] = get_args(Failure)
+
+_NO_DATA = ("cpu", "wall", "series", "film")
 
 PLACEMENTS = 200
 """Number of placements that prove that an object is out of reach."""
@@ -35,6 +37,7 @@ class StepTimeStatistics:
     count: int = 0
     mean: float = math.nan
     deviation: float = math.nan
+    median: float = math.nan
     p99: float = math.nan
     worst: float = math.nan
     wall: float = math.nan
@@ -49,10 +52,33 @@ class StepTimeStatistics:
             len(ms),
             float(ms.mean()),
             float(ms.std()),
+            float(np.median(ms)),
             float(np.quantile(ms, 0.99)),
             float(ms.max()),
             1e3 * float(np.mean(wall)) if len(wall) else math.nan,
         )
+
+
+@dataclass(frozen=True, slots=True)
+class Moment:
+    """One time of a trial.
+
+    Attributes
+    ----------
+    time
+        Time in the world [s].
+    phase
+        Phase of the skill.
+    values
+        True values of all coordinates by name.
+    vectors
+        Vectors of the controller by name, each with its origin in the world (3,).
+    """
+
+    time: float
+    phase: str
+    values: Mapping[str, float]
+    vectors: Mapping[str, tuple[Any, Any]]
 
 
 @dataclass(frozen=True, slots=True)
@@ -78,9 +104,13 @@ class Trial:
     wall
         Wall times of the steps [s].
     measures
-        Further figures by name.
-    series
-        Series of numbers by name, for figures: they are no part of the JSON data.
+        Further figures by name, in SI units; those of :class:`kineverse.worlds.Judge` among them.
+    world, noise
+        Name of the world; noise of the sensors, empty if the skill acted on the truth.
+    dof
+        Number of degrees of freedom of the robot, its base included.
+    series, film
+        Series of numbers by name, and moments, for figures: they are no part of the JSON data.
     """
 
     case: str
@@ -96,7 +126,11 @@ class Trial:
     cpu: tuple[float, ...] = ()
     wall: tuple[float, ...] = ()
     measures: Mapping[str, Any] = field(default_factory=dict)
+    world: str = "kinematic"
+    noise: str = ""
+    dof: int = 0
     series: Mapping[str, Sequence[float]] = field(default_factory=dict)
+    film: Sequence[Moment] = ()
 
     @property
     def out_of_reach(self) -> bool:
@@ -105,10 +139,9 @@ class Trial:
 
     def as_data(self) -> dict[str, Any]:
         """Return the trial as JSON data."""
-        data = asdict(self)
-        data.update(cpu=as_json(asdict(StepTimeStatistics.from_seconds(self.cpu, self.wall))))
-        del data["wall"], data["series"]
-        return {key: as_json(value) for key, value in data.items()}
+        data = {f.name: getattr(self, f.name) for f in fields(self) if f.name not in _NO_DATA}
+        step_ms = asdict(StepTimeStatistics.from_seconds(self.cpu, self.wall))
+        return {key: as_json(value) for key, value in {**data, "step_ms": step_ms}.items()}
 
 
 def find_failure(outcome: Outcome) -> Failure:
@@ -122,28 +155,21 @@ def find_failure(outcome: Outcome) -> Failure:
     return min(found, key=found.__getitem__) if found else "other"
 
 
-@dataclass(frozen=True, slots=True)
-class RobotSummary:
-    """Success of a robot: an object counts as done if all trials of it are.
+class ObjectCount(NamedTuple):
+    """Success at objects: one counts as done if all trials of it are.
 
     Attributes
     ----------
-    robot
-        Name.
     objects, done
         Number of objects, and of those that were done.
     excused
         Number of objects that :data:`PLACEMENTS` placements prove to be out of reach, at most the share
         :data:`MOST_EXCUSED` of all; others beyond that are failures.
-    steps
-        Times of all steps.
     """
 
-    robot: str
     objects: int
     done: int
     excused: int
-    steps: StepTimeStatistics
 
     @property
     def rate(self) -> float:
@@ -152,24 +178,20 @@ class RobotSummary:
         return self.done / counted if counted else math.nan
 
 
-def summarize_robots(trials: Iterable[Trial]) -> tuple[RobotSummary, ...]:
-    """Return the success of each robot, in the order of the trials."""
-    by_robot: dict[str, list[Trial]] = {}
+def count_objects(trials: Iterable[Trial]) -> ObjectCount:
+    """Return the success of one robot in one world."""
+    by_object = group_trials(trials, "case", "what")
+    done = sum(all(t.done for t in group) for group in by_object.values())
+    far = sum(any(t.out_of_reach for t in group) for group in by_object.values())
+    return ObjectCount(len(by_object), done, min(far, math.floor(MOST_EXCUSED * len(by_object) + 1e-9)))
+
+
+def group_trials(trials: Iterable[Trial], *names: str) -> dict[tuple[Any, ...], list[Trial]]:
+    """Return the trials by the values of some of their attributes, in their order."""
+    found: dict[tuple[Any, ...], list[Trial]] = {}
     for trial in trials:
-        by_robot.setdefault(trial.robot, []).append(trial)
-    found = []
-    for robot, own in by_robot.items():
-        by_object: dict[tuple[str, str], list[Trial]] = {}
-        for trial in own:
-            by_object.setdefault((trial.case, trial.what), []).append(trial)
-        done = sum(all(t.done for t in group) for group in by_object.values())
-        far = sum(any(t.out_of_reach for t in group) for group in by_object.values())
-        excused = min(far, math.floor(MOST_EXCUSED * len(by_object) + 1e-9))
-        steps = StepTimeStatistics.from_seconds(
-            [t for trial in own for t in trial.cpu], [t for trial in own for t in trial.wall]
-        )
-        found.append(RobotSummary(robot, len(by_object), done, excused, steps))
-    return tuple(found)
+        found.setdefault(tuple(getattr(trial, name) for name in names), []).append(trial)
+    return found
 
 
 def as_json(value: Any) -> Any:

@@ -2,7 +2,7 @@
 
 The programs alone come first: the papers' leader and follower, and one program over robot and object. Both
 start from inverse kinematics onto the grasp, and the object goes where the program says. Then the skill opens
-and closes each object in the kinematic world, approach and release included.
+and closes each object in a world, approach and release included.
 """
 
 from __future__ import annotations
@@ -10,8 +10,9 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 from kineverse.errors import NoSolutionError
-from kineverse.experiments.manipulation.robots import RobotSource, find_robots
-from kineverse.experiments.manipulation.skills import make_world, open_then_close
+from kineverse.experiments.manipulation.robots import RobotSource, find_data, find_robots
+from kineverse.experiments.manipulation.setting import SettingOptions, TrialSetting, make_settings
+from kineverse.experiments.manipulation.skills import TrialCase, open_then_close
 from kineverse.experiments.manipulation.trial_pool import run_jobs
 from kineverse.experiments.manipulation.trials import Failure, Trial
 from kineverse.experiments.registry import Options, Progress
@@ -21,11 +22,10 @@ from .objects import OBJECTS, OpeningSetup, make_opening_setup
 from .programs import DONE, DT, LOST, LeaderFollower, OneProgram, ProgramRun, open_by_program
 from .report import make_opening_report
 
-OPTIONS = ("quick", "data", "seed", "count", "robot", "processes")
+OPTIONS = ("quick", "data", "seed", "count", "robot", "processes", *SettingOptions)
 
 STARTS, QUICK_STARTS = 10, 1
 """Number of starts of each robot at each object."""
-WORLD = "kinematic"
 _COMPILED = 30.0
 """Longest wait for compiled code [s]; times are those of compiled programs."""
 
@@ -38,13 +38,15 @@ class OpeningJob:
     thing: str
     starts: int
     seed: int
+    settings: tuple[TrialSetting, ...]
 
 
 def run(progress: Progress, options: Options) -> Report:
     """Open the objects; the option ``quick`` takes one start of each, ``count`` so many."""
     starts = options.count or (QUICK_STARTS if options.quick else STARTS)
-    robots = find_robots(options.robot, options.data)
-    jobs = [OpeningJob(robot, thing, starts, options.seed) for robot in robots for thing in OBJECTS]
+    settings = make_settings(options)
+    robots = find_robots(options.robot, find_data(options.data, options.quick))
+    jobs = [OpeningJob(robot, thing, starts, options.seed, settings) for robot in robots for thing in OBJECTS]
     trials = run_jobs(run_openings, jobs, progress, "table1-open", "object", options.processes)
     return make_opening_report(trials, starts, options.seed)
 
@@ -54,9 +56,12 @@ def run_openings(job: OpeningJob) -> list[Trial]:
     setup = make_opening_setup(job.robot, OBJECTS[job.thing])
     start = setup.robot.start_state(setup.model)
     lower, upper = setup.model.limits(setup.what)
-    world = make_world(WORLD, setup.model, job.robot.prefix, start)
-    acted = open_then_close(job.thing, job.robot.name, world, str(setup.what), start, (DONE * upper, lower))
-    return [*open_by_programs(setup, job), *acted]
+    trials = open_by_programs(setup, job)
+    for setting in job.settings:
+        case = TrialCase(job.thing, job.robot, str(setup.what), setting, job.seed, film=True)
+        world = setting.make_world(setup.model, job.robot.prefix, start)
+        trials += open_then_close(case, setup.model, world, start, (DONE * upper, lower))
+    return trials
 
 
 def open_by_programs(setup: OpeningSetup, job: OpeningJob) -> list[Trial]:
@@ -95,9 +100,11 @@ def _trial(setup: OpeningSetup, program: str, found: ProgramRun, failure: Failur
         tuple(found.cpu),
         measures={
             "programs": found.programs,
-            "grasp_error": 1e3 * found.position_error,
-            "rotation_error": found.rotation_error,
-            "limits": found.violation,
+            "grasp_error": found.position_error,
+            "grasp_rotation": found.rotation_error,
+            "limit_violation": found.violation,
         },
+        world="none",
+        dof=setup.robot.count_freedom(setup.model),
         series={"solve": tuple(found.solve)},
     )

@@ -1,4 +1,4 @@
-"""Report of the pushing experiment: tables, numbers and figure."""
+"""Report of the pushing experiment: tables, numbers and figures."""
 
 from __future__ import annotations
 
@@ -8,14 +8,13 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from kineverse.experiments.manipulation.tables import (
-    make_failure_table,
-    make_quality_table,
-    make_success_table,
-    make_trial_numbers,
-)
-from kineverse.experiments.manipulation.trials import StepTimeStatistics, Trial, as_json
-from kineverse.experiments.report import Figure, Report, ReportTable
+from kineverse.experiments.manipulation.columns import ROW, TIMES, Column, step_times
+from kineverse.experiments.manipulation.tables import make_group_table, make_tables, make_trial_numbers
+from kineverse.experiments.manipulation.trials import StepTimeStatistics, Trial, as_json, group_trials
+from kineverse.experiments.report import Figure, Report
+from kineverse.worlds.judge import CONTACT_GAP
+
+from .figures import FILMED, make_pictures
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure as Canvas
@@ -26,53 +25,41 @@ PUBLISHED = {
 }
 """Mean time of a control step and its deviation over the objects, Table I of each paper [ms]."""
 
-PENETRATION, LIMITS, LOSSES = 0.5, 1e-6, 1
-"""Bars: deepest penetration [mm], largest violation of limits, and contact losses of one run."""
+PENETRATION, LIMITS, LOSSES = 5e-4, 1e-6, 1
+"""Bars: deepest penetration [m], largest violation of limits, and contact losses of one run."""
 
 
 def make_push_report(trials: Sequence[Trial], seed: int) -> Report:
     """Return the report on pushes."""
-    times = [_time_row(*group) for group in _groups(trials)]
+    by = ("case", "skill")
+    groups = group_trials(trials, *by, *(c.key for c in ROW)).values()
+    columns = (*ROW[:3], *OBJECT_COLUMNS, *PAPER_COLUMNS)
+    own = [dict(zip(by, (own[0].case, own[0].skill), strict=True)) for own in groups]
     numbers = {
         "seed": seed,
-        "times": [dict(zip(_KEYS, map(as_json, row), strict=True)) for row in times],
+        "pushes": [
+            one | {c.key: as_json(c.of(group)) for c in columns}
+            for one, group in zip(own, groups, strict=True)
+        ],
         **make_trial_numbers(trials),
     }
-    tables = (
-        make_success_table(trials, "Objects pushed shut"),
-        _bar_table(trials),
-        ReportTable(
-            "Times of a control step, distance queries included [ms]",
-            ("kitchen", "robot", "push", "CPU mean", "sd over objects", "p99", "worst", "in the paper"),
-            tuple((*row[:3], *(f"{v:.3g}" for v in row[3:7]), _pair(row[7], row[8])) for row in times),
-        ),
-        make_quality_table(trials),
-        make_failure_table(trials),
+    more = (
+        make_group_table("Starts and bars", trials, (*ROW[:3], *OBJECT_COLUMNS), by),
+        make_group_table("Control steps beside the papers [ms]", trials, (*ROW[:3], *PAPER_COLUMNS), by),
     )
-    title = "Objects pushed shut with and without base placement (2020 and 2022 papers, Table I)"
     return Report(
         "table1-push",
-        title,
-        tuple(table for table in tables if table.rows),
+        "Objects pushed shut with and without base placement (2020 and 2022 papers, Table I)",
+        make_tables(trials, "Objects pushed shut", more),
         numbers,
         Figure(lambda canvas: _draw_commands(canvas, trials), FIGURE_SIZE),
+        make_pictures(trials),
     )
 
 
-SHOWN = "fridge door"
-"""Object of the figure: joint velocity commands, as in the 2020 paper, Fig. 7."""
-FIGURE_SIZE = (12.0, 3.8)
-_KEYS = (
-    "kitchen",
-    "robot",
-    "push",
-    "mean_ms",
-    "sd_over_objects_ms",
-    "p99_ms",
-    "worst_ms",
-    "published_mean_ms",
-    "published_sd_ms",
-)
+FIGURE_SIZE = (13.0, 4.2)
+_NAMED = 6
+"""Number of the fastest joints that have their names in the figure."""
 
 
 def meets_bars(trial: Trial) -> bool:
@@ -82,51 +69,61 @@ def meets_bars(trial: Trial) -> bool:
         trial.done
         and m.get("contact_losses", 0) <= LOSSES
         and m.get("penetration", 0.0) <= PENETRATION
-        and m.get("limits", 0.0) <= LIMITS
+        and m.get("limit_violation", 0.0) <= LIMITS
     )
 
 
-def _bar_table(trials: Sequence[Trial]) -> ReportTable:
-    rows: list[tuple[float | str, ...]] = []
-    for kitchen, robot, push, own in _groups(trials):
-        shut = [t for t in own if t.done]
-        at_once = sum(t.measures.get("placed", 0) == 0 for t in shut)
-        rows.append((kitchen, robot, push, len(own), len(shut), at_once, sum(map(meets_bars, own))))
-    head = ("kitchen", "robot", "push", "objects", "shut", "from the papers' start", "within all bars")
-    return ReportTable("Starts and bars", head, tuple(rows))
+OBJECT_COLUMNS = (
+    Column("objects", "objects", len, 6),
+    Column("done", "shut", lambda trials: sum(t.done for t in trials), 6),
+    Column(
+        "at_once",
+        "from the papers' start",
+        lambda trials: sum(t.done and t.measures.get("placed", 0) == 0 for t in trials),
+        6,
+    ),
+    Column("within_bars", "within all bars", lambda trials: sum(map(meets_bars, trials)), 6),
+)
 
 
-def _time_row(kitchen: str, robot: str, push: str, own: Sequence[Trial]) -> tuple[float | str, ...]:
-    whole = StepTimeStatistics.from_seconds([t for trial in own for t in trial.cpu])
-    # As in the papers, the deviation is that of the objects' means.
-    means = [StepTimeStatistics.from_seconds(t.cpu).mean for t in own if t.cpu]
-    spread = StepTimeStatistics.from_seconds([1e-3 * m for m in means]).deviation
-    paper = next((values for name, values in PUBLISHED.items() if name in push), {})
-    published = paper.get(robot.partition(" ")[0], (math.nan, math.nan))
-    return kitchen, robot, push, whole.mean, spread, whole.p99, whole.worst, *published
+def _spread(trials: Sequence[Trial]) -> float:
+    """Return the deviation of the objects' means [ms], as in the papers."""
+    means = [1e-3 * StepTimeStatistics.from_seconds(t.cpu).mean for t in trials if t.cpu]
+    return StepTimeStatistics.from_seconds(means).deviation
 
 
-def _groups(trials: Sequence[Trial]) -> list[tuple[str, str, str, list[Trial]]]:
-    """Return the trials of each kitchen, robot and kind of push."""
-    found: dict[tuple[str, str, str], list[Trial]] = {}
-    for trial in trials:
-        found.setdefault((trial.case, trial.robot, trial.skill), []).append(trial)
-    return [(*key, own) for key, own in found.items()]
+def _published(trials: Sequence[Trial], entry: int) -> float:
+    paper = next((values for name, values in PUBLISHED.items() if name in trials[0].skill), {})
+    return paper.get(trials[0].robot.partition(" ")[0], (math.nan, math.nan))[entry]
 
 
-def _pair(mean: float | str, deviation: float | str) -> str:
-    return "" if isinstance(mean, str) or math.isnan(mean) else f"{mean:g} / {deviation:g}"
+PAPER_COLUMNS = (
+    TIMES[1],
+    Column("sd_over_objects_ms", "sd over objects", _spread),
+    Column("published_mean_ms", "paper mean", lambda trials: _published(trials, 0)),
+    Column("published_sd_ms", "sd over objects", lambda trials: _published(trials, 1)),
+    Column("cpu_worst_ms", "worst", lambda trials: step_times(trials).worst),
+)
 
 
 def _draw_commands(canvas: Canvas, trials: Sequence[Trial]) -> None:
-    """Draw the commanded speeds of each robot at one object of the first kitchen and period."""
-    shown = {t.robot: t for t in reversed(trials) if t.series.get("time")}
-    own = list(reversed(shown.values()))
-    panels = np.atleast_1d(canvas.subplots(1, max(1, len(own)), sharey=True))
+    """Draw the commanded speeds of each robot at the first filmed object (2020 paper, Fig. 7)."""
+    shown = [t for t in trials if t.series.get("time") and t.measures["thing"] == FILMED[0]]
+    own = list({t.robot: t for t in reversed(shown)}.values())[::-1]
+    panels = np.atleast_1d(canvas.subplots(1, max(1, len(own))))
     for axes, trial in zip(panels, own, strict=False):
-        for name, values in trial.series.items():
-            if name != "time" and np.abs(values).max() > 1e-3:
-                axes.plot(trial.series["time"], values, linewidth=0.9)
-        axes.set_title(f"{trial.robot}, {trial.measures.get('thing', trial.what)}")
+        time = np.asarray(trial.series["time"])
+        speeds = {name: np.asarray(v) for name, v in trial.series.items() if name != "time"}
+        fastest = sorted(speeds, key=lambda name: -float(np.abs(speeds[name]).max(initial=0.0)))
+        for name in reversed(fastest):
+            label = name.partition("/")[2].removesuffix(":velocity")
+            style = {"label": label} if name in fastest[:_NAMED] else {"color": "0.75"}
+            axes.plot(time, speeds[name], linewidth=0.9, **style)
+        gaps = ((m.time, np.linalg.norm(m.vectors["r - p"][1])) for m in trial.film if m.vectors)
+        touches = (at for at, gap in gaps if gap < CONTACT_GAP)
+        if (touch := next(touches, None)) is not None:
+            axes.axvline(touch, color="0.5", linewidth=0.8, linestyle=":")
+        axes.legend(fontsize="x-small", frameon=False)
+        axes.set_title(f"{trial.robot}, {trial.measures['thing']} (dotted: first contact)", fontsize="medium")
         axes.set_xlabel("time [s]")
     panels[0].set_ylabel("commanded speeds [rad/s], [m/s]")

@@ -1,0 +1,218 @@
+"""Press of a pusher on an object: touch, lag of the servos, speed, and the object's value at the contact.
+
+A robot that is late presses: its servos are springs between where it should be and where it is. The lag
+
+    ℓ = ∫ u·(J q̇ - ẋ) dt
+
+of the tip x in the direction u of the push is known from the encoders. The commanded speed exceeds the
+measured one by a ramp, which shrinks with the lag, so that a press grows slowly and ends.
+
+While a sensor reports a touch, the object is where the pusher is: the gap is 0, whatever the estimate says.
+The value of the coordinate is corrected so that it is, and moves with the pusher. An estimate in which the
+pusher penetrates the object is corrected likewise.
+"""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+
+from kineverse.lie import Array
+
+from .push_program import PRESS
+
+RAMP = 0.02
+"""Speed of the contact point beyond the measured one that is tried [m/s]."""
+SPEED = 0.25
+"""Largest speed of the contact point [m/s]."""
+_MOST_LAG = 8e-4
+"""Lag at which the press grows no more [m]."""
+_CREEP = 0.02
+"""Speed at which a pusher feels for an object that may be nearer or farther than estimated [m/s]."""
+_FORGET, _FORGET_WAY = 1.0, 0.01
+"""Time [s] and way [m] after which a lag is forgotten: that of acceleration and delays is none of the press,
+and what moves on gives way."""
+_REMEMBER = 0.1
+"""Time for which a touch counts after the last report [s]."""
+_RETURN = 0.3
+"""Time in which a correction returns to the estimate without a touch [s]."""
+_CERTAIN = 1e-4
+_LEAST_RATE = 0.02
+"""Least rate of a gap over the coordinate for a correction [m/rad]."""
+
+
+class PushPress:
+    """Estimates of a press, from one step to the next.
+
+    Parameters
+    ----------
+    dt
+        Time of a step [s].
+    sign
+        Direction of the coordinate towards its target.
+
+    Attributes
+    ----------
+    deviation
+        Standard deviation of gaps [m]; 0 if the state is exact.
+    speed
+        Speed of the contact point in the direction of the push [m/s].
+    lag
+        Lag of the tip in the direction of the push [m].
+    correction
+        Value of the coordinate less its estimate [m], [rad].
+    """
+
+    def __init__(self, dt: float, sign: float) -> None:
+        self._dt, self._sign = dt, sign
+        self.deviation = 0.0
+        self.reset()
+
+    def reset(self) -> None:
+        """Forget everything but the deviation."""
+        self.speed = self.lag = self.correction = 0.0
+        self._touch, self._estimate, self._value = math.inf, math.nan, math.nan
+        self._tip: Array | None = None
+        self._planned: Array = np.zeros(3)
+        self._velocity: Array = np.zeros(3)
+
+    @property
+    def slack(self) -> float:
+        """Error of gaps that is allowed for [m]: three deviations."""
+        return 3.0 * self.deviation
+
+    @property
+    def touched(self) -> bool:
+        """True if a sensor has just reported a touch."""
+        return self._touch <= _REMEMBER
+
+    @property
+    def presses(self) -> bool:
+        """True if the pusher is late by half of the largest lag."""
+        return self.reserve < 0.5
+
+    @property
+    def weight(self) -> float:
+        """Weight of the latest estimate in a filter that makes noise of speeds as small as the ramp."""
+        return self._dt / (self._dt + self.deviation / RAMP)
+
+    def report(self, touched: bool) -> None:
+        """Take the report of touch sensors for a step."""
+        self._touch = 0.0 if touched else self._touch + self._dt
+
+    def advance(self, estimate: float, tip: Array, touching: bool) -> float:
+        """Return the value of the coordinate at a step.
+
+        Parameters
+        ----------
+        estimate
+            Estimate of the value [m], [rad].
+        tip
+            Foremost point of the pusher (3,) by the readings of the encoders [m].
+        touching
+            Whether the object is being pushed.
+        """
+        moved = np.zeros(3) if self._tip is None else tip - self._tip
+        leverage = math.sqrt(float(self._velocity @ self._velocity))
+        along = self._velocity / max(leverage, 1e-9)
+        way = float(along @ moved)
+        shift = self._sign * (estimate - self._estimate) if math.isfinite(self._estimate) else 0.0
+        if touching and self.touched:
+            self.speed = max(way / self._dt, 0.0)
+        else:
+            self.speed = max(self.speed + self.weight * (shift * leverage / self._dt - self.speed), 0.0)
+        if touching:
+            kept = self.lag * math.exp(-self._dt / _FORGET - max(way, 0.0) / _FORGET_WAY)
+            self.lag = max(kept + float(along @ self._planned) - way, 0.0)
+        else:
+            self.lag = 0.0
+        if touching and self.touched and leverage > _LEAST_RATE:
+            self.correction += self._sign * (max(way, 0.0) / leverage - shift)
+        elif not self.touched:
+            self.correction *= 1.0 - self._dt / _RETURN
+        self._tip, self._estimate = tip, estimate
+        return estimate + self.correction
+
+    def correct(self, gap: float, rate: float, touching: bool) -> None:
+        """Correct the value by a gap, for the next step.
+
+        Parameters
+        ----------
+        gap
+            Gap at the value [m].
+        rate
+            Derivative of the gap by the coordinate [m/m], [m/rad].
+        touching
+            Whether the pusher is where it should touch.
+        """
+        if self.deviation > 0.0 and abs(rate) > _LEAST_RATE and ((self.touched and touching) or gap < 0.0):
+            most = self.slack / abs(rate)
+            self.correction = min(max(self.correction - gap / rate, -most), most)
+
+    def certain(self, velocity: Array) -> bool:
+        """Return True if the estimate had to be corrected by as much as can be allowed for."""
+        moved = abs(self.correction) * math.sqrt(float(velocity @ velocity))
+        return moved > self.slack - _CERTAIN
+
+    def plan(self, velocity: Array, tip_velocity: Array) -> None:
+        """Take the velocity of the contact point per unit of the push, and of the tip by a command (3,)."""
+        self._velocity, self._planned = velocity, self._dt * tip_velocity
+
+    def margin(self, gap: float, touching: bool, gain: float) -> float:
+        """Return the margin of contact slots between pusher and object [m].
+
+        Beyond the slack a gap shrinks as fast as slots allow, and within it at the speed of creeping. It may
+        seem to be negative there, as the estimate may be wrong by as much.
+
+        Parameters
+        ----------
+        gap
+            The gap [m].
+        touching
+            Whether the object is being pushed.
+        gain
+            Gain of the slots [1/s].
+        """
+        known = self.deviation == 0.0 or (self.touched and touching)
+        if known:
+            return max(min(0.0, gap - _CREEP / gain), -PRESS)
+        return min(self.slack, gap - _CREEP / gain)
+
+    @property
+    def reserve(self) -> float:
+        """Part of the largest lag that is left; negative beyond it."""
+        return 1.0 - self.lag / _MOST_LAG
+
+    def pace(self) -> float:
+        """Return the speed of the contact point that may be tried [m/s]."""
+        return min(max(self.speed + RAMP * self.reserve, 0.0), SPEED)
+
+
+class TipAnchor:
+    """Place on an object at which the tip of a pusher touched first."""
+
+    def __init__(self) -> None:
+        self._thing: int | None = None
+        self._anchor: Array = np.zeros(3)
+        self._drift: Array = np.zeros(3)
+
+    def drift(self, thing: int, pose: Array, tip: Array, weight: float) -> Array:
+        """Return how far the tip has moved on a body since the first touch (3,) [m], filtered.
+
+        Parameters
+        ----------
+        thing
+            Index of the body.
+        pose
+            Its pose (4, 4).
+        tip
+            The tip (3,) in the world [m].
+        weight
+            Weight of the latest drift, from 0 to 1.
+        """
+        R, t = pose[:3, :3], pose[:3, 3]
+        if self._thing != thing:
+            self._thing, self._anchor, self._drift = thing, R.T @ (tip - t), np.zeros(3)
+        self._drift = self._drift + weight * (tip - R @ self._anchor - t - self._drift)
+        return self._drift
