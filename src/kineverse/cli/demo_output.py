@@ -30,8 +30,8 @@ HEAD = (
 )
 """Titles of the table of objects."""
 ALIGN = "<<>>>>>>><"
-SHORT = 5
-"""Number of the first columns that pages show."""
+PAGE_HEAD = ("object", "opened", "closed", "time")
+"""Titles of the table on the page."""
 _REFRESH = 0.1
 """Least time between two states of the line of progress [s]."""
 _LONGEST_REASON = 100
@@ -108,6 +108,23 @@ def format_row(report: OpenCloseReport) -> list[str]:
         f"{np.quantile(steps, 0.99):.2f} ms",
         shorten_text(remark, _LONGEST_REASON),
     ]
+
+
+def format_page_row(report: OpenCloseReport) -> list[str]:
+    """Return the cells of an object on the page."""
+    name, _, opened, closed, seconds, *_ = format_row(report)
+    return [name.rpartition("/")[2], opened, closed, seconds]
+
+
+def describe_value(session: Session, one: ArticulatedObject) -> str:
+    """Return a line on the true and the believed value of an object."""
+    drawer, symbol = one.kind == "drawer", one.coordinate
+    scale, unit = (1e3, "mm") if drawer else (math.degrees(1.0), "°")
+    space = " " if drawer else ""
+    true, believed = scale * session.world.state[symbol], scale * session.state[symbol]
+    if not (deviation := scale * session.deviation(symbol)):
+        return f"at {true:.1f}{space}{unit}"
+    return f"at {true:.1f}, believed at {believed:.1f} ± {deviation:.1f}{space}{unit}"
 
 
 def report_as_data(report: OpenCloseReport) -> dict[str, Any]:

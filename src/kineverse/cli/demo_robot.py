@@ -10,7 +10,16 @@ from contextlib import ExitStack, redirect_stdout
 from typing import TYPE_CHECKING
 
 from kineverse.cli.demo_living import check_writable
-from kineverse.cli.demo_output import ALIGN, HEAD, SHORT, ProgressLine, format_row, report_as_data
+from kineverse.cli.demo_output import (
+    ALIGN,
+    HEAD,
+    PAGE_HEAD,
+    ProgressLine,
+    describe_value,
+    format_page_row,
+    format_row,
+    report_as_data,
+)
 from kineverse.cli.output import format_table, show_activity
 from kineverse.cli.view import handle_interrupts, page_options, print_address
 from kineverse.errors import InvalidValueError
@@ -25,6 +34,8 @@ KITCHEN, ROBOT, WORLD = "kitchen", "hsr", "kinematic"
 NOISE = "3mm+3mm/m,0.5deg,30Hz"
 """Noise of the observed poses, unless another one is asked for."""
 _FASTEST = 100.0
+_INTERRUPTED = 130
+"""Exit status after Ctrl-C, as of all commands."""
 _PATIENCE = 15.0
 """Time that a browser has to show the page before the robot begins [s]."""
 
@@ -49,14 +60,12 @@ def add_arguments(parser: argparse._ArgumentGroup) -> None:
 
 
 def run(arguments: argparse.Namespace) -> int:
-    """Let the robot open and close objects; return 0 if all of it was done, else 1.
+    """Let the robot open and close objects; return 0 if all of it was done, 1 if not, 130 after Ctrl-C.
 
     Raises
     ------
     KineverseError
         For wrong options, and extras that are missing.
-    KeyboardInterrupt
-        If it was interrupted before the end; what was done so far has been printed.
     """
     demo = RobotDemo(arguments)
     finished = False
@@ -69,7 +78,7 @@ def run(arguments: argparse.Namespace) -> int:
             page.wait()
     if not finished:
         demo.report()
-        raise KeyboardInterrupt
+        return _INTERRUPTED
     return 0 if all(demo.reports) else 1
 
 
@@ -146,7 +155,7 @@ class RobotDemo:
             runner = OpenCloseRunner(world, start, belief=belief, on_step=self._look, seed=self._seed)
         self._runner = runner
         if page is not None and self._speed:
-            self._say("begins when a browser shows this page")
+            self._say("The robot begins when a browser shows this page.")
             _wait_for_browser(page)
         for one in self.objects:
             self._begin(one)
@@ -154,10 +163,10 @@ class RobotDemo:
             self.reports.append(report)
             self._progress.finish(report)
             if self._live is not None:
-                self._live.show_table(HEAD[:SHORT], [format_row(r)[:SHORT] for r in self.reports])
+                self._live.show_table(PAGE_HEAD, map(format_page_row, self.reports))
             if self._stills is not None:
                 self._stills.end_row(one.coordinate)
-        self._say(f"{sum(map(bool, self.reports))} of {len(self.objects)} opened and closed")
+        self._say(f"{sum(map(bool, self.reports))} of {len(self.objects)} opened and closed.")
 
     def report(self) -> None:
         """Print what was done so far, and write the picture."""
@@ -203,15 +212,19 @@ class RobotDemo:
         """Show that an object comes next."""
         self._progress.begin()
         if self._live is not None:
-            self._live.captions = (f"{len(self.reports) + 1} of {len(self.objects)}: {one.coordinate}",)
-            self._live.show_text("a place, a grasp and a way are searched")
+            self._live.captions = (self._title(one),)
+            self._live.show_text("A place, a grasp and a way are searched.")
+
+    def _title(self, one: ArticulatedObject) -> str:
+        return f"{len(self.reports) + 1} of {len(self.objects)}: {one.coordinate}"
 
     def _look(self, session: Session) -> None:
         """Show a step."""
         runner = self._runner
-        assert runner.current is not None
-        self._progress.update(session, runner.current, runner.opening)
+        assert (one := runner.current) is not None
+        self._progress.update(session, one, runner.opening)
         if self._live is not None:
+            self._live.captions = (self._title(one), describe_value(session, one))
             self._live(session)
         if self._stills is not None:
             self._stills.watch(session, runner.opening)

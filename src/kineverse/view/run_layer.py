@@ -15,7 +15,7 @@ from kineverse.view.run_drawing import GHOST, WAY_RADIUS, RunDrawing, RunMoment
 from kineverse.view.triangle_mesh import Floats
 
 _ROOT = "/run"
-_CELL = "text-align:left;padding:1px 7px 1px 0;vertical-align:top"
+_CELL = "text-align:left;padding:1px 9px 1px 0;vertical-align:top;white-space:nowrap"
 
 
 class RunLayer:
@@ -66,7 +66,13 @@ class RunLayer:
         lines = [element("tr", *(element("th", cell, style=_CELL) for cell in head))]
         lines += [element("tr", *(element("td", cell, style=_CELL) for cell in row)) for row in rows]
         with self._lock:
-            self._table.show(element("table", *lines, style=f"{FONT}margin:6px 9px;border-collapse:collapse"))
+            self._table.show(
+                element(
+                    "table",
+                    *lines,
+                    style=f"{FONT}margin:6px 9px;border-collapse:collapse;display:block;overflow-x:auto",
+                )
+            )
 
     def remove(self) -> None:
         """Remove everything from the page."""
@@ -132,7 +138,7 @@ class RunLayer:
         if moment.way is not None and len(moment.way) > 1:
             color = tuple(round(255 * c) for c in TRACE[:3])
             ends = np.stack([moment.way[:-1], moment.way[1:]], axis=1).astype(np.float32)
-            self._way = scene.add_line_segments(f"{_ROOT}/way", ends, color, thickness=WAY_RADIUS)
+            self._way = scene.add_line_segments(f"{_ROOT}/way", ends, color, thickness=2 * WAY_RADIUS)
         if self._wanted is None and moment.wanted is not None:
             self._wanted = scene.add_frame(f"{_ROOT}/wanted", axes_length=0.12, axes_radius=0.005)
         if self._wanted is not None:
