@@ -7,13 +7,16 @@ from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from time import perf_counter, thread_time
 
+from kineverse.control import Command
 from kineverse.errors import ShapeError
 from kineverse.expressions import Expression
+from kineverse.lie import Array
 from kineverse.state import State
 from kineverse.symbols import Symbol
 from kineverse.worlds import Observation, World
 
 from .belief import Belief, TrueBelief
+from .hand_reference import HandReference
 
 Speeds = Mapping[Symbol, float]
 
@@ -47,6 +50,12 @@ class Session:
         The believed state.
     commands
         The speeds of the last step.
+    command
+        The controller's command from which they come; None if there is none.
+    reference
+        The way of the hand that a controller follows; None if there is none.
+    vectors
+        Vectors of the controller by name, each with its origin in the world [m], for pages and recordings.
     phase
         Name of the present phase of the skill, for recordings and messages.
     steps
@@ -68,6 +77,9 @@ class Session:
         self._on_step = on_step
         self.state: State = self.belief.update(world)
         self.commands: Speeds = {}
+        self.command: Command | None = None
+        self.reference: HandReference | None = None
+        self.vectors: Mapping[str, tuple[Array, Array]] = {}
         self.phase, self.steps = "", 0
         self.cpu: dict[str, list[float]] = {}
         self.wall: dict[str, list[float]] = {}
@@ -107,7 +119,7 @@ class Session:
         self.cpu.setdefault(name, []).append(thread_time() - cpu)
         self.wall.setdefault(name, []).append(perf_counter() - wall)
 
-    def act(self, speeds: Speeds) -> None:
+    def act(self, speeds: Speeds, command: Command | None = None) -> None:
         """Command speeds for one step, and update the belief. Speeds of objects are not sent.
 
         The belief gets them all.
@@ -116,8 +128,10 @@ class Session:
         ----------
         speeds
             Speeds of the robot, and possibly those planned for objects [m/s], [rad/s]; none to stop.
+        command
+            The controller's command that has these speeds, for pages.
         """
-        robot = f"{self.world.robot}/"
+        robot, self.command = f"{self.world.robot}/", command
         self.commands = {s: v for s, v in speeds.items() if s.path.startswith(robot)}
         self.world.apply(self.commands, self.dt, stamp=self.state.stamp)
         self._update(speeds)
