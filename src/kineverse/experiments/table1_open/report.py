@@ -69,7 +69,7 @@ PROGRAM_COLUMNS = (
     ROW[3],
     Column("opened", "opened", lambda trials: sum(t.done for t in trials), 6),
     Column("runs", "of", len, 6),
-    Column("solve_mean_ms", "solver mean", lambda trials: _solver_times(trials).mean),
+    Column("solve_mean_ms", "solver mean (wall)", lambda trials: _solver_times(trials).mean),
     Column("solve_sd_ms", "sd", lambda trials: _solver_times(trials).deviation),
     Column("published_mean_ms", "paper mean", lambda trials: _published(trials, 0)),
     Column("published_sd_ms", "sd", lambda trials: _published(trials, 1)),
