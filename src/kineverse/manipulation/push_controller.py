@@ -34,9 +34,9 @@ from kineverse.symbols import Symbol
 from kineverse.worlds import Observation
 
 from .push_choice import CONE, CONE_END, ContactChoice
-from .push_contact import PushPoint, PushSurface, cross_product, find_push_tool
-from .push_pair import PairFinder, PushPair, PushView
-from .push_press import PushPress
+from .push_contact import PushPoint, PushSurface, find_push_tool
+from .push_pair import PairFinder, PushPair, PushView, make_view
+from .push_press import PushPress, TipAnchor
 from .push_program import LOST, NEAR, PRESS, TOUCHING, PushProgram
 from .push_scene import find_overlapping_links, furniture_rules, match_bodies
 
@@ -50,8 +50,6 @@ _RETREAT = 0.1
 """Distance from the object at which a retreat ends [m]."""
 _LOW = 0.03
 """Height of the tip above a contact point from which on the pusher may touch [m]."""
-_CREEP = 0.02
-"""Speed at which a pusher feels for an object that may be nearer or farther than estimated [m/s]."""
 _HOLD_WEIGHT = 10.0
 _LARGEST_DEVIATION = 0.01
 _LEAST_DEVIATION = 1e-5
@@ -184,8 +182,7 @@ class Pushing:
             self._program.object_column,
             self.surface.sign,
         )
-        self._body_names = tuple(self.scene.bodies)
-        self._hand = self._body_names.index(self._hand_body())
+        self._hand = self.scene.bodies.index(self._hand_body())
         self._all = self.scene.watch(f"{self.robot}/*", "*", radius=0.0, moving=self.speeds)
         self.choice = ContactChoice(self.surface)
         self.press = PushPress(dt, self.surface.sign)
@@ -211,11 +208,10 @@ class Pushing:
         self.press.reset()
         self.press.deviation = 0.0
         self.touching, self.losses, self.retreating = False, 0, False
-        self._anchor: tuple[int, Array] | None = None
-        self._drifted: Array = np.zeros(3)
+        self._anchor = TipAnchor()
         self._aside = math.inf
         self._margin = math.nan
-        self._view: tuple[Array, Array, Array, Array, Array, float] | None = None
+        self._seen: tuple[PushPair | None, PushPoint, Array] | None = None
 
     # -- the step ------------------------------------------------------------------------------------------
 
@@ -250,11 +246,10 @@ class Pushing:
         if self.choice.chosen is not None:
             point = self.surface.point_at(state, self.choice.chosen)
             normal, velocity = point.normal, point.velocity
-        parts = [float(normal @ velocity) * deviation(self.coordinate)]
-        parts += [
-            float(normal @ column) * deviation(s) for s, column in zip(symbols, jacobian.T, strict=True)
-        ]
-        return math.hypot(*parts)
+        rates = dict(zip(symbols, (normal @ jacobian).tolist(), strict=True))
+        rates[self.coordinate] = float(normal @ velocity)
+        # The deviation of what was never seen is infinite, and counts only where it changes the gap.
+        return math.hypot(*(rate * deviation(s) for s, rate in rates.items() if rate))
 
     def step(self, state: State, observation: Observation | None = None, deviation: float = 0.0) -> Command:
         """Return the command for one time step at a state.
@@ -315,13 +310,13 @@ class Pushing:
             if contact.gap < (TOUCHING if certain else TOUCHING + press.slack) and (certain or press.touched):
                 self.touching = True
                 self.choice.restart()
-                self._anchor = None
+                self._anchor = TipAnchor()
         if contact is not None:
             rate = -float(contact.normal @ contact.velocity) * self.surface.sign
             press.correct(contact.gap, rate, self.touching)
 
     def _release(self) -> None:
-        self.touching, self._anchor = False, None
+        self.touching = False
         self.choice.restart()
 
     def _give_up(self) -> None:
@@ -370,19 +365,18 @@ class Pushing:
         program.set("touch", 0.0 if self.touching or self.retreating else 1.0)
         program.set("hold", _HOLD_WEIGHT if self.touching else 0.0)
         program.set("engaged", float(self.touching))
-        distance, r, p, normal, free = math.inf, tip, c, m, False
+        free = False
         if contact is None:
             for name in ("relative", "slip", "pushed"):
                 program.set(name, 0.0)
             program.set("gap", _FAR)
         else:
-            r, p, normal, distance = contact.r, contact.p, contact.normal, contact.gap
-            velocity, thing = contact.velocity, contact.thing
+            distance, normal, thing = contact.gap, contact.normal, contact.thing
             free = self.touching and -_JAMMED - press.slack < distance < LOST + press.slack
             slots, tangents = self._slots, contact.tangents
-            J = slots.point_jacobian(thing, p)
+            J = slots.point_jacobian(thing, contact.p)
             relative = np.empty((3, len(self.speeds)))
-            relative[0] = normal @ (slots.point_jacobian(contact.robot, r) - J)
+            relative[0] = normal @ (slots.point_jacobian(contact.robot, contact.r) - J)
             relative[1:] = tangents @ (
                 slots.point_jacobian(self._hand, tip) - slots.point_jacobian(thing, tip)
             )
@@ -391,43 +385,22 @@ class Pushing:
             most = -PRESS * (1.0 - min(max(press.reserve, 0.0), 1.0))
             program.set("gap", most if press.touched and self.touching else distance)
             program.set("pushed", float(normal @ J[:, program.object_column]))
-            program.set("slip", tangents @ self._drift(thing, tip))
+            pose = self.scene.pose(self.scene.bodies[thing])
+            program.set("slip", tangents @ self._anchor.drift(thing, pose, tip, press.weight))
         program.set("free", float(free))
-        self._view = (r, p, normal, velocity, c, distance)
+        self._seen = (contact, point, tip)
 
     @property
     def view(self) -> PushView | None:
         """Points and vectors of the last step; None before the first."""
-        if self._view is None:
-            return None
-        r, p, normal, velocity, c, distance = self._view
-        push = velocity / max(math.sqrt(float(velocity @ velocity)), 1e-9)
-        return PushView(p, r, normal, push, cross_product(cross_product(push, normal), normal), c, distance)
-
-    def _drift(self, thing: int, tip: Array) -> Array:
-        """Return how far the tip has moved on the object since the first touch, (3,) [m]."""
-        pose = self.scene.pose(self._body_names[thing])
-        if not self.touching:
-            self._anchor = None
-            return np.zeros(3)
-        if self._anchor is None or self._anchor[0] != thing:
-            self._anchor = (thing, pose[:3, :3].T @ (tip - pose[:3, 3]))
-            self._drifted = np.zeros(3)
-        drift = tip - pose[:3, :3] @ self._anchor[1] - pose[:3, 3]
-        self._drifted = self._drifted + self.press.weight * (drift - self._drifted)
-        return self._drifted
+        return None if self._seen is None else make_view(*self._seen)
 
     def _keep_apart(self, contact: PushPair | None, pressing: bool) -> None:
         """Set the distance of pusher and object: of both apart, or of a pusher that feels for the object."""
-        press = self.press
-        margin = _APART + press.slack
+        margin = _APART + self.press.slack
         if pressing:
-            # Beyond the slack the gap shrinks as fast as rows allow, within it at the speed of creeping.
-            known = press.deviation == 0.0 or (press.touched and self.touching)
-            slack = 0.0 if known else press.slack
-            margin = slack if contact is None else min(slack, contact.gap - _CREEP / self._slots.gain)
-            if known:
-                margin = max(margin, -PRESS)
+            gap = math.inf if contact is None else contact.gap
+            margin = self.press.margin(gap, self.touching, self._slots.gain)
         if margin != self._margin:
             self._margin = margin
             self._slots.set_margin(self.pusher, self.object_bodies, margin)

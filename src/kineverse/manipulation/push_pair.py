@@ -12,7 +12,7 @@ from kineverse.control.contact_slots import ContactSlots
 from kineverse.geometry.results import DistanceResults
 from kineverse.lie import Array
 
-from .push_contact import cross_product, find_alignment
+from .push_contact import PushPoint, cross_product, find_alignment
 from .push_program import PRESS, TOUCHING
 
 _MOST_PAIRS = 6
@@ -82,6 +82,16 @@ class PushPair:
         across = cross_product(self.normal, np.eye(3)[int(np.argmin(np.abs(self.normal)))])
         across /= math.sqrt(float(across @ across))
         return np.array([across, cross_product(self.normal, across)])
+
+
+def make_view(pair: PushPair | None, point: PushPoint, tip: Array) -> PushView:
+    """Return the points and vectors of a push with a near pair, or with a tip that is still far."""
+    p, n, r, velocity, distance = point.point, point.normal, tip, point.velocity, math.inf
+    if pair is not None:
+        p, n, r, velocity, distance = pair.p, pair.normal, pair.r, pair.velocity, pair.gap
+    push = velocity / max(math.sqrt(float(velocity @ velocity)), 1e-9)
+    tangent = cross_product(cross_product(push, n), n)
+    return PushView(p, r, n, push, tangent, point.point, distance)
 
 
 class PairFinder:

@@ -20,14 +20,19 @@ import numpy as np
 
 from kineverse.lie import Array
 
+from .push_program import PRESS
+
 RAMP = 0.02
 """Speed of the contact point beyond the measured one that is tried [m/s]."""
 SPEED = 0.25
 """Largest speed of the contact point [m/s]."""
 _MOST_LAG = 8e-4
 """Lag at which the press grows no more [m]."""
-_FORGET = 1.0
-"""Time after which a lag is forgotten: that of acceleration and delays is none of the press [s]."""
+_CREEP = 0.02
+"""Speed at which a pusher feels for an object that may be nearer or farther than estimated [m/s]."""
+_FORGET, _FORGET_WAY = 1.0, 0.01
+"""Time [s] and way [m] after which a lag is forgotten: that of acceleration and delays is none of the press,
+and what moves on gives way."""
 _REMEMBER = 0.1
 """Time for which a touch counts after the last report [s]."""
 _RETURN = 0.3
@@ -118,7 +123,7 @@ class PushPress:
         else:
             self.speed = max(self.speed + self.weight * (shift * leverage / self._dt - self.speed), 0.0)
         if touching:
-            kept = self.lag * (1.0 - self._dt / _FORGET) if self.lag > 0.0 else 0.0
+            kept = self.lag * math.exp(-self._dt / _FORGET - max(way, 0.0) / _FORGET_WAY)
             self.lag = max(kept + float(along @ self._planned) - way, 0.0)
         else:
             self.lag = 0.0
@@ -154,6 +159,26 @@ class PushPress:
         """Take the velocity of the contact point per unit of the push, and of the tip by a command (3,)."""
         self._velocity, self._planned = velocity, self._dt * tip_velocity
 
+    def margin(self, gap: float, touching: bool, gain: float) -> float:
+        """Return the margin of contact slots between pusher and object [m].
+
+        Beyond the slack a gap shrinks as fast as slots allow, and within it at the speed of creeping. It may
+        seem to be negative there, as the estimate may be wrong by as much.
+
+        Parameters
+        ----------
+        gap
+            The gap [m].
+        touching
+            Whether the object is being pushed.
+        gain
+            Gain of the slots [1/s].
+        """
+        known = self.deviation == 0.0 or (self.touched and touching)
+        if known:
+            return max(min(0.0, gap - _CREEP / gain), -PRESS)
+        return min(self.slack, gap - _CREEP / gain)
+
     @property
     def reserve(self) -> float:
         """Part of the largest lag that is left; negative beyond it."""
@@ -162,3 +187,32 @@ class PushPress:
     def pace(self) -> float:
         """Return the speed of the contact point that may be tried [m/s]."""
         return min(max(self.speed + RAMP * self.reserve, 0.0), SPEED)
+
+
+class TipAnchor:
+    """Place on an object at which the tip of a pusher touched first."""
+
+    def __init__(self) -> None:
+        self._thing: int | None = None
+        self._anchor: Array = np.zeros(3)
+        self._drift: Array = np.zeros(3)
+
+    def drift(self, thing: int, pose: Array, tip: Array, weight: float) -> Array:
+        """Return how far the tip has moved on a body since the first touch (3,) [m], filtered.
+
+        Parameters
+        ----------
+        thing
+            Index of the body.
+        pose
+            Its pose (4, 4).
+        tip
+            The tip (3,) in the world [m].
+        weight
+            Weight of the latest drift, from 0 to 1.
+        """
+        R, t = pose[:3, :3], pose[:3, 3]
+        if self._thing != thing:
+            self._thing, self._anchor, self._drift = thing, R.T @ (tip - t), np.zeros(3)
+        self._drift = self._drift + weight * (tip - R @ self._anchor - t - self._drift)
+        return self._drift

@@ -27,16 +27,17 @@ _PATIENCE = 25
 """Number of steps for which it is within the tolerance in addition when a push ends all the same."""
 _AVERAGED = 0.1
 """Weight of the latest estimate in the mean that counts at the end."""
-_STILL, _NEARLY = 5e-3, 2.0
-"""Speed of a contact point that counts as none [m/s], and the number of tolerances within which an object
-that gives way no more is at its target."""
+_STILL = 5e-3
+"""Speed of a contact point that counts as none [m/s]."""
 _PRESSED = 3
-"""Number of steps for which it gives way no more."""
+"""Number of steps for which an object within the tolerance gives way no more when a push ends."""
 _MOST_BLOCKED = 3
 """Number of contact points given up before an approach is planned."""
 _MOST_JAMMED = 3
 """Number of contact points at which the object does not move before it counts as jammed."""
 _MOST_APPROACHES = 2
+_UNKNOWN, _LOOK = 0.05, 2.0
+"""Deviation of a coordinate that is not known yet [m], [rad], and the time to wait until it is [s]."""
 _RETREAT_STEPS = 100
 
 
@@ -53,7 +54,6 @@ def push(
     rules: Iterable[Rule] = (),
     leave_out: Iterable[Exclusion] = (),
     logic: str | None = "and",
-    deviation: float | None = None,
     plan: bool = True,
     retreat: bool = False,
     pushing: Pushing | None = None,
@@ -62,7 +62,8 @@ def push(
     """Push an articulated object to a value of its coordinate.
 
     The controller finds contact points and changes them where it is blocked. After some of them a path is
-    planned to another one. The result is judged by the world's truth.
+    planned to another one. Where the session's belief is an estimate, the robot first looks until it knows
+    the coordinate, and then feels for the object. The result is judged by the world's truth.
 
     Parameters
     ----------
@@ -82,8 +83,6 @@ def push(
         Largest distance from the target [m], [rad].
     still, rules, leave_out, logic
         As for :class:`.Pushing`.
-    deviation
-        Standard deviation of gaps in the estimates [m]; by default that of the session's belief.
     plan
         Whether approaches are planned where the way of the controller is blocked.
     retreat
@@ -106,6 +105,17 @@ def push(
     """
     model, world = session.world.model, session.world
     coordinate = model.symbol(what) if isinstance(what, str) else what
+    first, begin = session.steps, world.time
+    while session.deviation(coordinate) > _UNKNOWN:
+        if world.time - begin > _LOOK:
+            reason = (
+                f"'{coordinate}' is not known: its deviation is {session.deviation(coordinate):.2g} after "
+                f"{_LOOK:g} s. No camera sees a marker that it moves, or its track is lost."
+            )
+            value, seconds = world.state[coordinate], world.time - begin
+            return Outcome(False, value, reason, world.name, seconds, session.steps - first)
+        session.phase = "look"
+        session.stop()
     if pushing is None:
         if bodies is None:
             bodies = find_gripper(model, world.robot).bodies
@@ -125,7 +135,7 @@ def push(
         )
         pushing.wait()
     pushing.reset()
-    run = _Run(session, pushing, seconds, tolerance, plan, deviation, on_step)
+    run = _Run(session, pushing, seconds, tolerance, plan, on_step)
     try:
         reason = run.push()
         if retreat:
@@ -160,7 +170,7 @@ class _End:
         self._within = self._within + 1 if rest < self._tolerance else 0
         self._settled = self._settled + 1 if rest < self._tolerance / 2 else 0
         still = pushing.touching and press.presses and press.speed < _STILL
-        self._pressed = self._pressed + 1 if still and rest < _NEARLY * self._tolerance else 0
+        self._pressed = self._pressed + 1 if still and rest < self._tolerance else 0
         long = _SETTLED_ESTIMATE if press.deviation > 0.0 else _SETTLED
         return self._settled >= long or self._within >= long + _PATIENCE or self._pressed >= _PRESSED
 
@@ -175,14 +185,12 @@ class _Run:
         seconds: float,
         tolerance: float,
         plan: bool,
-        deviation: float | None,
         on_step: Callable[[Pushing], object] | None,
     ) -> None:
         self._session, self._pushing, self._on_step = session, pushing, on_step
         self._seconds, self._tolerance, self._plan = seconds, tolerance, plan
         self._first, self._begin = session.steps, session.world.time
         self._approaches = 0
-        self._deviation = deviation
         self._changes: list[np.ndarray[Any, np.dtype[np.float64]]] = []
         self._last: np.ndarray[Any, np.dtype[np.float64]] | None = None
 
@@ -223,11 +231,8 @@ class _Run:
         session, pushing = self._session, self._pushing
         session.phase = phase
         with session.timed("push"):
-            if self._deviation is None:
-                deviation = pushing.find_deviation(session.state, session.belief.deviation)
-            else:
-                deviation = self._deviation
-            command = pushing.step(session.state, session.world.observe() if deviation else None, deviation)
+            deviation = pushing.find_deviation(session.state, session.belief.deviation)
+            command = pushing.step(session.state, session.observation if deviation else None, deviation)
         speeds = np.fromiter(command.speeds.values(), dtype=float)
         if pushing.touching and self._last is not None:
             self._changes.append(np.abs(speeds - self._last))
