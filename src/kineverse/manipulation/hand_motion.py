@@ -13,6 +13,7 @@ from kineverse.control.tasks import Task
 from kineverse.grasping import Grasp, Gripper, Handle
 from kineverse.lie import Array, inverse
 from kineverse.planning import Planner, Trajectory, TrajectoryFollower
+from kineverse.state import State
 from kineverse.symbols import Symbol
 from kineverse.worlds import Judge
 
@@ -26,8 +27,18 @@ _LINE_SPEED = 0.1
 """Speed of the hand on the straight way to the handle and from it [m/s]."""
 _SETTLED, _MOST_SETTLING = 5e-4, 150
 """Error of the hand's pose at the end of a straight way [m], [rad], and the most steps until it is met."""
-_FOLLOWING, _POSTURE = 5.0, 0.5
-"""Gain of the goals along the way [1/s], and the weight of the arm beside the object."""
+_KNOWN, _MOST_LOOKING, _UNKNOWN = 1.5e-3, 1.0, 0.02
+"""Deviation of a handle's position that is small [m], longest time to look until it is [s], and the deviation
+from which on nothing is done [m]."""
+_SIGMAS = 2.0
+"""Standard deviations of the believed handle by which the hand may be off instead."""
+FOLLOWING = 5.0
+"""Gain of all goals and holds [1/s]. A larger one follows the noise of estimates, and the delay of servos
+adds to it."""
+_POSTURE = 0.5
+"""Weight of the arm beside the object."""
+_LOST = 0.002
+"""Motion of closed fingers that says that nothing is between them any more [m]."""
 _BESIDE = 0.008
 """Difference of the gap of closed fingers to the thickness of the bar that says that it is not there [m]."""
 
@@ -71,6 +82,45 @@ class HandMotion:
         self.model = search.model
         self.turns: Array = np.zeros(len(search.moving))
         self._hand, self._bar = self.model.fk(gripper.hand), self.model.fk(handle.frame)
+        self._slope = self._bar[:3, 3].partial([handle.coordinate])
+        limits = {s: self.model.limits(s) for s in (*search.moving, handle.coordinate)}
+        self._limits = {s: (float(a), float(b)) for s, (a, b) in limits.items()}
+        self._closed_at: dict[Symbol, float] = {}
+
+    @property
+    def deviation(self) -> float:
+        """Standard deviation of the position of the handle [m]; 0 if it is known exactly."""
+        session, coordinate = self.session, self.handle.coordinate
+        if not (deviation := session.deviation(coordinate)):
+            return 0.0
+        slope = self._slope(session.state)
+        return deviation * float(np.linalg.norm(slope))
+
+    def look(self) -> None:
+        """Stand until the handle is known well, or raise SkillError if it is not seen."""
+        session = self.session
+        session.phase = "look"
+        begin = session.world.time
+        while self.deviation > _KNOWN and session.world.time - begin < _MOST_LOOKING:
+            self.act({})
+        if (deviation := self.deviation) > _UNKNOWN:
+            coordinate = self.handle.coordinate
+            raise SkillError(
+                "other",
+                f"'{coordinate}' is not seen: believed at {session.state[coordinate]:.3f}, with a standard "
+                f"deviation of {session.deviation(coordinate):.2g}, or {deviation:.2g} m at the handle.",
+            )
+
+    @property
+    def state(self) -> State:
+        """The believed state within the limits of positions.
+
+        A joint that rests at its limit is read to be a little beyond, and a controller would lead it back
+        before anything else.
+        """
+        state = self.session.state
+        inside = {s: min(max(state[s], a), b) for s, (a, b) in self._limits.items()}
+        return state.updated({s: v for s, v in inside.items() if v != state[s]})
 
     def follow(self, trajectory: Trajectory) -> None:
         """Follow a trajectory."""
@@ -82,18 +132,22 @@ class HandMotion:
             self.check_time()
             with session.timed("approach"):
                 follower.set(controller, session.world.time - begin)
-                command = controller.step(session.state)
+                command = controller.step(self.state)
             self.act(command.speeds)
 
     def follow_line(self, start: Array, end: Array, rows: Array | None = None) -> None:
         """Move the hand straight from a pose relative to the handle to another one, near to arms (L, n)."""
         session = self.session
-        wanted = Target("hand/pose", end)
+        wanted, rate = Target("hand/pose", end), Target("hand/rate", np.zeros(6))
         posture, goals = (None, []) if rows is None else self.posture(rows[0])
         error = same_pose(self._bar @ wanted.expression, self._hand)
-        controller = self.controller([Goal(error, gain=0.5 / session.dt, name="hand"), *goals])
-        length = float(np.linalg.norm(end[:3, 3] - start[:3, 3]))
-        steps = max(2, math.ceil(length / (_LINE_SPEED * session.dt)))
+        goal = Goal(error, gain=FOLLOWING, rate=rate.expression, name="hand")
+        controller = self.controller([goal, *goals])
+        way = end[:3, 3] - start[:3, 3]
+        steps = max(2, math.ceil(float(np.linalg.norm(way)) / (_LINE_SPEED * session.dt)))
+        speed = np.concatenate([end[:3, :3].T @ way / (steps * session.dt), np.zeros(3)])
+        uncertain = [session.deviation(x) for x in (self._bar @ end)[:3, 3]]
+        settled = max(_SETTLED, _SIGMAS * float(np.linalg.norm(uncertain)))
         for k in range(1, steps + _MOST_SETTLING):
             self.check_time()
             pose = end.copy()
@@ -101,10 +155,11 @@ class HandMotion:
             pose[:3, 3] = start[:3, 3] + share * (end[:3, 3] - start[:3, 3])
             with session.timed("line"):
                 controller.set(wanted, pose)
+                controller.set(rate, speed if k < steps else 0.0 * speed)
                 if posture is not None and rows is not None:
                     controller.set(posture, row_at(rows, share))
-                command = controller.step(session.state)
-            if k > steps and command.residuals["hand"] < _SETTLED:
+                command = controller.step(self.state)
+            if k > steps and command.residuals["hand"] < settled:
                 break
             self.act(command.speeds)
 
@@ -119,7 +174,7 @@ class HandMotion:
         """Return a target for the arm (n,), and the goals that keep the arm near to it."""
         posture = Target("arm/posture", row)
         goals = [
-            Goal(s, posture.expression[k], gain=_FOLLOWING, weight=_POSTURE, name=f"posture {s}")
+            Goal(s, posture.expression[k], gain=FOLLOWING, weight=_POSTURE, name=f"posture {s}")
             for k, s in enumerate(self.search.moving)
         ]
         return posture, goals
@@ -129,12 +184,22 @@ class HandMotion:
         self.session.phase = "close"
         self.move_fingers(self.gripper.closed)
         state, gripper = self.session.state, self.gripper
+        self._closed_at = {s: state[s] for s in gripper.joints}
         narrow = gripper.values_at(max(0.25 * grasp.thickness, grasp.thickness - _BESIDE))
         wide = gripper.values_at(grasp.thickness + _BESIDE)
         return all(
             min(narrow[s], wide[s]) - 1e-4 <= state[s] <= max(narrow[s], wide[s]) + 1e-4
             for s in gripper.joints
         )
+
+    def is_lost(self) -> bool:
+        """Return True if the fingers have closed further since they stood around the bar."""
+        gripper, state = self.gripper, self.session.state
+        closed = 0.0
+        for s, held in self._closed_at.items():
+            range_ = gripper.closed[s] - gripper.opened[s]
+            closed = max(closed, gripper.width * (state[s] - held) / range_ if range_ else 0.0)
+        return closed > _LOST
 
     def release(self, grasp: Grasp) -> None:
         """Open the fingers, and take the hand away."""

@@ -4,27 +4,30 @@ from __future__ import annotations
 
 import numpy as np
 
+from kineverse.compile import compile  # noqa: A004
 from kineverse.control import Goal, Hold, Target, same_pose
 from kineverse.control.tasks import Task
 from kineverse.geometry import Rule, Scene
 from kineverse.lie import inverse
 
-from .hand_motion import HandMotion, row_at
-from .outcome import SkillError
+from .hand_motion import FOLLOWING, HandMotion, row_at
+from .outcome import SkillError, SlipError
 from .placement import BasePlacement
 
-_SPEED = 0.3
-"""Speed of an object along its planned way [m/s], [rad/s]."""
-_FOLLOWING = 5.0
-"""Gain of the goals along the way [1/s]."""
+_SPEED, _RAMP = 0.3, 0.5
+"""Speed of an object along its planned way [m/s], [rad/s], and the time from rest to it [s]."""
 _LATE = 0.1
 """Distance from the way at which the reference begins to wait [m], [rad]."""
 _MARGIN = 0.002
 """Least distance of bodies while the object moves [m]; placements keep more."""
-_SLIPPED = 0.02
-"""Distance of the hand from its grasp from which on the handle has slipped [m]."""
-_STALLED, _PATIENCE = 1e-3, 4.0
-"""Least progress of the object [m], [rad] in a time [s]."""
+_SLIPPED, _SIGMAS = 0.01, 4.0
+"""Distance of the bar from its place in the hand from which on it has slipped [m], and the standard
+deviations of its estimate that are added."""
+_STALLED, _PATIENCE, _RESTING = 1e-3, 4.0, 0.5
+"""Least progress of the object [m], [rad] in a time [s], and in one at the end of the way."""
+
+_SETTLED = 25
+"""Number of steps for which an estimate is at the target when a motion ends."""
 
 
 def move_held(motion: HandMotion, placement: BasePlacement, tolerance: float) -> None:
@@ -41,8 +44,10 @@ def move_held(motion: HandMotion, placement: BasePlacement, tolerance: float) ->
 
     Raises
     ------
+    SlipError
+        If the bar is no longer where the hand took it.
     SkillError
-        If the object does not move on, slips out of the hand, or the time is up.
+        If the object does not move on, or the time is up.
     """
     bar, hand = motion.model.fk(motion.handle.frame), motion.model.fk(motion.gripper.hand)
     session, coordinate, grasp = motion.session, motion.handle.coordinate, placement.grasp
@@ -50,42 +55,63 @@ def move_held(motion: HandMotion, placement: BasePlacement, tolerance: float) ->
     session.phase = "move"
     state = session.state
     held = inverse(bar(state)) @ hand(state)
-    hold = Hold(same_pose(bar @ held, hand), name="grasp")
+    hold = Hold(same_pose(bar @ held, hand), gain=FOLLOWING, name="grasp")
+    middle = motion.gripper.grasp_pose[:, 3]
+    moved = ((bar @ held - hand) @ middle)[:3]
+    uncertain = [session.deviation(x) for x in moved]
+    slipped = _SLIPPED + _SIGMAS * float(np.linalg.norm(uncertain))
+    slip = compile(moved)
     target = float(placement.values[-1])
     moving = motion.search.moving
     rows = placement.way[:, : len(moving)] + motion.turns
     values = placement.values
     posture, goals = motion.posture(rows[0])
     wanted = Target("opening/object", np.array([values[0]]))
-    tasks: list[Task] = [hold, Goal(coordinate, wanted.expression[0], gain=_FOLLOWING, name="object")]
+    tasks: list[Task] = [hold, Goal(coordinate, wanted.expression[0], gain=FOLLOWING, name="object")]
     tasks += goals
     rules = [Rule(b, motion.handle.frame, False, "grasped") for b in motion.gripper.bodies]
     scene = Scene(motion.model, rules=[*motion.search.scene.rules, *rules])
     controller = motion.controller(tasks, scene=scene, margin=_MARGIN)
-    share, ends = 0.0, abs(target - values[0])
+    share, speed, length = 0.0, 0.0, abs(target - values[0])
     best, since = 0.0, session.world.time
-    while abs(session.state[coordinate] - target) > tolerance / 4:
+    within, enough = 0, _SETTLED if session.deviation(coordinate) else 1
+    while True:
+        rest = abs(session.state[coordinate] - target)
+        within = within + 1 if rest <= tolerance / 4 else 0
+        if within >= enough:
+            return
         motion.check_time()
         with session.timed("open"):
+            state = motion.state
             reference = row_at(rows, share)
             value = values[0] + share * (target - values[0])
             controller.set(posture, reference)
             controller.set(wanted, np.array([value]))
-            command = controller.step(session.state)
+            command = controller.step(state)
             # The reference waits for the slowest joint.
             late = max(
-                float(np.abs(reference - session.state.vector(moving)).max(initial=0.0)),
-                abs(value - session.state[coordinate]),
+                float(np.abs(reference - state.vector(moving)).max(initial=0.0)),
+                abs(value - state[coordinate]),
             )
-            share += _SPEED * session.dt / ends * min(1.0, max(0.0, 1.5 - late / _LATE))
-            share = min(1.0, share)
+            speed = min(speed + _SPEED / _RAMP * session.dt, _SPEED)
+            speed *= min(1.0, max(0.0, 1.5 - late / _LATE))
+            share = min(1.0, share + speed * session.dt / length)
+            apart = float(np.linalg.norm(slip(state.vector(slip.inputs))))
         motion.act(command.speeds)
-        if command.residuals["grasp"] > _SLIPPED:
-            raise SkillError("other", "The handle slipped out of the hand.")
+        if motion.is_lost() or apart > slipped:
+            how = (
+                "It is out of the hand."
+                if motion.is_lost()
+                else f"It moved {1e3 * apart:.0f} mm in the hand."
+            )
+            raise SlipError(f"The handle slipped at {session.state[coordinate]:.3f} of '{coordinate}'. {how}")
         done = abs(session.state[coordinate] - values[0])
         if done > best + _STALLED:
             best, since = done, session.world.time
-        elif session.world.time - since > _PATIENCE:
+        resting = session.world.time - since
+        if share == 1.0 and rest < 0.75 * tolerance and resting > _RESTING:
+            return
+        if resting > _PATIENCE:
             stops = ", ".join(command.active[:3]) or "nothing that the controller knows; it may be locked"
             raise SkillError(
                 "collision" if "contact" in stops else "other",

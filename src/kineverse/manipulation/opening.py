@@ -19,7 +19,7 @@ from kineverse.worlds import Judge
 
 from .hand_motion import HandMotion
 from .held_motion import move_held
-from .outcome import Outcome, SkillError
+from .outcome import Outcome, SkillError, SlipError
 from .placement import BasePlacement, PlacementSearch
 from .session import Session
 
@@ -75,8 +75,9 @@ def open_object(
     Returns
     -------
     Outcome
-        With ``measures``: those of :class:`.Judge`, ``placements``, ``grasps`` (number of grasps), and
-        ``failure``: ``"collision"``, ``"reach"``, ``"time"`` or ``"other"`` if it was not done.
+        With ``measures``: those of :class:`.Judge`, ``placements``, ``grasps`` and ``slips`` (number of
+        grasps, and of those that the handle slipped out of), and ``failure``: ``"collision"``, ``"reach"``,
+        ``"time"`` or ``"other"`` if it was not done.
 
     Raises
     ------
@@ -107,7 +108,9 @@ def open_object(
             if done
             else (f"'{coordinate}' ended at {value:.3f}, not at {goal:.3f}.")
         )
+    reason = " ".join([*run.slips, reason])
     measures: dict[str, Any] = {**run.measures, "placements": run.placements, "grasps": run.grasps}
+    measures["slips"] = len(run.slips)
     if not done:
         measures["failure"] = kind or "other"
     return Outcome(
@@ -183,6 +186,7 @@ class _Run:
         self.gripper = opener.gripper
         self.first, self.begin = session.steps, session.world.time
         self.placements = self.grasps = 0
+        self.slips: list[str] = []
         self._earlier: list[Mapping[str, Any]] = []
         self.judge = Judge(self.model, session.world.robot, self.gripper, handle=handle.frame)
         self.judge.update(session.world.state)
@@ -209,6 +213,7 @@ class _Run:
     def perform(self) -> None:
         """Move the object to the target with one grasp after the other, or raise SkillError."""
         coordinate = self.handle.coordinate
+        self.motion.look()
         self._check_start()
         for _ in range(_MOST_GRASPS):
             if abs(self.session.state[coordinate] - self.target) <= self.tolerance / 2:
@@ -217,8 +222,11 @@ class _Run:
             assert placement.grasp is not None
             self.grasps += 1
             self._approach(placement)
-            if self.motion.close(placement.grasp):
-                move_held(self.motion, placement, self.tolerance)
+            try:
+                if self.motion.close(placement.grasp):
+                    move_held(self.motion, placement, self.tolerance)
+            except SlipError as slip:
+                self.slips.append(str(slip))
             self.motion.release(placement.grasp)
         if abs(self.session.state[coordinate] - self.target) > self.tolerance:
             raise SkillError("reach", f"After {self.grasps} grasps '{coordinate}' is not at the target.")
@@ -263,10 +271,11 @@ class _Run:
         if search.standing:
             stands = {s: wanted[s] for s in search.standing}
             gone = session.world.time - self.begin
-            session.restart(session.world.state.updated(stands))
+            session.restart(session.world.state.updated(stands))  # everything else stays where it is
             self.begin = -gone
             self.motion.until = self.seconds - gone
             self._judge_afresh()
+            self.motion.look()
         motion = self.motion
         motion.move_fingers(self.gripper.opened)
         planner = self.opener.planner

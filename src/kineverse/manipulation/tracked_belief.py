@@ -33,8 +33,8 @@ from .base_filter import BaseFilter, motion_of, place
 
 _LEAST_POSITION, _LEAST_ORIENTATION = 1e-4, 1e-4
 """Smallest stated noise of poses [m], [rad], for sensors without any."""
-_MOVING, _RESTING = 0.25, 4e-4
-"""Shares of the tracker's default process noise: .05 rad/√s and .03 m/√s for a door and a drawer in motion,
+_MOVING, _RESTING = 0.04, 4e-4
+"""Shares of the tracker's default process noise: .02 rad/√s and .013 m/√s for a door and a drawer in motion,
 and .002 rad/√s and .0013 m/√s at rest."""
 _MOVED = 1.0
 """Time for which a part counts as moving after it was [s]."""

@@ -212,6 +212,7 @@ def add_contact_rules(
             geom.friction[0] = friction
             if body.name in held:
                 geom.condim, geom.priority = _CONDIM, 1
+                geom.solref[:2], geom.solimp[:3] = _solref(spec), _STIFF_SOLIMP
     option = spec.option
     option.cone, option.impratio = engine.mjtCone.mjCONE_ELLIPTIC, 10.0
     option.integrator = engine.mjtIntegrator.mjINT_IMPLICITFAST
