@@ -117,14 +117,35 @@ def test_distances_of_parallel_faces_edges_and_contacts():
     rng = np.random.default_rng(1)
     box, other = random_shape("box", rng), random_shape("box", rng)
     upright = np.eye(4)[:3]
-    for shift in (0.2, 1e-3, 2e-5, 0.0, -1e-7, -1e-3, -0.02):
+    for shift in (0.2, 1e-3, 2e-5, 5e-6, 1e-6, 3e-8, 0.0, -1e-7, -1e-3, -0.02):
         pose = upright.copy()
         pose[2, 3] = box.sizes[2] + other.sizes[2] + shift
         distance, (_, _, normal) = measured(placed((box, other), (upright, pose)))
         assert distance == pytest.approx(shift, abs=1e-9)
         np.testing.assert_allclose(normal, [0, 0, 1], atol=1e-4)
-    pose[2, 3] = box.sizes[2] + other.sizes[2] + 5e-6
-    assert np.isnan(measured(placed((box, other), (upright, pose)))[0])
+
+
+@settings(max_examples=attempts(100))
+@given(kind=kinds, other=kinds, seed=seeds, turned=st.booleans(), apart=st.sampled_from([9e-6, 1e-6, 3e-7]))
+def test_distances_of_solids_that_nearly_touch(kind, other, seed, turned, apart):
+    """Moved together along the normal, two convex solids are as far apart as is left of their distance."""
+    rng = np.random.default_rng(seed)
+    shapes = random_shape(kind, rng), random_shape(other, rng)
+    poses = [random_pose(rng, 0.6) for _ in shapes]
+    if not turned:
+        poses[1][:, :3] = poses[0][:, :3]  # parallel faces
+    distance, (_, _, normal) = measured(placed(shapes, poses))
+    if not distance > 1e-3:
+        return
+    poses[1][:, 3] -= (distance - apart) * normal
+    found, (point_a, point_b, normal) = measured(placed(shapes, poses))
+    if np.isnan(found):  # is left to coal
+        assert not {kind, other} <= set(EXACT)
+        assert apart < 1e-6
+        return
+    assert found == pytest.approx(apart, abs=1e-9)
+    assert normal @ (point_b - point_a) == pytest.approx(found, abs=1e-12)
+    assert gap(*shapes, np.stack(poses), normal) == pytest.approx(found, abs=1e-8)
 
 
 @pytest.mark.parametrize("kind", ["box", "ellipsoid"])

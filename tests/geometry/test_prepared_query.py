@@ -147,6 +147,43 @@ def test_motions_match_a_query_at_each_configuration(rows, monkeypatch, tmp_path
             question(coordinates, np.zeros((0, 3)), -1.0)
 
 
+@pytest.mark.compiler
+@pytest.mark.parametrize("step", [0.0005, 0.004, 0.3])
+def test_watch_matches_a_query_from_scratch_along_a_random_motion(model, step, monkeypatch):
+    """The list of neighbours misses no pair: as they move on or rest, at other radii, after resets."""
+    library, rng = bindings.CollisionLibrary(), np.random.default_rng(1)
+    assert library.prepare(wait=True)
+    for module in (collision_world, distance_queries):
+        monkeypatch.setattr(module, "collision_library", library)
+    searches = []
+    scene = Scene(model)
+    watches = [scene.watch("link*", radius=0.1), scene.watch(radius=0.1, moving="j2", per_shape=True)]
+    fresh = Scene(model)
+    anew = [fresh.watch("link*", radius=0.1), fresh.watch(radius=0.1, moving="j2", per_shape=True)]
+    state = random_state(model, rng)
+    drift = rng.normal(size=len(state))
+    for k in range(60):
+        if k % 10 < 8:
+            change = step * (drift + rng.normal(size=len(state)))
+            state = state.updated(
+                {s: v + d for (s, v), d in zip(state.items(), change.tolist(), strict=True)}
+            )
+        for one in (scene, fresh):
+            one.update(state)
+        if k == 30:
+            scene.collision_world.table.reset_travel()
+        fresh.collision_world.table.reset_travel()  # forgets neighbours and bounds
+        for watch, other in zip(watches, anew, strict=True):
+            radius = 0.15 if k == 40 else 0.05 if k == 41 else None
+            found, want = watch(radius), other(radius)
+            searches.append(len(want))
+            np.testing.assert_array_equal(found.body_indices, want.body_indices)
+            np.testing.assert_array_equal(found.shape_indices, want.shape_indices)
+            np.testing.assert_allclose(found.distances, want.distances, atol=1e-9)
+    assert max(searches) > 5
+    assert len(set(searches)) > 1 or step < 0.001
+
+
 def test_the_nearest_pairs_of_shapes_are_those_of_the_bodies(model):
     scene = Scene(model)
     one, each = scene.watch(radius=0.4), scene.watch(radius=0.4, per_shape=True)

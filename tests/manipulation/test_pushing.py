@@ -113,8 +113,9 @@ def test_contact_slots_keep_a_margin_for_each_pair_and_know_velocities_of_points
     n = len(speeds)
 
     def lower() -> float:
-        arrays = np.zeros((n, n)), np.zeros(n), np.zeros((4, n)), np.full(4, -np.inf), np.full(4, np.inf)
-        slots.write(*arrays, 5.0)
+        arrays = np.zeros((n, n)), np.zeros(n), np.zeros((4, n)), np.full(4, -np.inf)
+        slots.bind(*arrays)
+        slots.write(5.0)
         return float(arrays[3][0])
 
     assert lower() == pytest.approx(-10 * (nearest.distance - 0.005))

@@ -83,6 +83,8 @@ class Clearance:
         self._n, self._static = n, n + rows
         self._A = np.zeros((rows + _SLOTS, n))
         self._lower, self._upper = np.zeros((2, n + rows + _SLOTS))
+        self._H, self._f = np.zeros((n, n)), np.zeros(n)
+        self._contacts.bind(self._H, self._f, self._A[rows:], self._lower[n + rows :])
         self._solver = make_solver("daqp", n, rows + _SLOTS)
 
     def load(self, values: Mapping[Symbol, float]) -> None:
@@ -111,7 +113,7 @@ class Clearance:
         Parameters
         ----------
         H, f, A, lower, upper
-            Quadratic program of the tasks at the same coordinates; H and f are changed in place.
+            Quadratic program of the tasks at the same coordinates.
         """
         n, static = self._n, self._static
         self._A[: static - n], self._A[static - n :] = A, 0.0
@@ -119,8 +121,9 @@ class Clearance:
         self._upper[:static], self._upper[static:] = upper, np.inf
         self._lower[:n] = np.maximum(lower[:n], -_LONGEST)
         self._upper[:n] = np.minimum(upper[:n], _LONGEST)
-        self._contacts.write(H, f, self._A[static - n :], self._lower[static:], self._upper[static:], 1.0)
-        found = self._solver.solve(H, f, self._A, self._lower, self._upper)
+        self._H[:], self._f[:] = H, f
+        self._contacts.write(1.0)
+        found = self._solver.solve(self._H, self._f, self._A, self._lower, self._upper)
         return found.x if found.status == "solved" else None
 
     def _twist(self, body: str) -> Expression:

@@ -26,7 +26,8 @@ from kineverse.lie import Array
 from kineverse.model.frame_dependence import FrameDependence
 from kineverse.symbols import Symbol
 
-from .velocity_program import INWARDS, RECOVERY_WEIGHT
+from .contact_rows import ContactRows
+from .velocity_program import RECOVERY_WEIGHT
 
 
 class ContactSlots:
@@ -97,11 +98,13 @@ class ContactSlots:
         self.margin, self.radius, self.gain = margin, radius, gain
         motion = FrameDependence(model, speeds)
         self._query = scene.watch(radius=radius, moving=speeds, rules=rules, per_shape=True)
+        self._query.prepare()
         watched = set(self._query.pairs.ravel().tolist())
         moved = [motion.moving_ancestors(b) if k in watched else () for k, b in enumerate(scene.bodies)]
         groups = {group: k for k, group in enumerate(dict.fromkeys(((), *moved)))}
         self._group = np.array([groups[group] for group in moved], dtype=np.intp)
-        self._margins: Array | None = None
+        self._margins = np.full((len(scene.bodies), len(scene.bodies)), self.margin)
+        self._rows: ContactRows
         self._selected: dict[tuple[tuple[str, ...], tuple[str, ...]], PairFlags] = {}
         members = dict(zip(moved, scene.bodies, strict=True))
         twists: list[Expression] = [as_expression(np.zeros((6, len(speeds))))]
@@ -153,8 +156,6 @@ class ContactSlots:
         if not (math.isfinite(margin) and margin < self.radius):
             raise InvalidValueError(f"A margin is smaller than the radius {self.radius!r} m, not {margin!r}.")
         bodies = self.scene.bodies
-        if self._margins is None:
-            self._margins = np.full((len(bodies), len(bodies)), self.margin)
         ones, others = (tuple([names] if isinstance(names, str) else names) for names in (one, other))
         if (ones, others) not in self._selected:
             self._selected[ones, others] = flag_between(
@@ -177,49 +178,33 @@ class ContactSlots:
         across = np.array([[0.0, z, -y], [-z, 0.0, x], [y, -x, 0.0]])
         return np.asarray(twist[:3] + across @ twist[3:])
 
-    def write(
-        self,
-        H: Array,
-        f: Array,
-        A: Array,
-        lower: Array,
-        upper: Array,
-        recovery: float,
-        weight: float = RECOVERY_WEIGHT,
-    ) -> None:
-        """Write the rows of the nearest pairs into the rows of a program, and the soft goals into its costs.
+    def bind(self, H: Array, f: Array, A: Array, lower: Array) -> None:
+        """Choose the arrays of the program into which :meth:`write` writes.
 
         Parameters
         ----------
         H, f
-            Costs over all variables, the speeds first; changed in place.
-        A, lower, upper
-            The rows of the slots, (count, n) and (count,), all zero and unbounded before.
+            Costs over all variables, the speeds first; soft goals are added to them.
+        A, lower
+            The rows of the slots, (count, n) and (count,), all zero and unbounded before each :meth:`write`.
+        """
+        self._rows = ContactRows(
+            self._group, self._twists.outputs[0], self._margins, *map(_contiguous, (H, f, A, lower))
+        )
+
+    def write(self, recovery: float, weight: float = RECOVERY_WEIGHT) -> None:
+        """Write the rows of the nearest pairs into the program, and the soft goals into its costs.
+
+        Parameters
+        ----------
         recovery
             Rate at which a pair within the margin separates [1/s].
         weight
             Weight of the soft goals.
         """
-        found = self.found
-        used = min(len(found), self.count)
-        if not used:
-            return
-        distances, normals = found.distances[:used], found.normals[:used]
-        groups = self._group[found.body_indices[:used]]
-        twists = self._twists.outputs[0]
-        n = twists.shape[2]
-        points = np.concatenate([found.points_b[:used], found.points_a[:used]])
-        both = _project(np.concatenate([normals, -normals]), points, twists[groups.T[::-1].ravel()])
-        rows = both[:used] + both[used:]
-        margins = self.margin if self._margins is None else self._margins[tuple(found.body_indices[:used].T)]
-        gap = distances - margins
-        A[:used, :n] = rows
-        lower[:used] = -self.gain * np.maximum(gap, 0.0)
-        near = gap < 0.0
-        if near.any():
-            inside = rows[near]
-            H[:n, :n] += weight * (inside.T @ inside)
-            f[:n] -= weight * recovery * ((INWARDS - gap[near]) @ inside)
+        used = min(len(self.found), self.count)
+        if used:
+            self._rows.write(self.found, used, gain=self.gain, recovery=recovery, weight=weight)
 
 
 def check_slots(count: object) -> None:
@@ -228,13 +213,8 @@ def check_slots(count: object) -> None:
         raise InvalidValueError(f"contacts= is a number of rows, 0 or more, not {count!r}.")
 
 
-def _project(normals: Array, points: Array, twists: Array) -> Array:
-    """Return n·(v + ω × p) for each of K points and each column: (K, 3), (K, 3), (K, 6, n) -> (K, n)."""
-    nx, ny, nz = normals.T
-    px, py, pz = points.T
-    wrench = np.empty((len(normals), 1, 6))
-    wrench[:, 0, :3] = normals
-    wrench[:, 0, 3] = py * nz - pz * ny
-    wrench[:, 0, 4] = pz * nx - px * nz
-    wrench[:, 0, 5] = px * ny - py * nx
-    return np.asarray((wrench @ twists)[:, 0, :])
+def _contiguous(array: Array) -> Array:
+    """Return an array that C can write to."""
+    if not array.flags.c_contiguous or array.dtype != np.float64:
+        raise InvalidValueError("Rows of contacts are written in place, into contiguous arrays of doubles.")
+    return array

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import gc
 import math
 from collections.abc import Callable, Iterable, Mapping
 from time import perf_counter
@@ -172,13 +173,20 @@ class Controller:
         if self._contacts is not None:
             self._functions.append(self._contacts.function)
         self._evaluate = self._program.function.bind()
+        if self._contacts is not None:
+            H, f, A, lower, *_ = self._evaluate.outputs
+            rows, first = self._program.contact_rows, self._program.columns
+            self._contacts.bind(H, f, A[rows], lower[first + rows.start : first + rows.stop])
         n, first = len(self.speeds), len(self._program.inputs)
         program_values = self._evaluate.input[:first]
         self._values = np.zeros(len(self.inputs)) if self._contacts else program_values
         self._coordinates = tuple(s for s in self.inputs if s.value is None)
         self._parameters = {s: k for k, s in enumerate(self.inputs) if s.value is not None}
-        self._settings = {s: float(s.value or 0.0) for s in self._parameters}
-        self._values[len(self._coordinates) :] = list(self._settings.values())
+        # In a state a parameter may also have the name of a coordinate, see State.given.
+        self._settable = frozenset(n for s in self._parameters for n in (s, Symbol(s.path, s.order)))
+        self._settings = np.array([s.value or 0.0 for s in self._parameters])
+        self._values[len(self._coordinates) :] = self._settings
+        self._target_places: dict[Target, tuple[npt.NDArray[np.intp], npt.NDArray[np.intp]]] = {}
         self._dt = self._evaluate.input[first : first + 1]
         self._dt[:] = dt
         self._last = self._evaluate.input[first + 1 : first + 1 + n]
@@ -236,25 +244,37 @@ class Controller:
         ShapeError, InvalidValueError
             For a value of another shape, or one that is not finite.
         """
-        given: list[tuple[Symbol | str, float]]
         if isinstance(target, Target):
-            given = [*target.values(value).items()]
-        elif np.ndim(value):
+            self._set_target(target, value)
+            return
+        if np.ndim(value):
             raise ShapeError(f"The parameter '{target}' is a number, not of shape {np.shape(value)}.")
-        else:
-            named = {str(s): s for s in self._parameters}
-            given = [(named.get(str(target), target), float(np.asarray(value, dtype=float)))]
-        for symbol, number in given:
-            if not isinstance(symbol, Symbol) or symbol not in self._parameters:
-                if isinstance(target, Target) and any(s in self._parameters for s in target.parameters):
-                    continue
-                known = map(str, self._parameters)
-                raise UnknownNameError(
-                    f"No task depends on '{symbol}'. {suggest(str(symbol), known, 'parameter')}"
-                )
-            if not math.isfinite(number):
-                raise InvalidValueError(f"The value of '{symbol}' has to be finite, not {number!r}.")
-            self._values[self._parameters[symbol]] = self._settings[symbol] = number
+        named = {str(s): s for s in self._parameters}
+        symbol = named.get(str(target), target)
+        if not isinstance(symbol, Symbol) or symbol not in self._parameters:
+            raise self._unknown_parameter(symbol)
+        number = float(np.asarray(value, dtype=float))
+        if not math.isfinite(number):
+            raise InvalidValueError(f"The value of '{symbol}' has to be finite, not {number!r}.")
+        place = self._parameters[symbol]
+        self._values[place] = self._settings[place - len(self._coordinates)] = number
+
+    def _set_target(self, target: Target, value: npt.ArrayLike) -> None:
+        """Set the parameters of a target that tasks depend on."""
+        numbers = target.numbers(value)
+        if target not in self._target_places:
+            used = [k for k, s in enumerate(target.parameters) if s in self._parameters]
+            if not used:
+                raise self._unknown_parameter(target.parameters[0])
+            places = [self._parameters[target.parameters[k]] for k in used]
+            self._target_places[target] = np.array(used, dtype=np.intp), np.array(places, dtype=np.intp)
+        chosen, at = self._target_places[target]
+        self._values[at] = chosen_numbers = numbers[chosen]
+        self._settings[at - len(self._coordinates)] = chosen_numbers
+
+    def _unknown_parameter(self, symbol: object) -> UnknownNameError:
+        known = map(str, self._parameters)
+        return UnknownNameError(f"No task depends on '{symbol}'. {suggest(str(symbol), known, 'parameter')}")
 
     @property
     def contact_slots(self) -> ContactSlots:
@@ -304,6 +324,16 @@ class Controller:
         UnknownNameError, ShapeError, InvalidValueError
             For a state that lacks a value, or has another length, or a NaN.
         """
+        # A collection of the whole program takes many times as long as a step; it has time between steps.
+        collecting = gc.isenabled()
+        gc.disable()
+        try:
+            return self._step(state)
+        finally:
+            if collecting:
+                gc.enable()
+
+    def _step(self, state: StateLike | npt.ArrayLike) -> Command:
         start = perf_counter()
         self._read(state)
         if self._contacts is not None:
@@ -315,17 +345,7 @@ class Controller:
         self._evaluate()
         H, f, A, lower, upper, residuals, check, largest, *_ = self._evaluate.outputs
         if self._contacts is not None:
-            rows, first = self._program.contact_rows, self._program.columns
-            ends = slice(first + rows.start, first + rows.stop)
-            self._contacts.write(
-                H,
-                f,
-                A[rows],
-                lower[ends],
-                upper[ends],
-                self._costs.recovery,
-                RECOVERY_WEIGHT * float(largest[()]),
-            )
+            self._contacts.write(self._costs.recovery, RECOVERY_WEIGHT * float(largest[()]))
         if not math.isfinite(check[()]):
             raise self._diagnosis.not_finite()
         evaluated = perf_counter()
@@ -362,7 +382,7 @@ class Controller:
             min(values[n:], default=1.0),
             times,
             iterations,
-            multipliers.copy(),
+            multipliers,
             self._row_names,
             () if self._contacts is None else self._contacts.found,
         )
@@ -373,9 +393,12 @@ class Controller:
             if not isinstance(state, State):
                 state = as_state(state, (*self.model.symbols, *self.model.speeds, *self.inputs))
             self._values[: len(self._coordinates)] = state.vector(self._coordinates)
-            for symbol, place in self._parameters.items():
-                value = state.given(symbol)
-                self._values[place] = self._settings[symbol] if value is None else value
+            self._values[len(self._coordinates) :] = self._settings
+            if not self._settable.isdisjoint(state):
+                for symbol, place in self._parameters.items():
+                    value = state.given(symbol)
+                    if value is not None:
+                        self._values[place] = value
             return
         try:
             vector = np.asarray(state, dtype=float)

@@ -29,19 +29,40 @@ _ARRAYS = (
 )  # fmt: skip
 
 
+_GATHERED = ("pieces", "bodies", "distance", "witness")
+
 RankedPairs: TypeAlias = tuple[Indices, Indices, Floats, Floats]
 """Objects (K, 2), their bodies (K, 2), distances (K,) and witnesses (K, 9), nearest first."""
 
-SearchResult: TypeAlias = tuple[Indices, Floats, Floats, Floats, RankedPairs | None]
-"""Pairs, lower bounds, distances and witnesses, valid until the next query; and copies of ranked pairs."""
+MeasuredPairs: TypeAlias = tuple[Indices, Floats, Floats, Floats]
+"""Objects (K, 2), lower bounds (K,), distances (K,) and witnesses (K, 9), valid until the next query."""
 
 
 class _Struct(ctypes.Structure):
     _fields_ = (
         *((name, ctypes.c_int64) for name in ("count", "moving", "bodies", "axis")),
         *((name, ctypes.c_void_p) for name in (*_ARRAYS, "boxes", "leaves")),
-        ("node_count", ctypes.c_int64),
-        ("leaf_count", ctypes.c_int64),
+        *((name, ctypes.c_int64) for name in ("node_count", "leaf_count", "resets")),
+    )
+
+
+class _QueryStruct(ctypes.Structure):
+    _fields_ = (
+        *((name, ctypes.c_double) for name in ("reach", "radius")),
+        *((name, ctypes.c_int64) for name in ("all", "room")),
+        *((name, ctypes.c_void_p) for name in ("allowed", "active", "known")),
+        *((name, ctypes.c_void_p) for name in ("pairs", "lows", "distances", "witnesses", "order")),
+        ("kept", ctypes.c_int64),
+        *((name, ctypes.c_void_p) for name in ("pieces", "bodies", "distance", "witness")),
+    )
+
+
+class _NeighbourStruct(ctypes.Structure):
+    _fields_ = (
+        ("reach", ctypes.c_double),
+        ("travel", ctypes.c_void_p),
+        ("pairs", ctypes.c_void_p),
+        *((name, ctypes.c_int64) for name in ("found", "room", "resets")),
     )
 
 
@@ -167,33 +188,44 @@ class CollisionLibrary(SourceLibrary):
         radius: float,
         selection: PairSelection | None = None,
         per_shape: bool = False,
-    ) -> SearchResult:
+    ) -> tuple[MeasuredPairs | None, RankedPairs | None]:
         """Apply :meth:`near`, :meth:`measure` and, if none is left to coal, :meth:`rank` and :meth:`gather`.
 
         The search covers the selected pairs of bodies, or all checked pairs if None.
+
+        Returns
+        -------
+        measured, ranked
+            The measured pairs if some are left to coal, else the ranked ones.
         """
         if self._code is None:
             wanted = None if selection is None else selection.bodies
             pairs, lows = broadphase.find_near_pairs(table, reach, wanted)
-            return pairs, lows, *self.measure(table, pairs, radius), None
+            return (pairs, lows, *self.measure(table, pairs, radius)), None
         binding = _bind_table(table)
-        struct = binding.struct
-        checked = struct.allowed, struct.active
+        query, known = binding.query, None
+        query.reach, query.radius, query.all = reach, radius, per_shape
+        query.allowed = query.active = query.known = None
         if selection is not None:
-            struct.allowed, struct.active = selection.addresses
-        asked = binding.address, reach, radius, per_shape
-        try:
-            while (found := self._code.search(*asked, *binding.everything)) > len(binding.lows):
+            query.allowed, query.active = selection.addresses
+            known = selection.binding
+            if known is None:
+                known = selection.binding = _NeighbourBinding(table)
+            query.known = known.address
+        while True:
+            found = self._code.search(binding.address, binding.query_address)
+            if found < 0 and known is not None:
+                known.reserve(-2 * found)
+            elif found > query.room:
                 binding.reserve(2 * found)
-        finally:
-            struct.allowed, struct.active = checked
-        kept = binding.kept.value
-        pairs, lows, distances, witnesses = binding.pairs, binding.lows, binding.distances, binding.witnesses
+            else:
+                break
+        kept = query.kept
         if kept < 0:
-            return pairs[:found], lows[:found], distances[:found], witnesses[:found], None
+            pairs, lows = binding.pairs[:found], binding.lows[:found]
+            return (pairs, lows, binding.distances[:found], binding.witnesses[:found]), None
         objects, bodies, near, points = binding.nearest
-        nearest = objects[:kept].copy(), bodies[:kept].copy(), near[:kept].copy(), points[:kept].copy()
-        return pairs[:found], lows[:found], distances[:found], witnesses[:found], nearest
+        return None, (objects[:kept].copy(), bodies[:kept].copy(), near[:kept].copy(), points[:kept].copy())
 
 
 class _TableBinding:
@@ -207,6 +239,8 @@ class _TableBinding:
         self.struct.count, self.struct.moving = table.count, table.moving
         self.struct.bodies = len(table.allowed)
         self.address = ctypes.addressof(self.struct)
+        self.query = _QueryStruct()
+        self.query_address = ctypes.addressof(self.query)
         self.reserve(256)
 
     def rebuild_tree(self, table: ObjectTable) -> None:
@@ -222,20 +256,38 @@ class _TableBinding:
         self.pairs = np.empty((count, 2), dtype=np.int32)
         self.lows = np.empty(count)
         self.distances, self.witnesses = np.empty(count), np.empty((count, 9))
-        self.order, self.kept = np.empty(count, dtype=np.int64), ctypes.c_int64()
+        self.order = np.empty(count, dtype=np.int64)
         self.results = self.pairs.ctypes.data, self.lows.ctypes.data, count
         objects, bodies = np.empty((2, count, 2), dtype=np.int32)
         self.nearest = objects, bodies, np.empty(count), np.empty((count, 9))
-        measured = (array.ctypes.data for array in (self.distances, self.witnesses, self.order))
-        gathered = (array.ctypes.data for array in self.nearest)
-        self.everything = count, *self.results[:2], *measured, ctypes.addressof(self.kept), *gathered
+        measured: tuple[npt.NDArray[Any], ...] = self.pairs, self.lows, self.distances, self.witnesses
+        arrays = *measured, self.order, *self.nearest
+        names = ("pairs", "lows", "distances", "witnesses", "order", *_GATHERED)
+        for name, array in zip(names, arrays, strict=True):
+            setattr(self.query, name, array.ctypes.data)
+        self.query.room = count
+
+
+class _NeighbourBinding:
+    """List of neighbours among selected pairs, as C reads and writes it."""
+
+    def __init__(self, table: ObjectTable) -> None:
+        self._travel, self._struct = np.zeros(table.moving), _NeighbourStruct(resets=-1)
+        self._struct.travel = self._travel.ctypes.data
+        self.address = ctypes.addressof(self._struct)
+        self.reserve(1024)
+
+    def reserve(self, count: int) -> None:
+        """Allocate a list for a number of pairs, which are found anew."""
+        self._pairs = np.empty((count, 2), dtype=np.int32)
+        self._struct.pairs, self._struct.room, self._struct.resets = self._pairs.ctypes.data, count, -1
 
 
 def _bind_table(table: ObjectTable) -> _TableBinding:
     binding: _TableBinding | None = table.binding
     if binding is None:
         binding = table.binding = _TableBinding(table)
-    binding.struct.axis = table.axis
+    binding.struct.axis, binding.struct.resets = table.axis, table.resets
     if table.static_changed:
         binding.rebuild_tree(table)
     return binding
@@ -252,8 +304,7 @@ def _declare_signatures(code: Any) -> None:
     code.rank.restype = ctypes.c_int64
     code.gather.argtypes = (*(pointer,) * 5, ctypes.c_int64, *(pointer,) * 4)
     code.gather.restype = None
-    code.search.argtypes = (pointer, *(ctypes.c_double,) * 2, *(ctypes.c_int64,) * 2, *(pointer,) * 10)
-    code.search.restype = ctypes.c_int64
+    code.search.argtypes, code.search.restype = (pointer, pointer), ctypes.c_int64
     code.trace.argtypes, code.trace.restype = (pointer, pointer, ctypes.c_int64), ctypes.c_int64
     code.settle.argtypes, code.settle.restype = (pointer, pointer, ctypes.c_int64), ctypes.c_int64
     code.advance.argtypes = (pointer, pointer, ctypes.c_int64, ctypes.c_int64)

@@ -73,6 +73,8 @@ class ObjectTable:
         Axis of the sweep: 0, 1 or 2.
     binding
         The table as C reads it, once it exists.
+    resets
+        Number of resets of travel.
     static_changed
         True if a static object was placed since the static tree was built.
     bounds
@@ -104,6 +106,7 @@ class ObjectTable:
     bounds: Floats | None = field(init=False)
     axis: int = 0
     binding: Any = None
+    resets: int = 0
     static_changed: bool = True
 
     def __post_init__(self) -> None:
@@ -169,6 +172,7 @@ class ObjectTable:
     def reset_travel(self) -> None:
         """Reset travel, bounds and remembered results."""
         self.travel[:] = 0.0
+        self.resets += 1
         self.memory[:] = 0
         if self.bounds is not None:
             self.bounds[self.bounds != 0.0] = 0.0
@@ -216,14 +220,22 @@ class PairSelection:
         The table; the objects of selected bodies have solids.
     bodies
         (B, B) 1 for selected pairs, symmetric; 0 on the diagonal.
+
+    Attributes
+    ----------
+    addresses
+        Addresses of the flags of the pairs, and of those of the objects that are in any pair.
+    binding
+        Neighbours as C reads them, once they exist.
     """
+
+    binding: Any = None
 
     def __init__(self, table: ObjectTable, bodies: Flags) -> None:
         self.bodies = np.ascontiguousarray(bodies)
         involved = np.asarray(self.bodies.any(axis=1), dtype=np.uint8)
         self._objects = np.ascontiguousarray(involved[table.body])
         self.addresses = self.bodies.ctypes.data, self._objects.ctypes.data
-        """Addresses of the flags of the pairs, and of those of the objects that are in any pair."""
 
 
 TREE_WIDTH = 8

@@ -28,8 +28,16 @@ typedef struct {
   Memory *memory;
   const double *boxes;
   const int32_t *leaves;
-  int64_t node_count, leaf_count;
+  int64_t node_count, leaf_count, resets;
 } Table;
+
+/* Pairs that may be within a reach; see `near_again`. */
+typedef struct {
+  double reach;
+  double *travel; /* of the moving objects when they were found */
+  int32_t *pairs;
+  int64_t found, room, resets;
+} Neighbours;
 
 #define MEMORY_BITS @BITS@
 #define TREE_WIDTH @WIDTH@
@@ -55,6 +63,8 @@ static inline double larger(double x, double y) { return x > y ? x : y; }
 #define LONGEST_TRAVEL 1e4
 #define PLACED -1
 #define TRAVEL_EXCEEDED -2
+/* Difference of the reach of neighbours to that of a query. */
+#define SPARE 0.04
 
 EXPORT int64_t place(Table *t, const double *fresh) {
   int64_t outcome = PLACED;
@@ -63,6 +73,7 @@ EXPORT int64_t place(Table *t, const double *fresh) {
   for (int64_t k = 0; k < t->moving; k++) {
     const double *new = fresh + 12 * k, *c = t->centre + 3 * k, *h = t->half + 3 * k;
     double *old = t->poses + 12 * k, turned = 0.0, shifted = 0.0;
+    if (!memcmp(new, old, 12 * sizeof(double))) continue;
     for (int r = 0; r < 3; r++) {
       const double *row = new + 4 * r;
       const double at = row[0] * c[0] + row[1] * c[1] + row[2] * c[2] + row[3];
@@ -136,7 +147,7 @@ static void consider(const Table *t, int64_t one, int64_t other, Answer *answer)
   if (answer->found < answer->room) {
     answer->pairs[2 * answer->found] = (int32_t)i;
     answer->pairs[2 * answer->found + 1] = (int32_t)j;
-    answer->lows[answer->found] = low;
+    if (answer->lows) answer->lows[answer->found] = low;
   }
   answer->found++;
 }
@@ -207,6 +218,43 @@ EXPORT int64_t near(Table *t, double reach, int32_t *pairs, double *lows, int64_
     for (int64_t m = k + 1; m < end; m++)
       if (gap[m] <= reach * reach) consider(t, one, t->order[m], &answer);
     if (n < t->count) consider_static(t, one, &answer);
+  }
+  return answer.found;
+}
+
+/* Distance by which two objects may have come nearer since pairs were found. */
+static double approached(const Table *t, const Neighbours *known) {
+  double first = 0.0, second = 0.0;
+  for (int64_t k = 0; k < t->moving; k++) {
+    const double travel = t->active[k] ? t->travel[k] - known->travel[k] : 0.0;
+    if (travel > first) second = first, first = travel;
+    else if (travel > second) second = travel;
+  }
+  return first + second;
+}
+
+/* Does what `near` does, by a list of neighbours (Verlet, Physical Review 159, 1967): pairs within a larger
+   reach. All others stay beyond the reach until two objects have come nearer by the difference. Returns minus
+   the number of neighbours if there are more than the list has room for. */
+static int64_t near_again(
+    Table *t, Neighbours *known, double reach, int32_t *pairs, double *lows, int64_t room) {
+  if (known->resets != t->resets || !(reach + approached(t, known) <= known->reach)) {
+    known->resets = -1;
+    const int64_t found = near(t, reach + SPARE, known->pairs, NULL, known->room);
+    if (found > known->room) return -found;
+    known->found = found;
+    known->reach = reach + SPARE;
+    known->resets = t->resets;
+    memcpy(known->travel, t->travel, t->moving * sizeof(double));
+  }
+  Answer answer = {reach, pairs, lows, room, 0};
+  for (int64_t k = 0; k < known->found; k++) {
+    const int32_t i = known->pairs[2 * k], j = known->pairs[2 * k + 1];
+    double gap = 0.0;
+    for (int r = 0; r < 3; r++)
+      gap += square(larger(larger(t->low[3 * i + r] - t->high[3 * j + r],
+                                  t->low[3 * j + r] - t->high[3 * i + r]), 0.0));
+    if (gap <= reach * reach) consider(t, i, j, &answer);
   }
   return answer.found;
 }
@@ -355,22 +403,47 @@ static int measure_nearest(Table *t, const int32_t *pairs, int64_t n, const doub
   return enough;
 }
 
-/* Whole query: pairs that may be within `reach` are measured, ranked, and gathered. Returns the number of
-   measured pairs, and writes the number `kept`: -1 if some pairs are left to coal, or the buffers are too
-   short. */
-EXPORT int64_t search(
-    Table *t, double reach, double radius, int64_t all, int64_t room, int32_t *pairs, double *lows,
-    double *distances, double *witnesses, int64_t *order, int64_t *kept, int32_t *pieces, int32_t *bodies,
-    double *distance, double *witness) {
-  const int64_t found = near(t, reach, pairs, lows, room);
-  *kept = -1;
-  if (found > room) return found;
-  if (all || t->bodies == t->count || !measure_nearest(t, pairs, found, lows, radius, distances, witnesses))
-    measure(t, pairs, found, radius, distances, witnesses);
+/* Whole query. `allowed` and `active` take the place of the table's, unless they are NULL; `known` has the
+   neighbours among them, or is NULL. */
+typedef struct {
+  double reach, radius;
+  int64_t all, room;
+  const uint8_t *allowed, *active;
+  Neighbours *known;
+  int32_t *pairs;
+  double *lows, *distances, *witnesses;
+  int64_t *order;
+  int64_t kept;
+  int32_t *pieces, *bodies;
+  double *distance, *witness;
+} Query;
+
+static int64_t answer_query(Table *t, Query *q) {
+  const int64_t found = q->known ? near_again(t, q->known, q->reach, q->pairs, q->lows, q->room)
+                                 : near(t, q->reach, q->pairs, q->lows, q->room);
+  q->kept = -1;
+  if (found < 0 || found > q->room) return found;
+  if (q->all || t->bodies == t->count ||
+      !measure_nearest(t, q->pairs, found, q->lows, q->radius, q->distances, q->witnesses))
+    measure(t, q->pairs, found, q->radius, q->distances, q->witnesses);
   for (int64_t k = 0; k < found; k++)
-    if (isnan(distances[k])) return found;
-  *kept = rank(t, pairs, found, distances, radius, all, order);
-  if (*kept > 0) gather(t, pairs, distances, witnesses, order, *kept, pieces, bodies, distance, witness);
+    if (isnan(q->distances[k])) return found;
+  q->kept = rank(t, q->pairs, found, q->distances, q->radius, q->all, q->order);
+  if (q->kept > 0)
+    gather(t, q->pairs, q->distances, q->witnesses, q->order, q->kept, q->pieces, q->bodies, q->distance,
+           q->witness);
+  return found;
+}
+
+/* Measures, ranks and gathers the pairs that may be within `reach`. Returns the number of measured pairs, and
+   writes the number `kept`: -1 if some pairs are left to coal, or the buffers are too short. Minus the number
+   of neighbours is returned if that is more than there is room for. */
+EXPORT int64_t search(Table *t, Query *q) {
+  const uint8_t *allowed = t->allowed, *active = t->active;
+  if (q->allowed) t->allowed = q->allowed, t->active = q->active;
+  const int64_t found = answer_query(t, q);
+  t->allowed = allowed;
+  t->active = active;
   return found;
 }
 """

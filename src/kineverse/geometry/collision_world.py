@@ -278,22 +278,25 @@ class CollisionWorld:
         self.synchronize()
         if self._missing_state:
             raise UnknownNameError(f"{self._missing_state}: call scene.update(state) first.")
-        if self._all_loaded:
-            return
+        if not self._all_loaded:
+            first = not self.table.active.any()
+            if self.load(objects) and (first or objects is None):
+                self.table.choose_axis()
+
+    def load(self, objects: Iterable[int] | None = None) -> bool:
+        """Make the solids of some objects, or of all, and return whether any were missing."""
         wanted = [
             k for k in (range(len(self.objects)) if objects is None else objects) if self._solids[k] is None
         ]
         if not wanted and objects is not None:
-            return
+            return False
         # The choice between C and coal is made before the first distance, so that answers never change.
         collision_library.prepare(wait=True)
-        first = self.table.active.any()
         for k, solid in zip(wanted, load_solids(self.objects[k] for k in wanted), strict=True):
             self._solids[k] = solid
             self.table.set_solid(k, solid.centre, solid.half, solid.radius, solid.core)
-        if wanted and (objects is None or not first):
-            self.table.choose_axis()
         self._all_loaded = objects is None
+        return bool(wanted)
 
     def measure(self, pairs: Indices, lows: Floats, limit: float) -> tuple[Floats, Floats]:
         """Measure pairs of objects; of each pair of bodies, at least the nearest one.

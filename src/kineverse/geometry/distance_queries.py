@@ -51,11 +51,11 @@ def find_pairs_within(
     world.prepare(None if selection is None else ())
     table = world.table
     reach = radius + ACCURACY
-    pairs, lows, distances, witnesses, nearest = collision_library.search(
-        table, reach, radius, selection, per_shape
-    )
-    if nearest is not None:
+    measured, nearest = collision_library.search(table, reach, radius, selection, per_shape)
+    if measured is None:
+        assert nearest is not None
         return DistanceResults(world, *nearest)
+    pairs, lows, distances, witnesses = measured
     world.measure_remaining(pairs, lows, radius, distances, witnesses, per_shape)
     order = collision_library.rank(table, pairs, distances, radius, per_shape)
     return _make_results(world, pairs, distances, witnesses, order)

@@ -4,8 +4,9 @@ The iteration of Gilbert, Johnson and Keerthi (IEEE J. Robotics and Automation 4
 - a of the Minkowski difference {b - a} that is nearest to the origin. The distance of two cores is then
 ``|v|``; that of two solids is less by their radii, also where these overlap. Every step has a support point w
 in direction v, and ``vᵀw / |v| <= distance of the cores <= |v|``. A distance is returned only once both
-bounds meet, so it is right whatever the steps were. Deeper penetration is left to :data:`PENETRATION`, and
-uncertain pairs to coal. Results are remembered only for equal poses, so they depend on the poses alone.
+bounds meet, so it is right whatever the steps were. Of cores that nearly touch, both are those of the last
+step, so that its direction is certain. Deeper penetration is left to :data:`PENETRATION`, and uncertain pairs
+to coal. Results are remembered only for equal poses, so they depend on the poses alone.
 
 The depth is the distance of the origin from the surface of {b - a}. In the expanding polytope algorithm of
 van den Bergen (Proximity queries and penetration depth computation on 3D game objects, 2001), a polytope
@@ -18,8 +19,10 @@ SIMPLEX = r"""
 /* Tolerances of the two bounds: to converge, and to accept when no step improves any more [m]. */
 #define MET 1e-10
 #define STUCK 1e-9
-/* Below this distance the direction between the cores is too uncertain [m]. */
-#define LEAST 1e-5
+/* Below this distance the direction between the cores is too uncertain [m]; below the second one it has to
+   prove itself, and is that of a face where there is one. */
+#define LEAST 1e-7
+#define CLOSE 1e-4
 #define STEPS 64
 
 /* Points of {b - a}, with the points a that they come from. */
@@ -81,6 +84,12 @@ static Part nearest(const Simplex *s) {
   return found;
 }
 
+/* Point of a face nearest to the origin, along the normal of the face: rounding errors do not turn it. */
+static inline Vector foot(const Simplex *s) {
+  const Vector n = cross(plus(s->w[1], -1.0, s->w[0]), plus(s->w[2], -1.0, s->w[0]));
+  return plus((Vector){{0.0, 0.0, 0.0}}, dot(n, s->w[0]) / dot(n, n), n);
+}
+
 static void keep(Simplex *s, const Part *part) {
   for (int k = 0; k < part->n; k++) { /* indices ascend, so nothing is overwritten too early */
     s->w[k] = s->w[part->which[k]];
@@ -131,7 +140,8 @@ static double measured(const Table *t, int64_t i, int64_t j, double limit, doubl
     if (!(length > 0.0)) return deep(t, i, j, &pair, NULL, witness, low);
     Vector a;
     const Vector w = against(&pair, v, &a);
-    best = larger(best, dot(v, w) / length);
+    const double bound = dot(v, w) / length;
+    best = high < CLOSE ? bound : larger(best, bound);
     const double known = best - round_a - round_b;
     /* Stop only halfway to the upper bound, so that the lower bound is of use at later states. */
     if (known > limit + STUCK && 2.0 * best > high + limit + round_a + round_b) {
@@ -148,11 +158,15 @@ static double measured(const Table *t, int64_t i, int64_t j, double limit, doubl
     if (!(nearer < high)) break; /* The previous point is the better one. */
     keep(&s, &next);
     part = next;
-    v = next.v;
     high = nearer;
+    if (high < CLOSE && part.n == 3) {
+      part.v = foot(&s);
+      high = sqrt(dot(part.v, part.v));
+    }
+    v = part.v;
     if (high < LEAST) return deep(t, i, j, &pair, NULL, witness, low);
   }
-  if (!(high - best <= STUCK)) return NAN;
+  if (!(high - best <= STUCK)) return high < CLOSE ? deep(t, i, j, &pair, NULL, witness, low) : NAN;
   Vector a = {{0.0, 0.0, 0.0}};
   for (int k = 0; k < part.n; k++) a = plus(a, part.weight[k], s.a[k]);
   const Vector normal = plus((Vector){{0.0, 0.0, 0.0}}, 1.0 / high, part.v);
@@ -382,7 +396,7 @@ static double depth_of(const Pair *pair, const Simplex *s, double size, Vector *
     }
     if (reach - low <= DEEP_MET || !grow(&p, nearest, w, from, FLAT * size)) break;
   }
-  if (!(high - low <= DEEP_STUCK && best.height >= -DEEP_MET)) return NAN;
+  if (!(high - low <= DEEP_STUCK && best.height >= -LEAST)) return NAN;
   const int *c = best.corner;
   const Vector n = best.normal, x = p.w[c[0]], y = p.w[c[1]], z = p.w[c[2]];
   double weight[3] = {dot(n, cross(y, z)), dot(n, cross(z, x)), dot(n, cross(x, y))}, sum = 0.0;

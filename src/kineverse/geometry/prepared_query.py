@@ -114,13 +114,28 @@ class PreparedQuery:
                 found.limit = max(found.least, 0.0)
         return float(found.least)
 
+    def prepare(self) -> None:
+        """Make the solids of the selected bodies, which the first query does otherwise; no state is needed.
+
+        Raises
+        ------
+        KineverseError
+            If a solid cannot be made; the message names body and file.
+        """
+        self._world.load(self._involved(self._selected()))
+
+    def _involved(self, flags: Flags) -> list[int]:
+        """Return the objects of selected bodies."""
+        involved = np.asarray(flags.any(axis=1))
+        return np.flatnonzero(involved[self._world.table.body]).tolist()
+
     def _select(self) -> PairSelection:
         """Return the selected pairs, whose objects have solids."""
         world = self._world
         if self._selection is None or self._version != world.model.version:
             flags = self._selected()
-            involved = np.asarray(flags.any(axis=1))
-            world.prepare(k for k, body in enumerate(world.table.body.tolist()) if involved[body])
+            world.load(self._involved(flags))
+            world.table.choose_axis()
             self._selection = PairSelection(world.table, flags)
         return self._selection
 

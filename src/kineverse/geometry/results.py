@@ -127,6 +127,8 @@ class DistanceResults(Sequence[DistanceResult]):
         (K,) signed distances [m].
     points_a, points_b, normals
         (K, 3) each, as in :class:`DistanceResult`.
+    witnesses
+        (K, 9) all three side by side.
     body_indices
         (K, 2) indices of both bodies in the scene's ``bodies`` at the time of the query.
     """
@@ -136,7 +138,7 @@ class DistanceResults(Sequence[DistanceResult]):
     ) -> None:
         self._bodies, self._shape_numbers = world.bodies, world.shape_numbers
         self._object_indices, self.body_indices = objects, bodies
-        self.distances = distances
+        self.distances, self.witnesses = distances, witnesses
         self.points_a, self.points_b, self.normals = witnesses[:, :3], witnesses[:, 3:6], witnesses[:, 6:]
 
     @property

@@ -259,4 +259,7 @@ class HandMotion:
 def row_at(rows: Array, share: float) -> Array:
     """Return the configuration (n,) at a share of the way along some (K, n)."""
     place = share * (len(rows) - 1)
-    return np.array([np.interp(place, range(len(rows)), column) for column in rows.T])
+    k = min(max(int(place), 0), max(len(rows) - 2, 0))
+    rest = min(max(place - k, 0.0), 1.0)
+    found = (1.0 - rest) * rows[k] + rest * rows[min(k + 1, len(rows) - 1)]
+    return np.asarray(found)

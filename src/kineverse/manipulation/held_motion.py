@@ -26,7 +26,7 @@ deviations of its estimate that are added."""
 _STALLED, _PATIENCE, _RESTING = 1e-3, 4.0, 0.5
 """Least progress of the object [m], [rad] in a time [s], and in one at the end of the way."""
 
-_SETTLED = 25
+_SETTLED = 10
 """Number of steps for which an estimate is at the target when a motion ends."""
 
 

@@ -1,8 +1,8 @@
 """Belief from sensor readings: encoders, odometry, and poses that a camera sees at its rate.
 
 Coordinates of objects are estimated by a :class:`.Tracker` of all marked frames, at the times of pictures.
-Their process noise is that of a part in motion while it is commanded to move or its prediction is refuted,
-and for a second afterwards; else that of a part at rest, so that pictures average. From the last picture to
+Their process noise is that of a part in motion while it is commanded to move, or its prediction is refuted,
+and for a while afterwards; else that of a part at rest, so that pictures average. From the last picture to
 the present the state is predicted with the commanded speeds, those that a controller plans for objects among
 them. If the odometry drifts, a :class:`.BaseFilter` corrects it by marked frames that never move.
 """
@@ -36,8 +36,9 @@ _LEAST_POSITION, _LEAST_ORIENTATION = 1e-4, 1e-4
 _MOVING, _RESTING = 0.04, 4e-4
 """Shares of the tracker's default process noise: .02 rad/√s and .013 m/√s for a door and a drawer in motion,
 and .002 rad/√s and .0013 m/√s at rest."""
-_MOVED = 1.0
-"""Time for which a part counts as moving after it was [s]."""
+_MOVED, _REFUTED = 1.0, 0.3
+"""Times for which a part counts as moving after it was commanded to, and after its prediction was refuted [s].
+In the latter all of the tracker's process noise counts."""
 _STILL = 1e-3
 """Largest speed of a part that rests [m/s], [rad/s]."""
 _JOINT_SHARE, _JOINT_DRIFT = 0.2, 0.002
@@ -151,6 +152,7 @@ class TrackedBelief:
         self.seen: dict[Symbol, float] = {}
         self._history: list[tuple[float, float, Array]] = []
         self._moved: dict[Symbol, float] = {}
+        self._refuted: dict[Symbol, float] = {}
         self._now = self._picture = self._read = -math.inf
 
     def _make_tracker(self) -> Tracker:
@@ -200,6 +202,7 @@ class TrackedBelief:
             self.tracker.reset(dict(self.tracker.estimate.state), at=stamp)
         self._history.clear()
         self._moved.clear()
+        self._refuted.clear()
         self.seen.clear()
         self._now = self._read = -math.inf
         self._picture = stamp
@@ -285,7 +288,7 @@ class TrackedBelief:
             poses, mask, covariances=covariances, at=stamp, commands=commands, process_noise=noise
         )
         for group in estimate.refuted_groups:
-            self._moved |= dict.fromkeys(group, stamp)
+            self._refuted |= dict.fromkeys(group, stamp)
         for name in names:
             self.seen |= dict.fromkeys(self._coordinates_of[name], stamp)
         self._picture = stamp
@@ -293,6 +296,8 @@ class TrackedBelief:
             self._values[self._place[s]] = estimate.state[s]
 
     def _noise_share(self, coordinate: Symbol, now: float) -> float:
+        if now - self._refuted.get(coordinate, -math.inf) <= _REFUTED:
+            return 1.0
         return _MOVING if now - self._moved.get(coordinate, -math.inf) <= _MOVED else _RESTING
 
     def _deviations(self, poses: Array, eye: Array) -> Array:

@@ -41,6 +41,9 @@ def test_it_is_the_cubic_hermite_spline_of_its_knots(seed: int) -> None:
     largest = np.abs(spline.derivative()(times)).max()
     np.testing.assert_allclose(t.velocities_at(times), spline.derivative()(times), atol=1e-12 * largest)
     np.testing.assert_array_equal(t.positions_at(t.times), t.positions)
+    alone = [*times.ravel().tolist(), -0.1, 99.0]
+    np.testing.assert_allclose([t.positions_at(x) for x in alone], t.positions_at(alone), atol=1e-12)
+    np.testing.assert_array_equal([t.positions_at(x) for x in t.times.tolist()], t.positions)
     np.testing.assert_allclose(t.velocities_at(t.times), t.velocities, atol=1e-12 * largest)
 
 

@@ -85,6 +85,7 @@ class TrajectoryFollower:
         The rate is the mean one of the coming control period, so that a motion without disturbances stays
         on the trajectory. After the end, the goals hold the last position.
         """
-        now, later = self._trajectory.positions_at([time, time + controller.dt])
+        dt, trajectory = controller.dt, self._trajectory
+        now, later = trajectory.positions_at(float(time)), trajectory.positions_at(float(time) + dt)
         controller.set(self._position, now)
-        controller.set(self._speed, (later - now) / controller.dt)
+        controller.set(self._speed, (later - now) / dt)

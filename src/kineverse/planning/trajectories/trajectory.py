@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import math
 import os
 from collections.abc import Iterator
 from dataclasses import dataclass
+from functools import cached_property
 from pathlib import Path
 
 import numpy as np
@@ -99,6 +101,8 @@ class Trajectory:
 
         Before the beginning they are the first ones, and after the end the last ones.
         """
+        if isinstance(times, float) and math.isfinite(times):
+            return self._position_at(times)
         k, u, dt = self._locate(times)
         p, q = self.positions[k], self.positions[k + 1 - self._single]
         v, w = self.velocities[k] * dt, self.velocities[k + 1 - self._single] * dt
@@ -108,6 +112,31 @@ class Trajectory:
         r = u - 1
         far = q + r * (w + r * ((2 * w + v - 3 * change) + r * (v + w - 2 * change)))
         return np.asarray(np.where(u < 0.5, near, far))
+
+    @cached_property
+    def _polynomials(self) -> Array:
+        """Coefficients (2, T - 1, 4, n) of the cubics in the intervals, about their beginnings and ends."""
+        dt = np.diff(self.times)[:, None]
+        p, q = self.positions[:-1], self.positions[1:]
+        v, w = self.velocities[:-1] * dt, self.velocities[1:] * dt
+        change = q - p
+        cubic = v + w - 2 * change
+        begins = p, v, 3 * change - 2 * v - w, cubic
+        ends = q, w, 2 * w + v - 3 * change, cubic
+        return np.array([np.stack(rows, axis=1) for rows in (begins, ends)])
+
+    def _position_at(self, time: float) -> Array:
+        """Return the position (n,) at one time, for loops: as :meth:`positions_at`, ten times as fast."""
+        last = len(self.times) - 1
+        k = int(self.times.searchsorted(time, side="right")) - 1
+        if k < 0 or k >= last:
+            return np.array(self.positions[max(k, 0)])
+        start = self.times.item(k)
+        u = (time - start) / (self.times.item(k + 1) - start)
+        about_end = u >= 0.5
+        u -= about_end
+        powers = np.array((1.0, u, u * u, u * u * u))
+        return np.asarray(powers @ self._polynomials[int(about_end), k])
 
     def velocities_at(self, times: npt.ArrayLike) -> Array:
         """Return the velocities at times of shape (...), with the shape (..., n) [rad/s], [m/s].

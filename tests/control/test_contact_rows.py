@@ -1,0 +1,66 @@
+"""Rows of near pairs: equal in C and in numpy, and what a distance does at random speeds."""
+
+from __future__ import annotations
+
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+
+from kineverse.control import contact_rows
+from kineverse.control.contact_rows import ContactRows
+
+GAIN, RECOVERY, WEIGHT = 10.0, 5.0, 3.0
+
+
+@pytest.fixture(params=["numpy", pytest.param("c", marks=pytest.mark.compiler)])
+def either_library(request, monkeypatch):
+    if request.param == "c":
+        assert contact_rows.row_library.prepare(wait=True)
+    else:
+        monkeypatch.setattr(
+            contact_rows, "row_library", SimpleNamespace(code=None, prepare=lambda wait: False)
+        )
+
+
+def test_rows_are_the_rates_of_distances(either_library):
+    rng, n, pairs, bodies = np.random.default_rng(0), 7, 5, 6
+    group, twists = rng.integers(4, size=bodies), rng.normal(size=(4, 6, n))
+    margins = rng.uniform(-0.1, 0.1, (bodies, bodies))
+    witnesses = rng.normal(size=(pairs, 9))
+    witnesses[:, 6:] /= np.linalg.norm(witnesses[:, 6:], axis=1)[:, None]
+    owners = np.array([rng.choice(bodies, 2, replace=False) for _ in range(pairs)], dtype=np.int32)
+    distances = np.array([-0.2, 0.0, 0.02, 0.3, 0.4])
+    found = SimpleNamespace(
+        distances=distances,
+        body_indices=owners,
+        witnesses=witnesses,
+        points_a=witnesses[:, :3],
+        points_b=witnesses[:, 3:6],
+        normals=witnesses[:, 6:],
+    )
+    H, f, A, lower = np.eye(n + 1), np.ones(n + 1), np.zeros((6, n + 1)), np.full(6, -np.inf)
+    used = pairs - 1
+    rows = ContactRows(group, twists, margins, H, f, A, lower)
+    rows.write(found, used, gain=GAIN, recovery=RECOVERY, weight=WEIGHT)
+    costs, linear = np.eye(n + 1), np.ones(n + 1)
+    for k, (a, b) in enumerate(owners[:used]):
+        p, q, normal = witnesses[k].reshape(3, 3)
+        for speeds in rng.normal(size=(3, n)):
+            (v, w), (u, z) = ((twists[group[body]] @ speeds).reshape(2, 3) for body in (a, b))
+            rate = normal @ (u + np.cross(z, q) - v - np.cross(w, p))
+            assert A[k, :n] @ speeds == pytest.approx(rate)
+        gap = distances[k] - margins[a, b]
+        assert lower[k] == pytest.approx(-GAIN * max(gap, 0.0))
+        if gap < 0.0:  # half the weight times the squared difference to the wanted rate
+            costs += WEIGHT * np.outer(A[k], A[k])
+            linear -= WEIGHT * RECOVERY * (contact_rows.INWARDS - gap) * A[k]
+    assert {bool(d < margins[a, b]) for d, (a, b) in zip(distances, owners[:used], strict=False)} == {
+        True,
+        False,
+    }
+    np.testing.assert_allclose(H, costs, atol=1e-12)
+    np.testing.assert_allclose(f, linear, atol=1e-12)
+    assert not A[used:].any()
+    assert not A[:, n].any()
+    assert np.isinf(lower[used:]).all()
