@@ -78,18 +78,15 @@ class Session:
         self.belief = belief or TrueBelief()
         self._on_step = on_step
         self.state: State = self.belief.update(world)
-        self._observation: Observation | None = None
         self.commands: Speeds = {}
         self.phase, self.steps = "", 0
         self.cpu: dict[str, list[float]] = {}
         self.wall: dict[str, list[float]] = {}
 
     @property
-    def observation(self) -> Observation:
-        """The sensor readings after the last step; poses are handed out once, here and to the belief."""
-        if (found := self.belief.observation or self._observation) is None:
-            found = self._observation = self.world.observe()
-        return found
+    def observation(self) -> Observation | None:
+        """The sensor readings from which the state was estimated; None if it is the truth."""
+        return self.belief.observation
 
     def deviation(self, what: Symbol | str | Expression) -> float:
         """Return the standard deviation of a coordinate, or of an expression of coordinates [m], [rad].
@@ -187,7 +184,6 @@ class Session:
         self._update({})
 
     def _update(self, speeds: Speeds) -> None:
-        self._observation = None
         self.state = self.belief.update(self.world, State(speeds))
 
     def stop(self) -> None:
