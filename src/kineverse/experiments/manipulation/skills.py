@@ -31,7 +31,7 @@ _PLANS = ("plan", "place", "placement")
 
 @dataclass(frozen=True)
 class TrialCase:
-    """What is tried.
+    """One robot at one object, in one setting.
 
     Attributes
     ----------
@@ -114,7 +114,7 @@ def open_then_close(
     Parameters
     ----------
     case
-        What is tried.
+        Robot, object and setting.
     model, world
         The model, and its world.
     start
@@ -152,7 +152,7 @@ def run_push_trial(
     Parameters
     ----------
     case
-        What is tried.
+        Robot, object and setting.
     model, world, start
         As for :func:`open_then_close`.
     skill

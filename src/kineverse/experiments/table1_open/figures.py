@@ -20,7 +20,7 @@ _PICTURES = 6
 _SHARES = (0.0, 0.5, 1.0)
 
 
-def make_pictures(trials: Sequence[Trial]) -> dict[str, Figure]:
+def make_opening_pictures(trials: Sequence[Trial]) -> dict[str, Figure]:
     """Return the picture of the objects, and the film of the opening by each shipped robot, by name."""
     found = {"objects": make_film([_object_row(name) for name in OBJECTS])}
     # Physics is nearer to the paper's real door than a world without forces.
