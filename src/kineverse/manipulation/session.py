@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Iterator, Mapping
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
+from threading import Thread
 from time import perf_counter, thread_time
 
 from kineverse.control import Command
@@ -17,8 +18,12 @@ from kineverse.worlds import Observation, World
 
 from .belief import Belief, TrueBelief
 from .hand_reference import HandReference
+from .outcome import SkillError
 
 Speeds = Mapping[Symbol, float]
+
+STALE = 0.1
+"""Age of the latest readings from which on a skill ends [s]."""
 
 
 class Session:
@@ -41,6 +46,8 @@ class Session:
         Source of the state; the truth by default.
     on_step
         Is called with the session after each step, for recordings, measurements and pictures.
+    timeout
+        Longest wall time of a step of the world [s], for worlds that are elsewhere; None to wait for ever.
 
     Attributes
     ----------
@@ -62,6 +69,8 @@ class Session:
         Number of steps.
     cpu, wall
         Durations of the computations of each step by the name given to :meth:`timed` [s].
+    answers
+        Whether the world has answered the last step within the time-out.
     """
 
     def __init__(
@@ -71,8 +80,10 @@ class Session:
         dt: float = 0.02,
         belief: Belief | None = None,
         on_step: Callable[[Session], object] | None = None,
+        timeout: float | None = None,
     ) -> None:
         self.world, self.dt = world, dt
+        self._timeout, self.answers = timeout, True
         self.belief = belief or TrueBelief()
         self._on_step = on_step
         self.state: State = self.belief.update(world)
@@ -130,14 +141,57 @@ class Session:
             Speeds of the robot, and possibly those planned for objects [m/s], [rad/s]; none to stop.
         command
             The controller's command that has these speeds, for pages.
+
+        Raises
+        ------
+        SkillError
+            If the world does not answer within the time-out, stands still, or has not been observed for more
+            than :data:`STALE`. Worlds refuse commands from then on, and their robots stop.
         """
-        robot, self.command = f"{self.world.robot}/", command
+        before, self.command = self.world.time, command
+        self._advance(speeds)
+        now, stamp = self.world.time, self.state.stamp
+        if now <= before:
+            raise SkillError("other", f"The world '{self.world.name}' stands still at {now:g} s.")
+        if stamp is not None and now - stamp > STALE:
+            raise SkillError(
+                "other",
+                f"The world '{self.world.name}' was observed last at {stamp:.3f} s, {now - stamp:.3f} s ago.",
+            )
+
+    def _advance(self, speeds: Speeds) -> None:
+        """Advance the world by a step, and update the belief."""
+        robot = f"{self.world.robot}/"
         self.commands = {s: v for s, v in speeds.items() if s.path.startswith(robot)}
-        self.world.apply(self.commands, self.dt, stamp=self.state.stamp)
-        self._update(speeds)
+        self._wait(lambda: self.world.apply(self.commands, self.dt, stamp=self.state.stamp))
+        self._wait(lambda: self._update(speeds))
         self.steps += 1
         if self._on_step is not None:
             self._on_step(self)
+
+    def _wait(self, call: Callable[[], object]) -> None:
+        """Call a function of the world; raise SkillError if it takes longer than the time-out."""
+        if self._timeout is None:
+            call()
+            return
+        errors: list[Exception] = []
+
+        def run() -> None:
+            try:
+                call()
+            except Exception as error:
+                errors.append(error)
+
+        thread = Thread(target=run, daemon=True)
+        thread.start()
+        thread.join(self._timeout)
+        if thread.is_alive():
+            self.answers, self.commands = False, {}
+            raise SkillError(
+                "other", f"The world '{self.world.name}' has not answered for {self._timeout:g} s."
+            )
+        if errors:
+            raise errors[0]
 
     def restart(self, state: State) -> None:
         """Reset the world to a state, at time 0, and update the belief."""
@@ -148,5 +202,7 @@ class Session:
         self.state = self.belief.update(self.world, State(speeds))
 
     def stop(self) -> None:
-        """Command zero speeds for one step."""
-        self.act({})
+        """Command zero speeds for one step; nothing if the world does not answer."""
+        if self.answers:
+            with suppress(SkillError):
+                self._advance({})
