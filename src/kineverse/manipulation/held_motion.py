@@ -63,7 +63,7 @@ def move_held(motion: HandMotion, placement: BasePlacement, tolerance: float) ->
     slip = compile(moved)
     target = float(placement.values[-1])
     moving = motion.search.moving
-    rows = placement.way[:, : len(moving)] + motion.turns
+    rows = motion.rows(placement.way)
     values = placement.values
     posture, goals = motion.posture(rows[0])
     wanted = Target("opening/object", np.array([values[0]]))
