@@ -28,10 +28,10 @@ _GRASPS = 96
 _PLANNING = 2.0
 """Largest time to plan the way to the handle [s]."""
 _MOST_GRASPS = 4
-_MOST_SLIPS, _LEAST_PROGRESS = 2, 0.1
-"""Number of slips from which on a grasp has to take an object further, by a share of the rest."""
 _KEPT = 15
 """Number of sets of grasps that are kept."""
+_MOST_SLIPS, _LEAST_PROGRESS = 2, 0.1
+"""Number of slips from which on a grasp has to take an object further, by a share of the rest."""
 _LARGEST = ("limit_violation", "penetration", "grasp_error", "grasp_rotation", "jitter", "reversals")
 _SUMS = ("contact_losses", "distance", "hand_distance")
 """Measures of the parts of a run: the largest, or the sum."""
@@ -283,10 +283,9 @@ class _Run:
 
     def _check_progress(self) -> None:
         """Raise SkillError if the handle slips time and again and the object hardly moves."""
-        rest = self.left
         if len(self.slips) < _MOST_SLIPS:
-            self._rest = rest
-        elif rest > (1.0 - _LEAST_PROGRESS) * self._rest:
+            self._rest = self.left
+        elif self.left > (1.0 - _LEAST_PROGRESS) * self._rest:
             raise SkillError("other", "It moves too hard for the force of the fingers.")
 
     def _check_start(self) -> None:
