@@ -4,24 +4,29 @@ from __future__ import annotations
 
 import json
 import math
+from dataclasses import replace
 from types import SimpleNamespace
 
 import numpy as np
 import pytest
 
 from kineverse.cli.reproduce import format_report
-from kineverse.errors import InvalidValueError, ModelError, UnknownNameError
+from kineverse.errors import FormatError, InvalidValueError, UnknownNameError
 from kineverse.experiments import Options, kitchens, reproduce, table1_open, table1_push
 from kineverse.experiments.ablations.locks import RULES, THESIS, UPPER, draw_box, unlock
-from kineverse.experiments.manipulation import skills
-from kineverse.experiments.manipulation.robots import SHIPPED, find_robots
+from kineverse.experiments.manipulation import setting, skills
+from kineverse.experiments.manipulation.film import draw_vectors, find_telling_moment
+from kineverse.experiments.manipulation.robots import SHIPPED, find_data, find_robots
+from kineverse.experiments.manipulation.setting import TrialSetting, TrialWatch, list_series, make_settings
+from kineverse.experiments.manipulation.tables import make_exception_table, make_trial_tables
 from kineverse.experiments.manipulation.trial_pool import run_jobs
-from kineverse.experiments.manipulation.trials import Trial, find_failure, summarize_robots
+from kineverse.experiments.manipulation.trials import Moment, Trial, count_objects, find_failure
 from kineverse.experiments.table1_open.objects import OBJECTS, make_opening_setup
 from kineverse.experiments.table1_open.programs import LeaderFollower, SpeedScale, open_by_program
 from kineverse.experiments.table1_push.objects import find_kitchens, make_push_setup
 from kineverse.geometry import Rule, Scene
-from kineverse.manipulation.outcome import Outcome
+from kineverse.manipulation import Outcome, TrackedBelief, TrueBelief
+from kineverse.worlds import read_run_recording
 
 
 def _trial(what, failure="", *, skill="open", placements=0, case="7", cpu=()):
@@ -56,22 +61,51 @@ def test_find_failure_reads_the_reason_unless_it_is_measured(reason, failure):
     assert find_failure(Outcome(False, 0.0, reason, "kinematic", 1.0, 5, {"failure": "time"})) == "time"
 
 
-def test_summarize_robots_excuses_a_tenth_that_many_placements_prove():
+def test_count_objects_excuses_a_tenth_that_many_placements_prove():
     done = [_trial(f"a{k}", skill=skill) for k in range(16) for skill in ("open", "close")]
     half = [_trial("b"), _trial("b", "collision", skill="close")]
     far = [_trial(f"c{k}", "reach", placements=200) for k in range(3)]
-    (one,) = summarize_robots([*done, *half, *far])
-    assert (one.objects, one.done, one.excused) == (20, 16, 2)  # a tenth of 20, not 3
-    assert one.rate == pytest.approx(16 / 18)
-    (one,) = summarize_robots([*done, _trial("c", "reach", placements=199)])
-    assert one.excused == 0
+    found = count_objects([*done, *half, *far])
+    assert found == (20, 16, 2)  # a tenth of 20, not 3
+    assert found.rate == pytest.approx(16 / 18)
+    assert count_objects([*done, _trial("c", "reach", placements=199)]).excused == 0
 
 
-def test_summarize_robots_step_times_are_over_all_steps():
-    (one,) = summarize_robots([_trial("a", cpu=[1e-3] * 99), _trial("b", cpu=[5e-3])])
-    assert one.steps.count == 100
-    assert one.steps.mean == pytest.approx(1.04)
-    assert one.steps.worst == pytest.approx(5.0)
+def test_tables_have_a_row_for_each_robot_and_world_and_no_empty_columns():
+    trials = [_trial("a", cpu=[1e-3] * 99), _trial("b", cpu=[5e-3]), replace(_trial("a"), world="mujoco")]
+    trials[0] = replace(
+        trials[0], measures={"grasp_error": 2e-4, "penetration": 1e-4, "penetrating": ("x", "y")}
+    )
+    success, times, quality = make_trial_tables(trials, "Success")
+    assert [row[:2] for row in success.rows] == [("pr2", "kinematic"), ("pr2", "mujoco")]
+    assert "noise" not in success.head
+    row = dict(zip(times.head, times.rows[0], strict=True))
+    assert (row["steps"], row["CPU mean"], row["worst"]) == ("100", "1.04", "5")
+    row = dict(zip(quality.head, quality.rows[0], strict=True))
+    assert row == {
+        "robot": "pr2",
+        "world": "kinematic",
+        "grasp error [mm]": "0.2",
+        "penetration [mm]": "0.1",
+        "deepest pair": "x and y",
+    }
+    noisy = make_trial_tables([replace(trials[0], noise="3mm")], "Success")
+    assert all("noise" in table.head for table in noisy[:3])
+
+
+def test_exception_table_lists_all_pairs_once():
+    pairs = [
+        ("pr2/a", "pr2/b"),
+        ("pr2/a", "pr2/c"),
+        ("pr2/tip", "kitchen/handle"),
+        ("kitchen/x", "kitchen/y"),
+    ]
+    trials = [replace(_trial("a"), measures={"excepted": pairs})] * 2
+    assert make_exception_table(trials).rows == (
+        ("pr2", "pr2: a", "b, c"),
+        ("pr2", "handle that is grasped or pushed", "pr2: tip"),
+        ("pr2", "kitchen: x", "y"),
+    )
 
 
 def test_run_jobs_keeps_the_order_of_the_jobs():
@@ -91,28 +125,30 @@ def test_run_kitchen_opens_then_closes_and_reports_every_failure(monkeypatch):
     """A skill that fails at flaps, raises at a drawer, and fails to close another one."""
     calls = []
 
-    def open_object(session, what, *, target):
+    def open_object(session, what, *, target, seed):
         calls.append((what, target))
         session.cpu["open"], session.cpu["plan"] = [1e-3, 2e-3], [5.0]
         session.wall["open"] = [1e-3, 2e-3]
         if "pull_out" in what:
-            raise ModelError("no model")
+            raise RuntimeError("a bug")
         done = "larder_door" not in what and ("drawer_1" not in what or target > 0)
         return Outcome(done, target, "The arm collides.", "kinematic", 3.0, 2, {"grasp_error": 0.4})
 
     class World(SimpleNamespace):
-        def __init__(self, model, robot):
+        def __init__(self, model, robot, *, sensors, seed):
             super().__init__(model=model, robot=robot, name="kinematic", time=0.0)
 
         def reset(self, state):
             self.state = state
 
-    monkeypatch.setattr(skills, "import_entry", lambda text: open_object if "opening" in text else World)
+    monkeypatch.setattr(skills, "open_object", open_object)
+    monkeypatch.setattr(setting, "KinematicWorld", World)
     trials = kitchens.run_kitchen(kitchens.KitchenJob(2, SHIPPED["hsr"]))
     model = kitchens.make_kitchen_with(SHIPPED["hsr"], 2)
     objects = kitchens.list_objects(model, "kitchen")
     assert {t.what for t in trials} == set(objects)
-    assert all(t.cpu == (1e-3, 2e-3) for t in trials if "Error" not in t.reason)
+    assert all(t.cpu == (1e-3, 2e-3) for t in trials)
+    assert all(t.dof == 11 for t in trials)
     for what in objects:
         own = [t for t in trials if t.what == what]
         assert own[0].measures["height"] > 0.15
@@ -123,7 +159,7 @@ def test_run_kitchen_opens_then_closes_and_reports_every_failure(monkeypatch):
             assert [(t.skill, t.failure) for t in own] == [("open", "collision")]
         elif "pull_out" in what:
             assert [(t.skill, t.failure) for t in own] == [("open", "other")]
-            assert own[0].reason == "ModelError: no model"
+            assert own[0].reason == "RuntimeError: a bug"
         elif "drawer_1" in what:
             assert [(t.skill, t.done) for t in own] == [("open", True), ("close", False)]
         else:
@@ -131,7 +167,8 @@ def test_run_kitchen_opens_then_closes_and_reports_every_failure(monkeypatch):
     report = kitchens.report_trials(trials, range(2, 3))
     numbers = json.loads(json.dumps(report.numbers, allow_nan=False))
     assert len(numbers["failures"]) == sum(not t.done for t in trials) > 2
-    assert numbers["robots"]["hsr"]["objects"] == len(objects)
+    (row,) = numbers["robots"]
+    assert (row["robot"], row["world"], row["objects"]) == ("hsr", "kinematic", len(objects))
     assert "larder_door" in format_report(report)
 
 
@@ -183,10 +220,22 @@ def test_find_robots_and_options_name_what_there_is(tmp_path):
     with pytest.raises(UnknownNameError, match="Did you mean 'fetch'"):
         find_robots(["fetsch"])
     with pytest.raises(InvalidValueError, match="There is no folder"):
-        find_robots(data=tmp_path / "none")
-    for options, wrong in ((Options(count=0), "count"), (Options(seed=-1), "seed")):
-        with pytest.raises(InvalidValueError, match=f"--{wrong}"):
-            reproduce("kitchens", options=options)
+        find_data(tmp_path / "none")
+    with pytest.raises(InvalidValueError, match="has none of pr2, fetch"):
+        find_data(tmp_path)
+    (tmp_path / "file").touch()
+    for options, error, wrong in (
+        (Options(count=0), InvalidValueError, "--count"),
+        (Options(seed=-1), InvalidValueError, "--seed"),
+        (Options(world="moon"), UnknownNameError, "--world moon"),
+        (Options(noise="3parsec"), InvalidValueError, "3parsec"),
+        (Options(record=tmp_path / "file"), FormatError, "--record"),
+        (Options(robot=("hrs",)), UnknownNameError, "hsr"),
+    ):
+        for name in ("kitchens", "table1-open", "table1-push", "ablations"):
+            if name != "table1-push" or options.count is None:
+                with pytest.raises(error, match=wrong):
+                    reproduce(name, options=options)
     with pytest.raises(InvalidValueError, match="takes no --seed"):
         reproduce("fig3", options=Options(seed=3))
 
@@ -206,7 +255,7 @@ def test_opening_report_without_skill_has_the_papers_figures():
             2,
             (1e-3, 1e-3),
             series={"solve": (1e-4, 3e-4)},
-            measures={"programs": 2, "grasp_error": 0.5, "limits": 0.0},
+            measures={"programs": 2, "grasp_error": 5e-4, "limit_violation": 0.0},
         )
         for robot in ("hsr", "hsr (authors)")
         for program in table1_open.report.PROGRAMS
@@ -217,7 +266,9 @@ def test_opening_report_without_skill_has_the_papers_figures():
     assert first["solve_mean_ms"] == pytest.approx(0.2)
     assert first["solve_sd_ms"] == pytest.approx(np.std([0.1, 0.3]))
     json.dumps(report.numbers, allow_nan=False)
-    assert "3.3 / 2.2" in format_report(report)
+    assert first["grasp_error_mm"] == 0.5
+    assert report.numbers["programs"][1]["published_mean_ms"] is None
+    assert "paper mean" in format_report(report)
 
 
 def test_start_in_aisle_is_free_where_the_middle_is_not():
@@ -235,20 +286,50 @@ def test_start_in_aisle_is_free_where_the_middle_is_not():
     assert not near(start)
 
 
-def test_command_log_keeps_the_speeds_since_the_last_reset():
-    applied = []
-    world = SimpleNamespace(
-        time=0.5,
-        name="kinematic",
-        reset=lambda state: None,
-        apply=lambda *given, stamp: applied.append(given),
+def test_trial_watch_keeps_commands_of_the_last_session_and_records(tmp_path):
+    pytest.importorskip("mcap")
+    robot = SHIPPED["hsr"]
+    model = robot.load()
+    (recorded,) = make_settings(Options(record=tmp_path / "new"))
+    world = recorded.make_world(model, "hsr", robot.start_state(model))
+    x, lift = (model.symbol(f"hsr/{name}").derivative() for name in ("base/x", "arm_lift_joint"))
+    with TrialWatch(recorded, model, {"case": "a b", "what": "x/y"}, film=True) as watch:
+        watch.open_session(world, 0.02).act({x: 9.0})
+        world.reset(robot.start_state(model))
+        session = watch.open_session(world, 0.02)
+        for speeds in ({x: 0.1}, {lift: 0.05}, {}):
+            session.act(speeds)
+        watch.write_outcome(Outcome(True, 0.0, "", "kinematic", 0.06, 3))
+    series = list_series(watch.commands)
+    assert series == {
+        "time": pytest.approx([0.0, 0.02, 0.04]),
+        str(x): [0.1, 0.0, 0.0],
+        str(lift): [0.0, 0.05, 0.0],
+    }
+    run = read_run_recording(tmp_path / "new" / "a_b-x_y.mcap")
+    assert run.duration >= 0.06 - 1e-9
+
+
+def test_setting_believes_the_truth_only_without_noise():
+    model = kitchens.make_kitchen_with(SHIPPED["hsr"], 2)
+    start = SHIPPED["hsr"].start_state(model)
+    world = TrialSetting("kinematic", "3mm").make_world(model, "hsr", start)
+    assert isinstance(TrialSetting("kinematic", "3mm").make_belief(world), TrackedBelief)
+    assert isinstance(TrialSetting().make_belief(world), TrueBelief)
+    assert [one.world for one in make_settings(Options(world="both"))] == ["kinematic", "mujoco"]
+
+
+def test_push_vectors_are_drawn_at_nearest_points_with_the_longest_tangent():
+    def moment(time, apart, tangent):
+        p, n, push = np.zeros(3), np.array([0.0, 0.0, 1.0]), np.array([1.0, 0.0, 0.0])
+        vectors = {"n": n, "push": push, "tangent": tangent * push, "r - p": apart * n}
+        return Moment(time, "push", {}, {name: (p, vector) for name, vector in vectors.items()})
+
+    film = [moment(0, 0.5, 0.9), moment(1, 0.03, 0.2), moment(2, 0.01, 0.6), Moment(3, "approach", {}, {})]
+    assert find_telling_moment(film) == (pytest.approx(0.6), film[2])
+    assert find_telling_moment(film[:1]) == (0.0, None)
+    parts, ends = draw_vectors(film[2].vectors, 0.2)
+    np.testing.assert_allclose(
+        ends, [[0, 0, 0], [0, 0, 0.01], [0, 0, 0.2], [0.2, 0, 0], [0, -0.2, 0], [0.2, 0, 0]]
     )
-    log = skills.CommandLog(world)
-    log.apply({"a": 9.0}, 0.02)
-    log.reset({})
-    log.apply({"a": 1.0}, 0.02)
-    log.apply({"b": 2.0}, 0.02)
-    log.apply({}, 0.02)
-    assert log.commands == {"time": [0.5] * 3, "a": [1.0, 0.0, 0.0], "b": [0.0, 2.0, 0.0]}
-    assert [speeds for speeds, _ in applied] == [{"a": 9.0}, {"a": 1.0}, {"b": 2.0}, {}]
-    assert log.name == "kinematic"
+    assert len(parts) == 1 + 2 * 4

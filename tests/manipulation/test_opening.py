@@ -6,7 +6,7 @@ from kineverse.errors import InvalidValueError, KineverseError, UnknownNameError
 from kineverse.grasping import find_gripper, find_handle, sample_grasps
 from kineverse.manipulation import PlacementSearch, Session, TrackedBelief, open_object
 from kineverse.manipulation.belief import EstimateError
-from kineverse.worlds import KinematicWorld, Sensors
+from kineverse.worlds import KinematicWorld, MujocoWorld, Sensors
 
 DRAWER, DOOR = "shelf_drawers/upper_drawer", "shelf_door/door"
 
@@ -56,6 +56,41 @@ def test_drawer_closes_again(opened, session):
     closed = open_object(session, DRAWER, target=0.0)
     assert closed, closed.reason
     assert session.world.state[DRAWER] < 0.02
+
+
+def test_drawer_opens_by_friction_on_estimates(model):
+    pytest.importorskip("mujoco")
+    sensors = Sensors.parse("3mm+3mm/m,0.5deg,30Hz")
+    world = MujocoWorld(model, "hsr", sensors=sensors)
+    world.reset(start(model))
+    outcome = open_object(Session(world, belief=TrackedBelief(model, "hsr", sensors)), DRAWER)
+    assert outcome, outcome.reason
+    assert world.state[DRAWER] == pytest.approx(0.22, abs=0.02)
+    assert world.held is None
+    assert outcome.measures["slips"] == 0
+    assert outcome.measures["grasp_error"] < 2e-3
+
+
+def test_loss_of_a_drawer_that_moves_too_hard_is_noticed_and_said(model):
+    pytest.importorskip("mujoco")
+    world = MujocoWorld(model, "hsr", door_friction={DRAWER: 150.0})  # and friction holds 100 N
+    world.reset(start(model))
+    last_held, losses, phases = 0.0, [], [""]
+
+    def watch(session):
+        nonlocal last_held
+        if phases[-1] == "move" != session.phase:
+            arm = [v for s, v in session.commands.items() if "hand_motor" not in str(s)]
+            losses.append((world.time - session.dt - last_held, max(map(abs, arm), default=0.0)))
+        phases.append(session.phase)
+        last_held = world.time if world.held else last_held
+
+    outcome = open_object(Session(world, on_step=watch), DRAWER)
+    assert not outcome
+    assert outcome.measures["slips"] == len(losses) == 2
+    assert all(late <= 0.1 and speed == 0.0 for late, speed in losses), losses
+    assert "slipped at" in outcome.reason
+    assert "too hard" in outcome.reason
 
 
 def test_placement_keeps_the_grasp_along_the_way():

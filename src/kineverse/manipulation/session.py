@@ -4,18 +4,26 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Iterator, Mapping
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
+from threading import Thread
 from time import perf_counter, thread_time
 
+from kineverse.control import Command
 from kineverse.errors import ShapeError
 from kineverse.expressions import Expression
+from kineverse.lie import Array
 from kineverse.state import State
 from kineverse.symbols import Symbol
 from kineverse.worlds import Observation, World
 
 from .belief import Belief, TrueBelief
+from .hand_reference import HandReference
+from .outcome import SkillError
 
 Speeds = Mapping[Symbol, float]
+
+STALE = 0.1
+"""Age of the latest readings from which on a skill ends [s]."""
 
 
 class Session:
@@ -38,6 +46,8 @@ class Session:
         Source of the state; the truth by default.
     on_step
         Is called with the session after each step, for recordings, measurements and pictures.
+    timeout
+        Longest wall time of a step of the world [s], for worlds that are elsewhere; None to wait for ever.
 
     Attributes
     ----------
@@ -47,12 +57,20 @@ class Session:
         The believed state.
     commands
         The speeds of the last step.
+    command
+        The controller's command from which they come; None if there is none.
+    reference
+        The way of the hand that a controller follows; None if there is none.
+    vectors
+        Vectors of the controller by name, each with its origin in the world [m], for pages and recordings.
     phase
         Name of the present phase of the skill, for recordings and messages.
     steps
         Number of steps.
     cpu, wall
         Durations of the computations of each step by the name given to :meth:`timed` [s].
+    answers
+        Whether the world has answered the last step within the time-out.
     """
 
     def __init__(
@@ -62,12 +80,17 @@ class Session:
         dt: float = 0.02,
         belief: Belief | None = None,
         on_step: Callable[[Session], object] | None = None,
+        timeout: float | None = None,
     ) -> None:
         self.world, self.dt = world, dt
+        self._timeout, self.answers = timeout, True
         self.belief = belief or TrueBelief()
         self._on_step = on_step
         self.state: State = self.belief.update(world)
         self.commands: Speeds = {}
+        self.command: Command | None = None
+        self.reference: HandReference | None = None
+        self.vectors: Mapping[str, tuple[Array, Array]] = {}
         self.phase, self.steps = "", 0
         self.cpu: dict[str, list[float]] = {}
         self.wall: dict[str, list[float]] = {}
@@ -95,8 +118,9 @@ class Session:
             return self.belief.deviation(what)
         if what.shape != ():
             raise ShapeError(f"A deviation is one of a number, not of an expression of shape {what.shape}.")
-        slopes = {s: float(what.partial([s])(self.state)[0]) for s in what.symbols}
-        return math.hypot(*(k * self.belief.deviation(s) for s, k in slopes.items() if k))
+        own = {s: self.belief.deviation(s) for s in what.symbols}
+        slopes = {s: float(what.partial([s])(self.state)[0]) for s, deviation in own.items() if deviation}
+        return math.hypot(*(k * own[s] for s, k in slopes.items() if k))
 
     @contextmanager
     def timed(self, name: str) -> Iterator[None]:
@@ -106,7 +130,7 @@ class Session:
         self.cpu.setdefault(name, []).append(thread_time() - cpu)
         self.wall.setdefault(name, []).append(perf_counter() - wall)
 
-    def act(self, speeds: Speeds) -> None:
+    def act(self, speeds: Speeds, command: Command | None = None) -> None:
         """Command speeds for one step, and update the belief. Speeds of objects are not sent.
 
         The belief gets them all.
@@ -115,14 +139,59 @@ class Session:
         ----------
         speeds
             Speeds of the robot, and possibly those planned for objects [m/s], [rad/s]; none to stop.
+        command
+            The controller's command that has these speeds, for pages.
+
+        Raises
+        ------
+        SkillError
+            If the world does not answer within the time-out, stands still, or has not been observed for more
+            than :data:`STALE`. Worlds refuse commands from then on, and their robots stop.
         """
+        before, self.command = self.world.time, command
+        self._advance(speeds)
+        now, stamp = self.world.time, self.state.stamp
+        if now <= before:
+            raise SkillError("other", f"The world '{self.world.name}' stands still at {now:g} s.")
+        if stamp is not None and now - stamp > STALE:
+            raise SkillError(
+                "other",
+                f"The world '{self.world.name}' was observed last at {stamp:.3f} s, {now - stamp:.3f} s ago.",
+            )
+
+    def _advance(self, speeds: Speeds) -> None:
+        """Advance the world by a step, and update the belief."""
         robot = f"{self.world.robot}/"
         self.commands = {s: v for s, v in speeds.items() if s.path.startswith(robot)}
-        self.world.apply(self.commands, self.dt, stamp=self.state.stamp)
-        self._update(speeds)
+        self._wait(lambda: self.world.apply(self.commands, self.dt, stamp=self.state.stamp))
+        self._wait(lambda: self._update(speeds))
         self.steps += 1
         if self._on_step is not None:
             self._on_step(self)
+
+    def _wait(self, call: Callable[[], object]) -> None:
+        """Call a function of the world; raise SkillError if it takes longer than the time-out."""
+        if self._timeout is None:
+            call()
+            return
+        errors: list[Exception] = []
+
+        def run() -> None:
+            try:
+                call()
+            except Exception as error:
+                errors.append(error)
+
+        thread = Thread(target=run, daemon=True)
+        thread.start()
+        thread.join(self._timeout)
+        if thread.is_alive():
+            self.answers, self.commands = False, {}
+            raise SkillError(
+                "other", f"The world '{self.world.name}' has not answered for {self._timeout:g} s."
+            )
+        if errors:
+            raise errors[0]
 
     def restart(self, state: State) -> None:
         """Reset the world to a state, at time 0, and update the belief."""
@@ -133,5 +202,7 @@ class Session:
         self.state = self.belief.update(self.world, State(speeds))
 
     def stop(self) -> None:
-        """Command zero speeds for one step."""
-        self.act({})
+        """Command zero speeds for one step; nothing if the world does not answer."""
+        if self.answers:
+            with suppress(SkillError):
+                self._advance({})

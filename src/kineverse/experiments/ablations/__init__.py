@@ -45,10 +45,10 @@ _PUSH_LOGIC: dict[Rule, str | None] = {"and": "and", "product": "product", "none
 def run(progress: Progress, options: Options) -> Report:
     """Open boxes and push objects with each rule; ``quick`` takes few boxes, one robot and one object."""
     settings = make_settings(options)
+    robots = find_robots(options.robot, find_data(options.data, options.quick))
     boxes = options.count or (QUICK_BOXES if options.quick else BOXES)
     thesis = {rule: unlock(THESIS, "a", UPPER, rule) for rule in RULES}
     runs = run_boxes(boxes, options.seed, progress)
-    robots = find_robots(options.robot, find_data(options.data, options.quick))
     if options.quick and not options.robot:
         robots = robots[:1]
     jobs = [

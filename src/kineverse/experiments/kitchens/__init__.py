@@ -14,7 +14,11 @@ from kineverse.errors import NoSolutionError
 from kineverse.experiments.manipulation.robots import RobotSource, find_data, find_robots
 from kineverse.experiments.manipulation.setting import SettingOptions, TrialSetting, make_settings
 from kineverse.experiments.manipulation.skills import TrialCase, open_then_close
-from kineverse.experiments.manipulation.tables import make_success_figure, make_tables, make_trial_numbers
+from kineverse.experiments.manipulation.tables import (
+    make_success_figure,
+    make_trial_numbers,
+    make_trial_tables,
+)
 from kineverse.experiments.manipulation.trial_pool import run_jobs
 from kineverse.experiments.manipulation.trials import Trial
 from kineverse.experiments.registry import Options, Progress
@@ -80,7 +84,7 @@ def report_trials(trials: list[Trial], seeds: range) -> Report:
     return Report(
         name="kitchens",
         title=f"{len(seeds)} generated kitchens, seeds {seeds[0]} to {seeds[-1]}, opened and closed",
-        tables=make_tables(trials, "Objects that were opened and closed"),
+        tables=make_trial_tables(trials, "Objects that were opened and closed"),
         numbers={"seeds": [seeds[0], seeds[-1]], **make_trial_numbers(trials)},
         figure=make_success_figure(trials, "height", "height of the handle [m]"),
     )

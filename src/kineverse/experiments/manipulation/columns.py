@@ -68,6 +68,13 @@ def _failures(kind: str) -> Callable[[Sequence[Trial]], int]:
     return lambda trials: sum(t.failure == kind for t in trials)
 
 
+def _deepest_pair(trials: Sequence[Trial]) -> str:
+    deepest = max(trials, key=lambda t: t.measures.get("penetration") or 0.0)
+    return (
+        " and ".join(deepest.measures.get("penetrating", ())) if deepest.measures.get("penetration") else ""
+    )
+
+
 ROW = (
     Column("robot", "robot", lambda trials: trials[0].robot),
     Column("world", "world", lambda trials: trials[0].world),
@@ -99,6 +106,7 @@ QUALITY = (
     Column("grasp_error_mm", "grasp error [mm]", worst("grasp_error", 1e3)),
     Column("contact_losses", "contact losses", worst("contact_losses"), 6),
     Column("penetration_mm", "penetration [mm]", worst("penetration", 1e3)),
+    Column("penetrating", "deepest pair", _deepest_pair),
     Column("jitter", "jitter", worst("jitter")),
     Column("peak_force", "force [N]", worst("peak_force")),
 )

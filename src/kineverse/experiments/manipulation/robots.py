@@ -145,6 +145,7 @@ _AUTHORS = {
 
 DEFAULT_DATA = Path("../shared/data")
 """Folder of the authors' files, relative to the current one."""
+DATA_FOLDERS = ("pr2", "fetch", "hsrb", "iai_kitchen")
 
 
 def remove_unusable_shapes(model: Model) -> tuple[str, ...]:
@@ -167,13 +168,17 @@ def find_data(data: Path | None, quick: bool = False) -> Path | None:
     Raises
     ------
     InvalidValueError
-        If a given folder does not exist.
+        If a given folder does not exist, or has nothing of the authors in it.
     """
     if data is None:
         return DEFAULT_DATA if DEFAULT_DATA.is_dir() and not quick else None
     if not data.is_dir():
         raise InvalidValueError(
             f"There is no folder {data} with robots. Leave --data out for the shipped ones."
+        )
+    if not any((data / name).is_dir() for name in DATA_FOLDERS):
+        raise InvalidValueError(
+            f"The folder {data} has none of {', '.join(DATA_FOLDERS)}, so nothing of the authors is in it."
         )
     return data
 

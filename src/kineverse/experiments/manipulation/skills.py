@@ -9,6 +9,7 @@ from time import process_time
 from typing import Any
 
 from kineverse.errors import KineverseError
+from kineverse.geometry import Scene
 from kineverse.grasping import find_gripper, find_handle
 from kineverse.manipulation import Outcome, Session, open_object
 from kineverse.manipulation.push_controller import Pushing
@@ -16,6 +17,7 @@ from kineverse.manipulation.push_trials import try_push
 from kineverse.model.model import Model
 from kineverse.state import State
 from kineverse.worlds import Judge, World
+from kineverse.worlds.sensor_sampler import is_of_robot
 
 from .robots import RobotSource
 from .setting import TrialSetting, TrialWatch, list_series
@@ -29,7 +31,7 @@ _PLANS = ("plan", "place", "placement")
 
 @dataclass(frozen=True)
 class TrialCase:
-    """What is tried.
+    """One robot at one object, in one setting.
 
     Attributes
     ----------
@@ -112,7 +114,7 @@ def open_then_close(
     Parameters
     ----------
     case
-        What is tried.
+        Robot, object and setting.
     model, world
         The model, and its world.
     start
@@ -150,7 +152,7 @@ def run_push_trial(
     Parameters
     ----------
     case
-        What is tried.
+        Robot, object and setting.
     model, world, start
         As for :func:`open_then_close`.
     skill
@@ -162,7 +164,7 @@ def run_push_trial(
     """
 
     def act(watch: TrialWatch) -> Outcome:
-        judge = PushJudge(model, world, case.what, watch)
+        judge = PushJudge(model, world, case.what, start, watch)
         found = try_push(
             world,
             start,
@@ -189,16 +191,28 @@ class PushJudge:
         The model, and its world.
     what
         The coordinate of the object.
+    start
+        State at the beginning.
     watch
         The watch of the trial.
     """
 
-    def __init__(self, model: Model, world: World, what: str, watch: TrialWatch) -> None:
+    def __init__(self, model: Model, world: World, what: str, start: State, watch: TrialWatch) -> None:
         try:
             handle = find_handle(model, what).frame
         except KineverseError:
             handle = None
-        self._judge = Judge(model, world.robot, find_gripper(model, world.robot), handle)
+        # Shapes of a robot, or of furniture, that overlap before anything is done say nothing of a push.
+        plain = Scene(model)
+        rules = [
+            rule
+            for state in (start, model.default_state())
+            for rule in plain.find_always_colliding([state])
+            if is_of_robot(rule.a, world.robot) == is_of_robot(rule.b, world.robot)
+        ]
+        self._overlapping = tuple(dict.fromkeys((rule.a, rule.b) for rule in rules))
+        gripper = find_gripper(model, world.robot)
+        self._judge = Judge(model, world.robot, gripper, handle, scene=Scene(model, rules=rules))
         self._watch, self._pushing, self._force = watch, False, 0.0
         self._session: Session | None = None
 
@@ -218,4 +232,6 @@ class PushJudge:
     @property
     def measures(self) -> dict[str, Any]:
         """Measures of the judge; ``peak_force`` [N] in a world that has it."""
-        return {**self._judge.measures, "peak_force": self._force or math.nan}
+        measures = self._judge.measures
+        excepted = (*self._overlapping, *measures["excepted"])
+        return {**measures, "excepted": excepted, "peak_force": self._force or math.nan}

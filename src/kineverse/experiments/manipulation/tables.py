@@ -20,7 +20,7 @@ _TIMED = (
 )
 
 
-def make_tables(
+def make_trial_tables(
     trials: Sequence[Trial], title: str, more: Iterable[ReportTable] = ()
 ) -> tuple[ReportTable, ...]:
     """Return the tables of trials: success, times, quality, excepted pairs and failures.

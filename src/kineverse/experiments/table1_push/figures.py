@@ -24,7 +24,7 @@ FILMED = ("fridge door", "sink left upper drawer", "folding door")
 _PICTURES = 5
 
 
-def make_pictures(trials: Sequence[Trial]) -> dict[str, Figure]:
+def make_push_pictures(trials: Sequence[Trial]) -> dict[str, Figure]:
     """Return the pictures of shipped robots in the shipped kitchen, by name."""
     own = [t for t in trials if t.film and t.robot in SHIPPED and t.case == SHIPPED_KITCHEN]
     # Of several worlds the first counts.

@@ -9,12 +9,12 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from kineverse.experiments.manipulation.columns import ROW, TIMES, Column, step_times
-from kineverse.experiments.manipulation.tables import make_group_table, make_tables, make_trial_numbers
+from kineverse.experiments.manipulation.tables import make_group_table, make_trial_numbers, make_trial_tables
 from kineverse.experiments.manipulation.trials import StepTimeStatistics, Trial, as_json, group_trials
 from kineverse.experiments.report import Figure, Report
 from kineverse.worlds.judge import CONTACT_GAP
 
-from .figures import FILMED, make_pictures
+from .figures import FILMED, make_push_pictures
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure as Canvas
@@ -50,10 +50,10 @@ def make_push_report(trials: Sequence[Trial], seed: int) -> Report:
     return Report(
         "table1-push",
         "Objects pushed shut with and without base placement (2020 and 2022 papers, Table I)",
-        make_tables(trials, "Objects pushed shut", more),
+        make_trial_tables(trials, "Objects pushed shut", more),
         numbers,
         Figure(lambda canvas: _draw_commands(canvas, trials), FIGURE_SIZE),
-        make_pictures(trials),
+        make_push_pictures(trials),
     )
 
 

@@ -1,0 +1,176 @@
+"""Skills in worlds in which something is wrong: each result says what, and the robot stands within 100 ms."""
+
+from __future__ import annotations
+
+import re
+import sys
+import threading
+from pathlib import Path
+
+import pytest
+
+import kineverse as kv
+from kineverse.errors import KineverseError
+from kineverse.manipulation import Session, SkillError, TrueBelief, open_object, push
+from kineverse.model.body import Box
+from kineverse.worlds import KinematicWorld
+
+sys.path.insert(0, str(Path(__file__).parents[1] / "worlds"))
+from pusher import pusher, solid
+from test_pushing import PUSHER, opened, room
+
+DRAWER = "room/drawer"
+STOPPED = 0.1
+"""Longest time from a fault to zero speeds [s]."""
+
+
+class FaultyWorld(KinematicWorld):
+    """World with a fault that begins when the robot or the drawer has moved by 2 cm; moves are counted from then on.
+
+    Attributes
+    ----------
+    begin
+        Time of the fault [s]; None before.
+    moving
+        Time since the fault after which the robot still moved [s].
+    """
+
+    fault, watched, drawer = "", DRAWER, DRAWER
+
+    def reset(self, state):
+        super().reset(state)
+        self.begin, self.moving, self.first = None, 0.0, self.state.get(self.watched, 0.0)
+        self.blocked = threading.Event()
+
+    def apply(self, speeds, duration, *, stamp=None):
+        if self.begin is None and abs(self.state[self.watched] - self.first) > 0.02:
+            self.begin = self.time
+        if self.begin is None or not self.fault:
+            return super().apply(speeds, duration, stamp=stamp)
+        if self.fault == "blocks":
+            self.blocked.wait(20.0)
+        if self.fault in ("blocks", "stands still"):
+            return None
+        before = self.state
+        super().apply(speeds, duration, stamp=stamp)
+        if any(abs(self.state[s] - before[s]) > 1e-6 for s in before if s.path.startswith("robot/")):
+            self.moving = self.time - self.begin
+        if self.fault == "moves away" and self.state[self.drawer] < 0.3:
+            now = self.time
+            super().reset(self.state.updated({self.drawer: self.state[self.drawer] + 0.01}))
+            self._time = now
+        return None
+
+
+class StoppedBelief(TrueBelief):
+    """Belief whose readings end with the fault of its world."""
+
+    def update(self, world, commands=None):
+        if world.begin is None:
+            self.last = world.state
+        return self.last
+
+
+def before_drawer(model, **values):
+    start = {"robot/finger": 0.05, "robot/z": 2.0, DRAWER: values.get("drawer", 0.0)}
+    return model.default_state().updated(start)
+
+
+@pytest.fixture(scope="module")
+def world():
+    return FaultyWorld(pusher(), "robot")
+
+
+def start(world, fault, watched=DRAWER, **values):
+    world.fault, world.watched = fault, watched
+    world.reset(before_drawer(world.model, **values))
+
+
+@pytest.mark.parametrize(
+    ("fault", "says"),
+    [
+        ("unobserved", "was observed last at 0.22"),
+        ("stands still", "stands still at 0.22"),
+        ("blocks", "has not answered for 0.05 s"),
+    ],
+)
+def test_session_ends_when_its_world_stops_answering(world, fault, says):
+    start(world, fault, "robot/x")
+    belief = StoppedBelief() if fault == "unobserved" else None
+    session = Session(world, belief=belief, timeout=0.05 if fault == "blocks" else None)
+    with pytest.raises(SkillError, match=says):
+        for _ in range(40):
+            session.act({kv.velocity("robot/x"): 0.1})
+    assert world.moving <= STOPPED + 1e-9
+    session.stop()
+    assert not session.commands
+    assert session.answers == (fault != "blocks")
+    world.blocked.set()
+
+
+def test_open_ends_when_the_object_moves_away(world):
+    start(world, "moves away")
+    session = Session(world)
+    outcome = open_object(session, DRAWER, target=0.2, seconds=6.0)
+    assert not outcome
+    assert "slipped" in outcome.reason
+    assert not any(session.commands.values())
+    assert world.held is None
+
+
+@pytest.mark.parametrize(
+    ("fault", "says"),
+    [("unobserved", "was observed last at"), ("moves away", "Out of time")],
+)
+def test_push_ends_when_readings_end_or_the_object_moves_away(fault, says):
+    world = FaultyWorld(room(), "robot")
+    world.fault, world.drawer, world.watched = fault, "drawer", "drawer"
+    world.reset(opened(drawer=0.2) | {"robot/base/y": -1.0})
+    session = Session(world, belief=StoppedBelief() if fault == "unobserved" else None)
+    outcome = push(session, "drawer", bodies=PUSHER, seconds=8.0)
+    assert not outcome
+    assert says in outcome.reason
+    assert not any(session.commands.values())
+    if fault == "unobserved":
+        assert 0.0 < world.moving <= STOPPED + 1e-9
+
+
+def change(edit, what):
+    if what == "no gripper":
+        edit.remove("frame robot/left_finger")
+        edit.remove("frame robot/right_finger")
+    elif what == "no handle":
+        edit.remove("frame room/drawer_handle")
+    elif what == "hand too wide":
+        for side in (-1, 1):
+            pose, wall = kv.translation(0.92, 0.025 * side, 2), solid(Box((0.2, 0.01, 0.4)))
+            edit.add_frame(f"room/wall_{side}", "world", pose, wall)
+    elif what == "out of reach":
+        edit.constrain("robot/height", 0, kv.position("robot/z"), 1)
+
+
+@pytest.mark.parametrize(
+    ("what", "says"),
+    [
+        ("no gripper", "'robot' has no gripper"),
+        ("no handle", "'room/drawer' moves no handle"),
+        ("hand too wide", "no room at the handle .* collide: robot/palm at room/wall"),
+        ("out of reach", "bases goes through; failed: .* out of reach"),
+    ],
+)
+def test_open_without_what_it_needs_says_what_is_missing_and_moves_nothing(what, says):
+    model = pusher()
+    with model.edit() as edit:
+        change(edit, what)
+    world = KinematicWorld(model, "robot")
+    begin = before_drawer(model).updated({"robot/z": 0.5 if what == "out of reach" else 2.0})
+    world.reset(begin)
+    if what == "out of reach":
+        outcome = open_object(Session(world), DRAWER, target=0.3, placements=50)
+        assert not outcome
+        assert re.search(says, outcome.reason)
+        assert outcome.measures["failure"] == "reach"
+    else:
+        with pytest.raises(KineverseError, match=says):
+            open_object(Session(world), DRAWER, target=0.3)
+    assert dict(world.state) == dict(begin)
