@@ -89,6 +89,22 @@ def test_a_robot_file_pushes_with_a_named_body_and_the_run_is_recorded(run, file
     assert recorded.states[recorded.model.symbol("arm/base/x")][0] == pytest.approx(0.3, abs=0.02)
 
 
+def test_a_push_on_estimates_from_noisy_sensors(run, files):
+    words = ["push", "box.urdf", "--robot", "arm.urdf@0.3,0,0", "--base", "omni", "--what", "drawer"]
+    words += ["--hand", "arm/finger", "--noise", "3mm,0.5deg,30Hz,drop=0.1", "--json"]
+    status, out, err = run(*words)
+    answer = json.loads(out)
+    assert (status, answer["done"]) == (0, True), answer["reason"]
+    assert abs(answer["value"]) < 0.02
+    assert 0.0 < answer["measures"]["estimate_mean"] < 0.005
+    assert "No frame of 'arm' is named like a camera" in err
+    words[words.index("--noise") + 1] = "3mm,0.5deg,drop=1"
+    status, out, _ = run(*words)
+    answer = json.loads(out)
+    assert (status, answer["done"]) == (1, False)
+    assert "is not known" in answer["reason"]
+
+
 def test_without_a_gripper_it_is_not_done_and_says_why(run, files):
     for skill in ("open", "push"):
         status, out, _ = run(skill, "box.urdf", "--robot", "arm.urdf", "--what", "drawer", "--json")
@@ -145,6 +161,8 @@ def test_open_begins_shut_and_close_begins_open(run, asked, tmp_path):
         (["shelf_drawers", *HSR, "--hand", "hsr/hnd_palm_link"], "hsr/hand_palm_link"),
         (["shelf_drawers", *HSR, "--handle", "shelf_drawers/frame"], "shelf_drawers/"),
         (["shelf_drawers", *HSR, "--grasp", "tie"], "--world mujoco"),
+        (["shelf_drawers", *HSR, "--noise", "3apples"], "Noise '3apples' is not readable"),
+        (["shelf_drawers", *HSR, "--noise", "3mm,camera=hsr/haed"], "no frame 'hsr/haed'"),
         (["shelf_drawers", *HSR, "--seconds", "-1"], "--seconds"),
         (["shelf_drawers", *HSR, "--record", "run.bag"], ".mcap"),
         (["shelf_drawers", "--robot", "hrs", *HSR[2:]], "hsr"),

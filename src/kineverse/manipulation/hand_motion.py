@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections import deque
 from collections.abc import Iterable, Mapping
 from typing import Any
 
@@ -25,6 +26,8 @@ from .session import Session
 
 _CLOSING, _MOST_CLOSING = 1.5, 4.0
 """Time in which fingers open or close fully, and the largest one [s]."""
+_IDLE = 10
+"""Number of steps in which fingers that stand still have not moved."""
 _LINE_SPEED = 0.1
 """Speed of the hand on the straight way to the handle and from it [m/s]."""
 _SETTLED, _MOST_SETTLING = 5e-4, 150
@@ -197,6 +200,7 @@ class HandMotion:
         """Close the fingers until they stand still, and return True if they stand around the bar."""
         self.session.phase = "close"
         self.move_fingers(self.gripper.closed)
+        self._await_readings()
         state, gripper = self.session.state, self.gripper
         self._closed_at = {s: state[s] for s in gripper.joints}
         narrow = gripper.values_at(max(0.25 * grasp.thickness, grasp.thickness - _BESIDE))
@@ -212,7 +216,9 @@ class HandMotion:
         closed = 0.0
         for s, held in self._closed_at.items():
             range_ = gripper.closed[s] - gripper.opened[s]
-            closed = max(closed, gripper.width * (state[s] - held) / range_ if range_ else 0.0)
+            noise = math.copysign(4.0 * self.session.deviation(s), range_)
+            further = (state[s] - held - noise) / range_ if range_ else 0.0
+            closed = max(closed, gripper.width * further)
         return closed > _LOST
 
     def release(self, placement: BasePlacement) -> None:
@@ -247,23 +253,35 @@ class HandMotion:
     def move_fingers(self, values: Mapping[Symbol, float]) -> None:
         """Move the fingers to values, or until they stand still."""
         session, gripper = self.session, self.gripper
-        begin, idle, session.reference = session.world.time, 0, None
+        begin, session.reference = session.world.time, None
+        steps: deque[tuple[State, float]] = deque(maxlen=_IDLE)
         while session.world.time - begin < _MOST_CLOSING:
             state = session.state
+            noise = max((session.deviation(s) for s in gripper.joints), default=0.0)
             speeds = {}
             for s in gripper.joints:
                 most = abs(gripper.closed[s] - gripper.opened[s]) / _CLOSING
                 lower, upper = self.model.limits(s.derivative())
                 wanted = (values[s] - state[s]) / session.dt
                 speeds[s.derivative()] = float(np.clip(wanted, max(-most, lower), min(most, upper)))
-            if max((abs(values[s] - state[s]) for s in gripper.joints), default=0.0) < 1e-5:
+            if max((abs(values[s] - state[s]) for s in gripper.joints), default=0.0) < max(1e-5, noise):
                 break
             self.act(speeds)
-            moved = max(abs(session.state[s] - state[s]) for s in gripper.joints)
-            asked = max(abs(v) for v in speeds.values()) * session.dt
-            idle = idle + 1 if moved < 0.1 * asked else 0
-            if idle >= 10:
+            # Single steps are within the noise of encoders.
+            steps.append((state, max(abs(v) for v in speeds.values()) * session.dt))
+            moved = max(abs(session.state[s] - steps[0][0][s]) for s in gripper.joints)
+            asked = sum(one for _, one in steps)
+            if len(steps) == _IDLE and moved < 0.1 * asked + 2.0 * noise:
                 break
+
+    def _await_readings(self) -> None:
+        """Stand until readings of the present arrive; predicted fingers close through what they hold."""
+        session = self.session
+        begin = session.world.time
+        while (seen := session.observation) is not None and seen.stamp < begin - 1e-9:
+            if session.world.time - begin > _MOST_LOOKING:
+                raise SkillError("other", f"The sensors have said nothing for {_MOST_LOOKING:g} s.")
+            self.act({})
 
     def act(self, speeds: Mapping[Symbol, float], command: Command | None = None) -> None:
         """Command speeds for one step, those of a controller's command if given, and judge it."""
