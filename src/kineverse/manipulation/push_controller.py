@@ -306,14 +306,14 @@ class Pushing:
             elif contact.alignment < CONE_END:
                 self._give_up()
         elif self._aside < 2 * NEAR and contact is not None and contact.alignment > CONE:
-            certain = press.deviation == 0.0 or press.certain(contact.velocity)
+            certain = press.deviation == 0.0 or press.certain
             if contact.gap < (TOUCHING if certain else TOUCHING + press.slack) and (certain or press.touched):
                 self.touching = True
                 self.choice.restart()
                 self._anchor = TipAnchor()
         if contact is not None:
             rate = -float(contact.normal @ contact.velocity) * self.surface.sign
-            press.correct(contact.gap, rate, self.touching)
+            press.correct(contact.gap, rate)
 
     def _release(self) -> None:
         self.touching = False
