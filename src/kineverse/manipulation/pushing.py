@@ -24,7 +24,8 @@ from .session import Session
 _SETTLED, _SETTLED_ESTIMATE = 5, 25
 """Number of steps for which the value, or its estimate, is within half of the tolerance when a push ends."""
 _PATIENCE = 25
-"""Number of steps for which it is within the tolerance in addition when a push ends all the same."""
+"""Number of further steps within the tolerance without progress after which a push ends all the same."""
+_PROGRESS = 5e-4
 _AVERAGED = 0.1
 """Weight of the latest estimate in the mean that counts at the end."""
 _STILL = 5e-3
@@ -156,6 +157,7 @@ class _End:
     def __init__(self, pushing: Pushing, tolerance: float) -> None:
         self._pushing, self._tolerance = pushing, tolerance
         self._mean: float | None = None
+        self._least = math.inf
         self._settled = self._within = self._pressed = 0
 
     @property
@@ -172,7 +174,9 @@ class _End:
             rest = rest if self._mean is None else self._mean + _AVERAGED * (rest - self._mean)
             self._mean = rest
         rest = abs(rest)
-        self._within = self._within + 1 if rest < self._tolerance else 0
+        goes_on = rest < self._least - _PROGRESS
+        self._within = self._within + 1 if rest < self._tolerance and not goes_on else 0
+        self._least = rest if goes_on or rest >= self._tolerance else self._least
         self._settled = self._settled + 1 if rest < self._tolerance / 2 else 0
         still = pushing.touching and press.touched and press.speed < _STILL
         self._pressed = self._pressed + 1 if still and rest < self._tolerance else 0
