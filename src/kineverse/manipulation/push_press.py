@@ -30,6 +30,10 @@ _MOST_LAG = 8e-4
 """Lag at which the press grows no more [m]."""
 _CREEP = 0.02
 """Speed at which a pusher feels for an object that may be nearer or farther than estimated [m/s]."""
+STILL = 5e-3
+"""Speed of a contact point that counts as none [m/s]."""
+_DEEPEN, _DEEPER = 0.5, 3.0
+"""Time in which a press on what does not move becomes deeper [s], and by how many times its depth."""
 _FORGET, _FORGET_WAY = 1.0, 0.01
 """Time [s] and way [m] after which a lag is forgotten: that of acceleration and delays is none of the press,
 and what moves on gives way."""
@@ -71,7 +75,7 @@ class PushPress:
     def reset(self) -> None:
         """Forget everything but the deviation."""
         self.speed = self.lag = self.correction = 0.0
-        self._way = self._crept = 0.0
+        self._way = self._crept = self._stuck = 0.0
         self._touch, self._estimate, self._value = math.inf, math.nan, math.nan
         self._tip: Array | None = None
         self._planned: Array = np.zeros(3)
@@ -122,6 +126,7 @@ class PushPress:
             self.lag = max(kept + float(along @ self._planned) - way, 0.0)
         else:
             self.lag = 0.0
+        self._stuck = self._stuck + self._dt if touching and self.speed < STILL else 0.0
         if touching and self.touched and leverage > _LEAST_RATE:
             self.correction += self._sign * (max(way, 0.0) / leverage - shift)
         elif not self.touched:
@@ -153,6 +158,11 @@ class PushPress:
         """Take the velocity of the contact point per unit of the push, and of the tip by a command (3,)."""
         self._velocity, self._planned = velocity, self._dt * tip_velocity
 
+    @property
+    def depth(self) -> float:
+        """Depth to which the pusher may press on the object [m]; it grows while the object does not move."""
+        return PRESS * (1.0 + _DEEPER * min(self._stuck / _DEEPEN, 1.0))
+
     def margin(self, gap: float, touching: bool, gain: float) -> float:
         """Return the margin of contact slots between pusher and object [m].
 
@@ -170,7 +180,7 @@ class PushPress:
         """
         known = self.deviation == 0.0 or (self.touched and touching)
         if known:
-            return max(min(0.0, gap - _CREEP / gain), -PRESS)
+            return max(min(0.0, gap - _CREEP / gain), -self.depth)
         return min(self.slack, gap - _CREEP / gain)
 
     @property

@@ -19,6 +19,7 @@ from kineverse.symbols import Symbol
 from .outcome import Outcome
 from .push_approach import plan_push_approach
 from .push_controller import Pushing
+from .push_press import STILL
 from .session import Session
 
 _SETTLED, _SETTLED_ESTIMATE = 5, 25
@@ -28,8 +29,6 @@ _PATIENCE = 25
 _PROGRESS = 5e-4
 _AVERAGED = 0.1
 """Weight of the latest estimate in the mean that counts at the end."""
-_STILL = 5e-3
-"""Speed of a contact point that counts as none [m/s]."""
 _PRESSED = 5
 """Number of steps for which an object within the tolerance gives way no more when a push ends."""
 _MOST_BLOCKED = 3
@@ -178,7 +177,7 @@ class _End:
         self._within = self._within + 1 if rest < self._tolerance and not goes_on else 0
         self._least = rest if goes_on or rest >= self._tolerance else self._least
         self._settled = self._settled + 1 if rest < self._tolerance / 2 else 0
-        still = pushing.touching and press.touched and press.speed < _STILL
+        still = pushing.touching and press.touched and press.speed < STILL
         self._pressed = self._pressed + 1 if still and rest < self._tolerance else 0
         long = _SETTLED_ESTIMATE if press.deviation > 0.0 else _SETTLED
         return self._settled >= long or self._within >= long + _PATIENCE or self._pressed >= _PRESSED
