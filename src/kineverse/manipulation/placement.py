@@ -145,7 +145,7 @@ class PlacementSearch:
         self.base = find_planar_base(model, own)
         self.coordinates = (*self.moving, *self.standing)
         self.samples = PlacementSamples(model, self.moving, self.standing, self.base)
-        self.paths = HandPaths(model, gripper.hand, self.moving, self.standing, self.samples.ease)
+        self.paths = HandPaths(model, gripper.hand, self.moving, self.standing, self.samples.eases[0])
         self.scene = Scene(model)
         prefix = f"{gripper.robot}/" if gripper.robot else ""
         bodies = self.scene.bodies
@@ -212,8 +212,23 @@ class PlacementSearch:
             found = search.take(whole)
             if found is not None or number * batch >= samples or search.refused >= _MOST_REFUSED:
                 break
+            self.paths.ease = self.samples.eases[number % len(self.samples.eases)]
             search.add(batch, _MIDDLES[number % len(_MIDDLES)])
         return found or search.nothing
+
+    def blocked_bases(self, state: State, places: Array) -> npt.NDArray[np.bool_]:
+        """Return flags (B,) of places (B, 3) of the base at which its bodies are too near to something."""
+        found = np.zeros(len(places), dtype=bool)
+        if self._base_watch is not None:
+            for k, place in enumerate(places.tolist()):
+                self.scene.update(state.updated(dict(zip(self.base, place, strict=True))))
+                found[k] = len(self._base_watch()) > 0
+        return found
+
+    @cached_property
+    def _base_watch(self) -> PreparedQuery | None:
+        carried = [b for b in self.own if {*self.model.symbols_of(b)} <= {*self.base}]
+        return self.scene.watch(carried, self.others, self.margin) if carried else None
 
     def first_contact(self, grasp: Grasp, state: State, columns: Sequence[Symbol], rows: Array) -> int | None:
         """Return the index of the first row of values (N, n) at which the robot comes too near to something.
@@ -307,7 +322,12 @@ class _Search:
             return
         hands = handles[middle] @ self.poses[choice]
         outside = handles[middle] @ self.approaches[choice]
-        Q, base = samples.draw(self.random, self.state, hands, outside, _STARTS)
+        value = float(self.values[middle])
+
+        def blocked(places: Array) -> npt.NDArray[np.bool_]:
+            return self.owner.blocked_bases(self.state.updated({self.coordinate: value}), places)
+
+        Q, base = samples.draw(self.random, self.state, hands, outside, _STARTS, blocked)
         Q, error = paths.solve(Q, base, hands, _START_ITERATIONS)
         good = self._count(error < 1e-3, "out of reach")
         Q, base, choice = Q[good], base[good], choice[good]
