@@ -51,7 +51,8 @@ def open_object(
 
     A base, a grasp and a way of the arm are found, see :class:`.PlacementSearch`. The robot goes to the
     handle on a planned path, closes its fingers, moves the object, lets go and retracts. Where one grasp does
-    not lead to the target, the object is released on the way and grasped anew. A base that rolls on wheels is
+    not lead to the target, the object is released on the way and grasped anew. Where no grasp leads on, such as
+    at an oven door whose handle faces the floor, it is pushed. A base that rolls on wheels is
     put to its place by a reset of the world; its drive there is not part of the skill.
 
     Parameters
