@@ -19,8 +19,8 @@ _NEAREST, _FARTHEST = 0.3, 1.1
 _SIDE, _TURN = math.radians(80.0), math.radians(60.0)
 """Largest angles of a base beside the approach of the hand, and of its front beside the hand [rad]."""
 _BASE_EASE, _BASE_SPEED = (0.1, 0.01), 1.0
-"""Weights of a base that can move beside those of joints, so that it moves where they are not enough, or nearly
-stands where there is little room; and its speed where the model has no limit [m/s]."""
+"""Weights of a base that can move beside those of joints, so that it moves where they are not enough, or
+nearly stands where there is little room; and its speed where the model has no limit [m/s]."""
 _QUICK, _SOON = 0.5, 4.0
 """Speed from which on a joint has the full weight [m/s], [rad/s]; time in which most arms are reached [s]."""
 _BASE_TRIES = 4
