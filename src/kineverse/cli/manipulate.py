@@ -27,6 +27,7 @@ from kineverse.errors import InvalidValueError, MissingDependencyError
 from kineverse.expressions.printing import format_number
 
 if TYPE_CHECKING:
+    from kineverse.manipulation.belief import Belief
     from kineverse.manipulation.outcome import Outcome
     from kineverse.manipulation.push_controller import Pushing
     from kineverse.manipulation.session import Session
@@ -128,6 +129,12 @@ def _add_arguments(parser: argparse.ArgumentParser, skill: str) -> None:
         help="what holds in MuJoCo: friction (the default), or a weld as soon as both fingers touch",
     )
     parser.add_argument(
+        "--noise",
+        metavar="TEXT",
+        help="sensors, such as 3mm+3mm/m,0.5deg,30Hz,drop=0.1; the robot then acts on estimates from them "
+        "(the truth)",
+    )
+    parser.add_argument(
         "--base",
         choices=("omni",),
         help="put a robot file without a base on one that moves in all directions",
@@ -177,6 +184,10 @@ def _check(arguments: argparse.Namespace) -> None:
         raise InvalidValueError(f"--seed is a number from 0 on, not {arguments.seed}.")
     if arguments.grasp is not None and arguments.world != "mujoco":
         raise InvalidValueError("--grasp is for --world mujoco; the kinematic world has no friction.")
+    if arguments.noise is not None:
+        from kineverse.worlds import Sensors
+
+        Sensors.parse(arguments.noise)  # says at once what cannot be read
     if arguments.picture is not None:
         from kineverse.view.pictures import check_png_name
 
@@ -190,14 +201,17 @@ def _check(arguments: argparse.Namespace) -> None:
 
 def _make_world(arguments: argparse.Namespace, scene: ManipulationScene) -> World:
     """Return the world, at the start."""
-    from kineverse.worlds import KinematicWorld, MujocoWorld
+    from kineverse.worlds import KinematicWorld, MujocoWorld, Sensors
 
     world: World
+    sensors = None if arguments.noise is None else Sensors.parse(arguments.noise)
     if arguments.world == "mujoco":
         grasp: Literal["friction", "tie"] = arguments.grasp or "friction"
-        world = MujocoWorld(scene.model, scene.robot, scene.gripper, grasp=grasp, seed=arguments.seed)
+        world = MujocoWorld(
+            scene.model, scene.robot, scene.gripper, grasp=grasp, sensors=sensors, seed=arguments.seed
+        )
     else:
-        world = KinematicWorld(scene.model, scene.robot, scene.gripper, seed=arguments.seed)
+        world = KinematicWorld(scene.model, scene.robot, scene.gripper, sensors=sensors, seed=arguments.seed)
     world.reset(scene.start)
     return world
 
@@ -211,13 +225,24 @@ def _act(
     record: str | None,
 ) -> Outcome:
     """Run the skill, with a recording if wanted, and return its outcome."""
-    from kineverse.worlds import Recorder
+    from kineverse.manipulation.belief import EstimateError
+    from kineverse.manipulation.tracked_belief import TrackedBelief
+    from kineverse.worlds import Recorder, Sensors
 
+    belief: Belief | None = None
+    error = EstimateError(scene.coordinate)
     with ExitStack() as stack:
         watchers = [PhaseLines(scene), *watchers]
+        if arguments.noise is not None:
+            tracked = TrackedBelief(scene.model, scene.robot, Sensors.parse(arguments.noise))
+            print_notes(tracked.remarks)
+            belief = tracked
+            watchers.append(error)
         recorder = None
         if record is not None:
             about = {"skill": skill, "robot": scene.robot, "what": str(scene.coordinate), "world": world.name}
+            if arguments.noise is not None:
+                about["noise"] = arguments.noise
             recorder = stack.enter_context(Recorder(record, scene.model, about))
             watchers.append(recorder)
 
@@ -229,7 +254,8 @@ def _act(
             outcome = _without_steps(scene, world, True, f"'{scene.coordinate}' is there from the start")
         else:
             act = _push if skill == "push" else _grasp
-            outcome = act(arguments, scene, world, look)
+            outcome = act(arguments, scene, world, belief, look)
+            outcome = replace(outcome, measures={**outcome.measures, **error.measures})
         if recorder is not None:
             recorder.write_outcome(outcome)
     return outcome
@@ -239,6 +265,7 @@ def _grasp(
     arguments: argparse.Namespace,
     scene: ManipulationScene,
     world: World,
+    belief: Belief | None,
     look: Callable[[RecordedStep], None],
 ) -> Outcome:
     """Open or close the object by its handle."""
@@ -254,7 +281,7 @@ def _grasp(
     elif handles := find_handles(scene.model, scene.coordinate):
         print(handles[0], file=sys.stderr)
     outcome: Outcome = open_object(
-        Session(world, on_step=look),
+        Session(world, belief=belief, on_step=look),
         scene.coordinate,
         target=scene.target,
         hand=scene.gripper.hand,
@@ -269,6 +296,7 @@ def _push(
     arguments: argparse.Namespace,
     scene: ManipulationScene,
     world: World,
+    belief: Belief | None,
     look: Callable[[RecordedStep], None],
 ) -> Outcome:
     """Push the object, from where the robot stands or from a place that is searched."""
@@ -310,7 +338,7 @@ def _push(
     def watch(session: Session) -> None:
         look(_PushStep(session, pushing))
 
-    session = Session(world, on_step=watch)
+    session = Session(world, belief=belief, on_step=watch)
     outcome = push(session, scene.coordinate, seconds=arguments.seconds, pushing=pushing)
     reason = outcome.reason if outcome or not where else f"{outcome.reason} {where}"
     return replace(outcome, reason=reason, measures={**outcome.measures, "placed": placed})
@@ -321,7 +349,7 @@ class _PushStep:
 
     def __init__(self, session: Session, pushing: Pushing) -> None:
         self.world, self.state, self.commands = session.world, session.state, session.commands
-        self.phase = session.phase
+        self.phase, self.observation = session.phase, session.belief.observation
         self.vectors: dict[str, tuple[Any, Any]] = {}
         view = pushing.view
         if view is not None and math.isfinite(view.distance):

@@ -49,3 +49,42 @@ class TrueBelief:
     def deviation(self, coordinate: Symbol) -> float:
         """Return 0."""
         return 0.0
+
+
+class BelievedStep(Protocol):
+    """Step of a skill, as :class:`.Session` has it."""
+
+    @property
+    def world(self) -> World:
+        """The world."""
+
+    @property
+    def state(self) -> State:
+        """The believed state."""
+
+
+class EstimateError:
+    """Error of a believed coordinate over the steps of a session; call it after each of them.
+
+    Parameters
+    ----------
+    coordinate
+        The coordinate.
+    """
+
+    def __init__(self, coordinate: Symbol) -> None:
+        self._coordinate = coordinate
+        self._errors: list[float] = []
+
+    def __call__(self, session: BelievedStep) -> None:
+        """Take the error of the present step."""
+        error = session.state[self._coordinate] - session.world.state[self._coordinate]
+        self._errors.append(abs(error))
+
+    @property
+    def measures(self) -> dict[str, float]:
+        """Mean and largest error [m], [rad]: ``estimate_mean``, ``estimate_largest``; empty without steps."""
+        if not self._errors:
+            return {}
+        mean = sum(self._errors) / len(self._errors)
+        return {"estimate_mean": mean, "estimate_largest": max(self._errors)}

@@ -20,7 +20,7 @@ from kineverse.worlds import Judge
 
 from .hand_reference import HandReference
 from .outcome import SkillError
-from .placement import PlacementSearch
+from .placement import BasePlacement, PlacementSearch
 from .session import Session
 
 _CLOSING, _MOST_CLOSING = 1.5, 4.0
@@ -43,6 +43,8 @@ _POSTURE = 0.5
 """Weight of the arm beside the object."""
 _LOST = 0.002
 """Motion of closed fingers that says that nothing is between them any more [m]."""
+_ARRIVED = 0.05
+"""Distance from the end of a way up to which the retreat there is meant [m], [rad]."""
 _BESIDE = 0.008
 """Difference of the gap of closed fingers to the thickness of the bar that says that it is not there [m]."""
 
@@ -213,16 +215,23 @@ class HandMotion:
             closed = max(closed, gripper.width * (state[s] - held) / range_ if range_ else 0.0)
         return closed > _LOST
 
-    def release(self, grasp: Grasp) -> None:
+    def release(self, placement: BasePlacement) -> None:
         """Open the fingers, and take the hand away."""
         self.session.phase = "release"
-        state = self.session.state
+        state, grasp = self.session.state, placement.grasp
+        assert grasp is not None
         self.move_fingers(self.gripper.opened)
         pose = inverse(self._bar(state)) @ self._hand(state)
         away = pose.copy()
         away[:3, 3] += grasp.approach[:3, 3] - grasp.pose[:3, 3]
         self.session.phase = "retract"
-        self.follow_line(pose, away)
+        # An object that stopped on the way was not looked at here.
+        arrived = abs(state[self.handle.coordinate] - placement.values[-1]) < _ARRIVED
+        self.follow_line(pose, away, self.rows(placement.retreat) if arrived else None)
+
+    def rows(self, configurations: Array) -> Array:
+        """Return the arms (K, n) of configurations of a placement, with the present turns."""
+        return configurations[:, : len(self.search.moving)] + self.turns
 
     def controller(self, tasks: Iterable[Task], **options: Any) -> Controller:
         """Return a controller of the robot's coordinates, and of the object's if tasks are about it."""

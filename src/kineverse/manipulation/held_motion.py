@@ -64,7 +64,7 @@ def move_held(motion: HandMotion, placement: BasePlacement, tolerance: float) ->
     poses = compile([bar, hand])
     target = float(placement.values[-1])
     moving = motion.search.moving
-    rows = placement.way[:, : len(moving)] + motion.turns
+    rows = motion.rows(placement.way)
     values = placement.values
     posture, goals = motion.posture()
     wanted = Target("opening/object", np.zeros(1))

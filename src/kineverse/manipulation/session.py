@@ -76,7 +76,6 @@ class Session:
         self.belief = belief or TrueBelief()
         self._on_step = on_step
         self.state: State = self.belief.update(world)
-        self._observation: Observation | None = None
         self.commands: Speeds = {}
         self.command: Command | None = None
         self.reference: HandReference | None = None
@@ -86,11 +85,9 @@ class Session:
         self.wall: dict[str, list[float]] = {}
 
     @property
-    def observation(self) -> Observation:
-        """The sensor readings after the last step; poses are handed out once, here and to the belief."""
-        if (found := self.belief.observation or self._observation) is None:
-            found = self._observation = self.world.observe()
-        return found
+    def observation(self) -> Observation | None:
+        """The sensor readings from which the state was estimated; None if it is the truth."""
+        return self.belief.observation
 
     def deviation(self, what: Symbol | str | Expression) -> float:
         """Return the standard deviation of a coordinate, or of an expression of coordinates [m], [rad].
@@ -110,8 +107,9 @@ class Session:
             return self.belief.deviation(what)
         if what.shape != ():
             raise ShapeError(f"A deviation is one of a number, not of an expression of shape {what.shape}.")
-        slopes = {s: float(what.partial([s])(self.state)[0]) for s in what.symbols}
-        return math.hypot(*(k * self.belief.deviation(s) for s, k in slopes.items() if k))
+        own = {s: self.belief.deviation(s) for s in what.symbols}
+        slopes = {s: float(what.partial([s])(self.state)[0]) for s, deviation in own.items() if deviation}
+        return math.hypot(*(k * own[s] for s, k in slopes.items() if k))
 
     @contextmanager
     def timed(self, name: str) -> Iterator[None]:
@@ -147,7 +145,6 @@ class Session:
         self._update({})
 
     def _update(self, speeds: Speeds) -> None:
-        self._observation = None
         self.state = self.belief.update(self.world, State(speeds))
 
     def stop(self) -> None:

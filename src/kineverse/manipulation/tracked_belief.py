@@ -37,7 +37,7 @@ _MOVING, _RESTING = 0.04, 4e-4
 """Shares of the tracker's default process noise: .02 rad/√s and .013 m/√s for a door and a drawer in motion,
 and .002 rad/√s and .0013 m/√s at rest."""
 _MOVED, _REFUTED = 1.0, 0.3
-"""Times for which a part counts as moving after it was commanded to, and after its prediction was refuted [s].
+"""Times for which a part counts as moving after a command, and after a refuted prediction [s].
 In the latter all of the tracker's process noise counts."""
 _STILL = 1e-3
 """Largest speed of a part that rests [m/s], [rad/s]."""
@@ -71,6 +71,8 @@ class TrackedBelief:
         The readings of the last update; None before the first.
     camera
         Frame from which distances to markers count; the robot's first frame if none is named like a camera.
+    remarks
+        Texts on what limits the estimates: a robot without a camera, odometry that nothing corrects.
     seen
         Time [s] at which a marker of a coordinate was seen last, by coordinate.
 
@@ -89,7 +91,14 @@ class TrackedBelief:
         if not own:
             prefixes = {name.partition("/")[0] for name in model.frames}
             raise UnknownNameError(f"No frame begins with '{robot}/'. {suggest(robot, prefixes, 'prefix')}")
-        self.camera = sensors.camera or find_camera(own) or own[0]
+        remarks = []
+        found = sensors.camera or find_camera(own)
+        if found is None:
+            remarks.append(
+                f"No frame of '{robot}' is named like a camera, so markers are seen from '{own[0]}'; "
+                "camera= names another one."
+            )
+        self.camera = found or own[0]
         marked = find_marked_frames(model, robot) if sensors.marked is None else sensors.marked
         for name in (self.camera, *marked):
             if name not in model.frames:
@@ -109,6 +118,7 @@ class TrackedBelief:
             )
         self._index = {name: k for k, name in enumerate(self._frames)}
         self.tracker = self._make_tracker()
+        self._estimate = self.tracker.estimate
         speeds = {*self.tracker.process_noise}
         self._speeds_of = {
             s: tuple(speeds.intersection(model.rates[s] if s in model.rates else (s.derivative(),)))
@@ -124,9 +134,19 @@ class TrackedBelief:
                 "is no filter for it. Give sensors without odometry= and turn=."
             )
         self._base = base if drifts and base.coordinates else None
+        if self._base is not None and not self._landmarks:
+            remarks.append("No marked frame stands still, so nothing corrects the drift of the odometry.")
+        self.remarks = tuple(remarks)
         self._exact = base.coordinates
         self._filter = BaseFilter(sensors.odometry, sensors.turn, sensors.outliers > 0.0)
+        self._speeds = tuple(speeds)
+        self._shared: Array | None = None
+        self._carried = np.zeros((len(self._frames), 6, 3))
         if self._base is not None:
+            jacobians = [
+                model.jacobian(name, form="world_aligned", symbols=self._speeds) for name in self._frames
+            ]
+            self._jacobians = compile(np.concatenate([J.reshape(-1) for J in jacobians]))
             offset = model.fk(base.child, relative_to=base.parent)(dict.fromkeys(base.coordinates, 0.0))
             self._plane = np.asarray(model.fk(base.parent)({}) @ offset)
         self._encoded = tuple(
@@ -139,6 +159,8 @@ class TrackedBelief:
         self._values = np.array([start[s] for s in start])
         self._symbols = tuple(start)
         self._place = {s: k for k, s in enumerate(self._symbols)}
+        if self._base is not None:
+            self._jacobian_places = [self._place[s] for s in self._jacobians.inputs]
         self._integrate = model.integrator(symbols=self._symbols)
         self._column = {v: k for k, v in enumerate(self._integrate.speeds)}
         of_robot = np.array([is_of_robot(v.path, robot) for v in self._integrate.speeds])
@@ -186,7 +208,7 @@ class TrackedBelief:
         if now < self._now or (now == self._now and observation.poses) or math.isinf(self._now):
             self._begin(observation.stamp)
         elif now > self._now:
-            self._history.append((self._now, now, self._speeds(commands)))
+            self._history.append((self._now, now, self._vector(commands)))
         self.observation, self._now = observation, now
         self._read_robot(observation)
         if observation.poses:
@@ -199,7 +221,7 @@ class TrackedBelief:
     def _begin(self, stamp: float) -> None:
         """Begin anew at a time, with objects where they were believed."""
         if not math.isinf(self._now):
-            self.tracker.reset(dict(self.tracker.estimate.state), at=stamp)
+            self._estimate = self.tracker.reset(dict(self.tracker.estimate.state), at=stamp)
         self._history.clear()
         self._moved.clear()
         self._refuted.clear()
@@ -207,7 +229,7 @@ class TrackedBelief:
         self._now = self._read = -math.inf
         self._picture = stamp
 
-    def _speeds(self, commands: Mapping[Symbol, float] | None) -> Array:
+    def _vector(self, commands: Mapping[Symbol, float] | None) -> Array:
         vector = np.zeros(len(self._column))
         for speed, value in ({} if commands is None else commands).items():
             if (column := self._column.get(speed)) is not None:
@@ -259,18 +281,20 @@ class TrackedBelief:
 
     def _look(self, observation: Observation) -> None:
         """Update the tracker with the poses of a picture."""
-        names = [name for name in observation.poses if name in self._index]
-        stamp = observation.stamp
+        stamp, self._shared = observation.stamp, None
         poses = np.tile(np.eye(4), (len(self._index), 1, 1))
         mask = np.zeros(len(poses), dtype=bool)
-        rows = [self._index[name] for name in names]
-        poses[rows] = [observation.poses[name] for name in names]
-        mask[rows] = True
+        names = [name for name in observation.poses if name in self._index]
+        for name in names:
+            poses[self._index[name]] = observation.poses[name]
+            mask[self._index[name]] = True
         state = dict(zip(self._symbols, self._values.tolist(), strict=True)) | dict(observation.joints)
         eye = self._camera_pose(np.array([state[s] for s in self._camera_pose.inputs]))[0][:3, 3]
         more: Array | float = 0.0
         if self._base is not None:
             poses, more = self._correct(observation, poses, eye)
+        if not names:
+            return
         covariances = self._covariances(poses, eye) + more
         travel = self._displacement(self._picture, stamp)
         duration = stamp - self._picture
@@ -284,7 +308,7 @@ class TrackedBelief:
             noise |= dict.fromkeys(speeds, self._noise_share(s, stamp))
         usual = self.tracker.process_noise
         noise = {v: share * usual[v] for v, share in noise.items()}
-        estimate = self.tracker.update_poses(
+        self._estimate = estimate = self.tracker.update_poses(
             poses, mask, covariances=covariances, at=stamp, commands=commands, process_noise=noise
         )
         for group in estimate.refuted_groups:
@@ -313,10 +337,7 @@ class TrackedBelief:
         return np.asarray(variances[:, :, None] * np.eye(6))
 
     def _correct(self, observation: Observation, poses: Array, eye: Array) -> tuple[Array, Array]:
-        """Correct the base by landmarks; return poses that it carries, and the covariance it adds to them.
-
-        An error of the base is the same for all poses and pictures, and counts as if it was another for each.
-        """
+        """Correct the base by landmarks; return poses that it carries, and the covariance it adds to them."""
         assert self._base is not None
         read = np.array([observation.joints[s] for s in self._base.coordinates])
         base_T_world = inverse(place(read)) @ inverse(self._plane)
@@ -330,7 +351,21 @@ class TrackedBelief:
         motion = motion_of(carried)
         for rows in slice(3), slice(3, 6):
             motion[:, rows] = world_T_base[:3, :3] @ motion[:, rows]
+        self._carried = motion
         return world_T_base @ carried, motion @ self._filter.covariance @ np.swapaxes(motion, 1, 2)
+
+    def _shared_variance(self, coordinate: Symbol) -> float:
+        """Return the variance of a coordinate by the base's error, which no number of pictures averages."""
+        if self._base is None:
+            return 0.0
+        if self._shared is None:
+            J = self._jacobians(self._values[self._jacobian_places]).reshape(-1, 6, len(self._speeds))
+            weights = np.repeat([self.sensors.position, self.sensors.orientation], 3)
+            W = 1.0 / np.maximum(weights, _LEAST_POSITION) ** 2
+            A = np.einsum("kia,i,kib->ab", J, W, J) + 1e-9 * np.eye(len(self._speeds))
+            X = np.linalg.solve(A, np.einsum("kia,i,kib->ab", J, W, self._carried))
+            self._shared = np.einsum("ia,ab,ib->i", X, self._filter.covariance, X)
+        return float(sum(self._shared[self._speeds.index(v)] for v in self._speeds_of[coordinate]))
 
     def _predict(self, now: float) -> State:
         """Return the state predicted from the last readings to a time."""
@@ -359,12 +394,13 @@ class TrackedBelief:
             For a coordinate that the state does not have.
         """
         if coordinate in self._groups:
-            estimate = self.tracker.estimate
+            estimate = self._estimate
             if self._groups[coordinate] in estimate.lost_groups:
                 return math.inf
             usual, share = self.tracker.process_noise, self._noise_share(coordinate, self._now)
             rate = sum(share * usual[v] for v in self._speeds_of[coordinate])
-            return math.sqrt(estimate.deviation[coordinate] ** 2 + rate * max(self._now - self._picture, 0.0))
+            later = rate * max(self._now - self._picture, 0.0)
+            return math.sqrt(estimate.deviation[coordinate] ** 2 + later + self._shared_variance(coordinate))
         if coordinate in self._encoded:
             return math.sqrt(float(self._spread[self._encoded.index(coordinate)]))
         if self._base is not None and coordinate in self._base.coordinates:
