@@ -248,7 +248,9 @@ class _Run:
         if pushing.touching and self._last is not None:
             self._changes.append(np.abs(speeds - self._last))
         self._last = speeds if pushing.touching else None
+        session.vectors = {} if pushing.view is None else pushing.view.vectors
         session.act(command.speeds)
+        session.vectors = {}
         if self._on_step is not None:
             self._on_step(pushing)
 
