@@ -4,8 +4,9 @@ import pytest
 import kineverse as kv
 from kineverse.errors import InvalidValueError, KineverseError, UnknownNameError
 from kineverse.grasping import find_gripper, find_handle, sample_grasps
-from kineverse.manipulation import PlacementSearch, Session, open_object
-from kineverse.worlds import KinematicWorld
+from kineverse.manipulation import PlacementSearch, Session, TrackedBelief, open_object
+from kineverse.manipulation.belief import EstimateError
+from kineverse.worlds import KinematicWorld, MujocoWorld, Sensors
 
 DRAWER, DOOR = "shelf_drawers/upper_drawer", "shelf_door/door"
 
@@ -57,6 +58,41 @@ def test_drawer_closes_again(opened, session):
     assert session.world.state[DRAWER] < 0.02
 
 
+def test_drawer_opens_by_friction_on_estimates(model):
+    pytest.importorskip("mujoco")
+    sensors = Sensors.parse("3mm+3mm/m,0.5deg,30Hz")
+    world = MujocoWorld(model, "hsr", sensors=sensors)
+    world.reset(start(model))
+    outcome = open_object(Session(world, belief=TrackedBelief(model, "hsr", sensors)), DRAWER)
+    assert outcome, outcome.reason
+    assert world.state[DRAWER] == pytest.approx(0.22, abs=0.02)
+    assert world.held is None
+    assert outcome.measures["slips"] == 0
+    assert outcome.measures["grasp_error"] < 2e-3
+
+
+def test_loss_of_a_drawer_that_moves_too_hard_is_noticed_and_said(model):
+    pytest.importorskip("mujoco")
+    world = MujocoWorld(model, "hsr", door_friction={DRAWER: 150.0})  # and friction holds 100 N
+    world.reset(start(model))
+    last_held, losses, phases = 0.0, [], [""]
+
+    def watch(session):
+        nonlocal last_held
+        if phases[-1] == "move" != session.phase:
+            arm = [v for s, v in session.commands.items() if "hand_motor" not in str(s)]
+            losses.append((world.time - session.dt - last_held, max(map(abs, arm), default=0.0)))
+        phases.append(session.phase)
+        last_held = world.time if world.held else last_held
+
+    outcome = open_object(Session(world, on_step=watch), DRAWER)
+    assert not outcome
+    assert outcome.measures["slips"] == len(losses) == 2
+    assert all(late <= 0.1 and speed == 0.0 for late, speed in losses), losses
+    assert "slipped at" in outcome.reason
+    assert "too hard" in outcome.reason
+
+
 def test_placement_keeps_the_grasp_along_the_way():
     model = make_model("shelf_door")
     gripper, handle = find_gripper(model, "hsr"), find_handle(model, DOOR)
@@ -100,3 +136,26 @@ def test_wrong_arguments_are_refused(session):
         open_object(session, DRAWER, target=3.0)
     with pytest.raises(KineverseError):
         open_object(session, DRAWER, handle="shelf_drawers/lower_drawer_handle")
+
+
+def test_an_object_that_is_never_seen_is_not_opened(model):
+    sensors = Sensors.parse("3mm,0.5deg,drop=1")
+    world = KinematicWorld(model, "hsr", sensors=sensors)
+    world.reset(start(model).updated({DRAWER: 0.1}))
+    outcome = open_object(Session(world, belief=TrackedBelief(model, "hsr", sensors)), DRAWER)
+    assert not outcome
+    assert "not seen" in outcome.reason
+    assert world.state[DRAWER] == 0.1
+
+
+def test_drawer_opens_by_estimates_from_noisy_poses(model):
+    sensors = Sensors.parse("3mm+3mm/m,0.5deg,30Hz,drop=0.1,encoders=0.0002")
+    world = KinematicWorld(model, "hsr", sensors=sensors)
+    world.reset(start(model))
+    error = EstimateError(model.symbol(DRAWER))
+    session = Session(world, belief=TrackedBelief(model, "hsr", sensors), on_step=error)
+    outcome = open_object(session, DRAWER)
+    assert outcome, outcome.reason
+    assert outcome.measures["penetration"] < 5e-4
+    assert error.measures["estimate_mean"] < 0.003
+    assert outcome.measures["grasp_error"] < max(5e-4, 1.5 * error.measures["estimate_largest"])

@@ -189,6 +189,18 @@ def test_fingers_hold_a_bar_with_the_stated_force_until_they_open(robot: str) ->
     assert sum(world.state[q] for q in gripper(robot).joints) > sum(before[q] for q in gripper(robot).joints)
 
 
+def test_held_bar_does_not_creep_under_a_force() -> None:
+    world = world_with_bar(door_friction={"thing/way": 20.0})
+    world.apply(closing("fetch"), 1.2)
+    place = world.model.fk("thing/bar", gripper("fetch").hand)
+    back = {v: -0.1 * x for v, x in FORWARD["fetch"].items()}
+    world.apply(back, 0.5)
+    before, way = place(world.state)[:3, 3], world.state["thing/way"]
+    world.apply(back, 2.0)
+    assert world.state["thing/way"] - way == pytest.approx(-0.2, abs=1e-3)
+    np.testing.assert_allclose(place(world.state)[:3, 3], before, atol=1e-4)
+
+
 def test_tie_holds_what_friction_does_not_and_is_told() -> None:
     ways = {}
     for grasp in ("friction", "tie"):

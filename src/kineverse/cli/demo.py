@@ -1,78 +1,32 @@
-"""``kineverse demo``: a simulated kitchen that is tracked, or a kitchen and a robot with sliders."""
+"""``kineverse demo``: a robot opens and closes a kitchen; with options, a tracked kitchen, or sliders."""
 
 from __future__ import annotations
 
 import argparse
-import os
-import sys
-from pathlib import Path
-from typing import TYPE_CHECKING
 
-import kineverse
-from kineverse.cli.output import format_table, show_progress
-from kineverse.cli.view import add_page_options, handle_interrupts, page_options, print_address
+from kineverse.cli import demo_living, demo_robot
+from kineverse.cli.view import add_page_options
 from kineverse.errors import InvalidValueError
-from kineverse.expressions.printing import format_number
 
-if TYPE_CHECKING:
-    from living_kitchen.track import TrackingQuality
+HELP = """let a robot open and close the doors and drawers of a kitchen
 
-    import kineverse as kv
-    from kineverse.view.camera import Camera
+A robot that ships opens and closes the doors and drawers of the kitchen that ships, one after another, live
+in the browser until Ctrl-C: the robot and the true kitchen, what it believes of it from noisy poses, and what
+its controller wants. Each object is reported on the terminal, and all of them in a table at the end. With
+--headless it opens and closes one object of each kind without a browser, and writes a picture. The exit
+status is 0 if all was opened and closed, else 1. This needs the extras 'control' and 'geometry', the page
+'view'.
 
-HELP = """show a kitchen in motion that is tracked through noise, and a joint that is identified
-
-Opens it in the browser until Ctrl-C: doors and drawers move, and are tracked from noisy markers; the estimate
-is shown beside the truth. In front moves a mechanism of unknown type; it is identified, then tracked. With
---headless it simulates some seconds of that without a browser, and writes numbers and a picture; that needs
-nothing beyond the core. With --sliders, and outside of a source checkout, it shows the kitchen and a robot
-instead, to be moved by hand.
+With --living it shows a kitchen in motion without a robot, tracked from noisy markers, and a joint that is
+identified; with --headless that needs nothing beyond the core. With --sliders it shows the kitchen and a
+robot, to be moved by hand.
 
 examples:
   kineverse demo
+  kineverse demo --robot fetch --what 'kitchen/*_door' --speed 2
   kineverse demo --headless --picture kitchen.png
-  kineverse demo --stranger stool
+  kineverse demo --living --stranger stool
   kineverse demo --sliders"""
-
-MODELS = ("kitchen", "pr2")
-
-STATE = {
-    "kitchen/fridge_door": 1.0,
-    "kitchen/oven_door": 0.5,
-    "kitchen/oven_knob": 1.2,
-    "kitchen/oven_right_drawer": 0.3,
-    "kitchen/sink_left_middle_drawer": 0.14,
-    "kitchen/sink_left_upper_drawer": 0.32,
-    "kitchen/sink_trash_drawer": 0.22,
-    "pr2/base/angle": 0.95,
-    "pr2/base/x": 0.1,
-    "pr2/base/y": -0.35,
-    "pr2/head_pan_joint": 0.1,
-    "pr2/head_tilt_joint": 0.35,
-    "pr2/l_elbow_flex_joint": -1.75,
-    "pr2/l_gripper_joint": 0.05,
-    "pr2/l_shoulder_lift_joint": 0.55,
-    "pr2/l_shoulder_pan_joint": 0.75,
-    "pr2/l_upper_arm_roll_joint": 1.0,
-    "pr2/l_wrist_flex_joint": -0.9,
-    "pr2/r_elbow_flex_joint": -0.75,
-    "pr2/r_gripper_joint": 0.07,
-    "pr2/r_shoulder_lift_joint": 0.1,
-    "pr2/r_shoulder_pan_joint": -0.55,
-    "pr2/r_wrist_flex_joint": -0.35,
-    "pr2/torso_lift_joint": 0.15,
-}
-"""The initial values of the sliders [m], [rad]: open doors, and the robot in front of them."""
-
-EYE, TARGET, VIEW = (-3.5, 4.9, 2.75), (0.2, 0.0, 0.8), 0.66
-"""The initial camera [m], [rad]: over the corner of the island, along the open doors."""
-
-
-SECONDS, STEP, SETTLED = 18.0, 1.0 / 12.0, 3.0
-"""Duration and time step without a browser, and the time from which the quality counts [s]."""
-
-LONGEST = 3600.0
-"""The longest duration [s]."""
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -81,16 +35,11 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--picture", metavar="PATH", default="demo.png", help="with --headless, a .png (demo.png)"
     )
-    parser.add_argument(
-        "--stranger",
-        choices=("chest", "crate", "stool"),
-        default="chest",
-        help="the mechanism of unknown type",
-    )
-    parser.add_argument(
-        "--seconds", type=float, default=SECONDS, metavar="S", help=f"with --headless: how long ({SECONDS:g})"
-    )
-    parser.add_argument("--sliders", action="store_true", help="a kitchen and a robot, to be moved by hand")
+    demo_robot.add_arguments(parser.add_argument_group("the robot"))
+    others = parser.add_argument_group("other demos").add_mutually_exclusive_group()
+    others.add_argument("--living", action="store_true", help="a kitchen in motion, tracked and identified")
+    others.add_argument("--sliders", action="store_true", help="a kitchen and a robot, to be moved by hand")
+    demo_living.add_arguments(parser.add_argument_group("with --living"))
     add_page_options(parser)
 
 
@@ -99,146 +48,16 @@ def run(arguments: argparse.Namespace) -> int:
     from kineverse.view.pictures import check_png_name
 
     check_png_name(arguments.picture)
-    if not arguments.sliders and not _find_example():
-        print(
-            "kineverse: note: the living kitchen is an example of the source checkout "
-            "(examples/living_kitchen); these are its sliders.",
-            file=sys.stderr,
-        )
-        arguments.sliders = True
-    if arguments.sliders:
-        return _show_sliders(arguments)
-    from living_kitchen.simulation import Simulation
-
-    if arguments.headless:
-        return _simulate(arguments)
-    from living_kitchen.page import SimulationPage
-
-    with (
-        handle_interrupts(),
-        SimulationPage(
-            Simulation(mechanism=arguments.stranger), label="Kineverse demo", **page_options(arguments)
-        ) as page,
-    ):
-        print_address(page, browser=not arguments.no_browser)
-        print(f"{page.simulation.kitchen}, tracked; a {page.simulation.mechanism.name}, learned", flush=True)
-        page.wait()
-    return 0
+    other = "--living" if arguments.living else "--sliders" if arguments.sliders else ""
+    if other:
+        _refuse(arguments, demo_robot.OPTIONS, f"is for the robot, not for {other}")
+    if not arguments.living:
+        _refuse(arguments, demo_living.OPTIONS, "is for --living")
+    return demo_living.run(arguments) if other else demo_robot.run(arguments)
 
 
-def _find_example() -> bool:
-    """Make the package ``living_kitchen`` importable; return True if this is a checkout that has it."""
-    folder = Path(kineverse.__file__).resolve().parents[2] / "examples"
-    if not (folder / "living_kitchen" / "__init__.py").is_file():
-        return False
-    if str(folder) not in sys.path:
-        sys.path.append(str(folder))
-    return True
-
-
-def _simulate(arguments: argparse.Namespace) -> int:
-    """Run the simulation without a browser, print its results, and write a picture of its end."""
-    from living_kitchen.picture import save
-    from living_kitchen.report import tabulate_identification, tabulate_tracking
-    from living_kitchen.simulation import Simulation
-    from living_kitchen.track import average
-
-    steps = _count_steps(arguments.seconds)
-    simulation = Simulation(mechanism=arguments.stranger)
-    # First, so that an unwritable path is reported before the work.
-    _try_to_write(arguments.picture)
-    qualities: list[TrackingQuality] = []
-    for _ in show_progress(range(steps), "living", "step"):
-        simulation.step(STEP)
-        if simulation.time > SETTLED or not qualities:
-            qualities.append(simulation.quality)
-    print(format_table(*tabulate_tracking(simulation, average(qualities)), "<>"), end="\n\n")
-    print(format_table(*tabulate_identification(simulation), "<>"))
-    save(arguments.picture, simulation)
-    print(f"picture: {arguments.picture}")
-    return 0
-
-
-def _try_to_write(path: str) -> None:
-    """Check that a file can be written, without leaving an empty one if the run is interrupted."""
-    new = not os.path.lexists(path)
-    open(path, "ab").close()
-    if new:
-        os.remove(path)
-
-
-def _count_steps(seconds: float) -> int:
-    """Return the number of steps of a duration."""
-    if not STEP <= seconds <= LONGEST:
-        raise InvalidValueError(f"--seconds is between {STEP:.2g} and {LONGEST:g}, not {seconds!r}")
-    return round(seconds / STEP)
-
-
-def _show_sliders(arguments: argparse.Namespace) -> int:
-    """Load both models; show or drive them."""
-    import kineverse as kv
-
-    model = kv.Model()
-    for name in MODELS:
-        model.include(name)
-    if arguments.headless:
-        return _exercise_models(model, arguments.picture)
-    from kineverse.view.viewer import Viewer
-
-    with (
-        handle_interrupts(),
-        Viewer(
-            model, _initial_state(model), label="Kineverse demo", camera=_camera(), **page_options(arguments)
-        ) as page,
-    ):
-        print_address(page, browser=not arguments.no_browser)
-        print(_contents(model), flush=True)
-        page.wait()
-    return 0
-
-
-def _initial_state(model: kv.Model) -> dict[str, float]:
-    """Return the initial values of those symbols that the models have."""
-    known = {str(symbol) for symbol in model.symbols}
-    return {name: value for name, value in STATE.items() if name in known}
-
-
-def _camera() -> Camera:
-    from kineverse.view.camera import Camera
-
-    return Camera(EYE, TARGET, field_of_view=VIEW)
-
-
-def _contents(model: kv.Model) -> str:
-    """Return a table of the models."""
-    rows = []
-    for name in MODELS:
-        inside = f"{name}/"
-        rows.append(
-            (
-                name,
-                str(sum(frame.startswith(inside) for frame in model.frames)),
-                str(sum(symbol.path.startswith(inside) for symbol in model.degrees_of_freedom)),
-                str(sum(constraint.startswith(inside) for constraint in model.constraints)),
-            )
-        )
-    return format_table(("model", "frames", "DoF", "constraints"), rows, "<>>>")
-
-
-def _exercise_models(model: kv.Model, path: str) -> int:
-    """Drive all coordinates through their ranges, write a picture, and report problems."""
-    from kineverse.cli.exercise import exercise_model
-    from kineverse.view import save_picture
-
-    # First, so that an unwritable path is reported before the work.
-    save_picture(path, model, _initial_state(model), camera=_camera())
-    print(_contents(model), flush=True)
-    result = exercise_model(model)
-    print(
-        f"{result.freedoms} DoF driven through their ranges: {result.poses} poses of frames at "
-        f"{format_number(result.rate, 3)} poses/s, {result.violations} limits violated"
-    )
-    for line in result.problems[:10]:
-        print(f"kineverse: {line}", file=sys.stderr)
-    print(f"picture: {path}")
-    return 1 if result.problems else 0
+def _refuse(arguments: argparse.Namespace, options: tuple[str, ...], why: str) -> None:
+    """Raise InvalidValueError if any of some options is given."""
+    for name in options:
+        if getattr(arguments, name) not in (None, False):
+            raise InvalidValueError(f"--{name} {why}; leave one of them out.")

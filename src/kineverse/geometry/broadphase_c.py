@@ -1,8 +1,9 @@
 """C text: broad phase, and the ordered search that comes after :mod:`.narrowphase_c`."""
 
-from .broadphase import MEMORY_SLOTS, TREE_WIDTH
+from .broadphase import MEMORY_SLOTS, NO_STATIC_PARTNER, TREE_WIDTH
 
-SWEEP = r"""
+SWEEP = (
+    r"""
 #include <math.h>
 #include <stdint.h>
 #include <stdlib.h>
@@ -41,6 +42,8 @@ typedef struct {
 
 #define MEMORY_BITS @BITS@
 #define TREE_WIDTH @WIDTH@
+/* Value of `active` for objects that are in no pair with a static one. */
+#define NO_STATIC_PARTNER @NO_STATIC@
 #define EXPORT __attribute__((visibility("default")))
 
 /* Slot of a pair, which another pair may have overwritten. */
@@ -217,7 +220,7 @@ EXPORT int64_t near(Table *t, double reach, int32_t *pairs, double *lows, int64_
     square_gaps(t, k, k + 1, end);
     for (int64_t m = k + 1; m < end; m++)
       if (gap[m] <= reach * reach) consider(t, one, t->order[m], &answer);
-    if (n < t->count) consider_static(t, one, &answer);
+    if (n < t->count && t->active[one] != NO_STATIC_PARTNER) consider_static(t, one, &answer);
   }
   return answer.found;
 }
@@ -258,7 +261,10 @@ static int64_t near_again(
   }
   return answer.found;
 }
-""".replace("@BITS@", str(MEMORY_SLOTS.bit_length() - 1)).replace("@WIDTH@", str(TREE_WIDTH))
+""".replace("@BITS@", str(MEMORY_SLOTS.bit_length() - 1))
+    .replace("@WIDTH@", str(TREE_WIDTH))
+    .replace("@NO_STATIC@", str(NO_STATIC_PARTNER))
+)
 
 
 SEARCH = r"""

@@ -15,6 +15,7 @@ from kineverse.model.kinematics import ancestors
 from kineverse.model.model_view import ModelView
 from kineverse.symbols import Symbol
 
+from .bindings import collision_library
 from .broadphase import Flags, Indices, PairSelection
 from .collision_world import CollisionWorld
 from .distance_queries import check_radius, find_pairs_within
@@ -115,26 +116,24 @@ class PreparedQuery:
         return float(found.least)
 
     def prepare(self) -> None:
-        """Make the solids of the selected bodies, which the first query does otherwise; no state is needed.
+        """Make what the first query makes otherwise: solids of the selected bodies, tables; without a state.
 
         Raises
         ------
         KineverseError
             If a solid cannot be made; the message names body and file.
         """
-        self._world.load(self._involved(self._selected()))
-
-    def _involved(self, flags: Flags) -> list[int]:
-        """Return the objects of selected bodies."""
-        involved = np.asarray(flags.any(axis=1))
-        return np.flatnonzero(involved[self._world.table.body]).tolist()
+        self._select()
+        if collision_library.is_native:
+            collision_library.bind(self._world.table)
 
     def _select(self) -> PairSelection:
         """Return the selected pairs, whose objects have solids."""
         world = self._world
         if self._selection is None or self._version != world.model.version:
             flags = self._selected()
-            world.load(self._involved(flags))
+            involved = np.asarray(flags.any(axis=1))
+            world.load(np.flatnonzero(involved[world.table.body]).tolist())
             world.table.choose_axis()
             self._selection = PairSelection(world.table, flags)
         return self._selection

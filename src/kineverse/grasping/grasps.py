@@ -16,6 +16,7 @@ from kineverse.geometry.objects import collision_shapes, matches_pattern
 from kineverse.lie import Array
 from kineverse.model.body import Body
 from kineverse.model.model_view import ModelView
+from kineverse.state import State
 
 from .bars import Part, find_parts
 from .finger_pairs import path_to_root
@@ -29,7 +30,8 @@ _SLACK = 4e-3
 """Gap of the pads minus the thickness of the bar, before the fingers touch [m]."""
 _MARGIN = 1e-3
 """Least distance of the hand from the object before the fingers touch [m]."""
-_MOST_TILT, _MOST_TILT_OF_KNOB = math.radians(60), math.radians(20)
+_MOST_TILT, _MOST_TILT_OF_KNOB = math.radians(100), math.radians(20)
+"""Largest angle about the bar: a hand that comes from the edge of a flap keeps its grasp while that opens."""
 _DEPTHS = (0.0, 0.5, 1.0, -0.5)
 """Parts of the depth of the pads at which a bar is tried first; 1 is at their tips."""
 _CANDIDATES = 6
@@ -87,13 +89,14 @@ def sample_grasps(
     count: int = 64,
     seed: int = 0,
     *,
+    state: State | None = None,
     decomposed: Iterable[str] = (),
 ) -> tuple[Grasp, ...]:
     """Return grasps across a bar, without contact of the gripper with the object, the best first.
 
     Grasps differ in the angle about the bar, the place along it, the depth, and by half a turn about the
     approach; around a knob also in the angle about its axis. The way from ``approach`` to ``pose`` and the
-    closing fingers are free of collisions with everything that is not the robot's, at its default values.
+    closing fingers are free of collisions with everything that is not the robot's.
     Upright grasps at the middle of the bar and of the pads come first, of similar ones the clearer.
 
     Parameters
@@ -106,6 +109,8 @@ def sample_grasps(
         Most grasps that are returned.
     seed
         Seed of the samples: equal arguments give equal grasps.
+    state
+        Where everything stands while the hand approaches; default values without it.
     decomposed
         Bodies, or patterns, as for :class:`kineverse.geometry.Scene`: without them a mesh is its convex hull.
 
@@ -119,7 +124,7 @@ def sample_grasps(
             f"The handle {handle.frame} is {handle.thickness * 1e3:.0f} mm thick, and the gripper of "
             f"{gripper.hand} opens {gripper.width * 1e3:.0f} mm. find_handles and find_grippers list others."
         )
-    surroundings = _Surroundings(model, gripper, handle, tuple(decomposed))
+    surroundings = _Surroundings(model, gripper, handle, tuple(decomposed), state or model.default_state())
     found: list[tuple[float, Grasp]] = []
     hits: Counter[tuple[str, str]] = Counter()
     rng = np.random.default_rng(seed)
@@ -184,11 +189,16 @@ class _Surroundings:
     """Bodies around a handle, and a hand that is tried there, all in the frame of the handle."""
 
     def __init__(
-        self, model: ModelView, gripper: Gripper, handle: Handle, decomposed: tuple[str, ...]
+        self,
+        model: ModelView,
+        gripper: Gripper,
+        handle: Handle,
+        decomposed: tuple[str, ...],
+        state: State,
     ) -> None:
         robot = _frames_of_robot(model, gripper)
         scene = Scene(model, leave_out=[f for f in model.bodies if f in robot], decomposed=decomposed)
-        scene.update(model.default_state())
+        scene.update(state)
         frame_T_world = lie.inverse(scene.pose(handle.frame))
         middle = (scene.pose(handle.frame) @ handle.pose)[:3, 3]
         near: dict[str, list[int]] = {}

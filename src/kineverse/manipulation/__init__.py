@@ -1,6 +1,8 @@
 """Manipulation: skills that open, close and push articulated objects with a robot (layer 5)."""
 
+from .articulated_objects import ArticulatedObject, find_articulated_objects
 from .belief import Belief, TrueBelief
+from .open_close import OpenCloseReport, OpenCloseRunner
 from .opening import open_object
 from .outcome import Outcome, SkillError
 from .placement import BasePlacement, PlacementSearch
@@ -9,14 +11,18 @@ from .session import Session
 from .tracked_belief import TrackedBelief
 
 __all__ = [
+    "ArticulatedObject",
     "BasePlacement",
     "Belief",
+    "OpenCloseReport",
+    "OpenCloseRunner",
     "Outcome",
     "PlacementSearch",
     "Session",
     "SkillError",
     "TrackedBelief",
     "TrueBelief",
+    "find_articulated_objects",
     "open_object",
     "push",
 ]

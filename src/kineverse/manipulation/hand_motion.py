@@ -7,8 +7,9 @@ from collections.abc import Iterable, Mapping
 from typing import Any
 
 import numpy as np
+import numpy.typing as npt
 
-from kineverse.control import Controller, Goal, Hold, Target, same_pose
+from kineverse.control import Command, Controller, Goal, Hold, Target, same_pose
 from kineverse.control.tasks import Task
 from kineverse.grasping import Grasp, Gripper, Handle
 from kineverse.lie import Array, inverse
@@ -17,8 +18,9 @@ from kineverse.state import State
 from kineverse.symbols import Symbol
 from kineverse.worlds import Judge
 
+from .hand_reference import HandReference
 from .outcome import SkillError
-from .placement import PlacementSearch
+from .placement import BasePlacement, PlacementSearch
 from .session import Session
 
 _CLOSING, _MOST_CLOSING = 1.5, 4.0
@@ -27,6 +29,8 @@ _LINE_SPEED = 0.1
 """Speed of the hand on the straight way to the handle and from it [m/s]."""
 _SETTLED, _MOST_SETTLING = 5e-4, 150
 """Error of the hand's pose at the end of a straight way [m], [rad], and the most steps until it is met."""
+_REFERENCES = 24
+"""Number of poses that pages show of a way."""
 _KNOWN, _MOST_LOOKING, _UNKNOWN = 1.5e-3, 1.0, 0.02
 """Deviation of a handle's position that is small [m], longest time to look until it is [s], and the deviation
 from which on nothing is done [m]."""
@@ -39,6 +43,8 @@ _POSTURE = 0.5
 """Weight of the arm beside the object."""
 _LOST = 0.002
 """Motion of closed fingers that says that nothing is between them any more [m]."""
+_ARRIVED = 0.05
+"""Distance from the end of a way up to which the retreat there is meant [m], [rad]."""
 _BESIDE = 0.008
 """Difference of the gap of closed fingers to the thickness of the bar that says that it is not there [m]."""
 
@@ -128,18 +134,23 @@ class HandMotion:
         follower = TrajectoryFollower(trajectory)
         controller = self.controller(follower.tasks, posture=0.0)
         begin = session.world.time
+        times = np.linspace(0.0, trajectory.duration, _REFERENCES)
+        self.refer([self._hand(session.state.updated(trajectory.at(t))) for t in times.tolist()])
         while session.world.time - begin < trajectory.duration + 0.2:
             self.check_time()
+            self.refer_to((session.world.time - begin) / max(trajectory.duration, session.dt))
             with session.timed("approach"):
                 follower.set(controller, session.world.time - begin)
                 command = controller.step(self.state)
-            self.act(command.speeds)
+            self.act(command.speeds, command)
+        session.reference = None
 
     def follow_line(self, start: Array, end: Array, rows: Array | None = None) -> None:
         """Move the hand straight from a pose relative to the handle to another one, near to arms (L, n)."""
         session = self.session
-        wanted, rate = Target("hand/pose", end), Target("hand/rate", np.zeros(6))
-        posture, goals = (None, []) if rows is None else self.posture(rows[0])
+        # The initial values are of no run: a controller with others would be compiled for these alone.
+        wanted, rate = Target("hand/pose", np.eye(4)), Target("hand/rate", np.zeros(6))
+        posture, goals = (None, []) if rows is None else self.posture()
         error = same_pose(self._bar @ wanted.expression, self._hand)
         goal = Goal(error, gain=FOLLOWING, rate=rate.expression, name="hand")
         controller = self.controller([goal, *goals])
@@ -148,10 +159,12 @@ class HandMotion:
         speed = np.concatenate([end[:3, :3].T @ way / (steps * session.dt), np.zeros(3)])
         uncertain = [session.deviation(x) for x in (self._bar @ end)[:3, 3]]
         settled = max(_SETTLED, _SIGMAS * float(np.linalg.norm(uncertain)))
+        self.refer(self._bar(session.state) @ np.array([start, end]))
         for k in range(1, steps + _MOST_SETTLING):
             self.check_time()
             pose = end.copy()
             share = min(1.0, k / steps)
+            self.refer_to(share)
             pose[:3, 3] = start[:3, 3] + share * (end[:3, 3] - start[:3, 3])
             with session.timed("line"):
                 controller.set(wanted, pose)
@@ -161,7 +174,8 @@ class HandMotion:
                 command = controller.step(self.state)
             if k > steps and command.residuals["hand"] < settled:
                 break
-            self.act(command.speeds)
+            self.act(command.speeds, command)
+        session.reference = None
 
     def count_turns(self, row: Array) -> None:
         """Find the whole turns by which joints without limits are away from a configuration (n,)."""
@@ -170,9 +184,9 @@ class HandMotion:
         away = self.session.state.vector(moving) - row[: len(moving)]
         self.turns = np.where(turning, 2 * math.pi * np.round(away / (2 * math.pi)), 0.0)
 
-    def posture(self, row: Array) -> tuple[Target, list[Goal]]:
+    def posture(self) -> tuple[Target, list[Goal]]:
         """Return a target for the arm (n,), and the goals that keep the arm near to it."""
-        posture = Target("arm/posture", row)
+        posture = Target("arm/posture", np.zeros(len(self.search.moving)))
         goals = [
             Goal(s, posture.expression[k], gain=FOLLOWING, weight=_POSTURE, name=f"posture {s}")
             for k, s in enumerate(self.search.moving)
@@ -201,16 +215,23 @@ class HandMotion:
             closed = max(closed, gripper.width * (state[s] - held) / range_ if range_ else 0.0)
         return closed > _LOST
 
-    def release(self, grasp: Grasp) -> None:
+    def release(self, placement: BasePlacement) -> None:
         """Open the fingers, and take the hand away."""
         self.session.phase = "release"
-        state = self.session.state
+        state, grasp = self.session.state, placement.grasp
+        assert grasp is not None
         self.move_fingers(self.gripper.opened)
         pose = inverse(self._bar(state)) @ self._hand(state)
         away = pose.copy()
         away[:3, 3] += grasp.approach[:3, 3] - grasp.pose[:3, 3]
         self.session.phase = "retract"
-        self.follow_line(pose, away)
+        # An object that stopped on the way was not looked at here.
+        arrived = abs(state[self.handle.coordinate] - placement.values[-1]) < _ARRIVED
+        self.follow_line(pose, away, self.rows(placement.retreat) if arrived else None)
+
+    def rows(self, configurations: Array) -> Array:
+        """Return the arms (K, n) of configurations of a placement, with the present turns."""
+        return configurations[:, : len(self.search.moving)] + self.turns
 
     def controller(self, tasks: Iterable[Task], **options: Any) -> Controller:
         """Return a controller of the robot's coordinates, and of the object's if tasks are about it."""
@@ -226,7 +247,7 @@ class HandMotion:
     def move_fingers(self, values: Mapping[Symbol, float]) -> None:
         """Move the fingers to values, or until they stand still."""
         session, gripper = self.session, self.gripper
-        begin, idle = session.world.time, 0
+        begin, idle, session.reference = session.world.time, 0, None
         while session.world.time - begin < _MOST_CLOSING:
             state = session.state
             speeds = {}
@@ -244,11 +265,20 @@ class HandMotion:
             if idle >= 10:
                 break
 
-    def act(self, speeds: Mapping[Symbol, float]) -> None:
-        """Command speeds for one step, and judge it."""
+    def act(self, speeds: Mapping[Symbol, float], command: Command | None = None) -> None:
+        """Command speeds for one step, those of a controller's command if given, and judge it."""
         session = self.session
-        session.act(speeds)
+        session.act(speeds, command)
         self.judge.update(session.world.state, session.commands, held=session.world.held)
+
+    def refer(self, poses: npt.ArrayLike) -> None:
+        """State the world poses (K, 4, 4) of the hand along the way that begins."""
+        self.session.reference = HandReference(np.asarray(poses, dtype=float))
+
+    def refer_to(self, share: float) -> None:
+        """State the share of the way that lies behind, in [0, 1]."""
+        if self.session.reference is not None:
+            self.session.reference.share = share
 
     def check_time(self) -> None:
         """Raise SkillError if the time is up."""

@@ -55,18 +55,19 @@ def move_held(motion: HandMotion, placement: BasePlacement, tolerance: float) ->
     session.phase = "move"
     state = session.state
     held = inverse(bar(state)) @ hand(state)
-    hold = Hold(same_pose(bar @ held, hand), gain=FOLLOWING, name="grasp")
+    # The initial values are of no run: a controller with others would be compiled for these alone.
+    grasped = Target("grasp/pose", np.eye(4))
+    hold = Hold(same_pose(bar @ grasped.expression, hand), gain=FOLLOWING, name="grasp")
     middle = motion.gripper.grasp_pose[:, 3]
-    moved = ((bar @ held - hand) @ middle)[:3]
-    uncertain = [session.deviation(x) for x in moved]
+    uncertain = [session.deviation(x) for x in ((bar @ held - hand) @ middle)[:3]]
     slipped = _SLIPPED + _SIGMAS * float(np.linalg.norm(uncertain))
-    slip = compile(moved)
+    poses = compile([bar, hand])
     target = float(placement.values[-1])
     moving = motion.search.moving
-    rows = placement.way[:, : len(moving)] + motion.turns
+    rows = motion.rows(placement.way)
     values = placement.values
-    posture, goals = motion.posture(rows[0])
-    wanted = Target("opening/object", np.array([values[0]]))
+    posture, goals = motion.posture()
+    wanted = Target("opening/object", np.zeros(1))
     tasks: list[Task] = [hold, Goal(coordinate, wanted.expression[0], gain=FOLLOWING, name="object")]
     tasks += goals
     rules = [Rule(b, motion.handle.frame, False, "grasped") for b in motion.gripper.bodies]
@@ -74,6 +75,9 @@ def move_held(motion: HandMotion, placement: BasePlacement, tolerance: float) ->
     controller = motion.controller(tasks, scene=scene, margin=_MARGIN)
     share, speed, length = 0.0, 0.0, abs(target - values[0])
     best, since = 0.0, session.world.time
+    controller.set(grasped, held)
+    places = np.linspace(values[0], target, len(values)).tolist()
+    motion.refer([bar(session.state.updated({coordinate: v})) @ held for v in places])
     within, enough = 0, _SETTLED if session.deviation(coordinate) else 1
     while True:
         rest = abs(session.state[coordinate] - target)
@@ -96,8 +100,10 @@ def move_held(motion: HandMotion, placement: BasePlacement, tolerance: float) ->
             speed = min(speed + _SPEED / _RAMP * session.dt, _SPEED)
             speed *= min(1.0, max(0.0, 1.5 - late / _LATE))
             share = min(1.0, share + speed * session.dt / length)
-            apart = float(np.linalg.norm(slip(state.vector(slip.inputs))))
-        motion.act(command.speeds)
+            world_T_bar, world_T_hand = poses(state.vector(poses.inputs))
+            apart = float(np.linalg.norm(((world_T_bar @ held - world_T_hand) @ middle)[:3]))
+        motion.refer_to(share)
+        motion.act(command.speeds, command)
         if motion.is_lost() or apart > slipped:
             how = (
                 "It is out of the hand."

@@ -12,7 +12,7 @@ import numpy as np
 from kineverse.errors import InfeasibleError, InvalidValueError, NotFiniteError
 from kineverse.grasping import Grasp, Gripper, Handle, find_gripper, find_handle, sample_grasps
 from kineverse.model.model_view import ModelView
-from kineverse.planning import Planner
+from kineverse.planning import Planner, Trajectory
 from kineverse.state import State
 from kineverse.symbols import Symbol
 from kineverse.worlds import Judge
@@ -21,14 +21,17 @@ from .hand_motion import HandMotion
 from .held_motion import move_held
 from .outcome import Outcome, SkillError, SlipError
 from .placement import BasePlacement, PlacementSearch
+from .push_fallback import PushFallback
 from .session import Session
 
-_GRASPS = 128
+_GRASPS = 96
 _PLANNING = 2.0
 """Largest time to plan the way to the handle [s]."""
-_SHARES = (1.0, 0.75, 0.5, 0.3)
-"""Shares of the rest of a motion that are tried with one grasp."""
 _MOST_GRASPS = 4
+_MOST_SLIPS, _LEAST_PROGRESS = 2, 0.1
+"""Number of slips from which on a grasp has to take an object further, by a share of the rest."""
+_KEPT = 15
+"""Number of sets of grasps that are kept."""
 _LARGEST = ("limit_violation", "penetration", "grasp_error", "grasp_rotation", "jitter", "reversals")
 _SUMS = ("contact_losses", "distance", "hand_distance")
 """Measures of the parts of a run: the largest, or the sum."""
@@ -43,7 +46,7 @@ def open_object(
     handle: str | None = None,
     seconds: float = 60.0,
     tolerance: float = 0.02,
-    placements: int = 1000,
+    placements: int = 600,
     seed: int = 0,
 ) -> Outcome:
     """Move an object to a value of its coordinate by its handle.
@@ -104,13 +107,13 @@ def open_object(
     done = not reason and abs(value - goal) <= tolerance
     if not reason:
         reason = (
-            f"'{coordinate}' is at {value:.3f}, as wanted."
+            f"'{coordinate}' is at {value:.3f}, as wanted{run.how}."
             if done
             else (f"'{coordinate}' ended at {value:.3f}, not at {goal:.3f}.")
         )
     reason = " ".join([*run.slips, reason])
     measures: dict[str, Any] = {**run.measures, "placements": run.placements, "grasps": run.grasps}
-    measures["slips"] = len(run.slips)
+    measures |= {"pushed": run.pushed_from is not None, "resets": run.resets, "slips": len(run.slips)}
     if not done:
         measures["failure"] = kind or "other"
     return Outcome(
@@ -125,7 +128,7 @@ class _Opener:
         self.model, self.gripper, self.version = model, gripper, model.version
         self.search = PlacementSearch(model, gripper, state)
         self._planner: Planner | None = None
-        self._grasps: dict[tuple[str, Symbol, int], tuple[Grasp, ...]] = {}
+        self._grasps: dict[tuple[object, ...], tuple[Grasp, ...]] = {}
 
     @property
     def planner(self) -> Planner:
@@ -134,11 +137,14 @@ class _Opener:
             self._planner = Planner(self.model, self.search.moving, rules=self.search.scene.rules)
         return self._planner
 
-    def grasps(self, handle: Handle, seed: int) -> tuple[Grasp, ...]:
-        """Return the grasps of a handle."""
-        key = handle.frame, handle.coordinate, seed
+    def grasps(self, handle: Handle, state: State, seed: int) -> tuple[Grasp, ...]:
+        """Return the grasps of a handle where everything but the robot is as in a state."""
+        robot = f"{self.gripper.robot}/"
+        others = tuple(v for s, v in state.items() if not s.path.startswith(robot))
+        key = handle.frame, handle.coordinate, seed, others
         if key not in self._grasps:
-            self._grasps[key] = sample_grasps(self.model, self.gripper, handle, _GRASPS, seed)
+            found = sample_grasps(self.model, self.gripper, handle, _GRASPS, seed, state=state)
+            self._grasps = {**dict([*self._grasps.items()][-_KEPT:]), key: found}
         return self._grasps[key]
 
 
@@ -185,9 +191,13 @@ class _Run:
         self.model = opener.model
         self.gripper = opener.gripper
         self.first, self.begin = session.steps, session.world.time
-        self.placements = self.grasps = 0
+        self.placements = self.grasps = self.resets = 0
+        self.pushed_from: float | None = None
         self.slips: list[str] = []
+        self._rest = math.inf
         self._earlier: list[Mapping[str, Any]] = []
+        self._barrier = ""
+        self._trajectory: Trajectory
         self.judge = Judge(self.model, session.world.robot, self.gripper, handle=handle.frame)
         self.judge.update(session.world.state)
         self.motion = HandMotion(
@@ -205,20 +215,27 @@ class _Run:
             last[name] = sum(m[name] for m in found)
         return last
 
-    def _judge_afresh(self) -> None:
-        self._earlier.append(self.judge.measures)
-        self.judge.reset()
-        self.judge.update(self.session.world.state)
+    @property
+    def how(self) -> str:
+        """Words on what was done beside a grasped motion."""
+        if self.pushed_from is None:
+            return ""
+        return f"; it was pushed from {self.pushed_from:.3f} on, where no grasp led further"
 
     def perform(self) -> None:
         """Move the object to the target with one grasp after the other, or raise SkillError."""
-        coordinate = self.handle.coordinate
         self.motion.look()
         self._check_start()
         for _ in range(_MOST_GRASPS):
-            if abs(self.session.state[coordinate] - self.target) <= self.tolerance / 2:
+            if self.left <= self.tolerance / 2:
                 return
-            placement = self._place()
+            try:
+                placement = self._place()
+            except SkillError as failure:
+                if self.left <= self.tolerance:
+                    return
+                self._push(failure)
+                return
             assert placement.grasp is not None
             self.grasps += 1
             self._approach(placement)
@@ -227,9 +244,50 @@ class _Run:
                     move_held(self.motion, placement, self.tolerance)
             except SlipError as slip:
                 self.slips.append(str(slip))
-            self.motion.release(placement.grasp)
-        if abs(self.session.state[coordinate] - self.target) > self.tolerance:
-            raise SkillError("reach", f"After {self.grasps} grasps '{coordinate}' is not at the target.")
+            self.motion.release(placement)
+            self._check_progress()
+        if self.left > self.tolerance:
+            what = self.handle.coordinate
+            raise SkillError("reach", f"After {self.grasps} grasps '{what}' is not at the target.")
+
+    @property
+    def left(self) -> float:
+        """Distance of the object from the target [m], [rad]."""
+        return abs(float(self.session.state[self.handle.coordinate]) - self.target)
+
+    def _push(self, failure: SkillError) -> None:
+        """Push the object on where no grasp leads, or raise SkillError with both reasons."""
+        fallback = PushFallback(self.motion, self.target, self.tolerance)
+        self.pushed_from = float(self.session.state[self.handle.coordinate])
+        try:
+            start = fallback.find_start(self.seed)
+            self._put_base(start)
+            fallback.perform()
+        except SkillError as error:
+            kind = error.kind if error.kind == "time" else failure.kind
+            raise SkillError(kind, f"{failure} {error}") from error
+
+    def _put_base(self, wanted: Mapping[Symbol, float]) -> None:
+        """Put a base that only stands to its place, by a reset of the world."""
+        session, standing = self.session, self.opener.search.standing
+        if not standing:
+            return
+        gone = session.world.time - self.begin
+        session.restart(session.world.state.updated({s: wanted[s] for s in standing}))
+        self.begin, self.resets = -gone, self.resets + 1
+        self.motion.until = self.seconds - gone
+        self._earlier.append(self.judge.measures)
+        self.judge.reset()
+        self.judge.update(session.world.state)
+        self.motion.look()
+
+    def _check_progress(self) -> None:
+        """Raise SkillError if the handle slips time and again and the object hardly moves."""
+        rest = self.left
+        if len(self.slips) < _MOST_SLIPS:
+            self._rest = rest
+        elif rest > (1.0 - _LEAST_PROGRESS) * self._rest:
+            raise SkillError("other", "It moves too hard for the force of the fingers.")
 
     def _check_start(self) -> None:
         """Raise SkillError if the robot touches something before anything is done."""
@@ -245,50 +303,46 @@ class _Run:
     # -- phases --------------------------------------------------------------------------------------------
 
     def _place(self) -> BasePlacement:
-        """Return a placement that leads as far as possible."""
-        session, here = self.session, self.session.state[self.handle.coordinate]
+        """Return a placement that leads as far as possible, and plan the way to the handle."""
+        session, search = self.session, self.opener.search
         session.phase = "place"
-        grasps = self.opener.grasps(self.handle, self.seed)
-        why = ""
         with session.timed("place"):
-            for share in _SHARES:
-                until = here + share * (self.target - here)
-                found = self.opener.search.find(
-                    session.state, grasps, until, samples=self.samples, seed=self.seed + self.grasps
-                )
-                self.placements += found.samples
-                if found:
-                    return found
-                why = why or found.why
-        contacts = any(" at " in reason for reason in found.reasons)
-        raise SkillError("collision" if contacts else "reach", why)
+            try:
+                grasps = self.opener.grasps(self.handle, session.state, self.seed)
+            except InvalidValueError as error:
+                raise SkillError("collision", str(error)) from error
+            found = search.find(
+                session.state,
+                grasps,
+                self.target,
+                accept=self._plan,
+                samples=self.samples,
+                seed=self.seed + self.grasps,
+            )
+        self.placements += found.samples
+        if not found:
+            raise SkillError(found.failure, f"{found.why}{self._barrier}")
+        return found
+
+    def _plan(self, placement: BasePlacement) -> bool:
+        """Plan the way to the pose before the handle, and return whether there is one."""
+        state, planner = self.session.state, self.opener.planner
+        wanted = dict(zip(placement.coordinates, placement.approach.tolist(), strict=True))
+        planner.place(state.updated({s: wanted[s] for s in self.opener.search.standing}))
+        end = np.array([wanted[s] for s in planner.symbols])
+        path = planner.plan(state.vector(planner.symbols), end, seconds=_PLANNING, seed=self.seed)
+        self._barrier = "" if path.found else f" There is no way to the handle: {path.why}"
+        if path.found:
+            self._trajectory = path.trajectory()
+        return bool(path.found)
 
     def _approach(self, placement: BasePlacement) -> None:
-        """Bring the hand to the pose before the handle, on a planned path, and then straight to it."""
-        session, search = self.session, self.opener.search
+        """Bring the hand to the pose before the handle, on the planned path, and then straight to it."""
+        session, motion = self.session, self.motion
         session.phase = "approach"
-        wanted = dict(zip(placement.coordinates, placement.approach.tolist(), strict=True))
-        if search.standing:
-            stands = {s: wanted[s] for s in search.standing}
-            gone = session.world.time - self.begin
-            session.restart(session.world.state.updated(stands))  # everything else stays where it is
-            self.begin = -gone
-            self.motion.until = self.seconds - gone
-            self._judge_afresh()
-            self.motion.look()
-        motion = self.motion
+        self._put_base(dict(zip(placement.coordinates, placement.approach.tolist(), strict=True)))
+        motion.follow(self._trajectory)
         motion.move_fingers(self.gripper.opened)
-        planner = self.opener.planner
-        with session.timed("plan"):
-            planner.place(session.state)
-            start = session.state.vector(planner.symbols)
-            end = np.array([wanted[s] for s in planner.symbols])
-            path = planner.plan(start, end, seconds=_PLANNING, seed=self.seed)
-            if not path.found:
-                raise SkillError("collision", f"There is no way to the handle: {path.why}")
-            trajectory = path.trajectory()
-        motion.follow(trajectory)
         motion.count_turns(placement.line[0])
         assert placement.grasp is not None
-        rows = placement.line[:, : len(search.moving)] + motion.turns
-        motion.follow_line(placement.grasp.approach, placement.grasp.pose, rows)
+        motion.follow_line(placement.grasp.approach, placement.grasp.pose, motion.rows(placement.line))

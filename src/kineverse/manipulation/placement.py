@@ -4,9 +4,11 @@ from __future__ import annotations
 
 import math
 from collections import Counter
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
+from heapq import heappop, heappush
+from itertools import count
 from time import perf_counter
 
 import numpy as np
@@ -22,17 +24,13 @@ from kineverse.state import State
 from kineverse.symbols import Symbol
 
 from .hand_paths import HandPaths
+from .placement_samples import PlacementSamples, find_planar_base
 from .push_scene import find_overlapping_links, furniture_rules
 
-_NEAREST, _FARTHEST = 0.3, 1.1
-"""Distance of a base from the hand [m]."""
-_SIDE, _TURN = math.radians(80.0), math.radians(60.0)
-"""Largest angles of a base beside the approach of the hand, and of its front beside the hand [rad]."""
-_BASE_EASE = 0.1
-"""Weight of a base that can move beside those of joints, so that it moves where they are not enough."""
 _STEP = 0.05
 """Distance of neighbouring values of the object along its way [m], [rad]."""
 _LINE = 5
+"""Number of configurations on the straight way to the handle."""
 _OWN_MARGIN, _RANDOM_STATES = 0.003, 24
 """Least distance of the robot's own links [m]; pairs that are nearer in all of some states do not count."""
 _START_ITERATIONS = 30
@@ -40,6 +38,14 @@ _BETWEEN = 4
 """Number of samples between neighbouring configurations that are checked."""
 _STARTS = 4
 """Arms that are tried for each base."""
+_MIDDLES = (0.5, 0.5, 0.25, 0.5, 0.0)
+"""Shares of the object's way from which the arms of successive batches set out to both ends."""
+_WHOLE = 300
+"""Number of bases after which a way to a part of the motion is taken."""
+_LEAST_SHARE, _SHORTER = 0.2, 0.15
+"""Least share of the motion that one grasp is for, and by how much it is shortened where that helps."""
+_MOST_CHECKS, _MOST_REFUSED = 150, 3
+"""Most ways that are checked for contacts after a batch, and most that :func:`find` lets be refused."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -55,7 +61,10 @@ class BasePlacement:
     approach, line
         Configuration (n,) before the hand is at the handle, and those (L, n) from there to the grasp.
     values, way
-        Values (K,) of the object's coordinate [m], [rad], and configurations (K, n) of the robot there.
+        Values (K,) of the object's coordinate [m], [rad], and configurations (K, n) of the robot there. They
+        end at the target, or where the arm or something in the way ends them.
+    retreat
+        Configurations (L, n) with which the hand goes away from the handle at the end.
     samples
         Number of sampled bases.
     reasons
@@ -70,6 +79,7 @@ class BasePlacement:
     line: Array
     values: Array
     way: Array
+    retreat: Array
     samples: int
     reasons: Counter[str]
     seconds: float
@@ -78,11 +88,30 @@ class BasePlacement:
         return self.grasp is not None
 
     @property
+    def failure(self) -> str:
+        """Class of the failure: ``"collision"`` if an arm reaches along the way, otherwise ``"reach"``."""
+        return "collision" if any(" at " in r or r == _NO_WAY for r in self.reasons) else "reach"
+
+    @property
     def why(self) -> str:
         """Text with the number of samples and the reasons of failures."""
-        failed = ", ".join(f"{count} {reason}" for reason, count in self.reasons.most_common(6))
+        failed = ", ".join(f"{n} {reason}" for reason, n in self.reasons.most_common(6) if n)
         found = f"Found after {self.samples} bases" if self else f"None of {self.samples} bases goes through"
         return f"{found}; failed: {failed}." if failed else f"{found}."
+
+
+_NO_WAY = "no way to the handle"
+
+
+@dataclass(slots=True, eq=False)
+class _Candidate:
+    """Way of an arm that reaches, until the value with the index ``end``."""
+
+    choice: int
+    base: Array
+    back: Array
+    way: Array
+    end: int
 
 
 class PlacementSearch:
@@ -111,12 +140,12 @@ class PlacementSearch:
         self.model, self.gripper, self.margin = model, gripper, margin
         own = model.symbols_of(gripper.hand)
         free = {s for s in own if s in model.degrees_of_freedom and s not in gripper.joints}
-        self.standing = tuple(s for s in own if s in model.rates and s in free and not _is_free(model, s))
+        self.standing = tuple(s for s in own if s in model.rates and s in free)
         self.moving = tuple(s for s in own if s in free and s not in self.standing)
         self.base = find_planar_base(model, own)
-        ease = np.array([_BASE_EASE if s in self.base else 1.0 for s in self.moving])
-        self.paths = HandPaths(model, gripper.hand, self.moving, self.standing, ease)
         self.coordinates = (*self.moving, *self.standing)
+        self.samples = PlacementSamples(model, self.moving, self.standing, self.base)
+        self.paths = HandPaths(model, gripper.hand, self.moving, self.standing, self.samples.ease)
         self.scene = Scene(model)
         prefix = f"{gripper.robot}/" if gripper.robot else ""
         bodies = self.scene.bodies
@@ -133,6 +162,7 @@ class PlacementSearch:
         near = self.scene.find_always_colliding(self._random_states(state), _OWN_MARGIN)
         rules = (*rules, *near)
         self.scene = Scene(model, rules=rules)
+        self._hand = {b for b in self.own if b in gripper.bodies or not model.speeds_of(b, gripper.hand)}
 
     def _random_states(self, state: State) -> Iterator[State]:
         """Yield states with random arms."""
@@ -148,14 +178,16 @@ class PlacementSearch:
         grasps: Sequence[Grasp],
         target: float,
         *,
-        samples: int = 1000,
+        accept: Callable[[BasePlacement], bool] = lambda placement: True,
+        samples: int = 600,
         batch: int = 100,
         seed: int = 0,
     ) -> BasePlacement:
-        """Return a placement from which the object can be moved from its value to a target.
+        """Return a placement from which the object can be moved from its value to a target, or towards it.
 
-        Bases are sampled in front of the handle, arms at random. All of them follow the approach and the way
-        of the handle at once; then those that arrive are checked for contacts, the roomiest first.
+        Bases are sampled in front of the handle, arms at random. All of them follow the way of the handle at
+        once, and the straight ways to it and from it; those that arrive are checked for contacts, the
+        quickest first. Where none of many bases arrives, the one with the longest way is returned.
 
         Parameters
         ----------
@@ -165,160 +197,58 @@ class PlacementSearch:
             Grasps that may be taken, the best first.
         target
             Wanted value of the object's coordinate [m], [rad].
+        accept
+            Function that says whether a placement is taken; the search goes on if not.
         samples, batch
             Largest number of bases, and how many are tried at once.
         seed
             Seed of the samples.
         """
-        begin, reasons = perf_counter(), Counter[str]()
-        random = np.random.default_rng(seed)
-        coordinate = grasps[0].handle.coordinate
-        values = _divide(state[coordinate], target)
-        handle = self.model.fk(grasps[0].handle.frame)
-        handles = np.array([handle(state.updated({coordinate: v})) for v in values])
-        tried, middle = 0, len(values) // 2
+        search = _Search(self, state, grasps, target, accept, np.random.default_rng(seed))
         if not self.base:
             samples = batch
-        while tried < samples:
-            choice = self._choose(random, grasps, batch * _STARTS, upright=not tried)
-            poses = np.array([grasps[k].pose for k in choice])
-            approaches = np.array([grasps[k].approach for k in choice])
-            tried += batch
-            Q, base = self._sample(random, state, handles[middle] @ poses, handles[middle] @ approaches)
-            Q, error = self.paths.solve(Q, base, handles[middle] @ poses, _START_ITERATIONS)
-            good = error < 1e-3
-            reasons["out of reach"] += int((~good).sum()) // _STARTS
-            Q, base, poses, approaches = (a[good] for a in (Q, base, poses, approaches))
-            choice = choice[good]
-            before, reached = self.paths.follow(Q, base, handles[None, middle::-1] @ poses[:, None])
-            after, passed = self.paths.follow(Q, base, handles[None, middle:] @ poses[:, None])
-            good = (reached == before.shape[1]) & (passed == after.shape[1])
-            reasons["the arm ends on the way"] += int((~good).sum()) // _STARTS
-            way = np.concatenate([before[:, :0:-1], after], axis=1)[good]
-            base, poses, approaches = (a[good] for a in (base, poses, approaches))
-            choice = choice[good]
-            line = _interpolate(handles[0] @ poses, handles[0] @ approaches)
-            back, reached = self.paths.follow(way[:, 0], base, line)
-            good = reached == line.shape[1]
-            reasons["no straight approach"] += int((~good).sum()) // _STARTS
-            base, back, way = (a[good] for a in (base, back, way))
-            choice = choice[good]
-            for k in self._rank(way, choice):
-                problem = self._check(state, grasps[choice[k]], values, base[k], back[k], way[k])
-                if not problem:
-                    full = [np.hstack([a, np.tile(base[k], (len(a), 1))]) for a in (back[k][::-1], way[k])]
-                    return BasePlacement(
-                        grasps[choice[k]], self.coordinates, full[0][0], full[0], values, full[1],
-                        tried, reasons, perf_counter() - begin,
-                    )  # fmt: skip
-                reasons[problem] += 1
-        nothing = np.zeros((0, len(self.coordinates)))
-        return BasePlacement(
-            None, self.coordinates, nothing, nothing, values, nothing, tried, reasons, perf_counter() - begin
-        )
+        for number in count():
+            whole = number * batch < min(_WHOLE, samples)
+            found = search.take(whole)
+            if found is not None or number * batch >= samples or search.refused >= _MOST_REFUSED:
+                break
+            search.add(batch, _MIDDLES[number % len(_MIDDLES)])
+        return found or search.nothing
 
-    def _choose(
-        self, random: np.random.Generator, grasps: Sequence[Grasp], count: int, upright: bool
-    ) -> npt.NDArray[np.intp]:
-        """Return indices (N,) of grasps: good ones mostly, or all tilts alike."""
-        if upright:
-            chosen = random.geometric(min(1.0, 4.0 / len(grasps)), count) - 1
-            return np.where(chosen < len(grasps), chosen, random.integers(len(grasps), size=count)).astype(
-                int
-            )
-        # Some ways need a hand that comes from above or from the side, and few grasps are such.
-        tilts = np.array([grasp.tilt for grasp in grasps])
-        wanted = random.uniform(tilts.min(), tilts.max(), count)
-        order = np.argsort(tilts, kind="stable")
-        near = np.searchsorted(tilts[order], wanted) + random.integers(-2, 3, count)
-        return np.asarray(order[np.clip(near, 0, len(grasps) - 1)])
+    def first_contact(self, grasp: Grasp, state: State, columns: Sequence[Symbol], rows: Array) -> int | None:
+        """Return the index of the first row of values (N, n) at which the robot comes too near to something.
 
-    def _sample(
-        self, random: np.random.Generator, state: State, hands: Array, approaches: Array
-    ) -> tuple[Array, Array]:
-        """Return random arms (N, n), and bases (N, m) in front of poses of the hand (N, 4, 4)."""
-        count = len(hands)
-        bounded = np.isfinite(self.paths.lower) & np.isfinite(self.paths.upper)
-        here = state.vector(self.moving)
-        lower = np.where(bounded, self.paths.lower, here - math.pi)
-        upper = np.where(bounded, self.paths.upper, here + math.pi)
-        Q = random.uniform(lower, upper, (count, len(self.moving)))
-        still = np.tile(state.vector(self.standing), (count, 1))
-        if self.base:
-            out = (approaches - hands)[:, :2, 3]
-            angle = np.where(
-                np.hypot(*out.T) > 0.02, np.arctan2(out[:, 1], out[:, 0]), random.uniform(-3.2, 3.2, count)
-            )
-            angle = np.repeat((angle + random.uniform(-_SIDE, _SIDE, count))[::_STARTS], _STARTS)[:count]
-            distance = np.repeat(random.uniform(_NEAREST, _FARTHEST, count)[::_STARTS], _STARTS)[:count]
-            turn = np.repeat(random.uniform(-_TURN, _TURN, count)[::_STARTS], _STARTS)[:count]
-            place = hands[:, :2, 3] + distance[:, None] * np.stack([np.cos(angle), np.sin(angle)], axis=1)
-            values = np.column_stack([place, angle + math.pi + turn])
-            for k, s in enumerate(self.base):
-                columns, array = (self.moving, Q) if s in self.moving else (self.standing, still)
-                array[:, columns.index(s)] = values[:, k]
-        return Q, still
+        The scene is placed there.
+        """
+        self.scene.update(state.updated(dict(zip(columns, rows[0].tolist(), strict=True))))
+        around = self._watch(grasp.handle.frame)
+        found = [
+            watch.first_within(columns, rows, radius)
+            for watch, radius in ((around, self.margin), (self._own_watch, _OWN_MARGIN))
+        ]
+        first = min((k for k in found if k is not None), default=None)
+        if first is not None:
+            self.scene.update(state.updated(dict(zip(columns, rows[first].tolist(), strict=True))))
+        return first
 
-    def _rank(self, way: Array, choice: npt.NDArray[np.intp]) -> npt.NDArray[np.intp]:
-        """Return the order in which ways are checked: good grasps, far from limits, with little motion."""
-        if not len(way):
-            return np.zeros(0, dtype=int)
-        width = self.paths.upper - self.paths.lower
-        width = np.where(np.isfinite(width), width, 1e9)
-        room = np.minimum(way - self.paths.lower, self.paths.upper - way) / width
-        travel = np.abs(np.diff(way, axis=1)).sum(axis=(1, 2))
-        score = travel - 40.0 * np.minimum(room.min(axis=(1, 2)), 0.1) + 0.02 * choice
-        return np.argsort(score, kind="stable")
+    def touching(self, grasp: Grasp) -> tuple[str, str]:
+        """Return the pair of bodies that is too near in the scene, the robot's first."""
+        pair = [*self._watch(grasp.handle.frame)(self.margin), *self._own_watch(_OWN_MARGIN)][0]
+        return (pair.b, pair.a) if pair.b in self._hand else (pair.a, pair.b)
 
-    def _check(self, state: State, grasp: Grasp, values: Array, base: Array, back: Array, way: Array) -> str:
-        """Return the pair that touches on a way, empty if it is free."""
-        coordinate, fingers = grasp.handle.coordinate, self.gripper.joints
-        columns = (*self.coordinates, *fingers, coordinate)
+    def is_of_hand(self, body: str) -> bool:
+        """Return True if a body is rigid with the hand or one of its fingers."""
+        return body in self._hand
 
-        def rows(Q: Array, gap: dict[Symbol, float], where: Array) -> Array:
-            full = np.hstack(
-                [
-                    Q,
-                    np.tile(base, (len(Q), 1)),
-                    np.tile([gap[s] for s in fingers], (len(Q), 1)),
-                    where[:, None],
-                ]
-            )
-            share = np.arange(_BETWEEN) / _BETWEEN
-            dense = full[:-1, None] + share[:, None] * (full[1:] - full[:-1])[:, None]
-            return np.vstack([dense.reshape(-1, full.shape[1]), full[-1:]])
-
-        opened = {s: self.gripper.opened[s] for s in fingers}
-        holding = self.gripper.values_at(grasp.thickness)
-        here = [state.vector(self.moving)[None]] if self.standing else []
-        parts = (
-            *(rows(home, opened, values[:1]) for home in here),
-            rows(back[::-1], opened, np.full(len(back), values[0])),
-            rows(way, holding, values),
-            rows(back[:1], opened, values[:1]),
-        )
-        around, inside = self.watches(grasp)
-        for part in reversed(parts):
-            self.scene.update(state.updated(dict(zip(columns, part[0].tolist(), strict=True))))
-            for watch, radius in (around, self.margin), (inside, _OWN_MARGIN):
-                if watch.first_within(columns, part, radius) is not None:
-                    pair = watch(radius)[0]
-                    return f"{pair.a} at {pair.b}"
-        return ""
-
-    def watches(self, grasp: Grasp) -> tuple[PreparedQuery, PreparedQuery]:
-        """Return the queries of the robot's distance from everything else, and of its own links."""
-        frame = grasp.handle.frame
+    def _watch(self, frame: str) -> PreparedQuery:
+        """Return the query of the robot's distance from everything else, but of the hand from the handle."""
         if frame not in self._watches:
             allowed = [Rule(b, frame, False, "grasped") for b in self.gripper.bodies]
-            self._watches[frame] = (
-                self.scene.watch(self.own, self.others, self.margin, rules=allowed),
-                self._own_watch,
-            )
+            self._watches[frame] = self.scene.watch(self.own, self.others, self.margin, rules=allowed)
         return self._watches[frame]
 
     @cached_property
-    def _watches(self) -> dict[str, tuple[PreparedQuery, PreparedQuery]]:
+    def _watches(self) -> dict[str, PreparedQuery]:
         return {}
 
     @cached_property
@@ -326,26 +256,177 @@ class PlacementSearch:
         return self.scene.watch(self.own, self.own, _OWN_MARGIN)
 
 
-def find_planar_base(model: ModelView, symbols: Sequence[Symbol]) -> tuple[Symbol, ...]:
-    """Return the coordinates x, y and angle of a mobile base among some; empty without one."""
-    for joint in model.articulations.values():
-        names = tuple(s.path.rpartition("/")[2] for s in joint.coordinates)
-        if names == ("x", "y", "angle") and {*joint.coordinates} <= {*symbols}:
-            return tuple(joint.coordinates)
-    return ()
+class _Search:
+    """Search for one grasped motion: candidates, the best first, and why the others failed."""
+
+    def __init__(
+        self,
+        owner: PlacementSearch,
+        state: State,
+        grasps: Sequence[Grasp],
+        target: float,
+        accept: Callable[[BasePlacement], bool],
+        random: np.random.Generator,
+    ) -> None:
+        self.owner, self.state, self.grasps, self.random = owner, state, grasps, random
+        self.begin, self.reasons, self.tried = perf_counter(), Counter[str](), 0
+        self.accept, self.refused = accept, 0
+        self.coordinate = grasps[0].handle.coordinate
+        start = float(state[self.coordinate])
+        self.values = np.linspace(start, target, max(2, math.ceil(abs(target - start) / _STEP) + 1))
+        self.last = len(self.values) - 1
+        self.least = max(1, math.ceil(_LEAST_SHARE * self.last))
+        handle = owner.model.fk(grasps[0].handle.frame)
+        self.handles = np.array([handle(state.updated({self.coordinate: v})) for v in self.values])
+        self.poses = np.array([grasp.pose for grasp in grasps])
+        self.approaches = np.array([grasp.approach for grasp in grasps])
+        # The hand is rigid with the handle: what it hits does not depend on the base.
+        self.free = np.full(len(grasps), self.last)
+        self.heap: list[tuple[int, float, int, _Candidate]] = []
+        self.number = count()
+
+    @property
+    def nothing(self) -> BasePlacement:
+        """Placement that was not found."""
+        none = np.zeros((0, len(self.owner.coordinates)))
+        return BasePlacement(
+            None, self.owner.coordinates, none, none, self.values, none, none, self.tried, self.reasons,
+            perf_counter() - self.begin,
+        )  # fmt: skip
+
+    # -- sampling ------------------------------------------------------------------------------------------
+
+    def add(self, batch: int, middle_share: float) -> None:
+        """Sample bases, arms and grasps, and keep those that reach along the way."""
+        paths, handles = self.owner.paths, self.handles
+        middle = round(middle_share * self.last)
+        samples = self.owner.samples
+        choice = samples.choose_grasps(self.random, self.grasps, self.free, batch * _STARTS, not self.tried)
+        self.tried += batch
+        if not len(choice):
+            return
+        hands = handles[middle] @ self.poses[choice]
+        outside = handles[middle] @ self.approaches[choice]
+        Q, base = samples.draw(self.random, self.state, hands, outside, _STARTS)
+        Q, error = paths.solve(Q, base, hands, _START_ITERATIONS)
+        good = self._count(error < 1e-3, "out of reach")
+        Q, base, choice = Q[good], base[good], choice[good]
+        before, reached = paths.follow(Q, base, handles[None, middle::-1] @ self.poses[choice, None])
+        good = self._count(reached == middle + 1, "the arm ends on the way")
+        Q, base, choice, before = Q[good], base[good], choice[good], before[good]
+        line = interpolate_poses(handles[0] @ self.poses[choice], handles[0] @ self.approaches[choice])
+        back, reached = paths.follow(before[:, -1], base, line)
+        good = self._count(reached == line.shape[1], "no straight approach")
+        Q, base, choice, before, back = Q[good], base[good], choice[good], before[good], back[good]
+        poses = self.poses[choice]
+        after, passed = paths.follow(Q, base, handles[None, middle:] @ poses[:, None])
+        ends = np.minimum(middle + passed - 1, self.free[choice])
+        good = self._count(ends >= self.least, "the arm ends on the way")
+        way = np.concatenate([before[:, :0:-1], after], axis=1)
+        if not good.any():
+            return
+        score = self.owner.samples.cost(self.state, way, back[:, -1], ends) + 0.02 * choice
+        for k in np.flatnonzero(good):
+            self._push(_Candidate(int(choice[k]), base[k], back[k], way[k], int(ends[k])), float(score[k]))
+
+    def _count(self, good: npt.NDArray[np.bool_], reason: str) -> npt.NDArray[np.bool_]:
+        self.reasons[reason] += int((~good).sum()) // _STARTS
+        return good
+
+    def _push(self, candidate: _Candidate, score: float) -> None:
+        heappush(self.heap, (-candidate.end, score, next(self.number), candidate))
+
+    # -- checks --------------------------------------------------------------------------------------------
+
+    def take(self, whole: bool) -> BasePlacement | None:
+        """Return the best candidate without contacts, None without any.
+
+        Parameters
+        ----------
+        whole
+            Whether only those that reach the target count.
+        """
+        for _ in range(_MOST_CHECKS):
+            if not self.heap or (whole and -self.heap[0][0] < self.last) or self.refused >= _MOST_REFUSED:
+                break
+            _, score, _, candidate = heappop(self.heap)
+            free = int(self.free[candidate.choice])
+            if candidate.end <= free:
+                found = self._check(candidate)
+                if found is not None and self.accept(found):
+                    return found
+                if found is not None:
+                    self.refused += 1
+                    self.reasons[_NO_WAY] += 1
+                    continue
+            candidate.end = min(candidate.end, int(self.free[candidate.choice]))
+            if candidate.end >= self.least:
+                self._push(candidate, score)
+        return None
+
+    def _check(self, candidate: _Candidate) -> BasePlacement | None:
+        """Return the placement of a candidate without contacts; otherwise shorten its way."""
+        owner, end, base = self.owner, candidate.end, candidate.base
+        grasp = self.grasps[candidate.choice]
+        back, way, values = candidate.back, candidate.way[: end + 1], self.values
+        opened = owner.gripper.opened
+        home = [self.state.vector(owner.moving)[None]] if owner.standing else []
+        parts = (back, *home)
+        for Q in parts:
+            if self._find_contact(grasp, self._rows(Q, base, opened, np.full(len(Q), values[0]))) is not None:
+                body = self._note(grasp)
+                if owner.is_of_hand(body) and Q is back:
+                    self.free[candidate.choice] = -1
+                candidate.end = -1
+                return None
+        first = self._find_contact(
+            grasp, self._rows(way, base, owner.gripper.values_at(grasp.thickness), values[: end + 1])
+        )
+        if first is not None:
+            candidate.end = first // _BETWEEN - 1
+            if owner.is_of_hand(self._note(grasp)):
+                self.free[candidate.choice] = min(int(self.free[candidate.choice]), candidate.end)
+            return None
+        line = interpolate_poses(
+            self.handles[end] @ grasp.pose[None], self.handles[end] @ grasp.approach[None]
+        )
+        away, reached = owner.paths.follow(way[-1:], base[None], line)
+        rows = self._rows(away[0], base, opened, np.full(_LINE, values[end]))
+        blocked = reached[0] < _LINE
+        if blocked:
+            self.reasons["no straight retreat"] += 1
+        elif self._find_contact(grasp, rows) is not None:
+            self._note(grasp)
+            blocked = True
+        if blocked:
+            candidate.end = end - max(1, round(_SHORTER * self.last))
+            return None
+        full = [np.hstack([a, np.tile(base, (len(a), 1))]) for a in (back[::-1], way, away[0])]
+        return BasePlacement(
+            grasp, owner.coordinates, full[0][0], full[0], values[: end + 1], full[1], full[2],
+            self.tried, self.reasons, perf_counter() - self.begin,
+        )  # fmt: skip
+
+    def _rows(self, Q: Array, base: Array, fingers: Mapping[Symbol, float], values: Array) -> Array:
+        """Return rows of everything that moves (N, n), with some between neighbouring ones."""
+        fixed = [*base, *(fingers[s] for s in self.owner.gripper.joints)]
+        full = np.hstack([Q, np.tile(fixed, (len(Q), 1)), values[:, None]])
+        share = np.arange(_BETWEEN) / _BETWEEN
+        dense = full[:-1, None] + share[:, None] * (full[1:] - full[:-1])[:, None]
+        return np.vstack([dense.reshape(-1, full.shape[1]), full[-1:]])
+
+    def _find_contact(self, grasp: Grasp, rows: Array) -> int | None:
+        columns = (*self.owner.coordinates, *self.owner.gripper.joints, self.coordinate)
+        return self.owner.first_contact(grasp, self.state, columns, rows)
+
+    def _note(self, grasp: Grasp) -> str:
+        """Count the contact in the scene, and return the robot's body."""
+        one, other = self.owner.touching(grasp)
+        self.reasons[f"{one} at {other}"] += 1
+        return one
 
 
-def _is_free(model: ModelView, symbol: Symbol) -> bool:
-    """Return True if a coordinate moves by a speed of its own."""
-    return symbol not in model.rates
-
-
-def _divide(start: float, end: float) -> Array:
-    """Return values from a start to an end, close enough for the arm to follow."""
-    return np.linspace(start, end, max(2, math.ceil(abs(end - start) / _STEP) + 1))
-
-
-def _interpolate(a: Array, b: Array) -> Array:
+def interpolate_poses(a: Array, b: Array) -> Array:
     """Return poses (N, L, 4, 4) on the straight way between poses of one orientation, a first."""
     share = np.linspace(0.0, 1.0, _LINE)
     poses = np.repeat(a[:, None], _LINE, axis=1)

@@ -22,6 +22,7 @@ from collections.abc import Callable, Iterable
 
 import numpy as np
 
+from kineverse._gc import no_collection
 from kineverse.control import Command
 from kineverse.errors import InvalidValueError, KineverseError
 from kineverse.geometry import Rule, Scene
@@ -268,6 +269,10 @@ class Pushing:
         InfeasibleError, NotFiniteError
             As :meth:`.Controller.step`.
         """
+        with no_collection():
+            return self._step(state, deviation, observation)
+
+    def _step(self, state: State, deviation: float, observation: Observation | None) -> Command:
         press, choice = self.press, self.choice
         press.deviation = min(deviation, _LARGEST_DEVIATION) if deviation > _LEAST_DEVIATION else 0.0
         senses = press.deviation > 0.0

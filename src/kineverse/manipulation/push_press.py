@@ -88,11 +88,6 @@ class PushPress:
         return self._touch <= _REMEMBER
 
     @property
-    def presses(self) -> bool:
-        """True if the pusher is late by half of the largest lag."""
-        return self.reserve < 0.5
-
-    @property
     def weight(self) -> float:
         """Weight of the latest estimate in a filter that makes noise of speeds as small as the ramp."""
         return self._dt / (self._dt + self.deviation / RAMP)

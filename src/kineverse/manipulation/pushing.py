@@ -29,7 +29,7 @@ _AVERAGED = 0.1
 """Weight of the latest estimate in the mean that counts at the end."""
 _STILL = 5e-3
 """Speed of a contact point that counts as none [m/s]."""
-_PRESSED = 3
+_PRESSED = 5
 """Number of steps for which an object within the tolerance gives way no more when a push ends."""
 _MOST_BLOCKED = 3
 """Number of contact points given up before an approach is planned."""
@@ -158,6 +158,11 @@ class _End:
         self._mean: float | None = None
         self._settled = self._within = self._pressed = 0
 
+    @property
+    def near(self) -> bool:
+        """True if the object seems to be at its target, and is not pushed."""
+        return self._settled > 0 and not self._pushing.touching
+
     def reached(self, state: State) -> bool:
         """Return whether the push ends at a state."""
         pushing, press = self._pushing, self._pushing.press
@@ -169,7 +174,7 @@ class _End:
         rest = abs(rest)
         self._within = self._within + 1 if rest < self._tolerance else 0
         self._settled = self._settled + 1 if rest < self._tolerance / 2 else 0
-        still = pushing.touching and press.presses and press.speed < _STILL
+        still = pushing.touching and press.touched and press.speed < _STILL
         self._pressed = self._pressed + 1 if still and rest < self._tolerance else 0
         long = _SETTLED_ESTIMATE if press.deviation > 0.0 else _SETTLED
         return self._settled >= long or self._within >= long + _PATIENCE or self._pressed >= _PRESSED
@@ -223,6 +228,9 @@ class _Run:
                 problem = self._approach()
                 if problem:
                     return problem
+            if end.near:
+                session.stop()  # an object that has run on by itself is not followed
+                continue
             self._step("push")
         where = "touching" if pushing.touching else "on the way to a contact"
         return f"Out of time at {session.state[pushing.coordinate]:.3g}, {where}."
@@ -248,6 +256,7 @@ class _Run:
             return f"No contact point was reached, of {tried} and {self._approaches} plans."
         self._approaches += 1
         session, pushing = self._session, self._pushing
+        self.retreat()  # a way that begins with a contact cannot be planned
         session.stop()
         path, point = plan_push_approach(pushing, session.state)
         if not path.found:

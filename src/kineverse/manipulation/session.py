@@ -8,13 +8,16 @@ from contextlib import contextmanager, suppress
 from threading import Thread
 from time import perf_counter, thread_time
 
+from kineverse.control import Command
 from kineverse.errors import ShapeError
 from kineverse.expressions import Expression
+from kineverse.lie import Array
 from kineverse.state import State
 from kineverse.symbols import Symbol
 from kineverse.worlds import Observation, World
 
 from .belief import Belief, TrueBelief
+from .hand_reference import HandReference
 from .outcome import SkillError
 
 Speeds = Mapping[Symbol, float]
@@ -54,6 +57,12 @@ class Session:
         The believed state.
     commands
         The speeds of the last step.
+    command
+        The controller's command from which they come; None if there is none.
+    reference
+        The way of the hand that a controller follows; None if there is none.
+    vectors
+        Vectors of the controller by name, each with its origin in the world [m], for pages and recordings.
     phase
         Name of the present phase of the skill, for recordings and messages.
     steps
@@ -79,6 +88,9 @@ class Session:
         self._on_step = on_step
         self.state: State = self.belief.update(world)
         self.commands: Speeds = {}
+        self.command: Command | None = None
+        self.reference: HandReference | None = None
+        self.vectors: Mapping[str, tuple[Array, Array]] = {}
         self.phase, self.steps = "", 0
         self.cpu: dict[str, list[float]] = {}
         self.wall: dict[str, list[float]] = {}
@@ -106,8 +118,9 @@ class Session:
             return self.belief.deviation(what)
         if what.shape != ():
             raise ShapeError(f"A deviation is one of a number, not of an expression of shape {what.shape}.")
-        slopes = {s: float(what.partial([s])(self.state)[0]) for s in what.symbols}
-        return math.hypot(*(k * self.belief.deviation(s) for s, k in slopes.items() if k))
+        own = {s: self.belief.deviation(s) for s in what.symbols}
+        slopes = {s: float(what.partial([s])(self.state)[0]) for s, deviation in own.items() if deviation}
+        return math.hypot(*(k * own[s] for s, k in slopes.items() if k))
 
     @contextmanager
     def timed(self, name: str) -> Iterator[None]:
@@ -117,7 +130,7 @@ class Session:
         self.cpu.setdefault(name, []).append(thread_time() - cpu)
         self.wall.setdefault(name, []).append(perf_counter() - wall)
 
-    def act(self, speeds: Speeds) -> None:
+    def act(self, speeds: Speeds, command: Command | None = None) -> None:
         """Command speeds for one step, and update the belief. Speeds of objects are not sent.
 
         The belief gets them all.
@@ -126,6 +139,8 @@ class Session:
         ----------
         speeds
             Speeds of the robot, and possibly those planned for objects [m/s], [rad/s]; none to stop.
+        command
+            The controller's command that has these speeds, for pages.
 
         Raises
         ------
@@ -133,7 +148,7 @@ class Session:
             If the world does not answer within the time-out, stands still, or has not been observed for more
             than :data:`STALE`. Worlds refuse commands from then on, and their robots stop.
         """
-        before = self.world.time
+        before, self.command = self.world.time, command
         self._advance(speeds)
         now, stamp = self.world.time, self.state.stamp
         if now <= before:

@@ -37,8 +37,8 @@ _MOVING, _RESTING = 0.04, 4e-4
 """Shares of the tracker's default process noise: .02 rad/√s and .013 m/√s for a door and a drawer in motion,
 and .002 rad/√s and .0013 m/√s at rest."""
 _MOVED, _REFUTED = 1.0, 0.3
-"""Times for which a part counts as moving after it was commanded to, and after its prediction was refuted
-[s]. In the latter all of the tracker's process noise counts."""
+"""Times for which a part counts as moving after a command, and after a refuted prediction [s].
+In the latter all of the tracker's process noise counts."""
 _STILL = 1e-3
 """Largest speed of a part that rests [m/s], [rad/s]."""
 _JOINT_SHARE, _JOINT_DRIFT = 0.2, 0.002

@@ -194,6 +194,28 @@ def _draw(
     return _downsample(image, SAMPLES)
 
 
+def join_pictures(rows: Sequence[Sequence[npt.NDArray[np.uint8]]], gap: int = 4) -> npt.NDArray[np.uint8]:
+    """Return rows of pictures of one size as one, with white gaps [pixels] between them.
+
+    Raises
+    ------
+    ShapeError
+        If the pictures are not of one size, or there is none.
+    """
+    shapes = {image.shape for row in rows for image in row}
+    if len(shapes) != 1:
+        raise ShapeError(f"pictures of one size can be joined, not of {sorted(shapes)}")
+    height, width, channels = shapes.pop()
+    columns = max(map(len, rows))
+    size = len(rows) * (height + gap) - gap, columns * (width + gap) - gap, channels
+    joined = np.full(size, 255, dtype=np.uint8)
+    for i, row in enumerate(rows):
+        for j, image in enumerate(row):
+            y, x = i * (height + gap), j * (width + gap)
+            joined[y : y + height, x : x + width] = image
+    return joined
+
+
 def save_picture(path: str | Path, model: ModelView, state: StateLike | None = None, **options: Any) -> None:
     """Write :func:`picture` of a model, with the same options, to a PNG file."""
     write_png(path, picture(model, state, **options))

@@ -13,8 +13,10 @@ from kineverse.model.frame import WORLD
 from kineverse.model.model_view import ModelView
 from kineverse.state import StateLike
 from kineverse.view.drawables import Drawable, Rgba, collect_drawables
+from kineverse.view.motion_drawables import TRACE
 from kineverse.view.poses import FramePoses, complete, keep_known
 from kineverse.view.proximity import build_arrow
+from kineverse.view.sphere_drawables import build_spheres
 from kineverse.view.triangle_mesh import Floats
 from kineverse.worlds import Contact
 
@@ -33,6 +35,9 @@ ARROWS: tuple[Rgba, ...] = (
 
 ARROW_SCALE, LONGEST_ARROW = 0.25, 0.6
 """Length of the arrow of a vector of 1, and the largest length of an arrow [m]."""
+
+WAY_RADIUS = 0.008
+"""Half of the width of the way of a hand [m]."""
 
 _APART, _TURNED = 1e-3, 2e-3
 """Least difference of a belief that is shown [m], [rad]; below, the ghost would flicker on the body."""
@@ -55,11 +60,17 @@ class RunMoment:
         Ends (2, 3) of arrows in the world [m], by name.
     lines
         Lines of text.
+    way
+        Points (k, 3) of the way ahead of the hand [m]; None without a way.
+    wanted
+        Pose (4, 4) at which the hand is wanted now [m].
     """
 
     ghosts: Mapping[str, Floats]
     arrows: Mapping[str, Floats]
     lines: Sequence[str] = ()
+    way: Floats | None = None
+    wanted: Floats | None = None
 
 
 class RunDrawing:
@@ -129,12 +140,16 @@ class RunDrawing:
         ]
 
     def draw_arrows(self, moment: RunMoment) -> list[Drawable]:
-        """Return the arrows, as parts in the world."""
-        return [
+        """Return the arrows and the way of the hand, as parts in the world."""
+        drawn = [
             Drawable(WORLD, piece, self.color(name), "visual")
             for name, ends in moment.arrows.items()
             for piece in build_arrow(ends, float(np.linalg.norm(ends[1] - ends[0])))
         ]
+        if moment.way is not None:
+            surface = build_spheres(moment.way, np.full(len(moment.way), WAY_RADIUS))
+            drawn.append(Drawable(WORLD, surface, TRACE, "visual"))
+        return drawn
 
 
 def find_arrows(vectors: Vectors) -> dict[str, Floats]:

@@ -1,23 +1,25 @@
-"""Layer of a run on the page: the belief as a ghost, arrows of the controller, and what happens in words."""
+"""Layer of a run on the page: ghost of the belief, arrows and way of the controller, text and a table."""
 
 from __future__ import annotations
 
 import threading
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping, Sequence
 from typing import Any
 
 import numpy as np
 
 from kineverse.view.hypertext import BREAK, FONT, HtmlBox, element
+from kineverse.view.motion_drawables import TRACE
 from kineverse.view.poses import to_wxyz
-from kineverse.view.run_drawing import GHOST, RunDrawing, RunMoment
+from kineverse.view.run_drawing import GHOST, WAY_RADIUS, RunDrawing, RunMoment
 from kineverse.view.triangle_mesh import Floats
 
 _ROOT = "/run"
+_CELL = "text-align:left;padding:1px 9px 1px 0;vertical-align:top;white-space:nowrap"
 
 
 class RunLayer:
-    """Ghost, arrows and text of a run on the page.
+    """Ghost, arrows, way, text and table of a run on the page.
 
     Parameters
     ----------
@@ -36,13 +38,16 @@ class RunLayer:
         self._moment = RunMoment({}, {})
         self._ghosts: dict[str, Any] = {}
         self._arrows: list[Any] = []
+        self._way: Any = None
+        self._wanted: Any = None
         self._folder = server.gui.add_folder(title, order=-0.9)
         with self._folder:
             self._text = HtmlBox(server.gui, element("div"))
             self._ghost_box = server.gui.add_checkbox("belief", True, hint="Show what the robot believes.")
             self._arrow_box = server.gui.add_checkbox(
-                "controller", True, hint="Show vectors of the controller as arrows."
+                "controller", True, hint="Show vectors of the controller as arrows, and the way of the hand."
             )
+            self._table = HtmlBox(server.gui, element("div"))
         for box in (self._ghost_box, self._arrow_box):
             box.on_update(lambda _: self.draw(self._moment))
 
@@ -52,8 +57,22 @@ class RunLayer:
             self._moment = moment
             self._draw_ghosts(moment.ghosts if self._ghost_box.value else {})
             self._draw_arrows(moment.arrows if self._arrow_box.value else {})
+            self._draw_way(moment if self._arrow_box.value else RunMoment({}, {}))
             lines = [line for text in moment.lines for line in (text, BREAK)]
             self._text.show(element("div", *lines, style=f"{FONT}padding:0 9px"))
+
+    def show_table(self, head: Sequence[str], rows: Iterable[Sequence[str]]) -> None:
+        """Show a table below the text."""
+        lines = [element("tr", *(element("th", cell, style=_CELL) for cell in head))]
+        lines += [element("tr", *(element("td", cell, style=_CELL) for cell in row)) for row in rows]
+        with self._lock:
+            self._table.show(
+                element(
+                    "table",
+                    *lines,
+                    style=f"{FONT}margin:6px 9px;border-collapse:collapse;display:block;overflow-x:auto",
+                )
+            )
 
     def remove(self) -> None:
         """Remove everything from the page."""
@@ -109,3 +128,21 @@ class RunLayer:
             scene.add_label(f"{_ROOT}/name{k}", name, position=ends[k, 1], font_screen_scale=0.8)
             for k, name in enumerate(arrows)
         ]
+
+    def _draw_way(self, moment: RunMoment) -> None:
+        """Draw the way of the hand as a line, and the pose at which it is wanted as axes."""
+        scene = self._server.scene
+        if self._way is not None:
+            self._way.remove()
+            self._way = None
+        if moment.way is not None and len(moment.way) > 1:
+            color = tuple(round(255 * c) for c in TRACE[:3])
+            ends = np.stack([moment.way[:-1], moment.way[1:]], axis=1).astype(np.float32)
+            self._way = scene.add_line_segments(f"{_ROOT}/way", ends, color, thickness=2 * WAY_RADIUS)
+        if self._wanted is None and moment.wanted is not None:
+            self._wanted = scene.add_frame(f"{_ROOT}/wanted", axes_length=0.12, axes_radius=0.005)
+        if self._wanted is not None:
+            self._wanted.visible = moment.wanted is not None
+            if moment.wanted is not None:
+                self._wanted.position = moment.wanted[:3, 3]
+                self._wanted.wxyz = to_wxyz(moment.wanted[None])[0]

@@ -17,6 +17,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Iterable
 from typing import Any
 
 import numpy as np
@@ -145,6 +146,11 @@ class Judge:
             "hand_distance": float(self._way[-1]) if self.gripper is not None else math.nan,
             "excepted": self.excepted,
         }
+
+    def allow(self, bodies: Iterable[str]) -> None:
+        """Except penetrations of the gripper's bodies into some others, which are pushed."""
+        self._gripping.update(bodies)
+        self._select_pairs()
 
     def reset(self) -> None:
         """Forget all measurements."""

@@ -1,0 +1,160 @@
+"""Articulated objects of a model: doors, flaps and drawers, told apart by their motions."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass
+from typing import Literal, TypeAlias, get_args
+
+import numpy as np
+
+from kineverse.errors import UnknownNameError, suggest
+from kineverse.geometry.objects import collision_shapes, matches_pattern
+from kineverse.geometry.shapes import solid_from_geometry
+from kineverse.lie import Array, inverse, rotation_angle
+from kineverse.model.frame_dependence import moved_frames
+from kineverse.model.model_view import ModelView
+from kineverse.symbols import Symbol
+
+MotionKind: TypeAlias = Literal["door", "flap", "drawer", "knob", "linkage"]
+KINDS: tuple[MotionKind, ...] = get_args(MotionKind)
+
+_SAMPLES = 5
+_STILL = 1e-6
+"""Rotation below which a motion is a translation [rad]."""
+_SAME = 1e-3
+"""Largest difference of the axes of a motion about one axis, as direction and as point [m]."""
+_UPRIGHT = math.cos(math.pi / 4)
+_KNOB = 0.08
+"""Largest distance of a knob from its axis [m]."""
+
+
+@dataclass(frozen=True, slots=True)
+class ArticulatedObject:
+    """Object that one coordinate moves between two limits.
+
+    Attributes
+    ----------
+    coordinate
+        The coordinate.
+    kind
+        ``"drawer"``: it is translated; ``"door"``: it turns about an upright axis; ``"flap"``: about a level
+        one; ``"knob"``: about an axis through itself; ``"linkage"``: about an axis that moves.
+    shut
+        Limit nearest to the default value [m], [rad].
+    opened
+        The other limit [m], [rad].
+    """
+
+    coordinate: Symbol
+    kind: MotionKind
+    shut: float
+    opened: float
+
+
+def find_articulated_objects(model: ModelView, robot: str = "") -> tuple[ArticulatedObject, ...]:
+    """Return the objects that coordinates with two limits move, in the order of the model.
+
+    Parameters
+    ----------
+    model
+        The model.
+    robot
+        Prefix of a robot, which is not an object; none if empty.
+
+    Raises
+    ------
+    MissingDependencyError
+        Without the extra ``geometry``.
+    """
+    own = f"{robot}/"
+    free = [s for s in model.degrees_of_freedom if not (robot and s.path.startswith(own))]
+    defaults = model.default_state()
+    found = []
+    for coordinate, frames in moved_frames(model, free).items():
+        limits = sorted(map(float, model.limits(coordinate)), key=lambda v: abs(v - defaults[coordinate]))
+        bodies = [name for name in frames if name in model.bodies and collision_shapes(model.bodies[name])]
+        if bodies and all(map(math.isfinite, limits)) and limits[0] != limits[1]:
+            kind = _find_kind(model, coordinate, bodies, limits)
+            found.append(ArticulatedObject(coordinate, kind, *limits))
+    return tuple(found)
+
+
+def select_objects(
+    objects: Sequence[ArticulatedObject], patterns: Iterable[str]
+) -> tuple[ArticulatedObject, ...]:
+    """Return the objects whose coordinates match any of some names or patterns, in the order of the patterns.
+
+    Raises
+    ------
+    UnknownNameError
+        For a pattern that matches none, with similar names.
+    """
+    found: dict[Symbol, ArticulatedObject] = {}
+    for pattern in patterns:
+        matching = [one for one in objects if matches_pattern(str(one.coordinate), [pattern])]
+        if not matching:
+            names = [str(one.coordinate) for one in objects]
+            raise UnknownNameError(
+                f"No door, drawer or other object is named '{pattern}'. {suggest(pattern, names, 'object')}"
+            )
+        found.update((one.coordinate, one) for one in matching)
+    return tuple(found.values())
+
+
+def select_one_of_each_kind(objects: Iterable[ArticulatedObject]) -> tuple[ArticulatedObject, ...]:
+    """Return the first object of each kind."""
+    first: dict[MotionKind, ArticulatedObject] = {}
+    for one in objects:
+        first.setdefault(one.kind, one)
+    return tuple(first.values())
+
+
+def _find_kind(
+    model: ModelView, coordinate: Symbol, bodies: Sequence[str], limits: Sequence[float]
+) -> MotionKind:
+    """Return the kind of the motion of some bodies between two limits."""
+    state = model.default_state()
+    samples = [state.updated({coordinate: float(v)}) for v in np.linspace(limits[0], limits[1], _SAMPLES)]
+    axes: list[tuple[Array, Array]] = []
+    farthest = 0.0
+    for name in bodies:
+        pose = model.fk(name)
+        poses = np.array([np.asarray(pose(sample), dtype=float) for sample in samples])
+        steps = poses[1:] @ inverse(poses[:-1])
+        if float(rotation_angle(steps[:, :3, :3]).max()) < _STILL:
+            continue
+        own = [_find_axis(step) for step in steps]
+        axes += own
+        farthest = max(farthest, _find_extent(model, name, poses[0], *own[0]))
+    if not axes:
+        return "drawer"
+    along, point = axes[0]
+    for other, through in axes[1:]:
+        if 1.0 - abs(along @ other) > _SAME or np.linalg.norm(np.cross(through - point, along)) > _SAME:
+            return "linkage"
+    if farthest < _KNOB:
+        return "knob"
+    return "door" if abs(along[2]) > _UPRIGHT else "flap"
+
+
+def _find_axis(step: Array) -> tuple[Array, Array]:
+    """Return direction (3,) and a point (3,) of the screw axis of a rotation with translation (4, 4)."""
+    R, p = step[:3, :3], step[:3, 3]
+    along = np.array([R[2, 1] - R[1, 2], R[0, 2] - R[2, 0], R[1, 0] - R[0, 1]])
+    along /= np.linalg.norm(along)
+    across = p - along * (along @ p)
+    point = np.asarray(np.linalg.lstsq(np.eye(3) - R, across, rcond=None)[0], dtype=float)
+    return along, point
+
+
+def _find_extent(model: ModelView, name: str, pose: Array, along: Array, point: Array) -> float:
+    """Return the largest distance of the bounding spheres of a body's shapes from an axis [m]."""
+    farthest = 0.0
+    for shape in collision_shapes(model.bodies[name]):
+        solid = solid_from_geometry(shape.geometry)
+        centre = pose @ shape.origin.matrix @ np.append(solid.centre, 1.0)
+        distance = float(np.linalg.norm(np.cross(centre[:3] - point, along)))
+        farthest = max(farthest, distance + solid.radius)
+    return farthest

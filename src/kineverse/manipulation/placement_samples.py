@@ -1,0 +1,176 @@
+"""Samples of bases, arms and grasps in front of a handle, and what their ways cost."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+
+import numpy as np
+import numpy.typing as npt
+
+from kineverse.grasping import Grasp
+from kineverse.lie import Array
+from kineverse.model.model_view import ModelView
+from kineverse.state import State
+from kineverse.symbols import Symbol
+
+_NEAREST, _FARTHEST = 0.3, 1.1
+"""Distance of a base from the hand [m]."""
+_SIDE, _TURN = math.radians(80.0), math.radians(60.0)
+"""Largest angles of a base beside the approach of the hand, and of its front beside the hand [rad]."""
+_BASE_EASE, _BASE_SPEED = 0.1, 1.0
+"""Weight of a base that can move beside those of joints, so that it moves where they are not enough; and its
+speed where the model has no limit [m/s]."""
+_QUICK, _SOON = 0.5, 4.0
+"""Speed from which on a joint has the full weight [m/s], [rad/s]; time in which most arms are reached [s]."""
+_OBJECT_SPEED = 0.3
+"""Speed of an object along its way [m/s], [rad/s]."""
+
+
+class PlacementSamples:
+    """Random bases, arms and grasps.
+
+    Parameters
+    ----------
+    model
+        The model.
+    moving, standing, base
+        Coordinates that move along ways, those that only stand, and those of a mobile base among both.
+
+    Attributes
+    ----------
+    speeds
+        Largest speeds (n,) of the moving coordinates [m/s], [rad/s].
+    ease
+        Weights (n,) of their motions: those of slow ones and of the base are small.
+    """
+
+    def __init__(
+        self,
+        model: ModelView,
+        moving: Sequence[Symbol],
+        standing: Sequence[Symbol],
+        base: Sequence[Symbol],
+    ) -> None:
+        self.moving, self.standing, self.base = tuple(moving), tuple(standing), tuple(base)
+        limits = np.array([model.limits(s) for s in moving], dtype=float).reshape(-1, 2)
+        self.lower, self.upper = limits.T
+        self._bounded = np.isfinite(limits).all(axis=1)
+        speeds = [min(abs(v) for v in model.limits(s.derivative())) for s in moving]
+        self.speeds = np.array([v if 0.0 < v < math.inf else _BASE_SPEED for v in speeds])
+        on_base = np.array([s in self.base for s in moving], dtype=bool)
+        self.ease = np.where(on_base, _BASE_EASE, np.minimum(1.0, self.speeds / _QUICK))
+
+    def choose_grasps(
+        self,
+        random: np.random.Generator,
+        grasps: Sequence[Grasp],
+        free: npt.NDArray[np.int_],
+        count: int,
+        upright: bool,
+    ) -> npt.NDArray[np.intp]:
+        """Return indices (N,) of grasps: good ones mostly, or all tilts alike; none if none is free.
+
+        Parameters
+        ----------
+        random
+            Random numbers.
+        grasps
+            Grasps, the best first.
+        free
+            Index (G,) of the last value of the object at which the hand touches nothing; negative for none.
+        count
+            Number of indices.
+        upright
+            Whether good grasps are preferred to different ones.
+        """
+        usable = np.flatnonzero(free > 0)
+        if not len(usable):
+            return np.zeros(0, dtype=np.intp)
+        size = len(usable)
+        if upright:
+            rank = random.geometric(min(1.0, 4.0 / size), count) - 1
+            return usable[np.where(rank < size, rank, random.integers(size, size=count))]
+        # Some ways need a hand that comes from above or from the side, and few grasps are such.
+        tilts = np.array([grasp.tilt for grasp in grasps])[usable]
+        wanted = random.uniform(tilts.min(), tilts.max(), count)
+        order = np.argsort(tilts, kind="stable")
+        near = np.searchsorted(tilts[order], wanted) + random.integers(-2, 3, count)
+        return np.asarray(usable[order[np.clip(near, 0, size - 1)]])
+
+    def draw(
+        self, random: np.random.Generator, state: State, hands: Array, approaches: Array, starts: int
+    ) -> tuple[Array, Array]:
+        """Return random arms (N, n), and bases (N, m) in front of poses of the hand (N, 4, 4).
+
+        Parameters
+        ----------
+        random
+            Random numbers.
+        state
+            Present state: most arms are those that are soon reached.
+        hands, approaches
+            Poses of the hand at the handle, and before it.
+        starts
+            Number of successive samples that share a base.
+        """
+        count = len(hands)
+        here = state.vector(self.moving)
+        lower = np.where(self._bounded, self.lower, here - math.pi)
+        upper = np.where(self._bounded, self.upper, here + math.pi)
+        soon = random.random((count, 1)) < 0.75
+        span = _SOON * self.speeds
+        low = np.where(soon, np.minimum(np.maximum(lower, here - span), upper), lower)
+        high = np.where(soon, np.maximum(np.minimum(upper, here + span), lower), upper)
+        Q = random.uniform(low, high)
+        still = np.tile(state.vector(self.standing), (count, 1))
+        if self.base:
+            out = (approaches - hands)[:, :2, 3]
+            angle = np.where(
+                np.hypot(*out.T) > 0.02, np.arctan2(out[:, 1], out[:, 0]), random.uniform(-3.2, 3.2, count)
+            )
+            angle, distance, turn = (
+                np.repeat(values[::starts], starts)[:count]
+                for values in (
+                    angle + random.uniform(-_SIDE, _SIDE, count),
+                    random.uniform(_NEAREST, _FARTHEST, count),
+                    random.uniform(-_TURN, _TURN, count),
+                )
+            )
+            place = hands[:, :2, 3] + distance[:, None] * np.stack([np.cos(angle), np.sin(angle)], axis=1)
+            values = np.column_stack([place, angle + math.pi + turn])
+            for k, s in enumerate(self.base):
+                columns, array = (self.moving, Q) if s in self.moving else (self.standing, still)
+                array[:, columns.index(s)] = values[:, k]
+        return Q, still
+
+    def cost(self, state: State, ways: Array, approaches: Array, ends: npt.NDArray[np.int_]) -> Array:
+        """Return the costs (N,) of ways (N, K, n) until indices (N,): their times, and nearness to limits.
+
+        ``approaches`` (N, n) are the configurations before the hand is at the handle; the time [s] to get
+        there from a state counts half.
+        """
+        away = approaches - state.vector(self.moving)
+        away = np.where(self._bounded, away, (away + math.pi) % (2 * math.pi) - math.pi)
+        for s in self.base[:2]:
+            if s in self.moving:
+                k = self.moving.index(s)
+                away[:, k] = approaches[:, k] - state[s]
+        there = (np.abs(away) / self.speeds).max(axis=1, initial=0.0)
+        steps = (np.abs(np.diff(ways, axis=1)) / self.speeds).max(axis=2, initial=0.0)
+        used = np.arange(steps.shape[1]) < ends[:, None]
+        along = (steps * used).sum(axis=1)
+        width = np.where(self._bounded, self.upper - self.lower, np.inf)
+        room = np.minimum(ways - self.lower, self.upper - ways) / width
+        room = np.where(self._bounded & np.append(used, used[:, -1:], axis=1)[:, :, None], room, 1.0)
+        least = room.min(axis=(1, 2), initial=1.0)
+        return np.asarray(along + 0.5 * there - 40.0 * np.minimum(least, 0.1))
+
+
+def find_planar_base(model: ModelView, symbols: Sequence[Symbol]) -> tuple[Symbol, ...]:
+    """Return the coordinates x, y and angle of a mobile base among some; empty without one."""
+    for joint in model.articulations.values():
+        names = tuple(s.path.rpartition("/")[2] for s in joint.coordinates)
+        if names == ("x", "y", "angle") and {*joint.coordinates} <= {*symbols}:
+            return tuple(joint.coordinates)
+    return ()

@@ -1,0 +1,112 @@
+"""Push of an object where no grasp leads on, such as an oven door whose handle faces the floor."""
+
+from __future__ import annotations
+
+from kineverse.errors import InvalidValueError
+from kineverse.planning import Trajectory
+from kineverse.state import State
+
+from .hand_motion import HandMotion
+from .outcome import SkillError
+from .push_controller import Pushing
+from .push_placement import find_push_start
+from .pushing import push
+
+_SAMPLES, _SEARCHING = 120, 20.0
+"""Largest number of sampled starts, and largest time of their search [s]."""
+_PLANNING = 1.0
+"""Largest time to plan the way to a start [s]."""
+_PUSHING = 10.0
+"""Time in the world that a push is given at least [s]."""
+
+
+class PushFallback:
+    """Push that moves an object on.
+
+    Parameters
+    ----------
+    motion
+        Motions of the hand.
+    target
+        Wanted value [m], [rad].
+    tolerance
+        Largest distance from it [m], [rad].
+    """
+
+    def __init__(self, motion: HandMotion, target: float, tolerance: float) -> None:
+        self.motion, self.target, self.tolerance = motion, target, tolerance
+        self.samples = 0
+        self._trajectory: Trajectory | None = None
+
+    def find_start(self, seed: int) -> State:
+        """Return a state of the robot from which the push goes through and to which a way leads.
+
+        Raises
+        ------
+        SkillError
+            If there is none, with the reasons.
+        """
+        motion, session = self.motion, self.motion.session
+        session.phase = "place"
+        with session.timed("place"):
+            state = session.state
+            try:
+                self.pushing = Pushing(
+                    motion.model,
+                    motion.handle.coordinate,
+                    motion.gripper.bodies,
+                    state,
+                    target=self.target,
+                    robot=session.world.robot,
+                    dt=session.dt,
+                    still=motion.gripper.joints,
+                )
+                self.pushing.wait()
+                found = find_push_start(
+                    self.pushing, state, samples=_SAMPLES, seconds=_SEARCHING, seed=seed, accept=self._plan
+                )
+            except InvalidValueError as error:
+                raise SkillError("reach", f"It cannot be pushed: {error}") from error
+        self.samples += found.samples
+        if found.state is None:
+            touching = any(" and " in r or "blocked" in r or "path" in r for r in found.reasons)
+            raise SkillError("collision" if touching else "reach", f"Nor does a push: {found.why}")
+        return found.state
+
+    def _plan(self, start: State) -> str:
+        """Plan the way to a start, and return why there is none."""
+        motion, state = self.motion, self.motion.session.state
+        planner = motion.planner
+        planner.place(state.updated({s: start[s] for s in motion.search.standing}))
+        ends = start.vector(planner.symbols)
+        path = planner.plan(state.vector(planner.symbols), ends, seconds=_PLANNING)
+        if not path.found:
+            return "no path to the start"
+        self._trajectory = path.trajectory()
+        left = motion.until - motion.session.world.time
+        return "far away" if self._trajectory.duration > left - _PUSHING else ""
+
+    def perform(self) -> None:
+        """Go to the start that was found, push, and take the hand away, or raise SkillError."""
+        motion, session = self.motion, self.motion.session
+        assert self._trajectory is not None
+        motion.judge.allow(self.pushing.object_bodies)
+        session.phase = "approach"
+        motion.follow(self._trajectory)
+
+        def look(pushing: Pushing) -> None:
+            motion.judge.update(session.world.state, session.commands, pushing=session.phase == "push")
+
+        outcome = push(
+            session,
+            motion.handle.coordinate,
+            target=self.target,
+            tolerance=self.tolerance,
+            seconds=motion.until - session.world.time,
+            pushing=self.pushing,
+            plan=False,
+            retreat=True,
+            on_step=look,
+        )
+        if not outcome:
+            raise SkillError("time" if "time" in outcome.reason else "collision", outcome.reason)
