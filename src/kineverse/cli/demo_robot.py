@@ -221,7 +221,8 @@ class RobotDemo:
     def _look(self, session: Session) -> None:
         """Show a step."""
         runner = self._runner
-        assert (one := runner.current) is not None
+        one = runner.current
+        assert one is not None
         self._progress.update(session, one, runner.opening)
         if self._live is not None:
             self._live.captions = (self._title(one), describe_value(session, one))

@@ -160,9 +160,10 @@ class PlacementSamples:
         steps = (np.abs(np.diff(ways, axis=1)) / self.speeds).max(axis=2, initial=0.0)
         used = np.arange(steps.shape[1]) < ends[:, None]
         along = (steps * used).sum(axis=1)
-        width = np.where(self._bounded, self.upper - self.lower, np.inf)
-        room = np.minimum(ways - self.lower, self.upper - ways) / width
-        room = np.where(self._bounded & np.append(used, used[:, -1:], axis=1)[:, :, None], room, 1.0)
+        lower, upper = self.lower[self._bounded], self.upper[self._bounded]
+        bounded = ways[:, :, self._bounded]
+        room = np.minimum(bounded - lower, upper - bounded) / (upper - lower)
+        room = np.where(np.append(used, used[:, -1:], axis=1)[:, :, None], room, 1.0)
         least = room.min(axis=(1, 2), initial=1.0)
         return np.asarray(along + 0.5 * there - 40.0 * np.minimum(least, 0.1))
 
