@@ -14,7 +14,7 @@ DEMO := $(patsubst %,requirements/%.txt,build core view figures geometry control
 .NOTPARALLEL:
 
 help:
-	@echo "make demo    open a moving kitchen in the browser (ARGS=--headless: numbers, a picture, and end)"
+	@echo "make demo    a robot opens and closes a kitchen in the browser (ARGS=--headless: a table, a picture, and end)"
 	@echo "make test    formatter, linter, types, layers, tests"
 	@echo "make fuzz    look for inputs that break a reader (ARGS='--target sdf --minutes 60')"
 	@echo "make format  format the code and mend what the linter can mend"

@@ -123,7 +123,7 @@ def _simulate(arguments: argparse.Namespace) -> int:
     steps = _count_steps(SECONDS if arguments.seconds is None else arguments.seconds)
     simulation = Simulation(mechanism=arguments.stranger or _STRANGER)
     # First, so that an unwritable path is reported before the work.
-    check_writable(arguments.picture)
+    check_picture_path(arguments.picture)
     qualities: list[TrackingQuality] = []
     for _ in show_progress(range(steps), "living", "step"):
         simulation.step(STEP)
@@ -136,7 +136,7 @@ def _simulate(arguments: argparse.Namespace) -> int:
     return 0
 
 
-def check_writable(path: str) -> None:
+def check_picture_path(path: str) -> None:
     """Check that a file can be written, without leaving an empty one if the run is interrupted."""
     new = not os.path.lexists(path)
     open(path, "ab").close()

@@ -59,7 +59,7 @@ class ProgressLine:
         now = time.monotonic()
         if self._terminal and now - self._shown >= _REFRESH:
             self._shown = now
-            value = format_value(one, session.world.state[one.coordinate])
+            value = format_reading(one, session.world.state[one.coordinate])
             skill = "open" if opening else "close"
             text = f"{self._place} {one.coordinate}: {skill}, {session.phase}, {value}"
             print(f"\r\033[K{text}", end="", file=sys.stderr, flush=True)
@@ -85,7 +85,7 @@ def describe_report(report: OpenCloseReport) -> str:
     if report:
         how = "opened and closed, pushed in part," if report.pushed else "opened and closed"
         return f"{one.coordinate}: {how} in {report.seconds:.1f} s"
-    value = format_value(one, report.outcomes[-1].value)
+    value = format_reading(one, report.outcomes[-1].value)
     skill = "opened" if report.closed is None else "closed"
     return f"{one.coordinate}: not {skill}, at {value}. {join_lines(report.reason)}"
 
@@ -116,7 +116,7 @@ def format_page_row(report: OpenCloseReport) -> list[str]:
     return [name.rpartition("/")[2], opened, closed, seconds]
 
 
-def describe_value(session: Session, one: ArticulatedObject) -> str:
+def describe_belief(session: Session, one: ArticulatedObject) -> str:
     """Return a line on the true and the believed value of an object."""
     drawer, symbol = one.kind == "drawer", one.coordinate
     scale, unit = (1e3, "mm") if drawer else (math.degrees(1.0), "°")
@@ -148,7 +148,7 @@ def report_as_data(report: OpenCloseReport) -> dict[str, Any]:
     }
 
 
-def format_value(one: ArticulatedObject, value: float) -> str:
+def format_reading(one: ArticulatedObject, value: float) -> str:
     """Return a value of an object's coordinate with its unit."""
     return f"{format_number(value, 3)} {'m' if one.kind == 'drawer' else 'rad'}"
 
@@ -156,7 +156,7 @@ def format_value(one: ArticulatedObject, value: float) -> str:
 def _format_outcome(one: ArticulatedObject, outcome: Outcome | None) -> str:
     if outcome is None:
         return "-"
-    value = format_value(one, outcome.value)
+    value = format_reading(one, outcome.value)
     return value if outcome else f"no, {value}"
 
 

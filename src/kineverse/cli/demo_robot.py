@@ -9,13 +9,13 @@ import time
 from contextlib import ExitStack, redirect_stdout
 from typing import TYPE_CHECKING
 
-from kineverse.cli.demo_living import check_writable
+from kineverse.cli.demo_living import check_picture_path
 from kineverse.cli.demo_output import (
     ALIGN,
     HEAD,
     PAGE_HEAD,
     ProgressLine,
-    describe_value,
+    describe_belief,
     format_page_row,
     format_row,
     report_as_data,
@@ -117,7 +117,7 @@ class RobotDemo:
         self._sensors = None if noise == "none" else Sensors.parse(noise)
         self._robot = find_robots([arguments.robot or ROBOT])[0]
         if arguments.headless:
-            check_writable(arguments.picture)
+            check_picture_path(arguments.picture)
         with show_activity(f"reading the {KITCHEN} and the {self._robot.name}"):
             self.model = self._robot.load()
             self.model.include(KITCHEN)
@@ -232,7 +232,7 @@ class RobotDemo:
         assert one is not None
         self._progress.update(session, one, runner.opening)
         if self._live is not None:
-            self._live.captions = (self._title(one), describe_value(session, one))
+            self._live.captions = (self._title(one), describe_belief(session, one))
             self._live(session)
         if self._stills is not None:
             self._stills.watch(session, runner.opening)

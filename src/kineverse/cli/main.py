@@ -90,7 +90,7 @@ examples:
   kineverse convert kitchen kitchen.kv.json           write it in another format
   kineverse diff kitchen kitchen.kv.json              differences of two models
   kineverse fit poses.csv --child door                learn a joint from recorded poses
-  kineverse demo --headless                           a picture of kitchen and robot
+  kineverse demo --headless                           a robot opens and closes a door, a flap, a drawer
 """
 
 
