@@ -109,9 +109,9 @@ def test_documented_commands_print_the_documented_output(page, at_the_root, page
     assert pages == [(200, True)] * opened
 
 
-def test_the_demo_serves_its_page(at_the_root, pages, capsys):
-    """``make demo`` calls this."""
-    assert main(["demo"]) == 0
+def test_the_kitchen_in_motion_serves_its_page(at_the_root, pages, capsys):
+    """That of ``make demo`` is tested in ``cli/test_demo_robot.py``."""
+    assert main(["demo", "--living"]) == 0
     assert pages == [(200, True)]
 
 

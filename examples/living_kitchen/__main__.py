@@ -1,4 +1,4 @@
-"""``python examples/living_kitchen``: the demo, with the options of ``kineverse demo``."""
+"""``python examples/living_kitchen``: the kitchen in motion, with the options of ``kineverse demo --living``."""
 
 import sys
 from pathlib import Path
@@ -8,4 +8,4 @@ sys.path[0] = str(Path(__file__).resolve().parents[1])
 
 from kineverse.cli import main  # noqa: E402 - after the path
 
-sys.exit(main(["demo", *sys.argv[1:]]))
+sys.exit(main(["demo", "--living", *sys.argv[1:]]))

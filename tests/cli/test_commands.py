@@ -234,7 +234,7 @@ def test_commands_give_equal_results_without_a_compiler(run, monkeypatch, tmp_pa
 def test_a_missing_compiler_is_reported_only_with_verbose(run, monkeypatch, tmp_path):
     monkeypatch.delenv("CC", raising=False)
     words = ("demo", "--sliders", "--headless", "--picture", tmp_path / "picture.png")
-    monkeypatch.setattr("kineverse.cli.demo.MODELS", ("shelf_door",))  # one model is enough
+    monkeypatch.setattr("kineverse.cli.demo_living.MODELS", ("shelf_door",))  # one model is enough
     # What was not found on one path is logged once, so there are two.
     monkeypatch.setenv("PATH", str(tmp_path / "first"))
     status, _, err = run(*words)
@@ -263,7 +263,10 @@ def hears_ctrl_c():
 
 @pytest.mark.parametrize(
     ("stop", "words"),
-    [(signal.SIGINT, ["demo", "--port", "0"]), (signal.SIGTERM, ["view", "shelf_door", "--port", "0"])],
+    [
+        (signal.SIGINT, ["demo", "--living", "--port", "0"]),
+        (signal.SIGTERM, ["view", "shelf_door", "--port", "0"]),
+    ],
 )
 def test_pages_end_with_status_0(stop, words, hears_ctrl_c):
     pytest.importorskip("viser")

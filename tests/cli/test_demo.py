@@ -12,7 +12,8 @@ from living_kitchen.unknown_mechanisms import MECHANISMS
 
 import kineverse as kv
 from kineverse.cli import main
-from kineverse.cli.demo import MODELS, STATE, _find_example, add_arguments
+from kineverse.cli.demo import add_arguments
+from kineverse.cli.demo_living import MODELS, STATE, _find_example
 from kineverse.cli.exercise import SAMPLES_PER_RANGE, exercise_model
 
 
@@ -32,7 +33,7 @@ def test_the_initial_state_is_valid_for_the_models(both):
 
 @pytest.mark.parametrize("seconds", ["0", "nan", "1e9"])
 def test_invalid_durations_are_refused(tmp_path, capsys, seconds):
-    words = ["demo", "--headless", "--picture", str(tmp_path / "x.png"), "--seconds", seconds]
+    words = ["demo", "--living", "--headless", "--picture", str(tmp_path / "x.png"), "--seconds", seconds]
     assert main(words) == 2
     assert "--seconds is between" in capsys.readouterr().err
 
@@ -54,16 +55,24 @@ def test_headless_sliders_drive_all_coordinates_and_write_a_picture(tmp_path, ca
     assert path.read_bytes().startswith(b"\x89PNG")
 
 
-def test_outside_a_checkout_the_demo_shows_the_sliders_and_says_so(tmp_path, monkeypatch, capsys):
-    path = tmp_path / "picture.png"
-    monkeypatch.setattr("kineverse.cli.demo._find_example", lambda: False)
-    monkeypatch.setattr("kineverse.cli.demo.MODELS", ("shelf_door",))  # the whole is driven above
-    assert main(["demo", "--headless", "--picture", str(path)]) == 0
-    out, err = capsys.readouterr()
-    assert "DoF driven" in out
-    assert err.startswith("kineverse: note: the living kitchen is an example of the source checkout")
-    assert len(err.splitlines()) == 1
-    assert path.read_bytes().startswith(b"\x89PNG")
+def test_outside_a_checkout_there_is_no_kitchen_in_motion(tmp_path, monkeypatch, capsys):
+    monkeypatch.setattr("kineverse.cli.demo_living._find_example", lambda: False)
+    assert main(["demo", "--living", "--headless", "--picture", str(tmp_path / "x.png")]) == 2
+    assert "source checkout" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize(
+    ("words", "message"),
+    [
+        (["--living", "--robot", "hsr"], "--robot is for the robot, not for --living"),
+        (["--sliders", "--json"], "--json is for the robot, not for --sliders"),
+        (["--stranger", "stool"], "--stranger is for --living"),
+        (["--sliders", "--seconds", "3"], "--seconds is for --living"),
+    ],
+)
+def test_options_of_another_demo_are_refused(words, message, capsys):
+    assert main(["demo", "--headless", *words]) == 2
+    assert message in capsys.readouterr().err
 
 
 @pytest.mark.parametrize("in_checkout", [True, False])
@@ -84,7 +93,7 @@ def test_headless_demo_needs_the_core_only_and_prints_tables(tmp_path):
     code = (
         f"import sys\nfor name in {extras!r}: sys.modules[name] = None\n"
         f"from kineverse.cli import main\n"
-        f"words = ['--headless', '--stranger', 'stool', '--seconds', '1']\n"
+        f"words = ['--living', '--headless', '--stranger', 'stool', '--seconds', '1']\n"
         f"sys.exit(main(['demo', *words, '--picture', {str(tmp_path / 'core.png')!r}]))"
     )
     words = [sys.executable, "-c", code]
@@ -104,18 +113,18 @@ def test_an_interrupted_demo_leaves_no_empty_picture(tmp_path, monkeypatch):
 
     monkeypatch.setattr("living_kitchen.Simulation.step", interrupted)
     with contextlib.suppress(KeyboardInterrupt):
-        assert main(["demo", "--headless", "--picture", str(tmp_path / "x.png")]) != 0
+        assert main(["demo", "--living", "--headless", "--picture", str(tmp_path / "x.png")]) != 0
     assert not list(tmp_path.iterdir())
 
 
 def test_an_unwritable_picture_is_reported_in_one_line(tmp_path, capsys):
-    assert main(["demo", "--headless", "--picture", str(tmp_path / "none" / "x.png")]) == 2
+    assert main(["demo", "--living", "--headless", "--picture", str(tmp_path / "none" / "x.png")]) == 2
     err = capsys.readouterr().err
     assert err.endswith("No such file or directory\n")
     assert len(err.splitlines()) == 1
 
 
-@pytest.mark.parametrize("words", [[], ["--sliders"]])
+@pytest.mark.parametrize("words", [[], ["--living"], ["--sliders"]])
 def test_pictures_of_other_formats_are_refused(tmp_path, capsys, words):
     path = tmp_path / "x.jpg"
     assert main(["demo", "--headless", "--picture", str(path), *words]) == 2

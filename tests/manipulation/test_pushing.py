@@ -212,7 +212,7 @@ def test_press_grows_with_the_lag_no_more_and_corrects_what_is_touched() -> None
     assert planned < 5e-3
 
     def value(gap: float, estimate: float) -> float:
-        press.correct(gap, 0.8, True)
+        press.correct(gap, 0.8)
         return press.advance(estimate, tip, True)
 
     assert value(0.004, 0.5) == 0.5  # known exactly

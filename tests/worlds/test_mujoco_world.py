@@ -349,6 +349,7 @@ def test_remarks_tell_what_was_added_and_left_out() -> None:
     for part in (
         "'pr2/base/speed' is left out",
         "gravity does not act on 'pr2'",
+        "there is no floor",
         "servos of bandwidth 80/s drive 21 coordinates",
         "no effort is stated; servos have [N], [N m]: pr2/base/angle",
         "friction 1 N m and damping 1 N m s are assumed, as the model states none: kitchen/fridge_door",

@@ -83,7 +83,7 @@ def describe_report(report: OpenCloseReport) -> str:
     """Return a sentence on an object."""
     one = report.object
     if report:
-        how = "opened and pushed shut" if report.pushed else "opened and closed"
+        how = "opened and closed, pushed in part," if report.pushed else "opened and closed"
         return f"{one.coordinate}: {how} in {report.seconds:.1f} s"
     value = format_value(one, report.outcomes[-1].value)
     skill = "opened" if report.closed is None else "closed"
@@ -95,7 +95,7 @@ def format_row(report: OpenCloseReport) -> list[str]:
     one, scale = report.object, 1e3 if report.object.kind == "drawer" else math.degrees(1.0)
     unit = "mm" if one.kind == "drawer" else "°"
     steps = 1e3 * np.array(report.steps) if report.steps else np.array([math.nan])
-    remark = ("pushed shut" if report.pushed else "") if report else join_lines(report.reason)
+    remark = ("pushed in part" if report.pushed else "") if report else join_lines(report.reason)
     return [
         str(one.coordinate),
         one.kind,

@@ -152,7 +152,14 @@ class RobotDemo:
             world = make_world(self.model, prefix, self.gripper, sensors=sensors, seed=self._seed)
             belief = None if sensors is None else TrackedBelief(self.model, prefix, sensors)
             start = self._robot.start_state(self.model)
-            runner = OpenCloseRunner(world, start, belief=belief, on_step=self._look, seed=self._seed)
+            runner = OpenCloseRunner(
+                world,
+                start,
+                belief=belief,
+                on_step=self._look,
+                hand=self.gripper.hand,
+                seed=self._seed,
+            )
         self._runner = runner
         if page is not None and self._speed:
             self._say("The robot begins when a browser shows this page.")
@@ -221,7 +228,8 @@ class RobotDemo:
     def _look(self, session: Session) -> None:
         """Show a step."""
         runner = self._runner
-        assert (one := runner.current) is not None
+        one = runner.current
+        assert one is not None
         self._progress.update(session, one, runner.opening)
         if self._live is not None:
             self._live.captions = (self._title(one), describe_value(session, one))

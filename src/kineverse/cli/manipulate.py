@@ -10,7 +10,7 @@ from collections.abc import Callable
 from contextlib import ExitStack, redirect_stdout
 from dataclasses import replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Literal, NamedTuple
+from typing import TYPE_CHECKING, Literal, NamedTuple
 
 from kineverse.cli.arguments import add_model_options, print_notes
 from kineverse.cli.manipulate_output import PhaseLines, report_outcome
@@ -29,8 +29,6 @@ from kineverse.expressions.printing import format_number
 if TYPE_CHECKING:
     from kineverse.manipulation.belief import Belief
     from kineverse.manipulation.outcome import Outcome
-    from kineverse.manipulation.push_controller import Pushing
-    from kineverse.manipulation.session import Session
     from kineverse.worlds import World
     from kineverse.worlds.recorder import RecordedStep
 
@@ -335,26 +333,10 @@ def _push(
                 world.reset(found.state)
                 where = ""
 
-    def watch(session: Session) -> None:
-        look(_PushStep(session, pushing))
-
-    session = Session(world, belief=belief, on_step=watch)
+    session = Session(world, belief=belief, on_step=look)
     outcome = push(session, scene.coordinate, seconds=arguments.seconds, pushing=pushing)
     reason = outcome.reason if outcome or not where else f"{outcome.reason} {where}"
     return replace(outcome, reason=reason, measures={**outcome.measures, "placed": placed})
-
-
-class _PushStep:
-    """Step of a session, with the vectors of the controller for pages and recordings."""
-
-    def __init__(self, session: Session, pushing: Pushing) -> None:
-        self.world, self.state, self.commands = session.world, session.state, session.commands
-        self.phase, self.observation = session.phase, session.belief.observation
-        self.vectors: dict[str, tuple[Any, Any]] = {}
-        view = pushing.view
-        if view is not None and math.isfinite(view.distance):
-            vectors = {"n": view.n, "push": view.push, "tangent": view.tangent}
-            self.vectors = {name: (view.p, vector) for name, vector in vectors.items()}
 
 
 def _without_steps(scene: ManipulationScene, world: World, done: bool, reason: str) -> Outcome:

@@ -103,7 +103,7 @@ def _format_measure(value: Any) -> str:
     if isinstance(value, float):
         return format_number(value, 4)
     if isinstance(value, list) and all(isinstance(one, str) for one in value):
-        return ", ".join(value)
+        return ", ".join(filter(None, value)) or "-"
     if isinstance(value, (list, dict)):
         return f"{len(value)}, see --json"
     return "-" if value is None else str(value)

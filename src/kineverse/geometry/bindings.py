@@ -17,9 +17,11 @@ from kineverse.errors import CompileError
 from . import broadphase
 from .advancement_c import ADVANCE
 from .broadphase import Indices, ObjectTable, PairSelection, build_static_tree
-from .broadphase_c import SEARCH, SWEEP
+from .broadphase_c import SWEEP
 from .mesh_files import Floats
-from .narrowphase_c import NARROW, PENETRATION, SIMPLEX
+from .narrowphase_c import NARROW, SIMPLEX
+from .penetration_c import PENETRATION
+from .search_c import SEARCH
 from .support_c import SUPPORT
 
 _ARRAYS = (

@@ -40,7 +40,7 @@ _NEAR = 0.6
 """Distance from the bar up to which shapes are looked at [m]."""
 _REACH = 0.05
 """Distance up to which the clearance of a grasp counts [m]."""
-_CLOSING = 5
+_CLOSING = 14
 _ADVANCES, _TOUCHING = 20, 1e-4
 """Most steps in which fingers close, and the distance at which one touches [m]."""
 

@@ -7,7 +7,6 @@ from collections.abc import Callable
 from dataclasses import dataclass
 
 from kineverse.errors import KineverseError
-from kineverse.lie import Array
 from kineverse.state import State
 from kineverse.worlds import World
 
@@ -15,8 +14,6 @@ from .articulated_objects import ArticulatedObject
 from .belief import Belief
 from .opening import open_object
 from .outcome import Outcome
-from .push_controller import Pushing
-from .pushing import push
 from .session import Session
 
 _PLANS = ("plan", "place")
@@ -33,8 +30,6 @@ class OpenCloseReport:
         The object.
     opened, closed
         Outcomes; None for what was not begun.
-    pushed
-        Whether it was closed by a push, because no grasp led there.
     estimate_error
         Largest difference of the believed to the true coordinate meanwhile [m], [rad].
     steps
@@ -44,7 +39,6 @@ class OpenCloseReport:
     object: ArticulatedObject
     opened: Outcome | None
     closed: Outcome | None
-    pushed: bool
     estimate_error: float
     steps: tuple[float, ...]
 
@@ -55,6 +49,11 @@ class OpenCloseReport:
     def outcomes(self) -> tuple[Outcome, ...]:
         """Outcomes of what was begun."""
         return tuple(one for one in (self.opened, self.closed) if one is not None)
+
+    @property
+    def pushed(self) -> bool:
+        """True if it was pushed, because no grasp led on."""
+        return any(one.measures.get("pushed", False) for one in self.outcomes)
 
     @property
     def seconds(self) -> float:
@@ -88,6 +87,8 @@ class OpenCloseRunner:
         Source of the state; the truth by default.
     on_step
         Is called with the session after each step.
+    hand
+        Frame of the hand; the likeliest gripper by default.
     seconds
         Largest time of one skill in the world [s].
     seed
@@ -110,6 +111,7 @@ class OpenCloseRunner:
         *,
         belief: Belief | None = None,
         on_step: Callable[[Session], object] | None = None,
+        hand: str | None = None,
         seconds: float = 60.0,
         seed: int = 0,
     ) -> None:
@@ -117,23 +119,21 @@ class OpenCloseRunner:
         self.session = Session(world, belief=belief, on_step=self._look)
         self.current: ArticulatedObject | None = None
         self.opening = True
-        self._start, self._on_step, self._seconds, self._seed = start, on_step, seconds, seed
+        self._start, self._on_step = start, on_step
+        self._hand, self._seconds, self._seed = hand, seconds, seed
         self._error, self._failed = 0.0, False
 
     def open_and_close(self, one: ArticulatedObject) -> OpenCloseReport:
-        """Open an object and close it, by a push if no grasp leads there, and report it."""
+        """Open an object and close it, and report it."""
         session, self.current, self.opening, self._error = self.session, one, True, 0.0
         if self._failed:
             session.restart(self._start)
         counted = {name: len(times) for name, times in session.cpu.items()}
         opened = self._act(lambda: self._move(one, one.opened))
-        closed, pushed = None, False
+        closed = None
         if opened:
             self.opening = False
             closed = self._act(lambda: self._move(one, one.shut))
-            if not closed and closed.measures.get("failure") in ("reach", "collision"):
-                pushed = True
-                closed = self._act(lambda: self._push(one))
         times = [
             time
             for name, times in session.cpu.items()
@@ -141,20 +141,17 @@ class OpenCloseRunner:
             for time in times[counted.get(name, 0) :]
         ]
         self._failed = not (opened and closed)
-        return OpenCloseReport(one, opened, closed, pushed, self._error, tuple(times))
+        return OpenCloseReport(one, opened, closed, self._error, tuple(times))
 
     def _move(self, one: ArticulatedObject, target: float) -> Outcome:
         return open_object(
-            self.session, one.coordinate, target=target, seconds=self._seconds, seed=self._seed
+            self.session,
+            one.coordinate,
+            target=target,
+            hand=self._hand,
+            seconds=self._seconds,
+            seed=self._seed,
         )
-
-    def _push(self, one: ArticulatedObject) -> Outcome:
-        session = self.session
-
-        def note(pushing: Pushing) -> None:
-            session.vectors = find_push_vectors(pushing)
-
-        return push(session, one.coordinate, target=one.shut, retreat=True, on_step=note)
 
     def _act(self, skill: Callable[[], Outcome]) -> Outcome:
         """Return the outcome of a skill; an error of the library is one that is not done."""
@@ -185,14 +182,3 @@ class OpenCloseRunner:
             self._error = max(self._error, abs(float(difference)))
         if self._on_step is not None:
             self._on_step(session)
-
-
-def find_push_vectors(pushing: Pushing) -> dict[str, tuple[Array, Array]]:
-    """Return normal, push direction and tangent of a push, by name and with their origin, if it has them."""
-    view = pushing.view
-    if view is None or not math.isfinite(view.distance):
-        return {}
-    return {
-        name: (view.p, vector)
-        for name, vector in (("n", view.n), ("push", view.push), ("tangent", view.tangent))
-    }

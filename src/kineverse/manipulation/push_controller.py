@@ -55,8 +55,8 @@ _HOLD_WEIGHT = 10.0
 _LARGEST_DEVIATION = 0.01
 _LEAST_DEVIATION = 1e-5
 """Deviation below which gaps count as exact [m]."""
-_JAMMED = 4e-4
-"""Depth at which the object counts as not giving way [m]."""
+_JAMMED = 2.0
+"""Depth at which the object counts as not giving way, in depths of the press."""
 _DEEPEST = 2e-4
 
 
@@ -311,14 +311,14 @@ class Pushing:
             elif contact.alignment < CONE_END:
                 self._give_up()
         elif self._aside < 2 * NEAR and contact is not None and contact.alignment > CONE:
-            certain = press.deviation == 0.0 or press.certain(contact.velocity)
+            certain = press.deviation == 0.0 or press.certain
             if contact.gap < (TOUCHING if certain else TOUCHING + press.slack) and (certain or press.touched):
                 self.touching = True
                 self.choice.restart()
                 self._anchor = TipAnchor()
         if contact is not None:
             rate = -float(contact.normal @ contact.velocity) * self.surface.sign
-            press.correct(contact.gap, rate, self.touching)
+            press.correct(contact.gap, rate)
 
     def _release(self) -> None:
         self.touching = False
@@ -377,7 +377,7 @@ class Pushing:
             program.set("gap", _FAR)
         else:
             distance, normal, thing = contact.gap, contact.normal, contact.thing
-            free = self.touching and -_JAMMED - press.slack < distance < LOST + press.slack
+            free = self.touching and -_JAMMED * press.depth - press.slack < distance < LOST + press.slack
             slots, tangents = self._slots, contact.tangents
             J = slots.point_jacobian(thing, contact.p)
             relative = np.empty((3, len(self.speeds)))
@@ -388,7 +388,8 @@ class Pushing:
             program.set("relative", relative[:, program.columns].ravel())
             # A press that is late enough is not increased by the goal about the gap either.
             most = -PRESS * (1.0 - min(max(press.reserve, 0.0), 1.0))
-            program.set("gap", most if press.touched and self.touching else distance)
+            deeper = press.depth - PRESS
+            program.set("gap", most if press.touched and self.touching else distance + deeper)
             program.set("pushed", float(normal @ J[:, program.object_column]))
             pose = self.scene.pose(self.scene.bodies[thing])
             program.set("slip", tangents @ self._anchor.drift(thing, pose, tip, press.weight))

@@ -46,6 +46,13 @@ class PushView:
     target: Array
     distance: float
 
+    @property
+    def vectors(self) -> dict[str, tuple[Array, Array]]:
+        """Normal, push direction and tangent by name, each with its origin p; empty without a near pair."""
+        if not math.isfinite(self.distance):
+            return {}
+        return {"n": (self.p, self.n), "push": (self.p, self.push), "tangent": (self.p, self.tangent)}
+
 
 @dataclass(frozen=True, slots=True, eq=False)
 class PushPair:

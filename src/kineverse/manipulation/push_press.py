@@ -30,6 +30,10 @@ _MOST_LAG = 8e-4
 """Lag at which the press grows no more [m]."""
 _CREEP = 0.02
 """Speed at which a pusher feels for an object that may be nearer or farther than estimated [m/s]."""
+STILL = 5e-3
+"""Speed of a contact point that counts as none [m/s]."""
+_DEEPEN, _DEEPER = 0.5, 3.0
+"""Time in which a press on what does not move becomes deeper [s], and by how many times its depth."""
 _FORGET, _FORGET_WAY = 1.0, 0.01
 """Time [s] and way [m] after which a lag is forgotten: that of acceleration and delays is none of the press,
 and what moves on gives way."""
@@ -37,7 +41,6 @@ _REMEMBER = 0.1
 """Time for which a touch counts after the last report [s]."""
 _RETURN = 0.3
 """Time in which a correction returns to the estimate without a touch [s]."""
-_CERTAIN = 1e-4
 _LEAST_RATE = 0.02
 """Least rate of a gap over the coordinate for a correction [m/rad]."""
 
@@ -72,6 +75,7 @@ class PushPress:
     def reset(self) -> None:
         """Forget everything but the deviation."""
         self.speed = self.lag = self.correction = 0.0
+        self._way = self._crept = self._stuck = 0.0
         self._touch, self._estimate, self._value = math.inf, math.nan, math.nan
         self._tip: Array | None = None
         self._planned: Array = np.zeros(3)
@@ -111,7 +115,7 @@ class PushPress:
         moved = np.zeros(3) if self._tip is None else tip - self._tip
         leverage = math.sqrt(float(self._velocity @ self._velocity))
         along = self._velocity / max(leverage, 1e-9)
-        way = float(along @ moved)
+        self._way = way = float(along @ moved)
         shift = self._sign * (estimate - self._estimate) if math.isfinite(self._estimate) else 0.0
         if touching and self.touched:
             self.speed = max(way / self._dt, 0.0)
@@ -122,6 +126,7 @@ class PushPress:
             self.lag = max(kept + float(along @ self._planned) - way, 0.0)
         else:
             self.lag = 0.0
+        self._stuck = self._stuck + self._dt if touching and self.speed < STILL else 0.0
         if touching and self.touched and leverage > _LEAST_RATE:
             self.correction += self._sign * (max(way, 0.0) / leverage - shift)
         elif not self.touched:
@@ -129,7 +134,7 @@ class PushPress:
         self._tip, self._estimate = tip, estimate
         return estimate + self.correction
 
-    def correct(self, gap: float, rate: float, touching: bool) -> None:
+    def correct(self, gap: float, rate: float) -> None:
         """Correct the value by a gap, for the next step.
 
         Parameters
@@ -138,21 +143,25 @@ class PushPress:
             Gap at the value [m].
         rate
             Derivative of the gap by the coordinate [m/m], [m/rad].
-        touching
-            Whether the pusher is where it should touch.
         """
-        if self.deviation > 0.0 and abs(rate) > _LEAST_RATE and ((self.touched and touching) or gap < 0.0):
+        self._crept = self._crept + max(self._way, 0.0) if gap < self.slack else 0.0
+        if self.deviation > 0.0 and abs(rate) > _LEAST_RATE and gap < (self.slack if self.touched else 0.0):
             most = self.slack / abs(rate)
             self.correction = min(max(self.correction - gap / rate, -most), most)
 
-    def certain(self, velocity: Array) -> bool:
-        """Return True if the estimate had to be corrected by as much as can be allowed for."""
-        moved = abs(self.correction) * math.sqrt(float(velocity @ velocity))
-        return moved > self.slack - _CERTAIN
+    @property
+    def certain(self) -> bool:
+        """True if the pusher has crept from the one end of the allowed errors to the other."""
+        return self._crept >= 2.0 * self.slack
 
     def plan(self, velocity: Array, tip_velocity: Array) -> None:
         """Take the velocity of the contact point per unit of the push, and of the tip by a command (3,)."""
         self._velocity, self._planned = velocity, self._dt * tip_velocity
+
+    @property
+    def depth(self) -> float:
+        """Depth to which the pusher may press on the object [m]; it grows while the object does not move."""
+        return PRESS * (1.0 + _DEEPER * min(self._stuck / _DEEPEN, 1.0))
 
     def margin(self, gap: float, touching: bool, gain: float) -> float:
         """Return the margin of contact slots between pusher and object [m].
@@ -171,7 +180,7 @@ class PushPress:
         """
         known = self.deviation == 0.0 or (self.touched and touching)
         if known:
-            return max(min(0.0, gap - _CREEP / gain), -PRESS)
+            return max(min(0.0, gap - _CREEP / gain), -self.depth)
         return min(self.slack, gap - _CREEP / gain)
 
     @property

@@ -19,16 +19,16 @@ from kineverse.symbols import Symbol
 from .outcome import Outcome
 from .push_approach import plan_push_approach
 from .push_controller import Pushing
+from .push_press import STILL
 from .session import Session
 
 _SETTLED, _SETTLED_ESTIMATE = 5, 25
 """Number of steps for which the value, or its estimate, is within half of the tolerance when a push ends."""
 _PATIENCE = 25
-"""Number of steps for which it is within the tolerance in addition when a push ends all the same."""
+"""Number of further steps within the tolerance without progress after which a push ends all the same."""
+_PROGRESS = 5e-4
 _AVERAGED = 0.1
 """Weight of the latest estimate in the mean that counts at the end."""
-_STILL = 5e-3
-"""Speed of a contact point that counts as none [m/s]."""
 _PRESSED = 5
 """Number of steps for which an object within the tolerance gives way no more when a push ends."""
 _MOST_BLOCKED = 3
@@ -156,6 +156,7 @@ class _End:
     def __init__(self, pushing: Pushing, tolerance: float) -> None:
         self._pushing, self._tolerance = pushing, tolerance
         self._mean: float | None = None
+        self._least = math.inf
         self._settled = self._within = self._pressed = 0
 
     @property
@@ -172,9 +173,11 @@ class _End:
             rest = rest if self._mean is None else self._mean + _AVERAGED * (rest - self._mean)
             self._mean = rest
         rest = abs(rest)
-        self._within = self._within + 1 if rest < self._tolerance else 0
+        goes_on = rest < self._least - _PROGRESS
+        self._within = self._within + 1 if rest < self._tolerance and not goes_on else 0
+        self._least = rest if goes_on or rest >= self._tolerance else self._least
         self._settled = self._settled + 1 if rest < self._tolerance / 2 else 0
-        still = pushing.touching and press.touched and press.speed < _STILL
+        still = pushing.touching and press.touched and press.speed < STILL
         self._pressed = self._pressed + 1 if still and rest < self._tolerance else 0
         long = _SETTLED_ESTIMATE if press.deviation > 0.0 else _SETTLED
         return self._settled >= long or self._within >= long + _PATIENCE or self._pressed >= _PRESSED
@@ -245,7 +248,9 @@ class _Run:
         if pushing.touching and self._last is not None:
             self._changes.append(np.abs(speeds - self._last))
         self._last = speeds if pushing.touching else None
+        session.vectors = {} if pushing.view is None else pushing.view.vectors
         session.act(command.speeds)
+        session.vectors = {}
         if self._on_step is not None:
             self._on_step(pushing)
 

@@ -312,6 +312,7 @@ class MujocoWorld:
         for body in spec.bodies:
             if self._is_robot(body.name):
                 body.gravcomp = 1.0
+        self._remark("there is no floor, and nothing stops a body below z = 0")
         self._remark(f"gravity does not act on '{self.robot}': its servos are taken to carry the weight")
 
     def _exclude_overlaps(self, spec: Any, compiled: Any, seed: int) -> None:

@@ -59,11 +59,6 @@ def step_times(trials: Sequence[Trial]) -> StepTimeStatistics:
     )
 
 
-def _rate(trials: Sequence[Trial]) -> str:
-    rate = count_objects(trials).rate
-    return "" if math.isnan(rate) else f"{100 * rate:.1f} %"
-
-
 def _failures(kind: str) -> Callable[[Sequence[Trial]], int]:
     return lambda trials: sum(t.failure == kind for t in trials)
 
@@ -87,7 +82,7 @@ SUCCESS = (
     Column("objects", "objects", lambda trials: count_objects(trials).objects, 6),
     Column("done", "done", lambda trials: count_objects(trials).done, 6),
     Column("excused", "out of reach", lambda trials: count_objects(trials).excused, 6),
-    Column("rate", "of those in reach", _rate),
+    Column("rate", "of those in reach [%]", lambda trials: 100 * count_objects(trials).rate, 4),
     *(Column(kind, kind, _failures(kind), 6) for kind in FAILURES if kind),
 )
 

@@ -146,18 +146,17 @@ class TrialWatch:
     def _look(self, session: Session) -> None:
         for watch in self._watchers:
             watch(session)
-        vectors = {} if self.view is None else name_vectors(self.view)
+        if self.view is not None:
+            session.vectors = name_vectors(self.view)
         if self._recorder is not None:
             self._recorder(session)
-            if vectors:
-                self._recorder.write_vectors(session.world.time, vectors)
         if not self._film:
             return
         now, state = session.world.time, session.world.state
         self.commands.append((now - session.dt, {str(s): float(v) for s, v in session.commands.items()}))
         if session.steps % _FILM_STEPS == 0:
             values = {str(s): float(v) for s, v in state.items()}
-            self.moments.append(Moment(now, session.phase, values, vectors))
+            self.moments.append(Moment(now, session.phase, values, session.vectors))
 
 
 def name_vectors(view: PushView) -> dict[str, tuple[Any, Any]]:
