@@ -10,7 +10,7 @@ them. If the odometry drifts, a :class:`.BaseFilter` corrects it by marked frame
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Mapping
+from collections.abc import Mapping
 
 import numpy as np
 
@@ -125,7 +125,9 @@ class TrackedBelief:
             for s in self.tracker.symbols
         }
         self._groups = {s: group for group in self.tracker.groups for s in group}
-        self._coordinates_of = {name: self._coordinates_seen(moving[name]) for name in self._frames}
+        self._coordinates_of = {
+            name: tuple(s for s in moving[name] if s in self._groups) for name in self._frames
+        }
         base = find_robot_base(model, robot)
         drifts = sensors.odometry > 0.0 or sensors.turn > 0.0
         if drifts and base.coordinates and not base.is_planar:
@@ -188,9 +190,6 @@ class TrackedBelief:
         start = self._model.default_state()
         tracker.reset({s: start[s] for s in tracker.symbols})
         return tracker
-
-    def _coordinates_seen(self, symbols: Iterable[Symbol]) -> tuple[Symbol, ...]:
-        return tuple(s for s in symbols if s in self._groups)
 
     # -- the step ------------------------------------------------------------------------------------------
 
@@ -295,7 +294,8 @@ class TrackedBelief:
             poses, more = self._correct(observation, poses, eye)
         if not names:
             return
-        covariances = self._covariances(poses, eye) + more
+        variances = np.repeat(self._deviations(poses, eye), 3, axis=1) ** 2
+        covariances = variances[:, :, None] * np.eye(6) + more
         travel = self._displacement(self._picture, stamp)
         duration = stamp - self._picture
         commands: dict[Symbol, float] = {}
@@ -330,11 +330,6 @@ class TrackedBelief:
         result = np.full((len(poses), 2), max(self.sensors.orientation, _LEAST_ORIENTATION))
         result[:, 0] = np.maximum(position, _LEAST_POSITION)
         return result
-
-    def _covariances(self, poses: Array, eye: Array) -> Array:
-        """Return the stated covariances (m, 6, 6) of poses (m, 4, 4) seen from a point."""
-        variances = np.repeat(self._deviations(poses, eye), 3, axis=1) ** 2
-        return np.asarray(variances[:, :, None] * np.eye(6))
 
     def _correct(self, observation: Observation, poses: Array, eye: Array) -> tuple[Array, Array]:
         """Correct the base by landmarks; return poses that it carries, and the covariance it adds to them."""
