@@ -1,4 +1,4 @@
-"""``python examples/living_kitchen``: the kitchen in motion, with the options of ``kineverse demo --living``."""
+"""``python examples/living_kitchen``: the living kitchen, with the options of ``kineverse demo --living``."""
 
 import sys
 from pathlib import Path

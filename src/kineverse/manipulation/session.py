@@ -22,7 +22,7 @@ from .outcome import SkillError
 
 Speeds = Mapping[Symbol, float]
 
-STALE = 0.1
+STALE = 0.06
 """Age of the latest readings from which on a skill ends [s]."""
 
 

@@ -43,7 +43,7 @@ _STILL = 1e-3
 """Largest speed of a part that rests [m/s], [rad/s]."""
 _JOINT_SHARE, _JOINT_DRIFT = 0.2, 0.002
 """Error of the motion of joints relative to the commanded one, and beside it [rad/√s], [m/√s]."""
-_HORIZON = 0.15
+_HORIZON = 0.04
 """Longest prediction beyond the delay of the sensors [s]; then the stamp of the state stays."""
 
 
