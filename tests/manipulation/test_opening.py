@@ -105,6 +105,36 @@ def test_placement_keeps_the_grasp_along_the_way():
         np.testing.assert_allclose(hand(at), bar(at) @ found.grasp.pose, atol=1e-3)
 
 
+def test_grasps_are_sampled_where_the_object_stands():
+    model = kv.load("hsr")
+    model.include("kitchens/17")
+    door = "kitchen/oven_door"
+    gripper, handle = find_gripper(model, "hsr"), find_handle(model, door)
+    wide_open = model.default_state().updated({door: 1.5})
+    assert len(sample_grasps(model, gripper, handle, 16)) == 16
+    with pytest.raises(InvalidValueError, match="floor"):
+        sample_grasps(model, gripper, handle, 16, state=wide_open)
+
+
+def test_placement_says_how_far_it_leads_and_how_the_hand_goes_away():
+    model = make_model("shelf_door")
+    gripper, handle = find_gripper(model, "hsr"), find_handle(model, DOOR)
+    state = start(model)
+    search = PlacementSearch(model, gripper, state)
+    grasps = sample_grasps(model, gripper, handle, 32)
+    seen = []
+    found = search.find(state, grasps, 1.2, accept=lambda p: seen.append(p) or len(seen) > 1)
+    assert found is seen[1]
+    assert "no way to the handle" in found.why
+    end = dict(zip(found.coordinates, found.retreat[-1].tolist(), strict=True))
+    at = state.updated(end).updated({DOOR: found.values[-1]})
+    expected = model.fk(handle.frame)(at) @ found.grasp.approach
+    np.testing.assert_allclose(model.fk(gripper.hand)(at), expected, atol=1e-3)
+    refused = search.find(state, grasps, 1.2, accept=lambda p: False)
+    assert not refused
+    assert refused.failure == "collision"
+
+
 def test_locked_drawer_is_said_not_to_move():
     copy = make_model("shelf_drawers")
     with copy.edit() as edit:

@@ -17,8 +17,9 @@ from kineverse.state import State
 from kineverse.symbols import Symbol
 from kineverse.worlds import Judge
 
+from .base_placement import BasePlacement
 from .outcome import SkillError
-from .placement import BasePlacement, PlacementSearch
+from .placement import PlacementSearch
 from .session import Session
 
 _CLOSING, _MOST_CLOSING = 1.5, 4.0

@@ -40,6 +40,11 @@ class HandPaths:
         Coordinates (m,) that have a value for each configuration, such as those of a base that stands.
     ease
         Weights W (n,): coordinates with small ones move less.
+
+    Attributes
+    ----------
+    ease
+        The weights, which may be replaced.
     """
 
     def __init__(
@@ -53,7 +58,7 @@ class HandPaths:
         self.lower, self.upper = limits.T
         bounded = np.isfinite(limits).all(axis=1)
         self._middle = np.where(bounded, np.where(bounded[:, None], limits, 0.0).mean(axis=1), np.nan)
-        self._weights = ease
+        self.ease = ease
 
     def solve(self, Q: Array, base: Array, targets: Array, iterations: int) -> tuple[Array, Array]:
         """Return configurations (N, n) near to given ones at which the hand is at poses, and errors (N,).
@@ -77,9 +82,9 @@ class HandPaths:
             error = np.abs(e).max(axis=1)
             if k == iterations or (error < TOLERANCE / 10).all():
                 break
-            WJt = self._weights[:, None] * np.swapaxes(J, 1, 2)
+            WJt = self.ease[:, None] * np.swapaxes(J, 1, 2)
             damped = J @ WJt + (_DAMPING + 1e-3 * np.minimum(error, 0.5) ** 2)[:, None, None] * np.eye(6)
-            center = np.nan_to_num(_CENTERING * (self._middle - Q)) * self._weights
+            center = np.nan_to_num(_CENTERING * (self._middle - Q)) * self.ease
             e = e - (J @ center[:, :, None])[:, :, 0]
             step = center + (WJt @ np.linalg.solve(damped, e[:, :, None]))[:, :, 0]
             step *= np.minimum(1.0, _LONGEST / np.maximum(np.abs(step).max(axis=1), 1e-9))[:, None]

@@ -17,10 +17,11 @@ from kineverse.state import State
 from kineverse.symbols import Symbol
 from kineverse.worlds import Judge
 
+from .base_placement import BasePlacement
 from .hand_motion import HandMotion
 from .held_motion import move_held
 from .outcome import Outcome, SkillError, SlipError
-from .placement import BasePlacement, PlacementSearch
+from .placement import PlacementSearch
 from .push_fallback import PushFallback
 from .session import Session
 
@@ -44,7 +45,7 @@ def open_object(
     target: float | None = None,
     hand: str | None = None,
     handle: str | None = None,
-    seconds: float = 60.0,
+    seconds: float = 120.0,
     tolerance: float = 0.02,
     placements: int = 600,
     seed: int = 0,
@@ -53,7 +54,8 @@ def open_object(
 
     A base, a grasp and a way of the arm are found, see :class:`.PlacementSearch`. The robot goes to the
     handle on a planned path, closes its fingers, moves the object, lets go and retracts. Where one grasp does
-    not lead to the target, the object is released on the way and grasped anew. A base that rolls on wheels is
+    not lead to the target, the object is released on the way and grasped anew. Where no grasp leads on,
+    such as at an oven door whose handle faces the floor, it is pushed. A base that rolls on wheels is
     put to its place by a reset of the world; its drive there is not part of the skill.
 
     Parameters

@@ -23,6 +23,7 @@ from kineverse.model.model_view import ModelView
 from kineverse.state import State
 from kineverse.symbols import Symbol
 
+from .base_placement import NO_WAY, BasePlacement
 from .hand_paths import HandPaths
 from .placement_samples import PlacementSamples, find_planar_base
 from .push_scene import find_overlapping_links, furniture_rules
@@ -46,61 +47,6 @@ _LEAST_SHARE, _SHORTER = 0.2, 0.15
 """Least share of the motion that one grasp is for, and by how much it is shortened where that helps."""
 _MOST_CHECKS, _MOST_REFUSED = 150, 3
 """Most ways that are checked for contacts after a batch, and most that :func:`find` lets be refused."""
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class BasePlacement:
-    """Base, grasp and way of the arm, true if they were found.
-
-    Attributes
-    ----------
-    grasp
-        The grasp; None if nothing was found.
-    coordinates
-        Coordinates (n,) of the robot: base and arm.
-    approach, line
-        Configuration (n,) before the hand is at the handle, and those (L, n) from there to the grasp.
-    values, way
-        Values (K,) of the object's coordinate [m], [rad], and configurations (K, n) of the robot there. They
-        end at the target, or where the arm or something in the way ends them.
-    retreat
-        Configurations (L, n) with which the hand goes away from the handle at the end.
-    samples
-        Number of sampled bases.
-    reasons
-        Number of samples by the reason of their failure.
-    seconds
-        Duration of the search [s].
-    """
-
-    grasp: Grasp | None
-    coordinates: tuple[Symbol, ...]
-    approach: Array
-    line: Array
-    values: Array
-    way: Array
-    retreat: Array
-    samples: int
-    reasons: Counter[str]
-    seconds: float
-
-    def __bool__(self) -> bool:
-        return self.grasp is not None
-
-    @property
-    def failure(self) -> str:
-        """Class of the failure: ``"collision"`` if an arm reaches along the way, otherwise ``"reach"``."""
-        return "collision" if any(" at " in r or r == _NO_WAY for r in self.reasons) else "reach"
-
-    @property
-    def why(self) -> str:
-        """Text with the number of samples and the reasons of failures."""
-        failed = ", ".join(f"{n} {reason}" for reason, n in self.reasons.most_common(6) if n)
-        found = f"Found after {self.samples} bases" if self else f"None of {self.samples} bases goes through"
-        return f"{found}; failed: {failed}." if failed else f"{found}."
-
-
-_NO_WAY = "no way to the handle"
 
 
 @dataclass(slots=True, eq=False)
@@ -145,7 +91,7 @@ class PlacementSearch:
         self.base = find_planar_base(model, own)
         self.coordinates = (*self.moving, *self.standing)
         self.samples = PlacementSamples(model, self.moving, self.standing, self.base)
-        self.paths = HandPaths(model, gripper.hand, self.moving, self.standing, self.samples.ease)
+        self.paths = HandPaths(model, gripper.hand, self.moving, self.standing, self.samples.eases[0])
         self.scene = Scene(model)
         prefix = f"{gripper.robot}/" if gripper.robot else ""
         bodies = self.scene.bodies
@@ -212,8 +158,23 @@ class PlacementSearch:
             found = search.take(whole)
             if found is not None or number * batch >= samples or search.refused >= _MOST_REFUSED:
                 break
+            self.paths.ease = self.samples.eases[number % len(self.samples.eases)]
             search.add(batch, _MIDDLES[number % len(_MIDDLES)])
         return found or search.nothing
+
+    def blocked_bases(self, state: State, places: Array) -> npt.NDArray[np.bool_]:
+        """Return flags (B,) of places (B, 3) of the base at which its bodies are too near to something."""
+        found = np.zeros(len(places), dtype=bool)
+        if self._base_watch is not None:
+            for k, place in enumerate(places.tolist()):
+                self.scene.update(state.updated(dict(zip(self.base, place, strict=True))))
+                found[k] = len(self._base_watch()) > 0
+        return found
+
+    @cached_property
+    def _base_watch(self) -> PreparedQuery | None:
+        carried = [b for b in self.own if {*self.model.symbols_of(b)} <= {*self.base}]
+        return self.scene.watch(carried, self.others, self.margin) if carried else None
 
     def first_contact(self, grasp: Grasp, state: State, columns: Sequence[Symbol], rows: Array) -> int | None:
         """Return the index of the first row of values (N, n) at which the robot comes too near to something.
@@ -307,7 +268,12 @@ class _Search:
             return
         hands = handles[middle] @ self.poses[choice]
         outside = handles[middle] @ self.approaches[choice]
-        Q, base = samples.draw(self.random, self.state, hands, outside, _STARTS)
+        value = float(self.values[middle])
+
+        def blocked(places: Array) -> npt.NDArray[np.bool_]:
+            return self.owner.blocked_bases(self.state.updated({self.coordinate: value}), places)
+
+        Q, base = samples.draw(self.random, self.state, hands, outside, _STARTS, blocked)
         Q, error = paths.solve(Q, base, hands, _START_ITERATIONS)
         good = self._count(error < 1e-3, "out of reach")
         Q, base, choice = Q[good], base[good], choice[good]
@@ -357,7 +323,7 @@ class _Search:
                     return found
                 if found is not None:
                     self.refused += 1
-                    self.reasons[_NO_WAY] += 1
+                    self.reasons[NO_WAY] += 1
                     continue
             candidate.end = min(candidate.end, int(self.free[candidate.choice]))
             if candidate.end >= self.least:

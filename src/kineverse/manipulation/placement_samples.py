@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 
 import numpy as np
 import numpy.typing as npt
@@ -18,13 +18,13 @@ _NEAREST, _FARTHEST = 0.3, 1.1
 """Distance of a base from the hand [m]."""
 _SIDE, _TURN = math.radians(80.0), math.radians(60.0)
 """Largest angles of a base beside the approach of the hand, and of its front beside the hand [rad]."""
-_BASE_EASE, _BASE_SPEED = 0.1, 1.0
-"""Weight of a base that can move beside those of joints, so that it moves where they are not enough; and its
-speed where the model has no limit [m/s]."""
+_BASE_EASE, _BASE_SPEED = (0.1, 0.01), 1.0
+"""Weights of a base that can move beside those of joints, so that it moves where they are not enough, or
+nearly stands where there is little room; and its speed where the model has no limit [m/s]."""
 _QUICK, _SOON = 0.5, 4.0
 """Speed from which on a joint has the full weight [m/s], [rad/s]; time in which most arms are reached [s]."""
-_OBJECT_SPEED = 0.3
-"""Speed of an object along its way [m/s], [rad/s]."""
+_BASE_TRIES = 4
+"""Number of times that a base that touches something is drawn anew."""
 
 
 class PlacementSamples:
@@ -41,8 +41,8 @@ class PlacementSamples:
     ----------
     speeds
         Largest speeds (n,) of the moving coordinates [m/s], [rad/s].
-    ease
-        Weights (n,) of their motions: those of slow ones and of the base are small.
+    eases
+        Weights (n,) of their motions that are used in turn: those of slow ones and of the base are small.
     """
 
     def __init__(
@@ -59,7 +59,8 @@ class PlacementSamples:
         speeds = [min(abs(v) for v in model.limits(s.derivative())) for s in moving]
         self.speeds = np.array([v if 0.0 < v < math.inf else _BASE_SPEED for v in speeds])
         on_base = np.array([s in self.base for s in moving], dtype=bool)
-        self.ease = np.where(on_base, _BASE_EASE, np.minimum(1.0, self.speeds / _QUICK))
+        joints = np.minimum(1.0, self.speeds / _QUICK)
+        self.eases = tuple(np.where(on_base, weight, joints) for weight in _BASE_EASE)
 
     def choose_grasps(
         self,
@@ -99,7 +100,13 @@ class PlacementSamples:
         return np.asarray(usable[order[np.clip(near, 0, size - 1)]])
 
     def draw(
-        self, random: np.random.Generator, state: State, hands: Array, approaches: Array, starts: int
+        self,
+        random: np.random.Generator,
+        state: State,
+        hands: Array,
+        approaches: Array,
+        starts: int,
+        blocked: Callable[[Array], npt.NDArray[np.bool_]],
     ) -> tuple[Array, Array]:
         """Return random arms (N, n), and bases (N, m) in front of poses of the hand (N, 4, 4).
 
@@ -113,6 +120,8 @@ class PlacementSamples:
             Poses of the hand at the handle, and before it.
         starts
             Number of successive samples that share a base.
+        blocked
+            Function of places of the base (B, 3) that returns flags (B,) of those where it touches something.
         """
         count = len(hands)
         here = state.vector(self.moving)
@@ -125,30 +134,35 @@ class PlacementSamples:
         Q = random.uniform(low, high)
         still = np.tile(state.vector(self.standing), (count, 1))
         if self.base:
-            out = (approaches - hands)[:, :2, 3]
-            angle = np.where(
-                np.hypot(*out.T) > 0.02, np.arctan2(out[:, 1], out[:, 0]), random.uniform(-3.2, 3.2, count)
-            )
-            angle, distance, turn = (
-                np.repeat(values[::starts], starts)[:count]
-                for values in (
-                    angle + random.uniform(-_SIDE, _SIDE, count),
-                    random.uniform(_NEAREST, _FARTHEST, count),
-                    random.uniform(-_TURN, _TURN, count),
-                )
-            )
-            place = hands[:, :2, 3] + distance[:, None] * np.stack([np.cos(angle), np.sin(angle)], axis=1)
-            values = np.column_stack([place, angle + math.pi + turn])
+            first = slice(None, None, starts)
+            out, at = (approaches - hands)[first, :2, 3], hands[first, :2, 3]
+            values = self._draw_bases(random, out, at)
+            for _ in range(_BASE_TRIES):
+                hits = blocked(values)
+                if not hits.any():
+                    break
+                values[hits] = self._draw_bases(random, out[hits], at[hits])
+            values = np.repeat(values, starts, axis=0)[:count]
             for k, s in enumerate(self.base):
                 columns, array = (self.moving, Q) if s in self.moving else (self.standing, still)
                 array[:, columns.index(s)] = values[:, k]
         return Q, still
 
+    def _draw_bases(self, random: np.random.Generator, out: Array, hands: Array) -> Array:
+        """Return random places (B, 3) of a base in front of hands (B, 2) that come from some directions."""
+        count = len(out)
+        angle = np.arctan2(out[:, 1], out[:, 0]) + random.uniform(-_SIDE, _SIDE, count)
+        angle = np.where(np.hypot(*out.T) > 0.02, angle, random.uniform(-math.pi, math.pi, count))
+        distance = random.uniform(_NEAREST, _FARTHEST, count)
+        turn = random.uniform(-_TURN, _TURN, count)
+        place = hands + distance[:, None] * np.stack([np.cos(angle), np.sin(angle)], axis=1)
+        return np.column_stack([place, angle + math.pi + turn])
+
     def cost(self, state: State, ways: Array, approaches: Array, ends: npt.NDArray[np.int_]) -> Array:
         """Return the costs (N,) of ways (N, K, n) until indices (N,): their times, and nearness to limits.
 
         ``approaches`` (N, n) are the configurations before the hand is at the handle; the time [s] to get
-        there from a state counts half.
+        there from a state counts as well.
         """
         away = approaches - state.vector(self.moving)
         away = np.where(self._bounded, away, (away + math.pi) % (2 * math.pi) - math.pi)
@@ -160,11 +174,12 @@ class PlacementSamples:
         steps = (np.abs(np.diff(ways, axis=1)) / self.speeds).max(axis=2, initial=0.0)
         used = np.arange(steps.shape[1]) < ends[:, None]
         along = (steps * used).sum(axis=1)
-        width = np.where(self._bounded, self.upper - self.lower, np.inf)
-        room = np.minimum(ways - self.lower, self.upper - ways) / width
-        room = np.where(self._bounded & np.append(used, used[:, -1:], axis=1)[:, :, None], room, 1.0)
+        lower, upper = self.lower[self._bounded], self.upper[self._bounded]
+        bounded = ways[:, :, self._bounded]
+        room = np.minimum(bounded - lower, upper - bounded) / (upper - lower)
+        room = np.where(np.append(used, used[:, -1:], axis=1)[:, :, None], room, 1.0)
         least = room.min(axis=(1, 2), initial=1.0)
-        return np.asarray(along + 0.5 * there - 40.0 * np.minimum(least, 0.1))
+        return np.asarray(along + there - 40.0 * np.minimum(least, 0.1))
 
 
 def find_planar_base(model: ModelView, symbols: Sequence[Symbol]) -> tuple[Symbol, ...]:

@@ -12,7 +12,7 @@ from .push_controller import Pushing
 from .push_placement import find_push_start
 from .pushing import push
 
-_SAMPLES, _SEARCHING = 120, 20.0
+_SAMPLES, _SEARCHING = 120, 60.0
 """Largest number of sampled starts, and largest time of their search [s]."""
 _PLANNING = 1.0
 """Largest time to plan the way to a start [s]."""

@@ -1,0 +1,65 @@
+"""Results of searches of base placements."""
+
+from __future__ import annotations
+
+from collections import Counter
+from dataclasses import dataclass
+
+from kineverse.grasping import Grasp
+from kineverse.lie import Array
+from kineverse.symbols import Symbol
+
+NO_WAY = "no way to the handle"
+"""Reason of placements that are refused."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class BasePlacement:
+    """Base, grasp and way of the arm, true if they were found.
+
+    Attributes
+    ----------
+    grasp
+        The grasp; None if nothing was found.
+    coordinates
+        Coordinates (n,) of the robot: base and arm.
+    approach, line
+        Configuration (n,) before the hand is at the handle, and those (L, n) from there to the grasp.
+    values, way
+        Values (K,) of the object's coordinate [m], [rad], and configurations (K, n) of the robot there. They
+        end at the target, or where the arm or something in the way ends them.
+    retreat
+        Configurations (L, n) with which the hand goes away from the handle at the end.
+    samples
+        Number of sampled bases.
+    reasons
+        Number of samples by the reason of their failure.
+    seconds
+        Duration of the search [s].
+    """
+
+    grasp: Grasp | None
+    coordinates: tuple[Symbol, ...]
+    approach: Array
+    line: Array
+    values: Array
+    way: Array
+    retreat: Array
+    samples: int
+    reasons: Counter[str]
+    seconds: float
+
+    def __bool__(self) -> bool:
+        return self.grasp is not None
+
+    @property
+    def failure(self) -> str:
+        """Class of the failure: ``"collision"`` if an arm reaches along the way, otherwise ``"reach"``."""
+        return "collision" if any(" at " in r or r == NO_WAY for r in self.reasons) else "reach"
+
+    @property
+    def why(self) -> str:
+        """Text with the number of samples and the reasons of failures."""
+        failed = ", ".join(f"{n} {reason}" for reason, n in self.reasons.most_common(6) if n)
+        found = f"Found after {self.samples} bases" if self else f"None of {self.samples} bases goes through"
+        return f"{found}; failed: {failed}." if failed else f"{found}."
