@@ -1,0 +1,266 @@
+"""Belief about a part of unknown motion: where its marker is seen, and how a hand holds it."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+
+import numpy as np
+
+from kineverse.compile import compile  # noqa: A004
+from kineverse.errors import UnknownNameError, suggest
+from kineverse.estimation import pose_covariance
+from kineverse.lie import Array, inverse, pose_difference, retract, rotation_angle, skew
+from kineverse.state import State
+from kineverse.symbols import Symbol
+from kineverse.worlds import Observation, Sensors, World
+from kineverse.worlds.sensor_sampler import find_camera, is_of_robot
+
+from .unknown_part import UnknownPart
+
+_FLOOR_POSITION, _FLOOR_ORIENTATION = 2e-4, 2e-4
+"""Least standard deviations of observed poses [m], [rad]: no camera is exact."""
+_HELD_LOOKS, _STATIC_LOOKS = 10.0, 60.0
+"""Number of looks that a mean is worth: of the part in the hand, which slips, and of what stands still."""
+_NEAR, _TURNED = 0.06, 0.35
+"""Distance [m] and angle [rad] from where a part is believed beyond which a look is an outlier."""
+_FIRST = 5
+"""Number of first looks of which the largest cluster is believed."""
+LOST_LOOKS = 6
+"""Outliers in a row after which a part is not where it was believed."""
+
+
+@dataclass(slots=True, eq=False)
+class PoseMean:
+    """Running mean of poses that leaves outliers out.
+
+    Attributes
+    ----------
+    looks
+        Number of looks that the mean is worth at most.
+    pose
+        The mean (4, 4); None before the first pose.
+    count
+        Number of poses in the mean.
+    missed
+        Number of outliers in a row.
+    """
+
+    looks: float
+    pose: Array | None = None
+    count: int = 0
+    missed: int = 0
+    _first: list[Array] = field(default_factory=list)
+
+    def add(self, pose: Array) -> bool:
+        """Add a pose, and return False if it is an outlier."""
+        if self.pose is not None and len(self._first) == _FIRST:
+            if not _is_near(pose, self.pose):
+                self.missed += 1
+                return False
+            self.count, self.missed = self.count + 1, 0
+            step = pose_difference(pose, self.pose) / min(self.count, self.looks)
+            self.pose = retract(self.pose, step)
+            return True
+        self._first.append(pose)
+        clusters = [[b for b in self._first if _is_near(b, a)] for a in self._first]
+        best = max(clusters, key=len)
+        self.pose = retract(best[0], pose_difference(np.array(best), best[0]).mean(axis=0))
+        self.count = len(best)
+        return _is_near(pose, self.pose)
+
+
+def _is_near(a: Array, b: Array) -> bool:
+    error = pose_difference(a, b)
+    return bool(np.linalg.norm(error[:3]) <= _NEAR and np.linalg.norm(error[3:]) <= _TURNED)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class PartLook:
+    """Look at the part that is no outlier.
+
+    Attributes
+    ----------
+    pose
+        Pose (4, 4) of the part relative to what it moves in.
+    covariance
+        Covariance (6, 6) of its errors.
+    time
+        Time [s].
+    """
+
+    pose: Array
+    covariance: Array
+    time: float
+
+
+class PartBelief:
+    """Belief in which the robot is read by its encoders, and a part of unknown motion is seen.
+
+    Before a hand holds the part, it stands where the mean of all looks is. In a hand it is where the hand is,
+    times the mean of the last looks at the part in the hand. So the estimate does not lag behind the motion,
+    and looks that are far from it are outliers.
+
+    Parameters
+    ----------
+    unknown
+        The part.
+    world
+        The world, of which observations alone are read.
+    state
+        Values of everything that is not observed.
+    hand
+        Frame of the robot's hand.
+    marker, beside
+        Marked frames of the part, and of what it moves in; None for the world.
+    sensors
+        Stated noise of the looks.
+
+    Attributes
+    ----------
+    observation
+        The last observation.
+    looks
+        Looks since :meth:`hold` that are no outliers.
+
+    Raises
+    ------
+    UnknownNameError
+        If the marker is no frame of the model.
+    """
+
+    def __init__(
+        self,
+        unknown: UnknownPart,
+        world: World,
+        state: State,
+        hand: str,
+        marker: str,
+        beside: str | None,
+        sensors: Sensors,
+    ) -> None:
+        model = unknown.model
+        for name in (marker, *([beside] if beside else [])):
+            if name not in model.frames:
+                raise UnknownNameError(
+                    f"The model has no frame '{name}'. {suggest(name, model.frames, 'frame')}"
+                )
+        self.unknown, self.marker, self.beside, self.sensors = unknown, marker, beside, sensors
+        own = [name for name in model.frames if is_of_robot(name, world.robot)]
+        self._symbols = {s for s in model.symbols if not s.order}
+        self._camera = compile(model.fk(sensors.camera or find_camera(own) or own[0]))
+        self._hand = compile(model.fk(hand))
+        self._state = model.default_state().updated({s: v for s, v in state.items() if s in self._symbols})
+        self._marker_T_part = np.asarray(model.fk(unknown.frame, marker)({}))
+        self._world_T_parent = np.asarray(model.fk(unknown.parent)(self._state))
+        self.still = PoseMean(_STATIC_LOOKS)
+        self.reference = PoseMean(_STATIC_LOOKS)
+        self.held: PoseMean | None = None
+        self.looks: list[PartLook] = []
+        self.extra: dict[Symbol, float] = {}
+        self.observation: Observation | None = None
+        self._world_T_hand = np.eye(4)
+
+    @property
+    def is_seen(self) -> bool:
+        """Whether the part, and what it moves in, were seen often enough to be believed."""
+        return self.still.count >= _FIRST and (self.beside is None or self.reference.count >= _FIRST)
+
+    @property
+    def is_lost(self) -> bool:
+        """Whether the part is no longer where the hand is."""
+        return self.held is not None and self.held.missed >= LOST_LOOKS
+
+    @property
+    def pose(self) -> Array:
+        """Believed pose world_T_part (4, 4)."""
+        if self.held is not None and self.held.pose is not None:
+            return self._world_T_hand @ self.held.pose
+        if self.still.pose is not None:
+            return self.still.pose
+        return self._world_T_parent @ self.unknown.parent_T_frame
+
+    @property
+    def relative_pose(self) -> Array:
+        """Believed pose (4, 4) of the part relative to what it moves in."""
+        return inverse(self.reference_pose) @ self.pose
+
+    @property
+    def reference_pose(self) -> Array:
+        """Believed pose (4, 4) of what the part moves in."""
+        return np.eye(4) if self.reference.pose is None else self.reference.pose
+
+    @property
+    def hand_pose(self) -> Array:
+        """Pose world_T_hand (4, 4) by the encoders."""
+        return self._world_T_hand
+
+    def hold(self) -> None:
+        """From now on the part is in the hand."""
+        self.held, self.looks = PoseMean(_HELD_LOOKS), []
+
+    def release(self) -> None:
+        """From now on the part stands where it is believed."""
+        pose = self.pose
+        self.held, self.still = None, PoseMean(_STATIC_LOOKS)
+        for _ in range(_FIRST):
+            self.still.add(pose)
+
+    def reset(self) -> None:
+        """Forget all looks."""
+        self.held, self.looks = None, []
+        self.still, self.reference = PoseMean(_STATIC_LOOKS), PoseMean(_STATIC_LOOKS)
+
+    def update(self, world: World, commands: State | None = None) -> State:
+        """Return the state of the model of the part after reading the sensors."""
+        seen = self.observation = world.observe()
+        joints = {s: v for s, v in seen.joints.items() if s in self._symbols}
+        self._state = self._state.updated(joints)
+        self._world_T_hand = self._hand(self._state.vector(self._hand.inputs))
+        if self.beside is not None and (pose := seen.poses.get(self.beside)) is not None:
+            self.reference.add(pose)
+        if (pose := seen.poses.get(self.marker)) is not None:
+            self._look(pose, seen.stamp)
+        part = self.unknown.values(inverse(self._world_T_parent) @ self.pose)
+        self._state = self._state.updated(part)
+        values = {**dict(self._state.items()), **self.extra}
+        return State(values, stamp=seen.stamp, source="looks")
+
+    def deviation(self, coordinate: Symbol) -> float:
+        """Return 0: only coordinates of the robot are used, and its encoders are exact enough."""
+        return 0.0
+
+    def _look(self, world_T_marker: Array, time: float) -> None:
+        """Take a look at the part."""
+        pose = world_T_marker @ self._marker_T_part
+        if self.held is None:
+            self.still.add(pose)
+            return
+        if self.held.add(inverse(self._world_T_hand) @ pose) and self.reference_is_known:
+            relative = inverse(self.reference_pose)
+            covariance = self._covariance(world_T_marker, pose)
+            turn = np.kron(np.eye(2), relative[:3, :3])
+            self.looks.append(PartLook(relative @ pose, turn @ covariance @ turn.T, time))
+
+    @property
+    def reference_is_known(self) -> bool:
+        """Whether what the part moves in was seen."""
+        return self.beside is None or self.reference.pose is not None
+
+    def _covariance(self, world_T_marker: Array, world_T_part: Array) -> Array:
+        """Return the covariance (6, 6) of an observed pose of the part in the world."""
+        camera = self._camera(self._state.vector(self._camera.inputs))
+        distance = float(np.linalg.norm(camera[:3, 3] - world_T_marker[:3, 3]))
+        position = float(self.sensors.position_noise(np.asarray(distance)))
+        noise = pose_covariance(
+            max(position, _FLOOR_POSITION), max(self.sensors.orientation, _FLOOR_ORIENTATION)
+        )
+        # An error of the marker's orientation displaces the part by the lever between both.
+        moved = np.eye(6)
+        moved[:3, 3:] = -skew(world_T_part[:3, 3] - world_T_marker[:3, 3])
+        return moved @ noise @ moved.T
+
+
+def measure_way(first: Array, last: Array, point: Array) -> tuple[float, float]:
+    """Return the distance [m] by which a point (3,) of a part moved between two poses, and the angle [rad]."""
+    a, b = (pose @ np.append(point, 1.0) for pose in (first, last))
+    return float(np.linalg.norm((b - a)[:3])), float(rotation_angle(first[:3, :3].T @ last[:3, :3]))
