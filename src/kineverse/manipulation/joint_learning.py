@@ -55,13 +55,14 @@ class JointLearning:
     learned
         The decision; None before. Its fit is the latest one of the family, its motion and time are those of
         the decision.
-    poses
-        Number of poses.
+    likely
+        The most probable joint, if the last call of :meth:`update` looked for it; it need not be certain.
     """
 
     def __init__(self) -> None:
         self._identifier = Identifier()
         self.learned: LearnedJoint | None = None
+        self.likely: Fit | None = None
         self._family, self._looks, self._evaluated = "", 0, 0
 
     @property
@@ -83,11 +84,16 @@ class JointLearning:
         time
             Time of the world [s].
         """
-        if self.poses < self._evaluated + _EVERY or (way < LEAST_WAY and turn < LEAST_TURN):
+        self.likely = None
+        if self.poses < self._evaluated + _EVERY:
             return False
         self._evaluated = self.poses
         result = self._identifier.result
         fit = result.best
+        if fit.joint_values.shape[1] == 1 and fit.is_determined:
+            self.likely = fit
+        if way < LEAST_WAY and turn < LEAST_TURN:
+            return False
         certain = fit.probability >= CERTAIN and not result.is_ambiguous and fit.joint_values.shape[1] == 1
         self._looks = self._looks + 1 if certain and fit.family == self._family else int(certain)
         self._family = fit.family if certain else ""

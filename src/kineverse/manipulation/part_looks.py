@@ -2,30 +2,31 @@
 
 from __future__ import annotations
 
+import math
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 
 import numpy as np
 
 from kineverse.compile import compile  # noqa: A004
-from kineverse.errors import UnknownNameError, suggest
-from kineverse.estimation import pose_covariance
+from kineverse.estimation import PlausibilityMonitor, pose_covariance
 from kineverse.lie import Array, inverse, pose_difference, retract, rotation_angle, skew
+from kineverse.model.frame import WORLD
 from kineverse.state import State
-from kineverse.symbols import Symbol
 from kineverse.worlds import Observation, Sensors, World
 from kineverse.worlds.sensor_sampler import find_camera, is_of_robot
 
-from .unknown_part import UnknownPart
+from .unknown_part import JointPath, UnknownPart
 
 _FLOOR_POSITION, _FLOOR_ORIENTATION = 2e-4, 2e-4
 """Least standard deviations of observed poses [m], [rad]: no camera is exact."""
-_HELD_LOOKS, _STATIC_LOOKS = 10.0, 60.0
+_HELD_LOOKS, _STATIC_LOOKS = 12.0, 60.0
 """Number of looks that a mean is worth: of the part in the hand, which slips, and of what stands still."""
 _NEAR, _TURNED = 0.06, 0.35
 """Distance [m] and angle [rad] from where a part is believed beyond which a look is an outlier."""
 _FIRST = 5
 """Number of first looks of which the largest cluster is believed."""
-LOST_LOOKS = 6
+_LOST_LOOKS = 6
 """Outliers in a row after which a part is not where it was believed."""
 
 
@@ -54,7 +55,7 @@ class PoseMean:
     def add(self, pose: Array) -> bool:
         """Add a pose, and return False if it is an outlier."""
         if self.pose is not None and len(self._first) == _FIRST:
-            if not _is_near(pose, self.pose):
+            if not is_near(pose, self.pose):
                 self.missed += 1
                 return False
             self.count, self.missed = self.count + 1, 0
@@ -62,14 +63,15 @@ class PoseMean:
             self.pose = retract(self.pose, step)
             return True
         self._first.append(pose)
-        clusters = [[b for b in self._first if _is_near(b, a)] for a in self._first]
+        clusters = [[b for b in self._first if is_near(b, a)] for a in self._first]
         best = max(clusters, key=len)
         self.pose = retract(best[0], pose_difference(np.array(best), best[0]).mean(axis=0))
         self.count = len(best)
-        return _is_near(pose, self.pose)
+        return is_near(pose, self.pose)
 
 
-def _is_near(a: Array, b: Array) -> bool:
+def is_near(a: Array, b: Array) -> bool:
+    """Return whether two poses (4, 4) of a part are as near as looks at the same pose."""
     error = pose_difference(a, b)
     return bool(np.linalg.norm(error[:3]) <= _NEAR and np.linalg.norm(error[3:]) <= _TURNED)
 
@@ -110,10 +112,14 @@ class PartBelief:
         Values of everything that is not observed.
     hand
         Frame of the robot's hand.
-    marker, beside
-        Marked frames of the part, and of what it moves in; None for the world.
+    markers
+        Marked frames of the part.
+    ancestors
+        Frames of what it may move in, the nearest first: the first one that is seen is the reference.
     sensors
         Stated noise of the looks.
+    monitor
+        Test of the believed joint of the part, which gets all looks.
 
     Attributes
     ----------
@@ -121,11 +127,8 @@ class PartBelief:
         The last observation.
     looks
         Looks since :meth:`hold` that are no outliers.
-
-    Raises
-    ------
-    UnknownNameError
-        If the marker is no frame of the model.
+    path
+        Joint along which the held part moves, as far as it is known; the part is believed to be on it.
     """
 
     def __init__(
@@ -134,47 +137,58 @@ class PartBelief:
         world: World,
         state: State,
         hand: str,
-        marker: str,
-        beside: str | None,
+        markers: Sequence[str],
+        ancestors: Sequence[str],
         sensors: Sensors,
+        monitor: PlausibilityMonitor | None = None,
     ) -> None:
         model = unknown.model
-        for name in (marker, *([beside] if beside else [])):
-            if name not in model.frames:
-                raise UnknownNameError(
-                    f"The model has no frame '{name}'. {suggest(name, model.frames, 'frame')}"
-                )
-        self.unknown, self.marker, self.beside, self.sensors = unknown, marker, beside, sensors
+        self.unknown, self.sensors, self.monitor = unknown, sensors, monitor
+        self._ancestors = tuple(ancestors)
         own = [name for name in model.frames if is_of_robot(name, world.robot)]
         self._symbols = {s for s in model.symbols if not s.order}
         self._camera = compile(model.fk(sensors.camera or find_camera(own) or own[0]))
         self._hand = compile(model.fk(hand))
         self._state = model.default_state().updated({s: v for s, v in state.items() if s in self._symbols})
-        self._marker_T_part = np.asarray(model.fk(unknown.frame, marker)({}))
+        self._marker_T_part = {name: np.asarray(model.fk(unknown.frame, name)({})) for name in markers}
         self._world_T_parent = np.asarray(model.fk(unknown.parent)(self._state))
-        self.still = PoseMean(_STATIC_LOOKS)
-        self.reference = PoseMean(_STATIC_LOOKS)
-        self.held: PoseMean | None = None
-        self.looks: list[PartLook] = []
-        self.extra: dict[Symbol, float] = {}
+        self.reset()
+        self.path: JointPath | None = None
         self.observation: Observation | None = None
         self._world_T_hand = np.eye(4)
 
     @property
     def is_seen(self) -> bool:
-        """Whether the part, and what it moves in, were seen often enough to be believed."""
-        return self.still.count >= _FIRST and (self.beside is None or self.reference.count >= _FIRST)
+        """Whether the part was seen often enough to be believed."""
+        return self.still.count >= _FIRST
 
     @property
-    def is_lost(self) -> bool:
-        """Whether the part is no longer where the hand is."""
-        return self.held is not None and self.held.missed >= LOST_LOOKS
+    def beside(self) -> str:
+        """Frame in which the part moves: the nearest one above it that was seen, or the world."""
+        seen = (name for name, mean in self._references.items() if mean.count >= _FIRST)
+        return next(seen, WORLD) if self._beside is None else self._beside
+
+    def slip(self, part_T_hand: Array, point: Array) -> float:
+        """Return how far a point (3,) of the part is from its place in the hand [m], inf if it is not seen.
+
+        Parameters
+        ----------
+        part_T_hand
+            Place (4, 4) of the hand on the part.
+        point
+            The point, in the frame of the part.
+        """
+        if self.held is None or self.held.pose is None or self.held.missed >= _LOST_LOOKS:
+            return math.inf
+        place = np.append(point, 1.0)
+        return float(np.linalg.norm((self.held.pose - inverse(part_T_hand)) @ place))
 
     @property
     def pose(self) -> Array:
         """Believed pose world_T_part (4, 4)."""
         if self.held is not None and self.held.pose is not None:
-            return self._world_T_hand @ self.held.pose
+            pose = self._world_T_hand @ self.held.pose
+            return pose if self.path is None else self.reference_pose @ self.path.pose(self.path.value)
         if self.still.pose is not None:
             return self.still.pose
         return self._world_T_parent @ self.unknown.parent_T_frame
@@ -187,7 +201,8 @@ class PartBelief:
     @property
     def reference_pose(self) -> Array:
         """Believed pose (4, 4) of what the part moves in."""
-        return np.eye(4) if self.reference.pose is None else self.reference.pose
+        mean = self._references.get(self.beside)
+        return np.eye(4) if mean is None or mean.pose is None else mean.pose
 
     @property
     def hand_pose(self) -> Array:
@@ -196,19 +211,28 @@ class PartBelief:
 
     def hold(self) -> None:
         """From now on the part is in the hand."""
-        self.held, self.looks = PoseMean(_HELD_LOOKS), []
+        self._beside = self.beside
+        self.held, self.looks = PoseMean(_STATIC_LOOKS), []
+
+    def begin_motion(self) -> None:
+        """From now on the part may move in the hand."""
+        assert self.held is not None
+        self.held.looks = _HELD_LOOKS
 
     def release(self) -> None:
         """From now on the part stands where it is believed."""
         pose = self.pose
-        self.held, self.still = None, PoseMean(_STATIC_LOOKS)
+        self.held, self.path, self.still = None, None, PoseMean(_STATIC_LOOKS)
         for _ in range(_FIRST):
             self.still.add(pose)
 
     def reset(self) -> None:
         """Forget all looks."""
-        self.held, self.looks = None, []
-        self.still, self.reference = PoseMean(_STATIC_LOOKS), PoseMean(_STATIC_LOOKS)
+        self.held: PoseMean | None = None
+        self.looks: list[PartLook] = []
+        self.still = PoseMean(_STATIC_LOOKS)
+        self._references = {name: PoseMean(_STATIC_LOOKS) for name in self._ancestors}
+        self._beside: str | None = None
 
     def update(self, world: World, commands: State | None = None) -> State:
         """Return the state of the model of the part after reading the sensors."""
@@ -216,35 +240,41 @@ class PartBelief:
         joints = {s: v for s, v in seen.joints.items() if s in self._symbols}
         self._state = self._state.updated(joints)
         self._world_T_hand = self._hand(self._state.vector(self._hand.inputs))
-        if self.beside is not None and (pose := seen.poses.get(self.beside)) is not None:
-            self.reference.add(pose)
-        if (pose := seen.poses.get(self.marker)) is not None:
-            self._look(pose, seen.stamp)
+        for name, mean in self._references.items():
+            if name in seen.poses:
+                mean.add(seen.poses[name])
+        if self.monitor is not None and seen.poses:
+            known = {name: pose for name, pose in seen.poses.items() if name in self.monitor.frames}
+            self.monitor.update(known, at=seen.stamp)
+        if any(name in seen.poses for name in self._marker_T_part):
+            self._look(seen)
+        if self.path is not None and self.held is not None and self.held.pose is not None:
+            self.path.project(inverse(self.reference_pose) @ self._world_T_hand @ self.held.pose)
         part = self.unknown.values(inverse(self._world_T_parent) @ self.pose)
         self._state = self._state.updated(part)
-        values = {**dict(self._state.items()), **self.extra}
-        return State(values, stamp=seen.stamp, source="looks")
+        return State(self._state, stamp=seen.stamp, source="looks")
 
     def deviation(self, coordinate: Symbol) -> float:
         """Return 0: only coordinates of the robot are used, and its encoders are exact enough."""
         return 0.0
 
-    def _look(self, world_T_marker: Array, time: float) -> None:
-        """Take a look at the part."""
-        pose = world_T_marker @ self._marker_T_part
+    def _look(self, seen: Observation) -> None:
+        """Take a look at the part; several markers are weighted by their information."""
+        looks = []
+        believed = self.held.pose if self.held is not None else self.still.pose
+        frame = self._world_T_hand if self.held is not None else np.eye(4)
+        for name, marker_T_part in self._marker_T_part.items():
+            if (world_T_marker := seen.poses.get(name)) is not None:
+                pose = world_T_marker @ marker_T_part
+                looks.append((pose, self._covariance(world_T_marker, pose)))
+        near = [look for look in looks if believed is not None and is_near(inverse(frame) @ look[0], believed)]
+        pose, covariance = _fuse(near or looks[:1])
         if self.held is None:
             self.still.add(pose)
-            return
-        if self.held.add(inverse(self._world_T_hand) @ pose) and self.reference_is_known:
+        elif self.held.add(inverse(frame) @ pose):
             relative = inverse(self.reference_pose)
-            covariance = self._covariance(world_T_marker, pose)
             turn = np.kron(np.eye(2), relative[:3, :3])
-            self.looks.append(PartLook(relative @ pose, turn @ covariance @ turn.T, time))
-
-    @property
-    def reference_is_known(self) -> bool:
-        """Whether what the part moves in was seen."""
-        return self.beside is None or self.reference.pose is not None
+            self.looks.append(PartLook(relative @ pose, turn @ covariance @ turn.T, seen.stamp))
 
     def _covariance(self, world_T_marker: Array, world_T_part: Array) -> Array:
         """Return the covariance (6, 6) of an observed pose of the part in the world."""
@@ -258,6 +288,18 @@ class PartBelief:
         moved = np.eye(6)
         moved[:3, 3:] = -skew(world_T_part[:3, 3] - world_T_marker[:3, 3])
         return moved @ noise @ moved.T
+
+
+def _fuse(looks: Sequence[tuple[Array, Array]]) -> tuple[Array, Array]:
+    """Return the mean of poses weighted by their information, and its covariance (6, 6)."""
+    first, covariance = looks[0]
+    if len(looks) == 1:
+        return first, covariance
+    informations = [np.linalg.inv(covariance) for _, covariance in looks]
+    errors = [pose_difference(pose, first) for pose, _ in looks]
+    whole = np.linalg.inv(sum(informations))
+    step = whole @ sum(info @ error for info, error in zip(informations, errors, strict=True))
+    return retract(first, step), whole
 
 
 def measure_way(first: Array, last: Array, point: Array) -> tuple[float, float]:

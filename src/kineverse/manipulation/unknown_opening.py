@@ -1,4 +1,4 @@
-"""Opening of what nobody described: a handle is pulled, the joint is learned, and the part follows it."""
+"""Opening of a part whose joint nobody described: its handle is pulled, and the joint is learned."""
 
 from __future__ import annotations
 
@@ -8,9 +8,18 @@ from typing import Any
 import numpy as np
 
 from kineverse.compile import compile  # noqa: A004
-from kineverse.errors import InfeasibleError, InvalidValueError, KineverseError, NotFiniteError, UnknownNameError, suggest
+from kineverse.errors import (
+    InfeasibleError,
+    InvalidValueError,
+    KineverseError,
+    NotFiniteError,
+    UnknownNameError,
+    suggest,
+)
+from kineverse.estimation import PlausibilityMonitor, pose_covariance
 from kineverse.grasping import Grasp, find_gripper, sample_grasps
 from kineverse.lie import Array, inverse
+from kineverse.model.frame import WORLD
 from kineverse.model.model import Model
 from kineverse.planning import Planner
 from kineverse.worlds import Judge, Sensors
@@ -21,23 +30,29 @@ from .outcome import Outcome, SkillError
 from .part_looks import PartBelief, measure_way
 from .placement import BasePlacement, PlacementSearch
 from .session import Session
-from .unknown_part import find_joint, free_part, write_joint
+from .unknown_part import JointPath, find_joint, free_part, write_joint
 from .unknown_pull import LearnedPull, StraightPull, learn_model, place_beside
 
 OPEN_WAY, OPEN_TURN = 0.25, math.radians(60.0)
 """Opening that is wanted by default [m], [rad]."""
-_LOOKING, _HELD_LOOKING = 0.6, 0.7
-"""Times of looks before the approach, and with the hand closed [s]."""
-_MOST_LOOKING = 3.0
+_LEAST_WAY, _LEAST_TURN = 0.08, math.radians(10.0)
+"""Opening from which a part that goes no further counts as open [m], [rad]."""
+_LOOKING, _HELD_LOOKING, _MOST_LOOKING = 0.6, 1.0, 3.0
+"""Times of looks before the approach and with the hand closed, and the largest until a part is seen [s]."""
 _REACHES = (0.25, 0.15, 0.08)
 """Straight ways of the handle that a placement has to allow [m], one after the other."""
 _GRASPS, _PLANNING = 128, 2.0
+_MOST_GRASPS = 3
 _REFIT = 0.5
-"""Time between two fits of a learned joint [s]."""
-_STUCK_WAY, _STUCK_TURN, _PATIENCE = 0.008, math.radians(1.5), 1.5
-"""Motion of a part that follows the hand [m], [rad], in a time [s]."""
-_SLIPPED = 0.03
-"""Distance of the hand from its place on the handle from which on the handle has slipped [m]."""
+"""Time between two controllers for a learned joint [s]."""
+_FOLLOWS, _STALLED, _PATIENCE = 0.01, 0.004, 1.5
+"""Motion of a part that follows the hand, and its least progress [m] in a time [s]."""
+_SLIPPED = 0.012
+"""Distance of the handle from its place in the hand from which on it has slipped [m]."""
+_LIKELY = 0.01
+"""Way of a part from which on the likeliest joint leads the pull [m]."""
+_MOVED, _TURNED = 0.01, math.radians(1.0)
+"""Distance [m] and angle [rad] of furniture from where it was believed that are reported."""
 
 
 def open_unknown(
@@ -47,7 +62,6 @@ def open_unknown(
     model: Model,
     part: str | None = None,
     beside: str | None = None,
-    marker: str | None = None,
     sensors: Sensors | None = None,
     way: float = OPEN_WAY,
     turn: float = OPEN_TURN,
@@ -56,118 +70,243 @@ def open_unknown(
     placements: int = 1000,
     seed: int = 0,
 ) -> Outcome:
-    """Open a part whose joint is unknown by its handle, and write the learned joint into a model.
+    """Open a part whose joint is unknown, or not as believed, and write the learned joint into a model.
+
+    The robot sees markers on the part and on what it moves in. It grasps the handle, pulls straight along its
+    outward normal and yields to all other motion, while the joint is identified. As soon as its family is
+    certain, it is a joint of a model that a controller holds the hand to, and it is fitted anew on the way.
+    A handle that slips out of the hand is grasped anew.
+
+    If the model has a joint for the part already, that is tested meanwhile. It stays if it explains what was
+    seen. Else the learned joint replaces it.
+
+    Parameters
+    ----------
+    session
+        Robot in a world; of the world only observations are used. Its belief is another one meanwhile.
+    handle
+        Frame of the handle's body in the model.
+    model
+        What is known: the robot, what is around, and the bodies of the part, however they are attached. It is
+        edited at the end, if the joint was learned and the model had another one or none.
+    part
+        Frame of the part; by default that of the joint above the handle, or the handle's if there is none.
+    beside
+        Frame with a marker in which the part moves; by default the nearest frame above the part that is seen
+        and stands still, or the world as the robot's odometry has it.
+    sensors
+        Stated noise of the observations; exact by default.
+    way, turn
+        Wanted opening: way of the handle of a part that slides [m], angle of one that turns [rad].
+    hand
+        Frame of the hand, found by default.
+    seconds
+        Largest time in the world [s].
+    placements
+        Largest number of sampled bases.
+    seed
+        Seed of all searches.
+
+    Returns
+    -------
+    Outcome
+        Its value is the true opening [m], [rad]. ``measures``: those of :class:`.Judge`; true ``way`` [m] and
+        ``turn`` [rad]; ``family``, with ``decided_way`` [m], ``decided_turn`` [rad] and ``decided_seconds``
+        of the pull after which it was certain; ``axis`` and ``point`` in ``parent``; ``pull_seconds`` from
+        the first grasp on; ``grasps``; ``believed``, the verdict on the joint of the model; and ``failure``
+        if it was not done.
+
+    Raises
+    ------
+    UnknownNameError, InvalidValueError
+        For frames that do not exist, a robot without a gripper, a handle that is none, or a wanted opening
+        that is not positive.
     """
-    run = _Run(session, handle, model, part, beside, marker, sensors, (way, turn), hand, seconds, placements, seed)
-    return run.perform()
+    for name, value in (("way", way), ("turn", turn), ("seconds", seconds)):
+        if not (math.isfinite(value) and value > 0.0):
+            raise InvalidValueError(f"{name}= is a positive number, not {value!r}.")
+    for name in (handle, *(n for n in (part, beside) if n is not None)):
+        if name not in model.frames:
+            raise UnknownNameError(f"There is no frame '{name}'. {suggest(name, model.frames, 'frame')}")
+    return _Run(session, model, handle, part, beside, sensors, (way, turn), hand, seconds, placements, seed)()
 
 
 class _Run:
-    def __init__(self, session, handle, model, part, beside, marker, sensors, wanted, hand, seconds, placements, seed):
-        self.session, self.model = session, model
-        world = session.world
-        self.sensors = sensors or Sensors()
-        self.wanted, self.seconds, self.samples, self.seed = wanted, seconds, placements, seed
-        self.gripper = find_gripper(model, world.robot, hand)
-        if handle not in model.frames:
-            raise UnknownNameError(f"There is no frame '{handle}'. {suggest(handle, model.frames, 'frame')}")
-        seen = set(world.observe().poses)
-        self.frame = part or handle
-        self.beside = beside
-        self.unknown = free_part(model, self.frame, handle, session.state)
-        marker = marker or handle
-        self.belief = PartBelief(
-            self.unknown, world, session.state, self.gripper.hand, marker, self.beside, self.sensors
-        )
-        self.begin, self.first_step = world.time, session.steps
-        self.learning = JointLearning()
-        self.measures: dict[str, Any] = {}
+    """One opening: its phases, and what was found on the way."""
 
-    def perform(self) -> Outcome:
-        session, world = self.session, self.session.world
-        before = session.belief
-        truth = compile(world.model.fk(self.belief.marker, self.beside or "world"))
-        def part_truth():
-            return truth(world.state.vector(truth.inputs)) @ self.belief._marker_T_part
+    def __init__(
+        self,
+        session: Session,
+        model: Model,
+        handle: str,
+        part: str | None,
+        beside: str | None,
+        sensors: Sensors | None,
+        wanted: tuple[float, float],
+        hand: str | None,
+        seconds: float,
+        placements: int,
+        seed: int,
+    ) -> None:
+        self.session, self.model, self.world = session, model, session.world
+        self.wanted, self.seconds, self.samples, self.seed = wanted, seconds, placements, seed
+        self.gripper = find_gripper(model, self.world.robot, hand)
+        above = _ancestors(model, handle)
+        self.part = part or next((f for f in (handle, *above) if find_joint(model, f)), handle)
+        if self.part not in (handle, *above):
+            raise InvalidValueError(
+                f"The handle '{handle}' does not hang on the part '{self.part}'; above it are {', '.join(above)}."
+            )
+        before = model.default_state()
+        before = before.updated({s: v for s, v in session.state.items() if s in before})
+        self.unknown = unknown = free_part(model, self.part, handle, before)
+        self.frame_T_handle = np.asarray(unknown.model.fk(handle, self.part)({}))
+        self.point = (self.frame_T_handle @ unknown.handle.pose)[:3, 3]
+        rigid = [f for f in model.frames if f == self.part or self.part in _ancestors(model, f)]
+        markers = [f for f in rigid if not unknown.model.fk(f, self.part).symbols]
+        still = [f for f in _ancestors(model, self.part) if not model.fk(f).symbols]
+        references = still if beside is None else [beside]
+        self.belief = PartBelief(
+            unknown,
+            self.world,
+            before,
+            self.gripper.hand,
+            markers,
+            references,
+            sensors or Sensors(),
+            self._make_monitor((*markers, *references), sensors or Sensors()),
+        )
+        self.learning = JointLearning()
+        self.measures: dict[str, Any] = {"grasps": 0}
+        self.first_step, self.begin = session.steps, self.world.time
+        names = [f for f in markers if f in self.world.model.frames]
+        self._truth = compile(self.world.model.fk((names or [handle])[0]))
+
+    def _make_monitor(self, frames: tuple[str, ...], sensors: Sensors) -> PlausibilityMonitor | None:
+        """Return a test of the believed joint, None without one."""
+        if find_joint(self.model, self.part) is None:
+            return None
+        position = float(sensors.position_noise(np.asarray(1.0)))
+        noise = pose_covariance(max(position, 1e-3), max(sensors.orientation, 2e-3))
+        return PlausibilityMonitor(self.model, frames, noise=noise, outliers=sensors.outliers > 0.0 or None)
+
+    def __call__(self) -> Outcome:
+        """Open the part, and return the outcome."""
+        session, world = self.session, self.world
+        believed = session.belief
         session.belief = self.belief
         session.state = self.belief.update(world)
-        reason = kind = ""
-        self.truth0 = part_truth()
+        first = self._true_pose()
+        kind = ""
         try:
             reason = self._open()
         except SkillError as failure:
             reason, kind = str(failure), failure.kind
         except (InfeasibleError, NotFiniteError) as error:
             reason, kind = f"The controller has no command: {error}", "other"
+        finally:
+            session.belief = believed
         session.stop()
-        way, turn = measure_way(self.truth0, part_truth(), self.grip_point)
-        session.belief = before
-        session.state = before.update(world)
-        m = {**self.judge.measures, **self.measures, "way": way, "turn": turn}
-        return Outcome(not kind, turn, reason, world.name, world.time - self.begin, session.steps - self.first_step, m)
+        way, turn = measure_way(first, self._true_pose(), self.point)
+        self.measures |= {"way": way, "turn": turn}
+        learned = self.learning.learned
+        turns = bool(learned.fit.motion.kinds[0]) if learned is not None else turn > 0.5 * _LEAST_TURN
+        if learned is not None:
+            reason = f"{reason} {self._report_joint()}"
+        if kind:
+            self.measures["failure"] = kind
+        return Outcome(
+            not kind, turn if turns else way, reason, world.name, world.time - self.begin,
+            session.steps - self.first_step, {**self.judge.measures, **self.measures},
+        )  # fmt: skip
 
-    @property
-    def grip_point(self) -> Array:
-        return (self.unknown.model.fk(self.unknown.handle.frame, self.frame)({}) @ self.unknown.handle.pose)[:3, 3]
+    def _true_pose(self) -> Array:
+        pose: Array = self._truth(self.world.state.vector(self._truth.inputs))
+        return pose
+
+    # -- phases --------------------------------------------------------------------------------------------
 
     def _open(self) -> str:
+        """Open the part, and return how far, or raise SkillError."""
         session, unknown = self.session, self.unknown
-        self.search = PlacementSearch(unknown.model, self.gripper, session.state)
-        self.planner = Planner(unknown.model, self.search.moving, rules=self.search.scene.rules)
-        self.judge = Judge(session.world.model, session.world.robot, self.gripper, handle=unknown.handle.frame)
-        self.motion = HandMotion(
-            session, self.gripper, unknown.handle, self.search, self.planner, self.judge, self.begin + self.seconds
-        )
-        self._look()
+        robot = self.world.robot
+        self.judge = Judge(self.world.model, robot, self.gripper, handle=unknown.handle.frame)
+        self.judge.update(self.world.state)
         with session.timed("place"):
-            grasps = sample_grasps(unknown.model, self.gripper, unknown.handle, _GRASPS, self.seed)
-        placement = self._place(grasps)
+            self.search = PlacementSearch(unknown.model, self.gripper, session.state)
+            self.planner = Planner(unknown.model, self.search.moving, rules=self.search.scene.rules)
+        self.motion = HandMotion(
+            session, self.gripper, unknown.handle, self.search, self.planner, self.judge,
+            self.begin + self.seconds,
+        )  # fmt: skip
+        self._look()
+        placement = self._place()
+        grasp = placement.grasp
+        assert grasp is not None
         self._approach(placement)
-        if not self.motion.close(placement.grasp):
-            raise SkillError("other", "The fingers closed beside the handle.")
-        grasped = session.world.time
+        self.start, self.pulling = self.belief.relative_pose, self.world.time
         try:
-            reason = self._pull(placement.grasp)
+            return self._pull(grasp)
         finally:
-            self.measures["pull_seconds"] = session.world.time - grasped
+            self.measures["pull_seconds"] = self.world.time - self.pulling
             self.belief.release()
-        self.motion.release(placement.grasp)
-        return reason
+            if not self.motion_is_late():
+                self.motion.release(grasp)
+
+    def motion_is_late(self) -> bool:
+        """Return whether no time is left to let go."""
+        return self.world.time > self.motion.until
 
     def _wait(self, seconds: float) -> None:
-        end = self.session.world.time + seconds
-        while self.session.world.time < end - 1e-9:
+        end = self.world.time + seconds
+        while self.world.time < end - 1e-9:
             self.motion.act({})
 
     def _look(self) -> None:
+        """Look at the part while the robot stands."""
         self.session.phase = "look"
+        begin = self.world.time
         self._wait(_LOOKING)
         while not self.belief.is_seen:
-            if self.session.world.time - self.begin > _MOST_LOOKING:
-                raise SkillError("other", "not seen")
-            self._wait(0.1)
+            if self.world.time - begin > _MOST_LOOKING:
+                raise SkillError(
+                    "other", f"No marker of '{self.part}' was seen within {_MOST_LOOKING:g} s; it may be hidden."
+                )
+            self._wait(self.session.dt)
 
-    def _place(self, grasps) -> BasePlacement:
-        session = self.session
+    def _place(self) -> BasePlacement:
+        """Return a placement from which the handle can be pulled straight, as far as possible."""
+        session, why = self.session, ""
         session.phase = "place"
-        why = ""
         with session.timed("place"):
+            grasps = sample_grasps(
+                self.unknown.model, self.gripper, self.unknown.handle, _GRASPS, self.seed
+            )
             for reach in _REACHES:
-                found = self.search.find(session.state, grasps, reach, samples=self.samples, seed=self.seed)
+                found = self.search.find(
+                    session.state, grasps, reach, samples=self.samples, seed=self.seed
+                )
                 if found:
                     return found
                 why = why or found.why
-        raise SkillError("reach", why)
+        contacts = any(" at " in reason for reason in found.reasons)
+        raise SkillError("collision" if contacts else "reach", why)
 
     def _approach(self, placement: BasePlacement) -> None:
+        """Bring the hand to the pose before the handle, on a planned path, and then straight to it."""
         session, search, motion = self.session, self.search, self.motion
         session.phase = "approach"
         wanted = dict(zip(placement.coordinates, placement.approach.tolist(), strict=True))
         if search.standing:
             stands = {s: wanted[s] for s in search.standing}
+            gone = self.world.time - self.begin
             self.belief.reset()
-            session.restart(session.world.state.updated(stands))
+            session.restart(self.world.state.updated(stands))
+            self.begin = -gone
+            motion.until = self.seconds - gone
+            self.judge.reset()
             self._look()
+            session.phase = "approach"
         motion.move_fingers(self.gripper.opened)
         with session.timed("plan"):
             self.planner.place(session.state)
@@ -179,52 +318,150 @@ class _Run:
             trajectory = path.trajectory()
         motion.follow(trajectory)
         motion.count_turns(placement.line[0])
+        assert placement.grasp is not None
         rows = placement.line[:, : len(search.moving)] + motion.turns
         motion.follow_line(placement.grasp.approach, placement.grasp.pose, rows)
 
     def _pull(self, grasp: Grasp) -> str:
-        session, belief, motion = self.session, self.belief, self.motion
+        """Pull until the part is open or goes no further; grasp it anew where the handle slips."""
+        way = -math.inf
+        for _ in range(_MOST_GRASPS):
+            self.measures["grasps"] += 1
+            if not self.motion.close(grasp):
+                why = "The fingers closed beside the handle."
+            else:
+                if not self.learning.poses:
+                    self.pulling = self.world.time
+                why = self._pull_once()
+            if not why:
+                return self._describe_opening("is open")
+            last, way = way, self._opening()[0]
+            if way - last < _FOLLOWS:
+                break
+            self._grasp_anew(grasp)
+        opened, turned = self._opening()
+        if opened < _FOLLOWS:
+            raise SkillError(
+                "other",
+                f"'{self.part}' does not follow the hand: it moved by {1e3 * opened:.0f} mm. {why} It may be "
+                "fixed, locked, or need more force than the grip holds.",
+            )
+        if opened >= _LEAST_WAY or turned >= _LEAST_TURN:
+            return self._describe_opening("goes no further")
+        raise SkillError("other", self._describe_opening("goes no further") + f" {why}")
+
+    def _grasp_anew(self, grasp: Grasp) -> None:
+        """Open the fingers, look, and bring the hand back to its place on the handle."""
+        session, motion, belief = self.session, self.motion, self.belief
+        session.phase = "grasp anew"
+        belief.release()
+        motion.move_fingers(self.gripper.opened)
+        self._wait(_LOOKING)
+        pose = inverse(belief.pose @ self.frame_T_handle) @ belief.hand_pose
+        motion.follow_line(pose, grasp.pose)
+
+    def _pull_once(self) -> str:
+        """Pull until the part is open, and return why it is not, empty if it is."""
+        session, belief, motion, learning = self.session, self.belief, self.motion, self.learning
         session.phase = "pull"
         belief.hold()
         self._wait(_HELD_LOOKING)
-        world = session.world
-        frame_T_handle = self.unknown.model.fk(self.unknown.handle.frame, self.frame)({})
-        bar = belief.pose @ frame_T_handle
-        bar_T_hand = inverse(bar) @ belief.hand_pose
-        first, point = belief.relative_pose, self.grip_point
-        pull: Any = StraightPull(motion, belief, bar_T_hand)
-        fitted, best, since = -1.0, 0.0, world.time
-        for look in belief.looks:
-            self.learning.add(look.pose, look.covariance)
-        belief.looks.clear()
-        learned = None
+        part_T_hand = inverse(belief.pose) @ belief.hand_pose
+        bar_T_hand = inverse(self.frame_T_handle) @ part_T_hand
+        if not learning.poses:
+            self.start = belief.relative_pose
+        belief.begin_motion()
+        pull: StraightPull | LearnedPull = StraightPull(motion, belief, bar_T_hand)
+        fitted, known = -math.inf, learning.learned is not None
+        best, since = self._opening()[0], self.world.time
         while True:
             motion.check_time()
             for look in belief.looks:
-                self.learning.add(look.pose, look.covariance)
+                learning.add(look.pose, look.covariance)
             belief.looks.clear()
-            way, turn = measure_way(first, belief.relative_pose, point)
+            way, turn = self._opening()
+            now = self.world.time
             with session.timed("learn"):
-                new = self.learning.update(way, turn, world.time)
-            if new and (fitted < 0 or world.time - fitted >= _REFIT):
-                found = self.learning.learned
-                if fitted < 0:
-                    self.measures |= {"family": found.family, "decided_way": found.way, "decided_turn": found.turn,
-                      "decided_seconds": found.time}
-                fitted = world.time
-                with session.timed("learn"):
-                    learned = learn_model(self.model, belief, found.fit)
-                    kind = found.fit.motion.kinds[0]
-                    pull = LearnedPull(motion, belief, learned, bar_T_hand, first, self.wanted[kind])
+                if learning.update(way, turn, now - self.pulling):
+                    known = True
+                if known and now - fitted >= _REFIT and learning.learned is not None:
+                    fit, fitted = learning.learned.fit, now
+                    pull = LearnedPull(
+                        motion, belief, learn_model(self.model, belief, fit), bar_T_hand, self.start,
+                        self.wanted[fit.motion.kinds[0]],
+                    )  # fmt: skip
+                elif not known and learning.likely is not None and way > _LIKELY:
+                    belief.path = JointPath.of_fit(learning.likely, self.start)
             with session.timed("open"):
                 command = pull.step()
             motion.act(command.speeds)
-            self.last = (way, turn, command)
-            if turn >= self.wanted[1] or (way >= self.wanted[0] and (learned is None or kind == 0)):
-                return f"opened {way:.3f} {turn:.3f}"
-            if way > best + 0.005:
-                best, since = way, world.time
-            elif world.time - since > _PATIENCE:
-                raise SkillError("other", f"does not go on {way:.3f} {turn:.3f} {command.active[:3]} {self.learning.explain()}")
-            if belief.is_lost:
-                raise SkillError("other", "lost")
+            way, turn = self._opening()
+            if self._is_open(way, turn):
+                return ""
+            if belief.slip(part_T_hand, self.point) > _SLIPPED:
+                session.stop()
+                return "The handle slipped in the hand."
+            if way > best + _STALLED:
+                best, since = way, now
+            elif now - since > _PATIENCE:
+                return f"In the way: {', '.join(command.active[:3]) or 'nothing that the controller knows'}."
+
+    # -- what was found ------------------------------------------------------------------------------------
+
+    def _opening(self) -> tuple[float, float]:
+        """Return the believed way of the handle [m], and the angle of the part [rad], since the first grasp."""
+        return measure_way(self.start, self.belief.relative_pose, self.point)
+
+    def _is_open(self, way: float, turn: float) -> bool:
+        learned = self.learning.learned
+        if learned is not None and learned.fit.motion.kinds[0]:
+            return turn >= self.wanted[1]
+        return way >= self.wanted[0] or turn >= self.wanted[1]
+
+    def _describe_opening(self, verb: str) -> str:
+        way, turn = self._opening()
+        return f"'{self.part}' {verb}, by {100 * way:.0f} cm and {math.degrees(turn):.0f}°."
+
+    def _report_joint(self) -> str:
+        """Write the learned joint into the model if it had another one or none, and say so."""
+        learned, belief = self.learning.learned, self.belief
+        assert learned is not None
+        self.measures |= {
+            "family": learned.family,
+            "decided_way": learned.way,
+            "decided_turn": learned.turn,
+            "decided_seconds": learned.time,
+            "parent": belief.beside,
+        }
+        parameters = learned.fit.parameters
+        self.measures |= {key: parameters[key] for key in ("axis", "point") if key in parameters}
+        words = f"Its joint is {learned.family}, certain after {100 * learned.way:.1f} cm and "
+        words += f"{math.degrees(learned.turn):.1f}°."
+        if belief.beside != WORLD:
+            before = np.asarray(self.model.fk(belief.beside)({}))
+            away, turned = measure_way(before, belief.reference_pose, np.zeros(3))
+            if away > _MOVED or turned > _TURNED:
+                place_beside(self.model, belief)
+                words += f" '{belief.beside}' stands {100 * away:.0f} cm from where it was believed."
+        monitor = belief.monitor
+        if monitor is None:
+            self.measures["believed"] = "nothing"
+        elif not any(self.part in tag or True for tag in monitor.implausible_since):
+            self.measures["believed"] = "explains"
+            return f"{words} The model's joint explains what was seen, and stays."
+        else:
+            self.measures["believed"] = "refuted"
+            words += " It is not as the model had it."
+        try:
+            write_joint(self.model, self.part, learned.fit, belief.beside)
+        except KineverseError as error:
+            return f"{words} It could not be written: {error}"
+        return f"{words} It is in the model now."
+
+
+def _ancestors(model: Model, frame: str) -> list[str]:
+    """Return the frames above a frame, the nearest first, without the world."""
+    found = []
+    while (frame := model.frames[frame].parent) != WORLD:
+        found.append(frame)
+    return found

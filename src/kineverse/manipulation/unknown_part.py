@@ -2,7 +2,10 @@
 
 from __future__ import annotations
 
+import math
+from collections.abc import Callable
 from dataclasses import dataclass
+from typing import Self
 
 import numpy as np
 
@@ -10,7 +13,7 @@ from kineverse.articulations import Floating
 from kineverse.compile import compile  # noqa: A004
 from kineverse.estimation import Fit
 from kineverse.grasping import Handle, find_handle
-from kineverse.lie import Array, inverse, pose_difference, to_quaternion
+from kineverse.lie import Array, inverse, log_se3, pose_difference, to_quaternion
 from kineverse.model.articulation import Articulation
 from kineverse.model.body import Pose
 from kineverse.model.model import Model
@@ -141,30 +144,68 @@ def _written(model: Model, tag: str) -> set[str]:
     return {f"{kind}/{name}" for kind, name in model.history.entry(tag).writes}
 
 
-class JointProjection:
-    """Projection of poses of a part onto the joint of a model.
+class JointPath:
+    """Poses of a part along a joint with one degree of freedom, and the value where the part is.
 
     Parameters
     ----------
-    model
-        The model.
-    frame, parent
-        Frame of the part, and a frame in which the joint alone moves it.
+    pose
+        Function from a joint value to the pose (4, 4) of the part in what it moves in.
+    first
+        First pose (4, 4) of the part.
+
+    Attributes
+    ----------
+    start, value
+        Values at the first and at the present pose [m], [rad].
     """
 
-    def __init__(self, model: ModelView, frame: str, parent: str) -> None:
-        pose = model.fk(frame, parent)
-        (self.coordinate,) = pose.symbols
-        self._pose = compile(pose, [self.coordinate], tier="interpreter")
+    def __init__(self, pose: Callable[[float], Array], first: Array, start: float = 0.0) -> None:
+        self.pose = pose
+        self.start = self.value = start
+        self.start = self.project(first)
 
-    def project(self, pose: Array, start: float) -> float:
-        """Return the value at which the part is nearest to a pose (4, 4) in the parent [m], [rad].
+    @classmethod
+    def of_fit(cls, fit: Fit, first: Array) -> Self:
+        """Return the path of an identified joint."""
 
-        Gauss-Newton steps from a value nearby; a rotation counts by its angle times 0.3 m.
+        def pose(value: float) -> Array:
+            poses: Array = fit.motion.linearise(np.array([[value]])).pose
+            return poses[0]
+
+        return cls(pose, first, float(fit.joint_values[0, 0]))
+
+    @classmethod
+    def of_model(cls, model: ModelView, frame: str, parent: str, first: Array) -> tuple[Self, Symbol]:
+        """Return the path of a part in a model, and the coordinate that moves it."""
+        expression = model.fk(frame, parent)
+        (coordinate,) = expression.symbols
+        function = compile(expression, [coordinate], tier="interpreter")
+        return cls(lambda value: function(np.array([value])), first), coordinate
+
+    @property
+    def direction(self) -> float:
+        """Sign of the motion so far."""
+        return math.copysign(1.0, self.value - self.start)
+
+    @property
+    def progress(self) -> float:
+        """Distance from the first value [m], [rad]."""
+        return abs(self.value - self.start)
+
+    def project(self, pose: Array) -> float:
+        """Move the value to where the part is nearest to a pose (4, 4), and return it [m], [rad].
+
+        Gauss-Newton steps from the present value; a rotation counts by its angle times 0.3 m.
         """
-        value = start
         for _ in range(_STEPS):
-            here, ahead = (self._pose(np.array([v])) for v in (value, value + _DIFFERENCE))
+            here, ahead = self.pose(self.value), self.pose(self.value + _DIFFERENCE)
             slope = pose_difference(ahead, here) / _DIFFERENCE * _ROTATION_ARM
-            value += float(slope @ (pose_difference(pose, here) * _ROTATION_ARM)) / float(slope @ slope)
-        return value
+            off = pose_difference(pose, here) * _ROTATION_ARM
+            self.value += float(slope @ off) / float(slope @ slope)
+        return self.value
+
+    def twist(self) -> Array:
+        """Return the twist (6,) of the part in its own axes by the value, in the direction of the motion."""
+        here, ahead = self.pose(self.value), self.pose(self.value + _DIFFERENCE)
+        return self.direction * log_se3(inverse(here) @ ahead) / _DIFFERENCE

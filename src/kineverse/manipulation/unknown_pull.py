@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import math
-
 import numpy as np
 
 from kineverse.control import Controller, Goal, Hold, Target, same_pose
@@ -11,19 +9,22 @@ from kineverse.control.command import Command
 from kineverse.errors import InvalidValueError
 from kineverse.estimation import Fit
 from kineverse.geometry import Rule, Scene
-from kineverse.lie import Array, inverse
+from kineverse.lie import Array, adjoint, exp_se3, inverse
+from kineverse.model.frame import WORLD
 from kineverse.model.model import Model
 from kineverse.state import State
 from kineverse.symbols import Symbol
 
 from .hand_motion import HandMotion
 from .part_looks import PartBelief
-from .unknown_part import JointProjection, write_joint
+from .unknown_part import JointPath, write_joint
 
 PULL_SPEED = 0.05
 """Speed of the straight pull [m/s]."""
-_HAND_SPEED, _TURN_SPEED = 0.1, 0.3
-"""Largest speeds of the handle along a learned joint [m/s], [rad/s]."""
+PATH_SPEED = 0.1
+"""Speed of the handle along a learned joint [m/s]."""
+_BEYOND = 1.2
+"""Place of the goal by the wanted opening: before a goal the motion slows down."""
 _GAIN = 5.0
 """Rate at which errors of the hand's place on the part decay [1/s]."""
 _RAMP = 0.5
@@ -49,8 +50,9 @@ class StraightPull:
     """
 
     def __init__(self, motion: HandMotion, belief: PartBelief, bar_T_hand: Array) -> None:
-        self.motion, self.bar_T_hand = motion, bar_T_hand
+        self.motion, self.belief, self.bar_T_hand = motion, belief, bar_T_hand
         model, unknown = motion.model, belief.unknown
+        self._part_T_bar = np.asarray(model.fk(motion.handle.frame, unknown.frame)({}))
         hand, bar = model.fk(motion.gripper.hand), model.fk(motion.handle.frame)
         self._place = Target("pull/place", bar_T_hand)
         hold = Hold(same_pose(bar @ self._place.expression, hand), gain=_GAIN, name="grasp")
@@ -62,9 +64,15 @@ class StraightPull:
         """Return the command of a step."""
         session = self.motion.session
         share = min(1.0, (session.world.time - self._begin) / _RAMP)
-        place = self.bar_T_hand.copy()
-        place[:3, 3] += share * PULL_SPEED / _GAIN * self.motion.handle.pose[:3, 0]
-        self._controller.set(self._place, place)
+        lead = share * PULL_SPEED / _GAIN
+        path = self.belief.path
+        if path is None:
+            twist = np.concatenate([self.motion.handle.pose[:3, 0], np.zeros(3)])
+        else:
+            twist = adjoint(inverse(self._part_T_bar)) @ path.twist()
+            point = self.motion.handle.pose[:3, 3]
+            twist = twist / np.linalg.norm(twist[:3] + np.cross(twist[3:], point))
+        self._controller.set(self._place, exp_se3(lead * twist) @ self.bar_T_hand)
         return self._controller.step(session.state)
 
 
@@ -107,49 +115,28 @@ class LearnedPull:
     ) -> None:
         self.motion, self.belief, self.model = motion, belief, model
         unknown = belief.unknown
-        parent = belief.beside or "world"
-        self._projection = JointProjection(model, unknown.frame, parent)
-        self.coordinate = self._projection.coordinate
-        start = self._projection.project(first, 0.0)
-        self.value = self._projection.project(belief.relative_pose, start)
-        self.direction = math.copysign(1.0, self.value - start)
-        self.start, self.end = start, start + self.direction * opened
+        path, self.coordinate = JointPath.of_model(model, unknown.frame, belief.beside, first)
+        path.project(belief.relative_pose)
+        belief.path = self.path = path
+        end = path.start + path.direction * _BEYOND * opened
         hand, bar = model.fk(motion.gripper.hand), model.fk(motion.handle.frame)
         hold = Hold(same_pose(bar @ bar_T_hand, hand), gain=_GAIN, name="grasp")
-        lever = self._lever(first)
-        speed = min(_TURN_SPEED if lever < 0.999 or lever > 1.001 else _HAND_SPEED, _HAND_SPEED / lever)
-        goal = Goal(self.coordinate, self.end, speed=speed, name="object")
+        twist = adjoint(inverse(model.fk(motion.handle.frame, unknown.frame)({}))) @ path.twist()
+        speed = PATH_SPEED / np.linalg.norm(twist[:3] + np.cross(twist[3:], motion.handle.pose[:3, 3]))
+        goal = Goal(self.coordinate, end, speed=float(speed), name="object")
         still: list[Symbol] = [*motion.search.standing, *motion.gripper.joints]
         self._controller = _make_controller(motion, model, [hold, goal], still)
 
-    def _lever(self, first: Array) -> float:
-        """Return the way of the handle by the coordinate [m/rad], or 1 of a drawer."""
-        bar = self.model.fk(self.motion.handle.frame, self.belief.beside or "world")
-        a, b = (bar({self.coordinate: v})[:3, 3] for v in (self.value, self.value + 1e-3))
-        return max(float(np.linalg.norm(b - a)) / 1e-3, 1e-2)
-
-    @property
-    def progress(self) -> float:
-        """Distance from the first value [m], [rad]."""
-        return self.direction * (self.value - self.start)
-
-    def update(self) -> None:
-        """Project the believed pose of the part onto the joint."""
-        self.value = self._projection.project(self.belief.relative_pose, self.value)
-        self.belief.extra = {self.coordinate: self.value}
-
     def step(self) -> Command:
         """Return the command of a step."""
-        self.update()
-        state = self.motion.session.state | State({self.coordinate: self.value})
-        return self._controller.step(state)
+        return self._controller.step(self.motion.session.state | State({self.coordinate: self.path.value}))
 
 
 def learn_model(model: Model, belief: PartBelief, fit: Fit) -> Model:
     """Return a copy of a model with a joint that was learned, in which the furniture stands where it is seen."""
     copy = model.copy()
     place_beside(copy, belief)
-    write_joint(copy, belief.unknown.frame, fit, belief.beside or "world")
+    write_joint(copy, belief.unknown.frame, fit, belief.beside)
     return copy
 
 
@@ -161,18 +148,18 @@ def place_beside(model: Model, belief: PartBelief) -> None:
     InvalidValueError
         If joints move it, so that there is no frame to put elsewhere.
     """
-    if belief.beside is None:
+    if belief.beside == WORLD:
         return
     if model.fk(belief.beside).symbols:
         raise InvalidValueError(
             f"'{belief.beside}' is moved by joints itself; name a frame that stands still as beside=."
         )
     top = belief.beside
-    while model.frames[top].parent != "world":
+    while model.frames[top].parent != WORLD:
         top = model.frames[top].parent
     pose = belief.reference_pose @ inverse(model.fk(belief.beside)({})) @ model.fk(top)({})
     with model.edit() as edit:
-        edit.attach(top, "world", pose, f"seen {top}")
+        edit.attach(top, WORLD, pose, f"seen {top}")
 
 
 def _make_controller(motion: HandMotion, model: Model, tasks: list[Hold | Goal], still: list[Symbol]) -> Controller:
