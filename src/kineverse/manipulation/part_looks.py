@@ -20,7 +20,7 @@ from .unknown_part import JointPath, UnknownPart
 
 _FLOOR_POSITION, _FLOOR_ORIENTATION = 2e-4, 2e-4
 """Least standard deviations of observed poses [m], [rad]: no camera is exact."""
-_HELD_LOOKS, _STATIC_LOOKS = 12.0, 60.0
+_HELD_LOOKS, _STATIC_LOOKS = 16.0, 60.0
 """Number of looks that a mean is worth: of the part in the hand, which slips, and of what stands still."""
 _NEAR, _TURNED = 0.06, 0.35
 """Distance [m] and angle [rad] from where a part is believed beyond which a look is an outlier."""
@@ -152,6 +152,7 @@ class PartBelief:
         self._state = model.default_state().updated({s: v for s, v in state.items() if s in self._symbols})
         self._marker_T_part = {name: np.asarray(model.fk(unknown.frame, name)({})) for name in markers}
         self._world_T_parent = np.asarray(model.fk(unknown.parent)(self._state))
+        self._before = self._world_T_parent @ unknown.parent_T_frame
         self.reset()
         self.path: JointPath | None = None
         self.observation: Observation | None = None
@@ -191,7 +192,7 @@ class PartBelief:
             return pose if self.path is None else self.reference_pose @ self.path.pose(self.path.value)
         if self.still.pose is not None:
             return self.still.pose
-        return self._world_T_parent @ self.unknown.parent_T_frame
+        return self._before
 
     @property
     def relative_pose(self) -> Array:
@@ -220,11 +221,9 @@ class PartBelief:
         self.held.looks = _HELD_LOOKS
 
     def release(self) -> None:
-        """From now on the part stands where it is believed."""
-        pose = self.pose
+        """From now on the part stands somewhere, at first where it is believed."""
+        self._before = self.pose
         self.held, self.path, self.still = None, None, PoseMean(_STATIC_LOOKS)
-        for _ in range(_FIRST):
-            self.still.add(pose)
 
     def reset(self) -> None:
         """Forget all looks."""

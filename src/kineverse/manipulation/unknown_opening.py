@@ -49,8 +49,8 @@ _FOLLOWS, _STALLED, _PATIENCE = 0.01, 0.004, 1.5
 """Motion of a part that follows the hand, and its least progress [m] in a time [s]."""
 _SLIPPED = 0.012
 """Distance of the handle from its place in the hand from which on it has slipped [m]."""
-_LIKELY = 0.01
-"""Way of a part from which on the likeliest joint leads the pull [m]."""
+_LED = 0.06
+"""Way of the handle before which the hand does not rely on a joint that was learned [m]."""
 _MOVED, _TURNED = 0.01, math.radians(1.0)
 """Distance [m] and angle [rad] of furniture from where it was believed that are reported."""
 
@@ -113,7 +113,7 @@ def open_unknown(
         Its value is the true opening [m], [rad]. ``measures``: those of :class:`.Judge`; true ``way`` [m] and
         ``turn`` [rad]; ``family``, with ``decided_way`` [m], ``decided_turn`` [rad] and ``decided_seconds``
         of the pull after which it was certain; ``axis`` and ``point`` in ``parent``; ``pull_seconds`` from
-        the first grasp on; ``grasps``; ``believed``, the verdict on the joint of the model; and ``failure``
+        the first grasp on, and ``opened_seconds`` until the part moved no further; ``grasps``; ``believed``, the verdict on the joint of the model; and ``failure``
         if it was not done.
 
     Raises
@@ -178,6 +178,7 @@ class _Run:
         )
         self.learning = JointLearning()
         self.measures: dict[str, Any] = {"grasps": 0}
+        self.farthest = 0.0
         self.first_step, self.begin = session.steps, self.world.time
         names = [f for f in markers if f in self.world.model.frames]
         self._truth = compile(self.world.model.fk((names or [handle])[0]))
@@ -384,16 +385,16 @@ class _Run:
             with session.timed("learn"):
                 if learning.update(way, turn, now - self.pulling):
                     known = True
-                if known and now - fitted >= _REFIT and learning.learned is not None:
+                if known and now - fitted >= _REFIT and way >= _LED and learning.learned is not None:
                     fit, fitted = learning.learned.fit, now
                     pull = LearnedPull(
                         motion, belief, learn_model(self.model, belief, fit), bar_T_hand, self.start,
                         self.wanted[fit.motion.kinds[0]],
                     )  # fmt: skip
-                elif not known and learning.likely is not None and way > _LIKELY:
-                    belief.path = JointPath.of_fit(learning.likely, self.start)
+                elif learning.likely is not None and isinstance(pull, StraightPull):
+                    pull.likely = JointPath.of_fit(learning.likely, self.start)
             with session.timed("open"):
-                command = pull.step()
+                command = pull.step(way)
             motion.act(command.speeds)
             way, turn = self._opening()
             if self._is_open(way, turn):
@@ -403,6 +404,9 @@ class _Run:
                 return "The handle slipped in the hand."
             if way > best + _STALLED:
                 best, since = way, now
+                if way > self.farthest + _FOLLOWS:
+                    self.farthest = way
+                    self.measures["opened_seconds"] = now - self.pulling
             elif now - since > _PATIENCE:
                 return f"In the way: {', '.join(command.active[:3]) or 'nothing that the controller knows'}."
 
@@ -446,7 +450,7 @@ class _Run:
         monitor = belief.monitor
         if monitor is None:
             self.measures["believed"] = "nothing"
-        elif not any(self.part in tag or True for tag in monitor.implausible_since):
+        elif self.model.history.writers(f"frames/{self.part}")[-1] not in monitor.implausible_since:
             self.measures["believed"] = "explains"
             return f"{words} The model's joint explains what was seen, and stays."
         else:

@@ -27,6 +27,8 @@ _BEYOND = 1.2
 """Place of the goal by the wanted opening: before a goal the motion slows down."""
 _GAIN = 5.0
 """Rate at which errors of the hand's place on the part decay [1/s]."""
+_STRAIGHT = 0.02
+"""Way of the handle after which the likeliest joint counts as much as its normal for the direction [m]."""
 _RAMP = 0.5
 """Time in which the pull begins [s]."""
 _MARGIN = 0.002
@@ -47,6 +49,11 @@ class StraightPull:
         Belief about the part.
     bar_T_hand
         Place (4, 4) of the hand on the handle.
+
+    Attributes
+    ----------
+    likely
+        The likeliest joint, which leads the pull the more the further the part has moved.
     """
 
     def __init__(self, motion: HandMotion, belief: PartBelief, bar_T_hand: Array) -> None:
@@ -59,19 +66,20 @@ class StraightPull:
         still = [*motion.search.standing, *motion.gripper.joints, unknown.handle.coordinate]
         self._controller = _make_controller(motion, model, [hold], [*still, *unknown.floating])
         self._begin = motion.session.world.time
+        self._point = motion.handle.pose[:3, 3]
+        self.likely: JointPath | None = None
 
-    def step(self) -> Command:
-        """Return the command of a step."""
+    def step(self, way: float) -> Command:
+        """Return the command of a step, after a way of the handle [m]."""
         session = self.motion.session
         share = min(1.0, (session.world.time - self._begin) / _RAMP)
         lead = share * PULL_SPEED / _GAIN
-        path = self.belief.path
-        if path is None:
-            twist = np.concatenate([self.motion.handle.pose[:3, 0], np.zeros(3)])
-        else:
-            twist = adjoint(inverse(self._part_T_bar)) @ path.twist()
-            point = self.motion.handle.pose[:3, 3]
-            twist = twist / np.linalg.norm(twist[:3] + np.cross(twist[3:], point))
+        twist = np.concatenate([self.motion.handle.pose[:3, 0], np.zeros(3)])
+        if self.likely is not None:
+            self.likely.project(self.belief.relative_pose)
+            weight = way**2 / (way**2 + _STRAIGHT**2)
+            led = adjoint(inverse(self._part_T_bar)) @ self.likely.twist()
+            twist = (1.0 - weight) * twist + weight * led / point_speed(led, self._point)
         self._controller.set(self._place, exp_se3(lead * twist) @ self.bar_T_hand)
         return self._controller.step(session.state)
 
@@ -122,14 +130,19 @@ class LearnedPull:
         hand, bar = model.fk(motion.gripper.hand), model.fk(motion.handle.frame)
         hold = Hold(same_pose(bar @ bar_T_hand, hand), gain=_GAIN, name="grasp")
         twist = adjoint(inverse(model.fk(motion.handle.frame, unknown.frame)({}))) @ path.twist()
-        speed = PATH_SPEED / np.linalg.norm(twist[:3] + np.cross(twist[3:], motion.handle.pose[:3, 3]))
-        goal = Goal(self.coordinate, end, speed=float(speed), name="object")
+        speed = PATH_SPEED / point_speed(twist, motion.handle.pose[:3, 3])
+        goal = Goal(self.coordinate, end, speed=speed, name="object")
         still: list[Symbol] = [*motion.search.standing, *motion.gripper.joints]
         self._controller = _make_controller(motion, model, [hold, goal], still)
 
-    def step(self) -> Command:
-        """Return the command of a step."""
+    def step(self, way: float) -> Command:
+        """Return the command of a step, after a way of the handle [m]."""
         return self._controller.step(self.motion.session.state | State({self.coordinate: self.path.value}))
+
+
+def point_speed(twist: Array, point: Array) -> float:
+    """Return the speed of a point (3,) [m] of a body with a twist (6,), both in axes of the body."""
+    return float(np.linalg.norm(twist[:3] + np.cross(twist[3:], point)))
 
 
 def learn_model(model: Model, belief: PartBelief, fit: Fit) -> Model:
