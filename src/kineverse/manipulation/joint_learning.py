@@ -14,6 +14,8 @@ _LOOKS = 3
 """Results in a row that a decision takes."""
 _EVERY = 4
 """Number of new poses between two results."""
+_VISIBLE = 0.005
+"""Way of the part before which no joint is looked for [m]."""
 LEAST_WAY, LEAST_TURN = 0.03, math.radians(4.0)
 """Motion of the part before which nothing is decided [m], [rad]: noise alone looks like any joint."""
 
@@ -85,7 +87,7 @@ class JointLearning:
             Time of the world [s].
         """
         self.likely = None
-        if self.poses < self._evaluated + _EVERY:
+        if self.poses < self._evaluated + _EVERY or way < _VISIBLE:
             return False
         self._evaluated = self.poses
         result = self._identifier.result

@@ -118,11 +118,13 @@ class PartBelief:
         Frames of what it may move in, the nearest first: the first one that is seen is the reference.
     sensors
         Stated noise of the looks.
-    monitor
-        Test of the believed joint of the part, which gets all looks.
 
     Attributes
     ----------
+    monitor
+        Test of the believed joint of the part, which gets all looks; None without one.
+    seen
+        Names of frames that were seen.
     observation
         The last observation.
     looks
@@ -140,10 +142,11 @@ class PartBelief:
         markers: Sequence[str],
         ancestors: Sequence[str],
         sensors: Sensors,
-        monitor: PlausibilityMonitor | None = None,
     ) -> None:
         model = unknown.model
-        self.unknown, self.sensors, self.monitor = unknown, sensors, monitor
+        self.unknown, self.sensors = unknown, sensors
+        self.monitor: PlausibilityMonitor | None = None
+        self.seen: dict[str, None] = {}
         self._ancestors = tuple(ancestors)
         own = [name for name in model.frames if is_of_robot(name, world.robot)]
         self._symbols = {s for s in model.symbols if not s.order}
@@ -213,7 +216,8 @@ class PartBelief:
     def hold(self) -> None:
         """From now on the part is in the hand."""
         self._beside = self.beside
-        self.held, self.looks = PoseMean(_STATIC_LOOKS), []
+        believed = inverse(self._world_T_hand) @ self.pose
+        self.held, self.looks = PoseMean(_STATIC_LOOKS, believed, _first=[believed] * _FIRST), []
 
     def begin_motion(self) -> None:
         """From now on the part may move in the hand."""
@@ -239,6 +243,7 @@ class PartBelief:
         joints = {s: v for s, v in seen.joints.items() if s in self._symbols}
         self._state = self._state.updated(joints)
         self._world_T_hand = self._hand(self._state.vector(self._hand.inputs))
+        self.seen |= dict.fromkeys(seen.poses)
         for name, mean in self._references.items():
             if name in seen.poses:
                 mean.add(seen.poses[name])
@@ -267,6 +272,7 @@ class PartBelief:
                 pose = world_T_marker @ marker_T_part
                 looks.append((pose, self._covariance(world_T_marker, pose)))
         near = [look for look in looks if believed is not None and is_near(inverse(frame) @ look[0], believed)]
+        # One that is nowhere near is for the mean to count as an outlier.
         pose, covariance = _fuse(near or looks[:1])
         if self.held is None:
             self.still.add(pose)

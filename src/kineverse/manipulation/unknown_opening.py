@@ -41,6 +41,8 @@ _LOOKING, _HELD_LOOKING, _MOST_LOOKING = 0.6, 1.0, 3.0
 """Times of looks before the approach and with the hand closed, and the largest until a part is seen [s]."""
 _REACHES = (0.25, 0.15, 0.08)
 """Straight ways of the handle that a placement has to allow [m], one after the other."""
+_DISTANCE, _FLOOR_POSITION, _FLOOR_ORIENTATION = 1.0, 1e-3, 2e-3
+"""Distance of the camera, and least standard deviations, for the test of a believed joint [m], [rad]."""
 _GRASPS, _PLANNING = 128, 2.0
 _MOST_GRASPS = 3
 _REFIT = 0.5
@@ -174,7 +176,6 @@ class _Run:
             markers,
             references,
             sensors or Sensors(),
-            self._make_monitor((*markers, *references), sensors or Sensors()),
         )
         self.learning = JointLearning()
         self.measures: dict[str, Any] = {"grasps": 0}
@@ -183,13 +184,16 @@ class _Run:
         names = [f for f in markers if f in self.world.model.frames]
         self._truth = compile(self.world.model.fk((names or [handle])[0]))
 
-    def _make_monitor(self, frames: tuple[str, ...], sensors: Sensors) -> PlausibilityMonitor | None:
-        """Return a test of the believed joint, None without one."""
-        if find_joint(self.model, self.part) is None:
-            return None
-        position = float(sensors.position_noise(np.asarray(1.0)))
-        noise = pose_covariance(max(position, 1e-3), max(sensors.orientation, 2e-3))
-        return PlausibilityMonitor(self.model, frames, noise=noise, outliers=sensors.outliers > 0.0 or None)
+    def _watch_joint(self) -> None:
+        """Test the believed joint from now on, if there is one."""
+        sensors = self.belief.sensors
+        frames = [name for name in self.belief.seen if name in self.model.frames]
+        if find_joint(self.model, self.part) is None or self.belief.monitor is not None:
+            return
+        position = float(sensors.position_noise(np.asarray(_DISTANCE)))
+        noise = pose_covariance(max(position, _FLOOR_POSITION), max(sensors.orientation, _FLOOR_ORIENTATION))
+        outliers = sensors.outliers > 0.0 or None
+        self.belief.monitor = PlausibilityMonitor(self.model, frames, noise=noise, outliers=outliers)
 
     def __call__(self) -> Outcome:
         """Open the part, and return the outcome."""
@@ -241,6 +245,7 @@ class _Run:
             self.begin + self.seconds,
         )  # fmt: skip
         self._look()
+        self._watch_joint()
         placement = self._place()
         grasp = placement.grasp
         assert grasp is not None
@@ -447,20 +452,31 @@ class _Run:
             if away > _MOVED or turned > _TURNED:
                 place_beside(self.model, belief)
                 words += f" '{belief.beside}' stands {100 * away:.0f} cm from where it was believed."
-        monitor = belief.monitor
-        if monitor is None:
-            self.measures["believed"] = "nothing"
-        elif self.model.history.writers(f"frames/{self.part}")[-1] not in monitor.implausible_since:
-            self.measures["believed"] = "explains"
+        verdict = self._judge_belief()
+        self.measures["believed"] = verdict
+        if verdict == "explains":
             return f"{words} The model's joint explains what was seen, and stays."
-        else:
-            self.measures["believed"] = "refuted"
+        if verdict == "cannot tell":
+            return f"{words} What was seen does not refute the model's joint, which stays."
+        if verdict == "refuted":
             words += " It is not as the model had it."
         try:
             write_joint(self.model, self.part, learned.fit, belief.beside)
         except KineverseError as error:
             return f"{words} It could not be written: {error}"
         return f"{words} It is in the model now."
+
+
+    def _judge_belief(self) -> str:
+        """Return the verdict on the model's joint: nothing, explains, cannot tell or refuted."""
+        if self.belief.monitor is None:
+            return "nothing"
+        tag = self.model.history.writers(f"frames/{self.part}")[-1]
+        report = self.belief.monitor.report()
+        if tag in {verdict.tag for verdict in report.implausible}:
+            return "refuted"
+        certain = any(verdict.explains for verdict in report.verdicts if verdict.tag == tag)
+        return "explains" if certain else "cannot tell"
 
 
 def _ancestors(model: Model, frame: str) -> list[str]:

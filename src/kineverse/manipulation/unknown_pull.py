@@ -19,15 +19,15 @@ from .hand_motion import HandMotion
 from .part_looks import PartBelief
 from .unknown_part import JointPath, write_joint
 
-PULL_SPEED = 0.05
-"""Speed of the straight pull [m/s]."""
+_FIRST_SPEED, PULL_SPEED, _SPEED_UP = 0.02, 0.05, 0.04
+"""Speeds of the straight pull at first and after a way [m/s], [m]."""
 PATH_SPEED = 0.1
 """Speed of the handle along a learned joint [m/s]."""
 _BEYOND = 1.2
 """Place of the goal by the wanted opening: before a goal the motion slows down."""
 _GAIN = 5.0
 """Rate at which errors of the hand's place on the part decay [1/s]."""
-_STRAIGHT = 0.02
+_STRAIGHT = 0.035
 """Way of the handle after which the likeliest joint counts as much as its normal for the direction [m]."""
 _RAMP = 0.5
 """Time in which the pull begins [s]."""
@@ -39,7 +39,8 @@ class StraightPull:
     """Pull along the outward normal of a handle, while the hand follows the part as it is seen.
 
     The hand holds its place on the part, shifted ahead by speed / gain along the normal. So a part that does
-    not follow stops the hand after a centimetre, and the hand yields to any other motion of the part.
+    not follow stops the hand after 4 mm, and the hand yields to any other motion of the part. The pull begins
+    slowly, as nothing is known of the direction.
 
     Parameters
     ----------
@@ -73,7 +74,8 @@ class StraightPull:
         """Return the command of a step, after a way of the handle [m]."""
         session = self.motion.session
         share = min(1.0, (session.world.time - self._begin) / _RAMP)
-        lead = share * PULL_SPEED / _GAIN
+        speed = _FIRST_SPEED + min(1.0, way / _SPEED_UP) * (PULL_SPEED - _FIRST_SPEED)
+        lead = share * speed / _GAIN
         twist = np.concatenate([self.motion.handle.pose[:3, 0], np.zeros(3)])
         if self.likely is not None:
             self.likely.project(self.belief.relative_pose)
