@@ -6,6 +6,7 @@ from .outcome import Outcome, SkillError
 from .placement import BasePlacement, PlacementSearch
 from .pushing import push
 from .session import Session
+from .unknown_opening import open_unknown
 
 __all__ = [
     "BasePlacement",
@@ -16,5 +17,6 @@ __all__ = [
     "SkillError",
     "TrueBelief",
     "open_object",
+    "open_unknown",
     "push",
 ]

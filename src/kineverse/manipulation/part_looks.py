@@ -13,6 +13,7 @@ from kineverse.estimation import PlausibilityMonitor, pose_covariance
 from kineverse.lie import Array, inverse, pose_difference, retract, rotation_angle, skew
 from kineverse.model.frame import WORLD
 from kineverse.state import State
+from kineverse.symbols import Symbol
 from kineverse.worlds import Observation, Sensors, World
 from kineverse.worlds.sensor_sampler import find_camera, is_of_robot
 
@@ -125,8 +126,6 @@ class PartBelief:
         Test of the believed joint of the part, which gets all looks; None without one.
     seen
         Names of frames that were seen.
-    observation
-        The last observation.
     looks
         Looks since :meth:`hold` that are no outliers.
     path
@@ -155,11 +154,13 @@ class PartBelief:
         self._state = model.default_state().updated({s: v for s, v in state.items() if s in self._symbols})
         self._marker_T_part = {name: np.asarray(model.fk(unknown.frame, name)({})) for name in markers}
         self._world_T_parent = np.asarray(model.fk(unknown.parent)(self._state))
-        self._before = self._world_T_parent @ unknown.parent_T_frame
-        self.reset()
+        self._before = self._world_T_parent @ unknown.origin
+        self.held: PoseMean | None = None
+        self.looks: list[PartLook] = []
         self.path: JointPath | None = None
-        self.observation: Observation | None = None
+        self._beside: str | None = None
         self._world_T_hand = np.eye(4)
+        self.reset()
 
     @property
     def is_seen(self) -> bool:
@@ -214,32 +215,30 @@ class PartBelief:
         return self._world_T_hand
 
     def hold(self) -> None:
-        """From now on the part is in the hand."""
+        """Believe that the part is in the hand, from now on."""
         self._beside = self.beside
         believed = inverse(self._world_T_hand) @ self.pose
         self.held, self.looks = PoseMean(_STATIC_LOOKS, believed, _first=[believed] * _FIRST), []
 
     def begin_motion(self) -> None:
-        """From now on the part may move in the hand."""
+        """Let later looks count more, as the part may slip while it is moved."""
         assert self.held is not None
         self.held.looks = _HELD_LOOKS
 
     def release(self) -> None:
-        """From now on the part stands somewhere, at first where it is believed."""
+        """Believe that the part stands still: at first where it was, then where it is seen."""
         self._before = self.pose
         self.held, self.path, self.still = None, None, PoseMean(_STATIC_LOOKS)
 
     def reset(self) -> None:
         """Forget all looks."""
-        self.held: PoseMean | None = None
-        self.looks: list[PartLook] = []
+        self.held, self.path, self.looks, self._beside = None, None, [], None
         self.still = PoseMean(_STATIC_LOOKS)
         self._references = {name: PoseMean(_STATIC_LOOKS) for name in self._ancestors}
-        self._beside: str | None = None
 
     def update(self, world: World, commands: State | None = None) -> State:
         """Return the state of the model of the part after reading the sensors."""
-        seen = self.observation = world.observe()
+        seen = world.observe()
         joints = {s: v for s, v in seen.joints.items() if s in self._symbols}
         self._state = self._state.updated(joints)
         self._world_T_hand = self._hand(self._state.vector(self._hand.inputs))
@@ -264,14 +263,16 @@ class PartBelief:
 
     def _look(self, seen: Observation) -> None:
         """Take a look at the part; several markers are weighted by their information."""
-        looks = []
+        looks: list[tuple[Array, Array]] = []
         believed = self.held.pose if self.held is not None else self.still.pose
         frame = self._world_T_hand if self.held is not None else np.eye(4)
         for name, marker_T_part in self._marker_T_part.items():
             if (world_T_marker := seen.poses.get(name)) is not None:
                 pose = world_T_marker @ marker_T_part
                 looks.append((pose, self._covariance(world_T_marker, pose)))
-        near = [look for look in looks if believed is not None and is_near(inverse(frame) @ look[0], believed)]
+        near = [
+            look for look in looks if believed is not None and is_near(inverse(frame) @ look[0], believed)
+        ]
         # One that is nowhere near is for the mean to count as an outlier.
         pose, covariance = _fuse(near or looks[:1])
         if self.held is None:
@@ -308,6 +309,6 @@ def _fuse(looks: Sequence[tuple[Array, Array]]) -> tuple[Array, Array]:
 
 
 def measure_way(first: Array, last: Array, point: Array) -> tuple[float, float]:
-    """Return the distance [m] by which a point (3,) of a part moved between two poses, and the angle [rad]."""
+    """Return the way [m] of a point (3,) of a part between two poses (4, 4), and the angle [rad]."""
     a, b = (pose @ np.append(point, 1.0) for pose in (first, last))
     return float(np.linalg.norm((b - a)[:3])), float(rotation_angle(first[:3, :3].T @ last[:3, :3]))

@@ -115,8 +115,8 @@ def open_unknown(
         Its value is the true opening [m], [rad]. ``measures``: those of :class:`.Judge`; true ``way`` [m] and
         ``turn`` [rad]; ``family``, with ``decided_way`` [m], ``decided_turn`` [rad] and ``decided_seconds``
         of the pull after which it was certain; ``axis`` and ``point`` in ``parent``; ``pull_seconds`` from
-        the first grasp on, and ``opened_seconds`` until the part moved no further; ``grasps``; ``believed``, the verdict on the joint of the model; and ``failure``
-        if it was not done.
+        the first grasp on, and ``opened_seconds`` until the part moved no further; ``grasps``; ``believed``,
+        the verdict on the joint of the model; and ``failure`` if it was not done.
 
     Raises
     ------
@@ -130,7 +130,8 @@ def open_unknown(
     for name in (handle, *(n for n in (part, beside) if n is not None)):
         if name not in model.frames:
             raise UnknownNameError(f"There is no frame '{name}'. {suggest(name, model.frames, 'frame')}")
-    return _Run(session, model, handle, part, beside, sensors, (way, turn), hand, seconds, placements, seed)()
+    wanted = way, turn
+    return _Run(session, model, handle, part, beside, sensors, wanted, hand, seconds, placements, seed)()
 
 
 class _Run:
@@ -157,7 +158,7 @@ class _Run:
         self.part = part or next((f for f in (handle, *above) if find_joint(model, f)), handle)
         if self.part not in (handle, *above):
             raise InvalidValueError(
-                f"The handle '{handle}' does not hang on the part '{self.part}'; above it are {', '.join(above)}."
+                f"The handle '{handle}' is not below the part '{self.part}', but {', '.join(above)}."
             )
         before = model.default_state()
         before = before.updated({s: v for s, v in session.state.items() if s in before})
@@ -256,10 +257,10 @@ class _Run:
         finally:
             self.measures["pull_seconds"] = self.world.time - self.pulling
             self.belief.release()
-            if not self.motion_is_late():
+            if not self._is_late():
                 self.motion.release(grasp)
 
-    def motion_is_late(self) -> bool:
+    def _is_late(self) -> bool:
         """Return whether no time is left to let go."""
         return self.world.time > self.motion.until
 
@@ -276,7 +277,8 @@ class _Run:
         while not self.belief.is_seen:
             if self.world.time - begin > _MOST_LOOKING:
                 raise SkillError(
-                    "other", f"No marker of '{self.part}' was seen within {_MOST_LOOKING:g} s; it may be hidden."
+                    "other",
+                    f"No marker of '{self.part}' was seen within {_MOST_LOOKING:g} s; it may be hidden.",
                 )
             self._wait(self.session.dt)
 
@@ -285,13 +287,9 @@ class _Run:
         session, why = self.session, ""
         session.phase = "place"
         with session.timed("place"):
-            grasps = sample_grasps(
-                self.unknown.model, self.gripper, self.unknown.handle, _GRASPS, self.seed
-            )
+            grasps = sample_grasps(self.unknown.model, self.gripper, self.unknown.handle, _GRASPS, self.seed)
             for reach in _REACHES:
-                found = self.search.find(
-                    session.state, grasps, reach, samples=self.samples, seed=self.seed
-                )
+                found = self.search.find(session.state, grasps, reach, samples=self.samples, seed=self.seed)
                 if found:
                     return found
                 why = why or found.why
@@ -418,7 +416,7 @@ class _Run:
     # -- what was found ------------------------------------------------------------------------------------
 
     def _opening(self) -> tuple[float, float]:
-        """Return the believed way of the handle [m], and the angle of the part [rad], since the first grasp."""
+        """Return the believed way of the handle [m] and angle of the part [rad] since the first grasp."""
         return measure_way(self.start, self.belief.relative_pose, self.point)
 
     def _is_open(self, way: float, turn: float) -> bool:
@@ -465,7 +463,6 @@ class _Run:
         except KineverseError as error:
             return f"{words} It could not be written: {error}"
         return f"{words} It is in the model now."
-
 
     def _judge_belief(self) -> str:
         """Return the verdict on the model's joint: nothing, explains, cannot tell or refuted."""

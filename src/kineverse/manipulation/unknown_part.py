@@ -41,8 +41,8 @@ class UnknownPart:
         The handle; its coordinate is the one of the straight pull [m].
     parent
         Frame in which the part floats.
-    parent_T_frame
-        Pose (4, 4) of the part in the model that was copied.
+    origin
+        Pose (4, 4) of the part in the parent, in the model that was copied.
     floating
         The seven coordinates of the floating joint.
     """
@@ -51,12 +51,12 @@ class UnknownPart:
     frame: str
     handle: Handle
     parent: str
-    parent_T_frame: Array
+    origin: Array
     floating: tuple[Symbol, ...]
 
     def values(self, parent_T_frame: Array) -> dict[Symbol, float]:
         """Return the coordinates of the part for its pose (4, 4) in the parent."""
-        off = inverse(self.parent_T_frame) @ parent_T_frame
+        off = inverse(self.origin) @ parent_T_frame
         numbers = [*off[:3, 3], *to_quaternion(off[:3, :3])]
         return {**dict(zip(self.floating, map(float, numbers), strict=True)), self.handle.coordinate: 0.0}
 
@@ -107,7 +107,7 @@ def find_joint(model: ModelView, frame: str) -> Articulation | None:
 def write_joint(model: Model, frame: str, fit: Fit, parent: str) -> Symbol:
     """Write an identified joint into a model in place of what attached its part, and return its coordinate.
 
-    The name of the earlier joint stays. Limits are left out: the range that was seen is not that of the joint.
+    The name of the earlier joint stays. The joint has no limits: the range that was seen is not its own.
 
     Parameters
     ----------
@@ -170,8 +170,7 @@ class JointPath:
         """Return the path of an identified joint."""
 
         def pose(value: float) -> Array:
-            poses: Array = fit.motion.linearise(np.array([[value]])).pose
-            return poses[0]
+            return np.asarray(fit.motion.linearise(np.array([[value]])).pose[0])
 
         return cls(pose, first, float(fit.joint_values[0, 0]))
 
@@ -181,7 +180,7 @@ class JointPath:
         expression = model.fk(frame, parent)
         (coordinate,) = expression.symbols
         function = compile(expression, [coordinate], tier="interpreter")
-        return cls(lambda value: function(np.array([value])), first), coordinate
+        return cls(lambda value: np.asarray(function(np.array([value]))), first), coordinate
 
     @property
     def direction(self) -> float:

@@ -12,6 +12,7 @@ from kineverse.geometry import Rule, Scene
 from kineverse.lie import Array, adjoint, exp_se3, inverse
 from kineverse.model.frame import WORLD
 from kineverse.model.model import Model
+from kineverse.model.model_view import ModelView
 from kineverse.state import State
 from kineverse.symbols import Symbol
 
@@ -99,19 +100,15 @@ class LearnedPull:
         Model with a joint of the part; another one than that of the motions.
     bar_T_hand
         Place (4, 4) of the hand on the handle.
-    parent
-        Frame of the model in which the joint alone moves the part.
-    opened, direction
-        Wanted distance from the first pose of the part [m], [rad], and the sign of the motion.
     first
         First pose (4, 4) of the part relative to what it moves in.
+    opened
+        Wanted distance from there [m], [rad].
 
     Attributes
     ----------
-    coordinate
-        Coordinate of the joint.
-    value
-        Its present value [m], [rad].
+    coordinate, path
+        Coordinate of the joint, and the part's path by it.
     """
 
     def __init__(
@@ -148,7 +145,7 @@ def point_speed(twist: Array, point: Array) -> float:
 
 
 def learn_model(model: Model, belief: PartBelief, fit: Fit) -> Model:
-    """Return a copy of a model with a joint that was learned, in which the furniture stands where it is seen."""
+    """Return a copy of a model with a learned joint, in which the furniture stands where it is seen."""
     copy = model.copy()
     place_beside(copy, belief)
     write_joint(copy, belief.unknown.frame, fit, belief.beside)
@@ -177,7 +174,9 @@ def place_beside(model: Model, belief: PartBelief) -> None:
         edit.attach(top, WORLD, pose, f"seen {top}")
 
 
-def _make_controller(motion: HandMotion, model: Model, tasks: list[Hold | Goal], still: list[Symbol]) -> Controller:
+def _make_controller(
+    motion: HandMotion, model: ModelView, tasks: list[Hold | Goal], still: list[Symbol]
+) -> Controller:
     """Return a controller with rows for near bodies, in which the hand may touch the handle."""
     rules = [Rule(b, motion.handle.frame, False, "grasped") for b in motion.gripper.bodies]
     with motion.session.timed("plan"):
