@@ -164,7 +164,7 @@ class PartBelief:
 
     @property
     def is_seen(self) -> bool:
-        """Whether the part was seen often enough to be believed."""
+        """Presence of the part: True if it was seen often enough to be believed."""
         return self.still.count >= _FIRST
 
     @property
