@@ -10,6 +10,7 @@ from .placement import PlacementSearch
 from .pushing import push
 from .session import Session
 from .tracked_belief import TrackedBelief
+from .unknown_opening import open_unknown
 
 __all__ = [
     "ArticulatedObject",
@@ -25,5 +26,6 @@ __all__ = [
     "TrueBelief",
     "find_articulated_objects",
     "open_object",
+    "open_unknown",
     "push",
 ]

@@ -1,0 +1,210 @@
+"""Part of unknown motion in a model: where it was seen, and as something that a hand pulls straight."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Self
+
+import numpy as np
+
+from kineverse.articulations import Floating
+from kineverse.compile import compile  # noqa: A004
+from kineverse.estimation import Fit
+from kineverse.grasping import Handle, find_handle
+from kineverse.lie import Array, inverse, log_se3, pose_difference, to_quaternion
+from kineverse.model.articulation import Articulation
+from kineverse.model.body import Pose
+from kineverse.model.model import Model
+from kineverse.model.model_view import ModelView
+from kineverse.spatial import translation
+from kineverse.state import State
+from kineverse.symbols import Symbol, position
+
+_ROTATION_ARM = np.array([1.0, 1.0, 1.0, 0.3, 0.3, 0.3])
+"""Lengths that make rotations comparable to distances [m]."""
+_STEPS, _DIFFERENCE = 3, 1e-5
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class UnknownPart:
+    """Part that moves freely in a model, and its handle.
+
+    Attributes
+    ----------
+    model
+        Copy of a model in which the part floats, and is pulled along the outward normal of its handle.
+    frame
+        Frame of the part.
+    handle
+        The handle; its coordinate is the one of the straight pull [m].
+    parent
+        Frame in which the part floats.
+    origin
+        Pose (4, 4) of the part in the parent, in the model that was copied.
+    floating
+        The seven coordinates of the floating joint.
+    """
+
+    model: Model
+    frame: str
+    handle: Handle
+    parent: str
+    origin: Array
+    floating: tuple[Symbol, ...]
+
+    def values(self, parent_T_frame: Array) -> dict[Symbol, float]:
+        """Return the coordinates of the part for its pose (4, 4) in the parent."""
+        off = inverse(self.origin) @ parent_T_frame
+        numbers = [*off[:3, 3], *to_quaternion(off[:3, :3])]
+        return {**dict(zip(self.floating, map(float, numbers), strict=True)), self.handle.coordinate: 0.0}
+
+
+def free_part(model: Model, frame: str, handle: str, state: State) -> UnknownPart:
+    """Return a part as something that floats, in a copy of a model.
+
+    Parameters
+    ----------
+    model
+        The model; how it attaches the part does not matter.
+    frame, handle
+        Frame of the part, and frame of the handle's body, which is the part or rigidly below it.
+    state
+        State at which the part is where the model has it.
+
+    Raises
+    ------
+    UnknownNameError
+        For a frame that does not exist, or a handle without a slim shape that stands out.
+    """
+    model.fk(handle, frame)
+    copy = model.copy()
+    parent = model.frames[frame].parent
+    pose = model.fk(frame, parent)
+    parent_T_frame = np.asarray(pose(State({s: state[s] for s in pose.symbols})))
+    name, pull = f"{frame}/seen", position(f"{frame}/pull")
+    tag = f"pull {frame}"
+    with copy.edit() as edit:
+        floating = Floating(name=name, parent=parent, child=name, origin=Pose.from_matrix(parent_T_frame))
+        edit.apply(floating)
+        edit.attach(frame, name, translation(pull, 0, 0), tag)
+    found = find_handle(copy, pull, handle)
+    frame_T_handle = copy.fk(handle, frame)({})
+    outward = frame_T_handle[:3, :3] @ found.pose[:3, 0]
+    with copy.edit() as edit:
+        edit.remove(tag)
+        edit.attach(frame, name, translation(*(float(v) * pull for v in outward)), tag)
+    return UnknownPart(copy, frame, found, parent, parent_T_frame, copy.articulations[name].coordinates)
+
+
+def find_joint(model: ModelView, frame: str) -> Articulation | None:
+    """Return the articulation with coordinates that places a frame, if any."""
+    records = (record for record in model.articulations.values() if record.child == frame)
+    return next((record for record in records if record.coordinates), None)
+
+
+def write_joint(model: Model, frame: str, fit: Fit, parent: str) -> Symbol:
+    """Write an identified joint into a model in place of what attached its part, and return its coordinate.
+
+    The name of the earlier joint stays. The joint has no limits: the range that was seen is not its own.
+
+    Parameters
+    ----------
+    model
+        The model.
+    frame
+        Frame of the part.
+    fit
+        The identified joint between the parent and the part, with one joint value.
+    parent
+        Frame in which the part was observed.
+
+    Raises
+    ------
+    EditError
+        If something else in the model needs the earlier joint; the model is then unchanged.
+    """
+    records = {name: a for name, a in model.articulations.items() if a.child == frame}
+    name = next(iter(records), f"{frame}/joint")
+    writer = model.history.writers(f"frames/{frame}")[-1]
+    with model.edit() as edit:
+        if f"articulations/{name}" in _written(model, writer):
+            edit.replace(writer, fit.operation(name, parent, frame, limits=False))
+        else:
+            child = f"{frame}/learned"
+            edit.apply(fit.operation(name, parent, child, limits=False))
+            edit.attach(frame, child, translation(0, 0, 0))
+    (coordinate,) = model.fk(frame, parent).symbols
+    return coordinate
+
+
+def _written(model: Model, tag: str) -> set[str]:
+    """Return the paths that an operation writes."""
+    return {f"{kind}/{name}" for kind, name in model.history.entry(tag).writes}
+
+
+class JointPath:
+    """Poses of a part along a joint with one degree of freedom, and the value where the part is.
+
+    Parameters
+    ----------
+    pose
+        Function from a joint value to the pose (4, 4) of the part in what it moves in.
+    first
+        First pose (4, 4) of the part.
+
+    Attributes
+    ----------
+    start, value
+        Values at the first and at the present pose [m], [rad].
+    """
+
+    def __init__(self, pose: Callable[[float], Array], first: Array, start: float = 0.0) -> None:
+        self.pose = pose
+        self.start = self.value = start
+        self.start = self.project(first)
+
+    @classmethod
+    def of_fit(cls, fit: Fit, first: Array) -> Self:
+        """Return the path of an identified joint."""
+
+        def pose(value: float) -> Array:
+            return np.asarray(fit.motion.linearise(np.array([[value]])).pose[0])
+
+        return cls(pose, first, float(fit.joint_values[0, 0]))
+
+    @classmethod
+    def of_model(cls, model: ModelView, frame: str, parent: str, first: Array) -> tuple[Self, Symbol]:
+        """Return the path of a part in a model, and the coordinate that moves it."""
+        expression = model.fk(frame, parent)
+        (coordinate,) = expression.symbols
+        function = compile(expression, [coordinate], tier="interpreter")
+        return cls(lambda value: np.asarray(function(np.array([value]))), first), coordinate
+
+    @property
+    def direction(self) -> float:
+        """Sign of the motion so far."""
+        return math.copysign(1.0, self.value - self.start)
+
+    @property
+    def progress(self) -> float:
+        """Distance from the first value [m], [rad]."""
+        return abs(self.value - self.start)
+
+    def project(self, pose: Array) -> float:
+        """Move the value to where the part is nearest to a pose (4, 4), and return it [m], [rad].
+
+        Gauss-Newton steps from the present value; a rotation counts by its angle times 0.3 m.
+        """
+        for _ in range(_STEPS):
+            here, ahead = self.pose(self.value), self.pose(self.value + _DIFFERENCE)
+            slope = pose_difference(ahead, here) / _DIFFERENCE * _ROTATION_ARM
+            off = pose_difference(pose, here) * _ROTATION_ARM
+            self.value += float(slope @ off) / float(slope @ slope)
+        return self.value
+
+    def twist(self) -> Array:
+        """Return the twist (6,) of the part in its own axes by the value, in the direction of the motion."""
+        here, ahead = self.pose(self.value), self.pose(self.value + _DIFFERENCE)
+        return self.direction * log_se3(inverse(here) @ ahead) / _DIFFERENCE

@@ -1,0 +1,184 @@
+"""Pulling of a held part: straight while nobody knows how it moves, then along the joint that was learned."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from kineverse.control import Controller, Goal, Hold, Target, same_pose
+from kineverse.control.command import Command
+from kineverse.errors import InvalidValueError
+from kineverse.estimation import Fit
+from kineverse.geometry import Rule, Scene
+from kineverse.lie import Array, adjoint, exp_se3, inverse
+from kineverse.model.frame import WORLD
+from kineverse.model.model import Model
+from kineverse.model.model_view import ModelView
+from kineverse.state import State
+from kineverse.symbols import Symbol
+
+from .hand_motion import HandMotion
+from .part_looks import PartBelief
+from .unknown_part import JointPath, write_joint
+
+_FIRST_SPEED, PULL_SPEED, _SPEED_UP = 0.02, 0.05, 0.04
+"""Speeds of the straight pull at first and after a way [m/s], [m]."""
+PATH_SPEED = 0.1
+"""Speed of the handle along a learned joint [m/s]."""
+_BEYOND = 1.2
+"""Place of the goal by the wanted opening: before a goal the motion slows down."""
+_GAIN = 5.0
+"""Rate at which errors of the hand's place on the part decay [1/s]."""
+_STRAIGHT = 0.035
+"""Way of the handle after which the likeliest joint counts as much as its normal for the direction [m]."""
+_RAMP = 0.5
+"""Time in which the pull begins [s]."""
+_MARGIN = 0.002
+"""Least distance of bodies while the part moves [m]."""
+
+
+class StraightPull:
+    """Pull along the outward normal of a handle, while the hand follows the part as it is seen.
+
+    The hand holds its place on the part, shifted ahead by speed / gain along the normal. So a part that does
+    not follow stops the hand after 4 mm, and the hand yields to any other motion of the part. The pull begins
+    slowly, as nothing is known of the direction.
+
+    Parameters
+    ----------
+    motion
+        Motions of the hand.
+    belief
+        Belief about the part.
+    bar_T_hand
+        Place (4, 4) of the hand on the handle.
+
+    Attributes
+    ----------
+    likely
+        The likeliest joint, which leads the pull the more the further the part has moved.
+    """
+
+    def __init__(self, motion: HandMotion, belief: PartBelief, bar_T_hand: Array) -> None:
+        self.motion, self.belief, self.bar_T_hand = motion, belief, bar_T_hand
+        model, unknown = motion.model, belief.unknown
+        self._part_T_bar = np.asarray(model.fk(motion.handle.frame, unknown.frame)({}))
+        hand, bar = model.fk(motion.gripper.hand), model.fk(motion.handle.frame)
+        self._place = Target("pull/place", bar_T_hand)
+        hold = Hold(same_pose(bar @ self._place.expression, hand), gain=_GAIN, name="grasp")
+        still = [*motion.search.standing, *motion.gripper.joints, unknown.handle.coordinate]
+        self._controller = _make_controller(motion, model, [hold], [*still, *unknown.floating])
+        self._begin = motion.session.world.time
+        self._point = motion.handle.pose[:3, 3]
+        self.likely: JointPath | None = None
+
+    def step(self, way: float) -> Command:
+        """Return the command of a step, after a way of the handle [m]."""
+        session = self.motion.session
+        share = min(1.0, (session.world.time - self._begin) / _RAMP)
+        speed = _FIRST_SPEED + min(1.0, way / _SPEED_UP) * (PULL_SPEED - _FIRST_SPEED)
+        lead = share * speed / _GAIN
+        twist = np.concatenate([self.motion.handle.pose[:3, 0], np.zeros(3)])
+        if self.likely is not None:
+            self.likely.project(self.belief.relative_pose)
+            weight = way**2 / (way**2 + _STRAIGHT**2)
+            led = adjoint(inverse(self._part_T_bar)) @ self.likely.twist()
+            twist = (1.0 - weight) * twist + weight * led / point_speed(led, self._point)
+        self._controller.set(self._place, exp_se3(lead * twist) @ self.bar_T_hand)
+        return self._controller.step(session.state)
+
+
+class LearnedPull:
+    """Motion of the hand with a part along its joint in a model.
+
+    Parameters
+    ----------
+    motion
+        Motions of the hand.
+    belief
+        Belief about the part.
+    model
+        Model with a joint of the part; another one than that of the motions.
+    bar_T_hand
+        Place (4, 4) of the hand on the handle.
+    first
+        First pose (4, 4) of the part relative to what it moves in.
+    opened
+        Wanted distance from there [m], [rad].
+
+    Attributes
+    ----------
+    coordinate, path
+        Coordinate of the joint, and the part's path by it.
+    """
+
+    def __init__(
+        self,
+        motion: HandMotion,
+        belief: PartBelief,
+        model: Model,
+        bar_T_hand: Array,
+        first: Array,
+        opened: float,
+    ) -> None:
+        self.motion, self.belief, self.model = motion, belief, model
+        unknown = belief.unknown
+        path, self.coordinate = JointPath.of_model(model, unknown.frame, belief.beside, first)
+        path.project(belief.relative_pose)
+        belief.path = self.path = path
+        end = path.start + path.direction * _BEYOND * opened
+        hand, bar = model.fk(motion.gripper.hand), model.fk(motion.handle.frame)
+        hold = Hold(same_pose(bar @ bar_T_hand, hand), gain=_GAIN, name="grasp")
+        twist = adjoint(inverse(model.fk(motion.handle.frame, unknown.frame)({}))) @ path.twist()
+        speed = PATH_SPEED / point_speed(twist, motion.handle.pose[:3, 3])
+        goal = Goal(self.coordinate, end, speed=speed, name="object")
+        still: list[Symbol] = [*motion.search.standing, *motion.gripper.joints]
+        self._controller = _make_controller(motion, model, [hold, goal], still)
+
+    def step(self, way: float) -> Command:
+        """Return the command of a step, after a way of the handle [m]."""
+        return self._controller.step(self.motion.session.state | State({self.coordinate: self.path.value}))
+
+
+def point_speed(twist: Array, point: Array) -> float:
+    """Return the speed of a point (3,) [m] of a body with a twist (6,), both in axes of the body."""
+    return float(np.linalg.norm(twist[:3] + np.cross(twist[3:], point)))
+
+
+def learn_model(model: Model, belief: PartBelief, fit: Fit) -> Model:
+    """Return a copy of a model with a learned joint, in which the furniture stands where it is seen."""
+    copy = model.copy()
+    place_beside(copy, belief)
+    write_joint(copy, belief.unknown.frame, fit, belief.beside)
+    return copy
+
+
+def place_beside(model: Model, belief: PartBelief) -> None:
+    """Put the furniture that carries the part where it is seen.
+
+    Raises
+    ------
+    InvalidValueError
+        If joints move it, so that there is no frame to put elsewhere.
+    """
+    if belief.beside == WORLD:
+        return
+    if model.fk(belief.beside).symbols:
+        raise InvalidValueError(
+            f"'{belief.beside}' is moved by joints itself; name a frame that stands still as beside=."
+        )
+    top = belief.beside
+    while model.frames[top].parent != WORLD:
+        top = model.frames[top].parent
+    pose = belief.reference_pose @ inverse(model.fk(belief.beside)({})) @ model.fk(top)({})
+    with model.edit() as edit:
+        edit.attach(top, WORLD, pose, f"seen {top}")
+
+
+def _make_controller(
+    motion: HandMotion, model: ModelView, tasks: list[Hold | Goal], still: list[Symbol]
+) -> Controller:
+    """Return a controller with rows for near bodies, in which the hand may touch the handle."""
+    rules = [Rule(b, motion.handle.frame, False, "grasped") for b in motion.gripper.bodies]
+    with motion.session.timed("plan"):
+        scene = Scene(model, rules=[*motion.search.scene.rules, *rules])
+        return Controller(model, tasks, dt=motion.session.dt, still=still, scene=scene, margin=_MARGIN)

@@ -1,0 +1,141 @@
+import numpy as np
+import pytest
+
+import kineverse as kv
+from kineverse.errors import InvalidValueError, UnknownNameError
+from kineverse.estimation import identify, pose_covariance
+from kineverse.lie import inverse, quaternion, retract, rotation_z, transform, translation
+from kineverse.manipulation import Session, open_unknown
+from kineverse.manipulation.joint_learning import JointLearning
+from kineverse.manipulation.part_looks import PoseMean
+from kineverse.manipulation.unknown_part import JointPath, free_part, write_joint
+from kineverse.worlds import KinematicWorld, Sensors
+
+DOOR, HANDLE = "shelf_door/door", "shelf_door/door_handle"
+NOISE = np.array([0.0045] * 3 + [0.0087] * 3)
+
+
+def make_model():
+    model = kv.load("hsr")
+    with model.edit() as edit:
+        edit.include("shelf_door", "shelf_door")
+        edit.attach("shelf_door/shelf", parent="world", transform=kv.translation(1, 0, 0.7))
+    return model
+
+
+def forget_joint(model, joint=kv.Fixed, **options):
+    tag = f"joint {DOOR}"
+    old = model.history.operation(tag)
+    new = joint(name=old.name, parent=old.parent, child=old.child, origin=old.origin, **options)
+    with model.edit() as edit:
+        edit.replace(tag, new)
+
+
+def look(pose, random, outliers=0.05):
+    if random.random() < outliers:
+        return transform(quaternion(random.normal(size=4)), pose[:3, 3] + random.uniform(-1, 1, 3))
+    return retract(pose, NOISE * random.normal(size=6))
+
+
+def hinge(way):
+    return transform(rotation_z(way / 0.38), np.zeros(3)) @ translation(np.array([0.0, -0.38, 0.0]))
+
+
+def rail(way):
+    return translation(np.array([way, 0.0, 0.0]))
+
+
+@pytest.mark.parametrize(("path", "family"), [(hinge, "revolute"), (rail, "prismatic")])
+def test_family_is_known_before_8_cm_with_outliers(path, family):
+    known = 0
+    for seed in range(10):
+        random, learning = np.random.default_rng(seed), JointLearning()
+        for way in [*np.zeros(20), *np.arange(0.0, 0.15, 0.05 / 30)]:
+            seen = look(path(way), random)
+            if np.linalg.norm(seen[:3, 3] - path(way)[:3, 3]) < 0.06:  # a part in a hand is near it
+                learning.add(seen, np.diag(NOISE**2))
+            learning.update(way, way / 0.38 if family == "revolute" else 0.0, 0.0)
+        found = learning.learned
+        known += found is not None and found.family == family and found.way < 0.08
+    assert known >= 9
+
+
+def test_mean_of_poses_leaves_a_first_outlier_out():
+    random, true = np.random.default_rng(0), translation(np.array([1.0, 2.0, 0.5]))
+    mean = PoseMean(60.0)
+    mean.add(translation(np.array([2.0, 2.0, 0.5])))
+    for _ in range(40):
+        mean.add(look(true, random, 0.2))
+    np.testing.assert_allclose(mean.pose, true, atol=5e-3)
+    assert not mean.add(translation(np.array([2.0, 2.0, 0.5])))
+
+
+def test_free_part_is_where_it_is_seen_and_is_pulled_along_the_normal():
+    model = make_model()
+    unknown = free_part(model, DOOR, HANDLE, model.default_state())
+    seen = retract(unknown.origin, np.array([0.02, -0.01, 0.03, 0.1, 0.2, -0.3]))
+    state = unknown.model.default_state().updated(unknown.values(seen))
+    np.testing.assert_allclose(unknown.model.fk(DOOR, unknown.parent)(state), seen, atol=1e-12)
+    pulled = state.updated({unknown.handle.coordinate: 0.1})
+    handle = unknown.model.fk(HANDLE)
+    shift = (inverse(handle(state) @ unknown.handle.pose) @ handle(pulled) @ unknown.handle.pose)[:3, 3]
+    np.testing.assert_allclose(shift, [0.1, 0.0, 0.0], atol=1e-12)
+
+
+def test_learned_joint_replaces_the_attachment_without_limits():
+    random, model, truth = np.random.default_rng(1), make_model(), make_model()
+    forget_joint(model)
+    door = truth.fk(DOOR, "shelf_door/body")
+    angles = np.linspace(0.0, 1.0, 60)
+    poses = np.array([look(door({DOOR: q}), random, 0.0) for q in angles])
+    fit = identify(None, poses, noise=pose_covariance(0.0045, 0.0087)).best
+    coordinate = write_joint(model, DOOR, fit, "shelf_door/body")
+    assert coordinate in model.degrees_of_freedom
+    assert model.limits(coordinate) == (-np.inf, np.inf)
+    expression = model.fk(DOOR, "shelf_door/body")
+    path = JointPath(lambda q: expression({coordinate: q}), door({DOOR: 0.0}))
+    value = path.project(door({DOOR: 1.5}))
+    np.testing.assert_allclose(expression({coordinate: value}), door({DOOR: 1.5}), atol=0.02)
+    assert path.progress == pytest.approx(1.5, abs=0.02)
+
+
+def run(model, world_model, part=None, seed=1, **options):
+    sensors = Sensors.parse("3mm+3mm/m,0.5deg,30Hz,outliers=0.05")
+    world = KinematicWorld(world_model, "hsr", sensors=sensors, seed=seed)
+    world.reset(world_model.default_state().updated({"hsr/base/x": -0.5}))
+    return open_unknown(Session(world), HANDLE, model=model, part=part, sensors=sensors, **options)
+
+
+def test_door_that_was_believed_to_slide_is_relearned_and_opened():
+    model, truth = make_model(), make_model()
+    forget_joint(model, kv.Prismatic, axis=(1.0, 0.0, 0.0), lower=0.0, upper=0.3)
+    outcome = run(model, truth)
+    assert outcome, outcome.reason
+    assert outcome.value == pytest.approx(np.radians(60), abs=0.05)
+    assert outcome.measures["believed"] == "refuted"
+    assert outcome.measures["decided_turn"] < np.radians(10)
+    assert outcome.measures["opened_seconds"] < 15
+    assert model.articulations[DOOR].kind == "revolute"
+
+
+def test_door_that_nothing_moves_is_said_not_to_follow():
+    model, truth = make_model(), make_model()
+    forget_joint(model)
+    with truth.edit() as edit:
+        edit.constrain("lock", 0, kv.position(DOOR).derivative(), 0)
+    outcome = run(model, truth, part=DOOR)
+    assert not outcome
+    assert "does not follow the hand" in outcome.reason
+    assert outcome.measures["failure"] == "other"
+    assert model.articulations[DOOR].kind == "fixed"
+
+
+def test_wrong_arguments_name_the_mistake():
+    model = make_model()
+    with pytest.raises(UnknownNameError, match="door_handle"):
+        open_unknown(Session(KinematicWorld(model, "hsr")), "shelf_door/handle", model=model)
+    session = Session(KinematicWorld(model, "hsr"))
+    with pytest.raises(InvalidValueError, match="way="):
+        open_unknown(session, HANDLE, model=model, way=-1.0)
+    with pytest.raises(InvalidValueError, match="is not below the part"):
+        open_unknown(session, HANDLE, model=model, part="hsr/hand_palm_link")
