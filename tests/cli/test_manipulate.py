@@ -64,7 +64,9 @@ def asked(monkeypatch):
         return Outcome(done, 0.3, "it is over", session.world.name, 0.04, 2, {"grasp": float("nan")})
 
     monkeypatch.setitem(
-        sys.modules, "kineverse.manipulation.opening", SimpleNamespace(open_object=open_object)
+        sys.modules,
+        "kineverse.manipulation.opening.grasped_opening",
+        SimpleNamespace(open_object=open_object),
     )
     return calls
 

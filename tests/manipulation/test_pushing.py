@@ -13,13 +13,13 @@ from kineverse.control.contact_slots import ContactSlots
 from kineverse.errors import InvalidValueError, UnknownNameError
 from kineverse.geometry import Scene
 from kineverse.manipulation.outcome import Outcome
-from kineverse.manipulation.push_approach import plan_push_approach
-from kineverse.manipulation.push_contact import PushSurface, find_push_tool
-from kineverse.manipulation.push_controller import Pushing
-from kineverse.manipulation.push_placement import find_push_start, roll_out
-from kineverse.manipulation.push_press import PushPress
-from kineverse.manipulation.push_trials import try_push
-from kineverse.manipulation.pushing import push
+from kineverse.manipulation.pushing.approach import plan_push_approach
+from kineverse.manipulation.pushing.contact_points import PushSurface, find_push_tool
+from kineverse.manipulation.pushing.controller import Pushing
+from kineverse.manipulation.pushing.placement import find_push_start, roll_out
+from kineverse.manipulation.pushing.press import PushPress
+from kineverse.manipulation.pushing.push_skill import push
+from kineverse.manipulation.pushing.trials import try_push
 from kineverse.manipulation.session import Session
 from kineverse.manipulation.tracked_belief import TrackedBelief
 from kineverse.model.body import Body, Box, Pose, Shape

@@ -6,9 +6,9 @@ from kineverse.errors import InvalidValueError, UnknownNameError
 from kineverse.estimation import identify, pose_covariance
 from kineverse.lie import inverse, quaternion, retract, rotation_z, transform, translation
 from kineverse.manipulation import Session, open_unknown
-from kineverse.manipulation.joint_learning import JointLearning
-from kineverse.manipulation.part_looks import PoseMean
-from kineverse.manipulation.unknown_part import JointPath, free_part, write_joint
+from kineverse.manipulation.unknown_objects.joint_learning import JointLearning
+from kineverse.manipulation.unknown_objects.part import JointPath, free_part, write_joint
+from kineverse.manipulation.unknown_objects.part_belief import PoseMean
 from kineverse.worlds import KinematicWorld, Sensors
 
 DOOR, HANDLE = "shelf_door/door", "shelf_door/door_handle"

@@ -271,7 +271,7 @@ def _grasp(
         return _without_steps(scene, world, False, scene.why)
 
     from kineverse.grasping import find_handle, find_handles
-    from kineverse.manipulation.opening import open_object
+    from kineverse.manipulation.opening.grasped_opening import open_object
     from kineverse.manipulation.session import Session
 
     if arguments.handle is not None:
@@ -298,9 +298,9 @@ def _push(
     look: Callable[[RecordedStep], None],
 ) -> Outcome:
     """Push the object, from where the robot stands or from a place that is searched."""
-    from kineverse.manipulation.push_controller import Pushing
-    from kineverse.manipulation.push_placement import find_push_start, roll_out
-    from kineverse.manipulation.pushing import push
+    from kineverse.manipulation.pushing.controller import Pushing
+    from kineverse.manipulation.pushing.placement import find_push_start, roll_out
+    from kineverse.manipulation.pushing.push_skill import push
     from kineverse.manipulation.session import Session
 
     if not scene.pusher:

@@ -1,16 +1,14 @@
 """Manipulation: skills that open, close and push articulated objects with a robot (layer 5)."""
 
 from .articulated_objects import ArticulatedObject, find_articulated_objects
-from .base_placement import BasePlacement
 from .belief import Belief, TrueBelief
 from .open_close import OpenCloseReport, OpenCloseRunner
-from .opening import open_object
+from .opening import BasePlacement, PlacementSearch, open_object
 from .outcome import Outcome, SkillError
-from .placement import PlacementSearch
 from .pushing import push
 from .session import Session
 from .tracked_belief import TrackedBelief
-from .unknown_opening import open_unknown
+from .unknown_objects import open_unknown
 
 __all__ = [
     "ArticulatedObject",

@@ -13,7 +13,7 @@ from typing import Any
 from kineverse.errors import FormatError
 from kineverse.experiments.registry import BOTH, WORLDS, Options
 from kineverse.manipulation import Belief, Outcome, Session, TrackedBelief, TrueBelief
-from kineverse.manipulation.push_pair import PushView
+from kineverse.manipulation.pushing.nearest_pair import PushView
 from kineverse.model.model import Model
 from kineverse.state import StateLike
 from kineverse.worlds import KinematicWorld, MujocoWorld, Recorder, Sensors, World

@@ -12,8 +12,8 @@ from kineverse.errors import KineverseError
 from kineverse.geometry import Scene
 from kineverse.grasping import find_gripper, find_handle
 from kineverse.manipulation import Outcome, Session, open_object
-from kineverse.manipulation.push_controller import Pushing
-from kineverse.manipulation.push_trials import try_push
+from kineverse.manipulation.pushing.controller import Pushing
+from kineverse.manipulation.pushing.trials import try_push
 from kineverse.model.model import Model
 from kineverse.state import State
 from kineverse.worlds import Judge, World

@@ -10,15 +10,15 @@ import numpy as np
 from kineverse.geometry import Rule, Scene
 from kineverse.geometry.objects import Exclusion
 from kineverse.grasping import find_gripper
+from kineverse.manipulation.outcome import Outcome
+from kineverse.manipulation.session import Session
 from kineverse.state import State
 from kineverse.symbols import Symbol
 from kineverse.worlds import World
 
-from .outcome import Outcome
-from .push_controller import Pushing
-from .push_placement import find_push_start
-from .pushing import push
-from .session import Session
+from .controller import Pushing
+from .placement import find_push_start
+from .push_skill import push
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -34,12 +34,12 @@ from kineverse.state import State, StateLike
 from kineverse.symbols import Symbol
 from kineverse.worlds import Observation
 
-from .push_choice import CONE, CONE_END, ContactChoice
-from .push_contact import PushPoint, PushSurface, find_push_tool
-from .push_pair import PairFinder, PushPair, PushView, make_view
-from .push_press import PushPress, TipAnchor
-from .push_program import LOST, NEAR, PRESS, TOUCHING, PushProgram
-from .push_scene import find_overlapping_links, furniture_rules, match_bodies
+from .contact_choice import CONE, CONE_END, ContactChoice
+from .contact_points import PushPoint, PushSurface, find_push_tool
+from .nearest_pair import PairFinder, PushPair, PushView, make_view
+from .press import PushPress, TipAnchor
+from .program import LOST, NEAR, PRESS, TOUCHING, PushProgram
+from .scene import find_overlapping_links, furniture_rules, match_bodies
 
 _APART = 4e-3
 """Gap between pusher and object away from the contact [m]."""

@@ -20,7 +20,7 @@ import numpy as np
 
 from kineverse.lie import Array
 
-from .push_program import PRESS
+from .program import PRESS
 
 RAMP = 0.02
 """Speed of the contact point beyond the measured one that is tried [m/s]."""

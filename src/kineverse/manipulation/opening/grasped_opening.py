@@ -11,6 +11,8 @@ import numpy as np
 
 from kineverse.errors import InfeasibleError, InvalidValueError, NotFiniteError
 from kineverse.grasping import Grasp, Gripper, Handle, find_gripper, find_handle, sample_grasps
+from kineverse.manipulation.outcome import Outcome, SkillError, SlipError
+from kineverse.manipulation.session import Session
 from kineverse.model.model_view import ModelView
 from kineverse.planning import Planner, Trajectory
 from kineverse.state import State
@@ -20,10 +22,8 @@ from kineverse.worlds import Judge
 from .base_placement import BasePlacement
 from .hand_motion import HandMotion
 from .held_motion import move_held
-from .outcome import Outcome, SkillError, SlipError
 from .placement import PlacementSearch
 from .push_fallback import PushFallback
-from .session import Session
 
 _GRASPS = 96
 _PLANNING = 2.0

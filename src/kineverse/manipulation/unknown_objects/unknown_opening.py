@@ -19,19 +19,19 @@ from kineverse.errors import (
 from kineverse.estimation import PlausibilityMonitor, pose_covariance
 from kineverse.grasping import Grasp, find_gripper, sample_grasps
 from kineverse.lie import Array, inverse
+from kineverse.manipulation.opening import BasePlacement, PlacementSearch
+from kineverse.manipulation.opening.hand_motion import HandMotion
+from kineverse.manipulation.outcome import Outcome, SkillError
+from kineverse.manipulation.session import Session
 from kineverse.model.frame import WORLD
 from kineverse.model.model import Model
 from kineverse.planning import Planner
 from kineverse.worlds import Judge, Sensors
 
-from .hand_motion import HandMotion
 from .joint_learning import JointLearning
-from .outcome import Outcome, SkillError
-from .part_looks import PartBelief, measure_way
-from .placement import BasePlacement, PlacementSearch
-from .session import Session
-from .unknown_part import JointPath, find_joint, free_part, write_joint
-from .unknown_pull import LearnedPull, StraightPull, learn_model, place_beside
+from .part import JointPath, find_joint, free_part, write_joint
+from .part_belief import PartBelief, measure_way
+from .pull import LearnedPull, StraightPull, learn_model, place_beside
 
 OPEN_WAY, OPEN_TURN = 0.25, math.radians(60.0)
 """Opening that is wanted by default [m], [rad]."""
@@ -258,7 +258,7 @@ class _Run:
             self.measures["pull_seconds"] = self.world.time - self.pulling
             self.belief.release()
             if not self._is_late():
-                self.motion.release(grasp)
+                self.motion.release(placement)
 
     def _is_late(self) -> bool:
         """Return whether no time is left to let go."""

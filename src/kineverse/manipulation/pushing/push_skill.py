@@ -12,15 +12,15 @@ from kineverse.errors import KineverseError
 from kineverse.geometry import Rule
 from kineverse.geometry.objects import Exclusion
 from kineverse.grasping import find_gripper
+from kineverse.manipulation.outcome import Outcome
+from kineverse.manipulation.session import Session
 from kineverse.planning import Path
 from kineverse.state import State
 from kineverse.symbols import Symbol
 
-from .outcome import Outcome
-from .push_approach import plan_push_approach
-from .push_controller import Pushing
-from .push_press import STILL
-from .session import Session
+from .approach import plan_push_approach
+from .controller import Pushing
+from .press import STILL
 
 _SETTLED, _SETTLED_ESTIMATE = 5, 25
 """Number of steps for which the value, or its estimate, is within half of the tolerance when a push ends."""

@@ -22,7 +22,7 @@ from kineverse.model.model_view import ModelView
 from kineverse.state import State
 from kineverse.symbols import Symbol, parameter
 
-from .push_contact import PushTool
+from .contact_points import PushTool
 
 TOUCHING = 1e-3
 """Largest gap of a contact [m]."""

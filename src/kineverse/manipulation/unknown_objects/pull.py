@@ -10,15 +10,15 @@ from kineverse.errors import InvalidValueError
 from kineverse.estimation import Fit
 from kineverse.geometry import Rule, Scene
 from kineverse.lie import Array, adjoint, exp_se3, inverse
+from kineverse.manipulation.opening.hand_motion import HandMotion
 from kineverse.model.frame import WORLD
 from kineverse.model.model import Model
 from kineverse.model.model_view import ModelView
 from kineverse.state import State
 from kineverse.symbols import Symbol
 
-from .hand_motion import HandMotion
-from .part_looks import PartBelief
-from .unknown_part import JointPath, write_joint
+from .part import JointPath, write_joint
+from .part_belief import PartBelief
 
 _FIRST_SPEED, PULL_SPEED, _SPEED_UP = 0.02, 0.05, 0.04
 """Speeds of the straight pull at first and after a way [m/s], [m]."""

@@ -14,16 +14,16 @@ from kineverse.control import Command, Controller, Goal, Hold, Target, same_pose
 from kineverse.control.tasks import Task
 from kineverse.grasping import Grasp, Gripper, Handle
 from kineverse.lie import Array, inverse
+from kineverse.manipulation.hand_reference import HandReference
+from kineverse.manipulation.outcome import SkillError
+from kineverse.manipulation.session import Session
 from kineverse.planning import Planner, Trajectory, TrajectoryFollower
 from kineverse.state import State
 from kineverse.symbols import Symbol
 from kineverse.worlds import Judge
 
 from .base_placement import BasePlacement
-from .hand_reference import HandReference
-from .outcome import SkillError
 from .placement import PlacementSearch
-from .session import Session
 
 _CLOSING, _MOST_CLOSING = 1.5, 4.0
 """Time in which fingers open or close fully, and the largest one [s]."""

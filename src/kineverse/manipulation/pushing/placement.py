@@ -17,7 +17,7 @@ from kineverse.expressions.expression import array
 from kineverse.state import State
 from kineverse.symbols import Symbol
 
-from .push_controller import Pushing
+from .controller import Pushing
 
 _STANDOFF = 0.03
 """Distance of the tip from the contact point at the start [m]."""

@@ -12,8 +12,8 @@ from kineverse.control.contact_slots import ContactSlots
 from kineverse.geometry.results import DistanceResults
 from kineverse.lie import Array
 
-from .push_contact import PushPoint, cross_product, find_alignment
-from .push_program import PRESS, TOUCHING
+from .contact_points import PushPoint, cross_product, find_alignment
+from .program import PRESS, TOUCHING
 
 _MOST_PAIRS = 6
 

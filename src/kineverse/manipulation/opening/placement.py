@@ -19,6 +19,7 @@ from kineverse.geometry import Rule, Scene
 from kineverse.geometry.prepared_query import PreparedQuery
 from kineverse.grasping import Grasp, Gripper
 from kineverse.lie import Array
+from kineverse.manipulation.pushing.scene import find_overlapping_links, furniture_rules
 from kineverse.model.model_view import ModelView
 from kineverse.state import State
 from kineverse.symbols import Symbol
@@ -26,7 +27,6 @@ from kineverse.symbols import Symbol
 from .base_placement import NO_WAY, BasePlacement
 from .hand_paths import HandPaths
 from .placement_samples import PlacementSamples, find_planar_base
-from .push_scene import find_overlapping_links, furniture_rules
 
 _STEP = 0.05
 """Distance of neighbouring values of the object along its way [m], [rad]."""

@@ -3,14 +3,14 @@
 from __future__ import annotations
 
 from kineverse.errors import InvalidValueError
+from kineverse.manipulation.outcome import SkillError
+from kineverse.manipulation.pushing.controller import Pushing
+from kineverse.manipulation.pushing.placement import find_push_start
+from kineverse.manipulation.pushing.push_skill import push
 from kineverse.planning import Trajectory
 from kineverse.state import State
 
 from .hand_motion import HandMotion
-from .outcome import SkillError
-from .push_controller import Pushing
-from .push_placement import find_push_start
-from .pushing import push
 
 _SAMPLES, _SEARCHING = 120, 60.0
 """Largest number of sampled starts, and largest time of their search [s]."""

@@ -9,7 +9,7 @@ import numpy as np
 from kineverse.lie import Array
 from kineverse.state import State
 
-from .push_contact import PushContacts, PushPoint, PushSurface
+from .contact_points import PushContacts, PushPoint, PushSurface
 
 CONE, CONE_END = math.cos(math.radians(25.0)), math.cos(math.radians(40.0))
 """Cosines of the friction cone in which a contact point is chosen, and of the one in which it is kept."""

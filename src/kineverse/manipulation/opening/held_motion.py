@@ -9,10 +9,10 @@ from kineverse.control import Goal, Hold, Target, same_pose
 from kineverse.control.tasks import Task
 from kineverse.geometry import Rule, Scene
 from kineverse.lie import inverse
+from kineverse.manipulation.outcome import SkillError, SlipError
 
 from .base_placement import BasePlacement
 from .hand_motion import FOLLOWING, HandMotion, row_at
-from .outcome import SkillError, SlipError
 
 _SPEED, _RAMP = 0.3, 0.5
 """Speed of an object along its planned way [m/s], [rad/s], and the time from rest to it [s]."""

@@ -17,7 +17,7 @@ from kineverse.symbols import Symbol
 from kineverse.worlds import Observation, Sensors, World
 from kineverse.worlds.sensor_sampler import find_camera, is_of_robot
 
-from .unknown_part import JointPath, UnknownPart
+from .part import JointPath, UnknownPart
 
 _FLOOR_POSITION, _FLOOR_ORIENTATION = 2e-4, 2e-4
 """Least standard deviations of observed poses [m], [rad]: no camera is exact."""
@@ -233,12 +233,13 @@ class PartBelief:
     def reset(self) -> None:
         """Forget all looks."""
         self.held, self.path, self.looks, self._beside = None, None, [], None
+        self.observation: Observation | None = None
         self.still = PoseMean(_STATIC_LOOKS)
         self._references = {name: PoseMean(_STATIC_LOOKS) for name in self._ancestors}
 
     def update(self, world: World, commands: State | None = None) -> State:
         """Return the state of the model of the part after reading the sensors."""
-        seen = world.observe()
+        self.observation = seen = world.observe()
         joints = {s: v for s, v in seen.joints.items() if s in self._symbols}
         self._state = self._state.updated(joints)
         self._world_T_hand = self._hand(self._state.vector(self._hand.inputs))
