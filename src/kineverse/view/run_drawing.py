@@ -39,7 +39,7 @@ ARROW_SCALE, LONGEST_ARROW = 0.25, 0.6
 WAY_RADIUS = 0.008
 """Half of the width of the way of a hand [m]."""
 
-_APART, _TURNED = 1e-3, 2e-3
+_APART, _TURNED = 3e-3, 5e-3
 """Least difference of a belief that is shown [m], [rad]; below, the ghost would flicker on the body."""
 
 _MOST_CONTACTS = 4
