@@ -143,9 +143,9 @@ def test_run_kitchen_opens_then_closes_and_reports_every_failure(monkeypatch):
 
     monkeypatch.setattr(skills, "open_object", open_object)
     monkeypatch.setattr(setting, "KinematicWorld", World)
-    trials = kitchens.run_kitchen(kitchens.KitchenJob(2, SHIPPED["hsr"]))
-    model = kitchens.make_kitchen_with(SHIPPED["hsr"], 2)
-    objects = kitchens.list_objects(model, "kitchen")
+    trials = kitchens.run_kitchen(kitchens.KitchenJob("kitchens/2", SHIPPED["hsr"]))
+    model = kitchens.make_kitchen_with(SHIPPED["hsr"], "kitchens/2")
+    objects = [str(s) for s in model.degrees_of_freedom if str(s).startswith("kitchen/")]
     assert {t.what for t in trials} == set(objects)
     assert all(t.cpu == (1e-3, 2e-3) for t in trials)
     assert all(t.dof == 11 for t in trials)
@@ -164,7 +164,7 @@ def test_run_kitchen_opens_then_closes_and_reports_every_failure(monkeypatch):
             assert [(t.skill, t.done) for t in own] == [("open", True), ("close", False)]
         else:
             assert [(t.skill, t.done) for t in own] == [("open", True), ("close", True)]
-    report = kitchens.report_trials(trials, range(2, 3))
+    report = kitchens.report_trials(trials, ["kitchens/2"])
     numbers = json.loads(json.dumps(report.numbers, allow_nan=False))
     assert len(numbers["failures"]) == sum(not t.done for t in trials) > 2
     (row,) = numbers["robots"]
@@ -273,7 +273,7 @@ def test_opening_report_without_skill_has_the_papers_figures():
 
 def test_start_in_aisle_is_free_where_the_middle_is_not():
     """The elbow of the PR2 at its start is wider than the narrowest aisles."""
-    robot, model = SHIPPED["pr2"], kitchens.make_kitchen_with(SHIPPED["pr2"], 305)
+    robot, model = SHIPPED["pr2"], kitchens.make_kitchen_with(SHIPPED["pr2"], "kitchens/305")
     start = kitchens.start_in_aisle(robot, model)
     scene = Scene(model, rules=[Rule("*", "kitchen/floor")])
 
@@ -311,7 +311,7 @@ def test_trial_watch_keeps_commands_of_the_last_session_and_records(tmp_path):
 
 
 def test_setting_believes_the_truth_only_without_noise():
-    model = kitchens.make_kitchen_with(SHIPPED["hsr"], 2)
+    model = kitchens.make_kitchen_with(SHIPPED["hsr"], "kitchens/2")
     start = SHIPPED["hsr"].start_state(model)
     world = TrialSetting("kinematic", "3mm").make_world(model, "hsr", start)
     assert isinstance(TrialSetting("kinematic", "3mm").make_belief(world), TrackedBelief)

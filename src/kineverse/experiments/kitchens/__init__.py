@@ -1,4 +1,4 @@
-"""``kitchens``: robots open and close everything in generated kitchens.
+"""``kitchens``: robots open and close everything in generated kitchens, or in any other model.
 
 Each kitchen is generated from a seed; see :mod:`kineverse.gallery.kitchens`. For each object, a robot begins
 in the aisle, and all is shut. It opens the object, and closes it again if that succeeded.
@@ -7,10 +7,11 @@ in the aisle, and all is shut. It opens the object, and closes it again if that 
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 from itertools import product
 
-from kineverse.errors import NoSolutionError
+from kineverse.errors import KineverseError, NoSolutionError
 from kineverse.experiments.manipulation.robots import RobotSource, find_data, find_robots
 from kineverse.experiments.manipulation.setting import SettingOptions, TrialSetting, make_settings
 from kineverse.experiments.manipulation.skills import TrialCase, open_then_close
@@ -24,10 +25,13 @@ from kineverse.experiments.manipulation.trials import Trial
 from kineverse.experiments.registry import Options, Progress
 from kineverse.experiments.report import Report
 from kineverse.geometry import Rule, Scene
+from kineverse.grasping import find_handle
+from kineverse.manipulation import find_articulated_objects
 from kineverse.model.model import Model
 from kineverse.state import State
+from kineverse.symbols import Symbol
 
-OPTIONS = ("quick", "data", "seed", "count", "robot", "processes", *SettingOptions)
+OPTIONS = ("quick", "data", "model", "seed", "count", "robot", "processes", *SettingOptions)
 
 COUNT, QUICK_COUNT = 50, 1
 QUICK_OBJECTS = 2
@@ -46,8 +50,8 @@ class KitchenJob:
 
     Attributes
     ----------
-    seed
-        Seed of the kitchen.
+    kitchen
+        Name or path of its model, such as ``"kitchens/17"``.
     robot
         The robot.
     setting
@@ -56,7 +60,7 @@ class KitchenJob:
         Largest number of objects; None for all.
     """
 
-    seed: int
+    kitchen: str
     robot: RobotSource
     setting: TrialSetting = field(default_factory=TrialSetting)
     most: int | None = None
@@ -68,40 +72,47 @@ def run(progress: Progress, options: Options) -> Report:
     robots = find_robots(options.robot, options.data and find_data(options.data))
     if options.quick and not options.robot:
         robots = robots[-1:]
-    seeds = range(options.seed, options.seed + count)
+    names = [options.model] if options.model else name_kitchens(options.seed, count)
     jobs = [
-        KitchenJob(seed, robot, setting, QUICK_OBJECTS if options.quick else None)
-        for seed in seeds
+        KitchenJob(name, robot, setting, QUICK_OBJECTS if options.quick else None)
+        for name in names
         for setting in make_settings(options)
         for robot in robots
     ]
     trials = run_jobs(run_kitchen, jobs, progress, "kitchens", "kitchen", options.processes)
-    return report_trials(trials, seeds)
+    return report_trials(trials, names)
 
 
-def report_trials(trials: list[Trial], seeds: range) -> Report:
-    """Return the report on the trials."""
+def name_kitchens(seed: int, count: int) -> list[str]:
+    """Return the names of generated kitchens, from a first seed on."""
+    return [f"kitchens/{k}" for k in range(seed, seed + count)]
+
+
+def report_trials(trials: list[Trial], names: Sequence[str]) -> Report:
+    """Return the report on the trials in kitchens of some names."""
+    which = names[0] if len(names) == 1 else f"{len(names)} kitchens, {names[0]} to {names[-1]}"
     return Report(
         name="kitchens",
-        title=f"{len(seeds)} generated kitchens, seeds {seeds[0]} to {seeds[-1]}, opened and closed",
+        title=f"{which}: opened and closed",
         tables=make_trial_tables(trials, "Objects that were opened and closed"),
-        numbers={"seeds": [seeds[0], seeds[-1]], **make_trial_numbers(trials)},
+        numbers={"kitchens": list(names), **make_trial_numbers(trials)},
         figure=make_success_figure(trials, "height", "height of the handle [m]"),
     )
 
 
 def run_kitchen(job: KitchenJob) -> list[Trial]:
     """Return the trials of one kitchen and one robot."""
-    model = make_kitchen_with(job.robot, job.seed)
+    model = make_kitchen_with(job.robot, job.kitchen)
+    objects = [one for one in find_articulated_objects(model, job.robot.prefix) if one.kind != "knob"]
     cases = [
         TrialCase(
-            str(job.seed),
+            job.kitchen,
             job.robot,
-            what,
+            str(one.coordinate),
             job.setting,
-            measures=(("height", find_handle_height(model, what)),),
+            measures=(("height", find_handle_height(model, one.coordinate)),),
         )
-        for what in list_objects(model, KITCHEN)[: job.most]
+        for one in objects[: job.most]
     ]
     try:
         start = start_in_aisle(job.robot, model)
@@ -109,18 +120,17 @@ def run_kitchen(job: KitchenJob) -> list[Trial]:
         return [case.fail("open", model, "collision", str(error)) for case in cases]
     world = job.setting.make_world(model, job.robot.prefix, start)
     trials = []
-    for case in cases:
-        lower, upper = model.limits(case.what)
-        targets = (lower + OPEN_SHARE * (upper - lower), lower)
+    for case, one in zip(cases, objects, strict=False):
+        targets = (one.shut + OPEN_SHARE * (one.opened - one.shut), one.shut)
         trials += open_then_close(case, model, world, start, targets)
     return trials
 
 
-def make_kitchen_with(robot: RobotSource, seed: int) -> Model:
-    """Return a robot in a generated kitchen."""
+def make_kitchen_with(robot: RobotSource, name: str) -> Model:
+    """Return a robot in a kitchen of a name or path."""
     model = robot.load()
     with model.edit() as edit:
-        edit.include(f"kitchens/{seed}", KITCHEN)
+        edit.include(name, KITCHEN)
     return model
 
 
@@ -135,7 +145,9 @@ def start_in_aisle(robot: RobotSource, model: Model) -> State:
         If there is no such place.
     """
     scene = Scene(model)
-    rules = [Rule("*", f"{KITCHEN}/floor"), Rule(f"{robot.prefix}/*", f"{robot.prefix}/*")]
+    floor = f"{KITCHEN}/floor"
+    rules = [Rule(f"{robot.prefix}/*", f"{robot.prefix}/*")]
+    rules += [Rule("*", floor)] if floor in model.frames else []
     near = scene.watch(f"{robot.prefix}/*", "*", radius=_CLEARANCE, rules=rules)
     for offset, angle in product(_OFFSETS, (math.pi / 2, -math.pi / 2)):
         base = {f"{robot.prefix}/base/y": offset, f"{robot.prefix}/base/angle": angle}
@@ -146,14 +158,10 @@ def start_in_aisle(robot: RobotSource, model: Model) -> State:
     raise NoSolutionError(f"The {robot.name} stands free nowhere along the aisle.")
 
 
-def list_objects(model: Model, prefix: str) -> tuple[str, ...]:
-    """Return the names of the coordinates below a prefix."""
-    return tuple(str(q) for q in model.degrees_of_freedom if str(q).startswith(f"{prefix}/"))
-
-
-def find_handle_height(model: Model, what: str) -> float:
-    """Return the height of an object's handle while all is shut [m]; NaN without a frame of that name."""
-    for name in (f"{what}_handle", f"{what}/handle"):
-        if name in model.frames:
-            return float(model.fk(name)(model.default_state())[2, 3])
-    return math.nan
+def find_handle_height(model: Model, coordinate: Symbol) -> float:
+    """Return the height of an object's handle while all is shut [m]; NaN if none is found."""
+    try:
+        frame = find_handle(model, coordinate).frame
+    except KineverseError:
+        return math.nan
+    return float(model.fk(frame)(model.default_state())[2, 3])
