@@ -157,11 +157,11 @@ def test_commands_draw_a_recording_and_a_trajectory(run, tmp_path, capsys):
     for wrong, says in (
         ([*words, "--plot", "a.png"], "recordings"),
         (["view", str(run), "--set", "cupboard/door=1"], "its own motion"),
-        (["view", "kitchen", "--play", str(tmp_path / "way.json")], "cupboard/door"),
-        (["view", "kitchen", "--play", str(run)], "not JSON"),
+        (["view", "shelf_door", "--play", str(tmp_path / "way.json")], "cupboard/door"),
+        (["view", "shelf_door", "--play", str(run)], "not JSON"),
         (["view", str(tmp_path / "way.json")], "--play"),
         (["view", str(tmp_path / "no.mcap")], "no such file"),
-        (["view", "kitchen", "--time", "1"], "recordings"),
+        (["view", "shelf_door", "--time", "1"], "recordings"),
         (["view", str(run), "--time", "nan"], "from 0 s"),
     ):
         assert main(wrong) == 2
