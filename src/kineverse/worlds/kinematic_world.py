@@ -360,6 +360,7 @@ class KinematicWorld:
             self._grip.move(time, moved)
         else:
             self._motion.resolve(time, moved)
+        self._motion.settle()
 
     def _watch_contacts(self) -> None:
         """Prepare the queries of contacts."""
