@@ -239,11 +239,11 @@ def test_a_drawer_follows_within_its_limits_and_is_lost_beyond(world):
     move(world, 2.0, x=-0.15)
     assert world.state["room/drawer"] == pytest.approx(0.4, abs=1e-7)
     assert world.held
-    move(world, 0.04, x=-0.1)
+    move(world, 0.09, dt=0.03, x=-0.1)
     assert world.held
-    move(world, 0.02, x=-0.1)
+    move(world, 0.03, dt=0.03, x=-0.1)
     assert world.held is None
-    assert "is lost: it is 6 mm" in world.events[-1].text
+    assert "is lost: it is 12 mm" in world.events[-1].text
     # Fingers that were never opened hold nothing anew.
     move(world, 0.1, x=0.05)
     assert world.held is None

@@ -5,21 +5,20 @@ and G their derivative by the displacement of the objects. The speeds v of the o
 
     min  1/2 Σ w_i v_i² + 1/(2ρ) Σ s_k²    subject to    g + h G v + s >= 0,    l <= A v <= u
 
-with the rows A of the model's limits, locks and closures. An object is pushed along the normal, and stays where
-nothing touches it. A contact jams if its normal is 60° or more off all motions that the object has at that point,
-as with a friction of 0.58: then it does not move the object. What was penetrated before comes free at 0.1 m/s
-at most. So a contact moves an object's point there by at most twice the sum of the robot's way along the normal
-and that way out. The slacks s are zero unless the object is blocked; then the
-penetration remains. The weights w are the squares of the speeds that coordinates give to points of bodies, so
-rotations and translations compare. The problem is linear in the neighbourhood of a configuration, and it is
-solved again where it led, until nothing changes (sequential quadratic programming).
+with the rows A of the model's limits, locks and closures. An object is pushed along the normal, and stays
+where nothing touches it. A contact jams if its normal is 60° or more off all motions that the object has at
+that point, as with a friction of 0.58: then it does not move the object. What was penetrated before comes
+free at 0.1 m/s at most. So a contact moves an object's point there by at most twice the sum of the robot's
+way and that way out. The slacks s are zero unless the object is blocked; then the penetration remains. The
+weights w are the squares of the speeds that coordinates give to points of bodies, so rotations and
+translations compare. The problem is linear in the neighbourhood of a configuration, and it is solved again
+where it led, until nothing changes (sequential quadratic programming).
 """
 
 from __future__ import annotations
 
 import math
 from collections.abc import Callable, Collection, Iterable, Sequence
-from dataclasses import dataclass
 from typing import Any, TypeAlias
 
 import numpy as np
@@ -36,6 +35,7 @@ from kineverse.model.frame_dependence import FrameDependence
 from kineverse.model.model_view import ModelView
 from kineverse.symbols import Symbol
 
+from .object_gaps import Gaps, align_motion, pair_keys, project_twists
 from .object_limits import ObjectLimits, Rows
 
 SKIN = 1e-6
@@ -59,36 +59,9 @@ _RELEASE = 0.1
 """Largest speed out of a penetration that was there before a motion [m/s]."""
 _JAM = 0.5
 """Cosine of the angle between a normal and the motion that it causes, below which a contact jams."""
-_PARALLEL = 1e-3
-"""Least eigenvalue of directions of motion that are not parallel."""
 
 Residual: TypeAlias = Callable[[], tuple[Array, Array]]
 """Function that returns the error of a hold at the present configuration, (6,), and its Jacobian (6, n)."""
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class Gaps:
-    """Gaps of near pairs of shapes and their derivatives.
-
-    Attributes
-    ----------
-    pairs
-        The pairs as the scene found them, nearest first.
-    index
-        (K,) indices of the gaps among these pairs.
-    distances
-        (K,) gaps [m].
-    rows
-        (K, n) derivatives by the displacement of all columns.
-    jammed
-        (K,) flags of contacts that move no object.
-    """
-
-    pairs: DistanceResults
-    index: npt.NDArray[np.intp]
-    distances: Array
-    rows: Array
-    jammed: npt.NDArray[np.bool_]
 
 
 class ObjectMotion:
@@ -222,7 +195,7 @@ class ObjectMotion:
     def settle(self) -> None:
         """End a motion: what is penetrated now comes free slowly."""
         pairs, index = self.find_near(0.0)
-        keys = _pair_keys(pairs) if len(index) else []
+        keys = pair_keys(pairs) if len(index) else []
         self._before = {keys[k]: float(pairs.distances[k]) for k in index.tolist()}
 
     def find_near(self, radius: float) -> tuple[DistanceResults, npt.NDArray[np.intp]]:
@@ -249,13 +222,13 @@ class ObjectMotion:
         twists = self._twists.outputs[0]
         a, b = self.group[pairs.body_indices[index]].T
         normals, distances = pairs.normals[index], pairs.distances[index]
-        rows = _project(normals, pairs.points_b[index], twists[b])
-        rows -= _project(normals, pairs.points_a[index], twists[a])
+        rows = project_twists(normals, pairs.points_b[index], twists[b])
+        rows -= project_twists(normals, pairs.points_a[index], twists[a])
         jammed, n = np.zeros(len(index), dtype=bool), self.count
         for k in np.flatnonzero(distances < 0.0).tolist():
             of_a, of_b = twists[a[k], :, :n], twists[b[k], :, :n]
             point, of_object = (pairs.points_b, of_b) if of_b.any() else (pairs.points_a, of_a)
-            jammed[k] = _alignment(normals[k], point[index[k]], of_object) < _JAM
+            jammed[k] = align_motion(normals[k], point[index[k]], of_object) < _JAM
         return Gaps(pairs, index, distances, rows, jammed)
 
     def _aims(self, gaps: Gaps, h: float) -> Array:
@@ -263,14 +236,14 @@ class ObjectMotion:
         # Shapes that nearly touch stay as they are: what is not penetrated does not move by itself.
         aims = np.where(gaps.distances < 0.0, SKIN, np.minimum(gaps.distances, SKIN))
         if self._before and len(aims):
-            keys = _pair_keys(gaps.pairs)
+            keys = pair_keys(gaps.pairs)
             before = np.array([self._before.get(keys[k], 0.0) for k in gaps.index.tolist()])
             np.minimum(aims, before + _RELEASE * h, out=aims, where=before < 0.0)
         return aims
 
     def _same_side(self, pairs: DistanceResults, index: npt.NDArray[np.intp]) -> npt.NDArray[np.intp]:
         """Return the indices of pairs without those that are penetrated beyond their middle."""
-        keys = _pair_keys(pairs)
+        keys = pair_keys(pairs)
         inside = {keys[k] for k in index.tolist() if pairs.distances[k] < 0.0}
         self._penetrated = {key: n for key, n in self._penetrated.items() if key in inside}
         kept = [
@@ -284,7 +257,7 @@ class ObjectMotion:
         """Remember the sides from which shapes are penetrated because nothing yields."""
         deep = gaps.index[gaps.distances < -_DEEP]
         if len(deep):
-            keys = _pair_keys(gaps.pairs)
+            keys = pair_keys(gaps.pairs)
             for k in deep.tolist():
                 self._penetrated.setdefault(keys[k], gaps.pairs.normals[k].copy())
 
@@ -412,31 +385,6 @@ def _clip_to_bounds(x: Array, rows: Array, lower: Array, upper: Array) -> None:
         ends = (low / row[k], high / row[k])
         if min(ends) <= max(ends):
             x[k] = min(max(x[k], min(ends)), max(ends))
-
-
-def _alignment(normal: Array, point: Array, twists: Array) -> float:
-    """Return the largest cosine of the angle between a normal and the motions of a point by twists (6, n)."""
-    ways = twists[:3] + np.cross(twists[3:].T, point).T
-    lengths = np.linalg.norm(ways, axis=0)
-    ways = ways[:, lengths > 0.0] / lengths[lengths > 0.0]
-    values, directions = np.linalg.eigh(ways @ ways.T)
-    return float(np.linalg.norm(normal @ directions[:, values > _PARALLEL]))
-
-
-def _pair_keys(pairs: DistanceResults) -> list[tuple[int, ...]]:
-    """Return the numbers of bodies and shapes of pairs."""
-    return [tuple(row) for row in np.hstack([pairs.body_indices, pairs.shape_indices]).tolist()]
-
-
-def _project(normals: Array, points: Array, twists: Array) -> Array:
-    """Return n·(v + ω × p) for each of K points and each column: (K, 3), (K, 3), (K, 6, n) -> (K, n)."""
-    (nx, ny, nz), (px, py, pz) = normals.T, points.T
-    wrench = np.empty((len(normals), 1, 6))
-    wrench[:, 0, :3] = normals
-    wrench[:, 0, 3] = py * nz - pz * ny
-    wrench[:, 0, 4] = pz * nx - px * nz
-    wrench[:, 0, 5] = px * ny - py * nx
-    return np.asarray((wrench @ twists)[:, 0])
 
 
 def _import_daqp() -> Any:
