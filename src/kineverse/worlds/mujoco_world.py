@@ -179,6 +179,7 @@ class MujocoWorld:
         self._map = SpeedMap(model, [*driven, *held], self._coordinates.address)
         self._is_finger = self._map.columns_of(held)
         self._count = len(driven)
+        self._state: State | None = None
         self._sampler = SensorSampler(sensors or Sensors(), model, robot, seed)
         self.remarks = tuple(self._remarks)
         self.reset(model.default_state())
@@ -221,7 +222,7 @@ class MujocoWorld:
     def reset(self, state: StateLike) -> None:
         """Start anew from a state, at time 0, with nothing in the gripper and all speeds zero."""
         qpos = self._coordinates.positions(state)
-        self._state: State | None = None
+        self._state = None
         engine, data = mujoco(), self._data
         engine.mj_resetData(self._compiled, data)
         data.qpos[:] = qpos
