@@ -343,13 +343,35 @@ def test_free_and_turned_bodies_keep_their_state() -> None:
     assert any("globe" in remark and "no inertia" in remark for remark in world.remarks)
 
 
+@pytest.mark.parametrize(("lowest", "floor"), [(0.0, True), (0.0, False), (-0.3, True)])
+def test_a_box_falls_to_the_floor_unless_furniture_reaches_below_it(lowest: float, floor: bool) -> None:
+    model = kv.load("fetch")
+    with model.edit() as edit:
+        edit.apply(kv.Floating(name="box", parent="world", child="box", origin=kv.translation(2, 0, 0.05)))
+        edit.apply(SetBody("box", cube(1.0, (0.1, 0.1, 0.1))))
+        place = kv.translation(3, 0, 0.2)
+        edit.apply(
+            kv.Prismatic(
+                name="lift", parent="world", child="lift", origin=place, axis=(0, 0, 1), lower=lowest, upper=1
+            )
+        )
+        edit.apply(SetBody("lift", cube(1.0, (0.1, 0.1, 0.1))))
+    world = MujocoWorld(model, "fetch", gripper("fetch"), floor=floor)
+    world.apply({}, 0.6)
+    rests = floor and lowest == 0.0
+    assert world.state["box/z"] == pytest.approx(0.0 if rests else -9.81 * 0.6**2 / 2, abs=0.03)
+    assert any("lift reaches below z = 0" in remark for remark in world.remarks) == (lowest < 0.0)
+    # Wheels that stand on it do not rub.
+    assert not any("fetch" in contact.a for contact in world.contacts())
+
+
 def test_remarks_tell_what_was_added_and_left_out() -> None:
     world = kitchen_world("pr2")
     text = "\n".join(world.remarks)
     for part in (
         "'pr2/base/speed' is left out",
         "gravity does not act on 'pr2'",
-        "there is no floor",
+        "there is a floor at z = 0; these stand on it, without contact: pr2/base_link",
         "servos of bandwidth 80/s drive 21 coordinates",
         "no effort is stated; servos have [N], [N m]: pr2/base/angle",
         "friction 1 N m and damping 1 N m s are assumed, as the model states none: kitchen/fridge_door",

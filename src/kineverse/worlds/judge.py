@@ -33,6 +33,7 @@ from kineverse.lie import Array, inverse, rotation_angle
 from kineverse.model.frame_dependence import FrameDependence
 from kineverse.model.model_view import ModelView
 from kineverse.state import State, StateLike
+from kineverse.symbols import Symbol
 
 from .sensor_sampler import is_of_robot
 
@@ -107,7 +108,8 @@ class Judge:
             self._gripping.add(handle)
         self._select_pairs()
         self._place = compile([model.fk(name)[:3, 3] for name in self._followed()])
-        self._in_hand: dict[str, CompiledFunction[Array]] = {}
+        self._place_values = self._indices(self._place.inputs)
+        self._in_hand: dict[str, tuple[CompiledFunction[Array], npt.NDArray[np.intp]]] = {}
         self.reset()
 
     # -- what is measured ----------------------------------------------------------------------------------
@@ -207,8 +209,8 @@ class Judge:
         self._measure_limits(values, stamp, commanded)
         if commanded is not None:
             self._measure_jitter(commanded)
-        self._measure_hold(state, held)
-        self._measure_way(state)
+        self._measure_hold(values, held)
+        self._measure_way(values)
         searches = self._steps % self._every == 0
         if searches or self._touches is not None:
             self._scene.update(values[self._scene_values])
@@ -239,10 +241,18 @@ class Judge:
         self._differed = np.array([k for k, _ in pairs], dtype=np.intp)
         self._coordinate = np.array([at for _, at in pairs], dtype=np.intp)
         self._robot_speeds = [v for v in columns if is_of_robot(v.path, self.robot)]
+        # Speeds are given by symbol or by name.
+        self._speed_place: dict[Symbol | str, int] = {v: k for k, v in enumerate(self._robot_speeds)}
+        self._speed_place |= {str(v): k for k, v in enumerate(self._robot_speeds)}
         column = {v: k for k, v in enumerate(columns)}
         self._robot_columns = np.array([column[v] for v in self._robot_speeds], dtype=np.intp)
         self._vector = np.zeros(len(self._symbols) + len(columns))
-        self._scene_values = np.array([place[s] for s in self._scene.inputs], dtype=np.intp)
+        self._scene_values = self._indices(self._scene.inputs)
+
+    def _indices(self, symbols: Iterable[Symbol]) -> npt.NDArray[np.intp]:
+        """Return the places of symbols among those of the model."""
+        place = {s: k for k, s in enumerate(self._symbols)}
+        return np.array([place[s] for s in symbols], dtype=np.intp)
 
     def _watch_handle(self, handle: str, gap: float) -> None:
         """Prepare the query of contacts of the robot with what moves like the handle."""
@@ -273,8 +283,12 @@ class Judge:
 
     def _select_speeds(self, speeds: StateLike) -> Array:
         """Return the commanded speeds of the robot; 0 for missing ones."""
-        given = {str(v): value for v, value in speeds.items()}
-        return np.array([given.get(str(v), 0.0) for v in self._robot_speeds])
+        found = np.zeros(len(self._robot_speeds))
+        for v, value in speeds.items():
+            k = self._speed_place.get(v)
+            if k is not None:
+                found[k] = value
+        return found
 
     # -- measurements --------------------------------------------------------------------------------------
 
@@ -316,17 +330,18 @@ class Judge:
         self._reversals += int(np.count_nonzero(signs * self._signs < 0.0))
         self._signs = np.where(signs != 0.0, signs, self._signs)
 
-    def _measure_hold(self, state: State, held: str | None) -> None:
+    def _measure_hold(self, values: Array, held: str | None) -> None:
         if held is None or self.gripper is None:
             self._held = None
             return
         if held not in self._in_hand:
-            self._in_hand[held] = compile(self.model.fk(held, self.gripper.hand))
+            relative = compile(self.model.fk(held, self.gripper.hand))
+            self._in_hand[held] = relative, self._indices(relative.inputs)
             if held not in self._gripping:
                 self._gripping.add(held)
                 self._select_pairs()
-        function = self._in_hand[held]
-        pose = function(state.vector(function.inputs))
+        function, at = self._in_hand[held]
+        pose = function(values[at])
         middle = self.gripper.grasp_pose[:, 3]
         if self._held != held:
             self._held, self._pose, self._middle = held, pose, inverse(pose) @ middle
@@ -336,8 +351,8 @@ class Judge:
         turned = float(rotation_angle(pose[:3, :3] @ self._pose[:3, :3].T))
         self._slip, self._turn = max(self._slip, apart), max(self._turn, turned)
 
-    def _measure_way(self, state: State) -> None:
-        places = np.array(self._place(state.vector(self._place.inputs)))
+    def _measure_way(self, values: Array) -> None:
+        places = np.array(self._place(values[self._place_values]))
         if self._first is not None:
             self._way[: len(places)] += np.linalg.norm(places - self._places, axis=1)
         self._places = places

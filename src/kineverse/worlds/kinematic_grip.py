@@ -23,7 +23,8 @@ from kineverse.grasping.gripper import Gripper
 from kineverse.lie import Array, inverse, log_so3
 from kineverse.symbols import Symbol
 
-from .object_motion import SKIN, Gaps, ObjectMotion
+from .object_gaps import Gaps
+from .object_motion import SKIN, ObjectMotion
 
 TOUCH = 1e-4
 """Gap below which bodies touch [m]."""

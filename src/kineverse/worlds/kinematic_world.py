@@ -72,7 +72,8 @@ class KinematicWorld:
         Largest gap of the second finger when a hold begins [m]: as much as a real hand gives way.
     slip
         Largest distance [m] and angle [rad] by which a held body may leave its place in the hand, measured in
-        the middle between the fingers. Beyond, it is lost, and nothing is held before the fingers opened.
+        the middle between the fingers, as an arm yields and pads slide. Beyond, it is lost, and nothing is
+        held before the fingers opened.
     timeout
         Age [s] of a command with a stamp beyond which the robot stops.
     delay
@@ -110,7 +111,7 @@ class KinematicWorld:
         gripper: Gripper | None = None,
         *,
         grasp_tolerance: float = 0.006,
-        slip: tuple[float, float] = (0.005, 0.1),
+        slip: tuple[float, float] = (0.01, 0.1),
         timeout: float = 0.1,
         delay: float = 0.0,
         sensors: Sensors | None = None,
@@ -360,6 +361,7 @@ class KinematicWorld:
             self._grip.move(time, moved)
         else:
             self._motion.resolve(time, moved)
+        self._motion.settle()
 
     def _watch_contacts(self) -> None:
         """Prepare the queries of contacts."""

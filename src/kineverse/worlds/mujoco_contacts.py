@@ -78,9 +78,13 @@ class MujocoContacts:
         wanted = (self._is_robot[bodies].sum(axis=1) == 1) & (contact.efc_address >= 0)
         if not wanted.any():
             return 0.0
-        pairs = np.sort(bodies[wanted], axis=1) @ (self._compiled.nbody, 1)
+        # Contacts are few, and this runs in each time step: plain Python is faster than arrays here.
+        sums: dict[tuple[int, int], float] = {}
         forces = data.efc_force[contact.efc_address[wanted]]
-        return float(np.bincount(np.unique(pairs, return_inverse=True)[1], forces).max())
+        for (one, other), force in zip(bodies[wanted].tolist(), forces.tolist(), strict=True):
+            pair = (one, other) if one < other else (other, one)
+            sums[pair] = sums.get(pair, 0.0) + force
+        return max(sums.values())
 
     def grip(self, data: Any) -> dict[str, tuple[float, float]]:
         """Return the normal forces of both fingers by what they touch [N].

@@ -21,6 +21,7 @@ from kineverse.symbols import Symbol
 from . import mujoco_model
 from .mujoco_contacts import MujocoContacts
 from .mujoco_coordinates import MujocoCoordinates
+from .mujoco_floor import add_floor
 from .mujoco_gripper import GripperDrive
 from .mujoco_servos import BANDWIDTH, JointServos, SpeedMap
 from .sensor_sampler import SensorSampler, is_of_robot
@@ -75,6 +76,8 @@ class MujocoWorld:
         Friction of furniture by coordinate [N], [N m], in place of that of the model.
     bandwidth
         Bandwidth of the servos [1/s].
+    floor
+        Whether there is a floor at z = 0, if no furniture and nothing of the robot reaches below it at first.
     seed
         Seed of sampled configurations.
 
@@ -108,6 +111,7 @@ class MujocoWorld:
         leave_out: Iterable[str] = (),
         door_friction: Mapping[Symbol, float] | Mapping[str, float] | None = None,
         bandwidth: float = BANDWIDTH,
+        floor: bool = True,
         seed: int = 0,
     ) -> None:
         positive = {"step": step, "grip": grip, "timeout": timeout, "bandwidth": bandwidth}
@@ -143,6 +147,11 @@ class MujocoWorld:
         compiled = mujoco_model.compile_world(spec)
         self._coordinates = MujocoCoordinates(model, compiled)
         self._exclude_overlaps(spec, compiled, seed)
+        if floor:
+            add_floor(spec, self._coordinates, self._is_robot, model.frames, _SAMPLES, seed, self._remark)
+        else:
+            self._remark("there is no floor, as asked for")
+        compiled = mujoco_model.compile_world(spec)
         self._drive = None
         if gripper is None:
             self._remark(f"no gripper of '{robot}' is known, so it holds nothing")
@@ -170,6 +179,7 @@ class MujocoWorld:
         self._map = SpeedMap(model, [*driven, *held], self._coordinates.address)
         self._is_finger = self._map.columns_of(held)
         self._count = len(driven)
+        self._state: State | None = None
         self._sampler = SensorSampler(sensors or Sensors(), model, robot, seed)
         self.remarks = tuple(self._remarks)
         self.reset(model.default_state())
@@ -185,7 +195,9 @@ class MujocoWorld:
     @property
     def state(self) -> State:
         """True values of all coordinates; its stamp is the time [s]."""
-        return self._coordinates.state(self._data.qpos, self.time)
+        if self._state is None:
+            self._state = self._coordinates.state(self._data.qpos, self.time)
+        return self._state
 
     @property
     def held(self) -> str | None:
@@ -210,6 +222,7 @@ class MujocoWorld:
     def reset(self, state: StateLike) -> None:
         """Start anew from a state, at time 0, with nothing in the gripper and all speeds zero."""
         qpos = self._coordinates.positions(state)
+        self._state = None
         engine, data = mujoco(), self._data
         engine.mj_resetData(self._compiled, data)
         data.qpos[:] = qpos
@@ -267,7 +280,7 @@ class MujocoWorld:
         self._end = now + length
         if self._drive is not None:
             self._drive.update_limits(self._data)
-        self._peak_force = 0.0
+        self._peak_force, self._state = 0.0, None
         while self.time < self._end - _ROUNDING:
             self._advance()
             self._peak_force = max(self._peak_force, self._contacts.largest_force(self._data))
@@ -312,7 +325,6 @@ class MujocoWorld:
         for body in spec.bodies:
             if self._is_robot(body.name):
                 body.gravcomp = 1.0
-        self._remark("there is no floor, and nothing stops a body below z = 0")
         self._remark(f"gravity does not act on '{self.robot}': its servos are taken to carry the weight")
 
     def _exclude_overlaps(self, spec: Any, compiled: Any, seed: int) -> None:

@@ -5,18 +5,20 @@ and G their derivative by the displacement of the objects. The speeds v of the o
 
     min  1/2 Σ w_i v_i² + 1/(2ρ) Σ s_k²    subject to    g + h G v + s >= 0,    l <= A v <= u
 
-with the rows A of the model's limits, locks and closures. There is no friction: an object is pushed along the
-normal, and stays where nothing touches it. The slacks s are zero unless the object is blocked; then the
-penetration remains. The weights w are the squares of the speeds that coordinates give to points of bodies, so
-rotations and translations compare. The problem is linear in the neighbourhood of a configuration, and it is
-solved again where it led, until nothing changes (sequential quadratic programming).
+with the rows A of the model's limits, locks and closures. An object is pushed along the normal, and stays
+where nothing touches it. A contact jams if its normal is 60° or more off all motions that the object has at
+that point, as with a friction of 0.58: then it does not move the object. What was penetrated before comes
+free at 0.1 m/s at most. So a contact moves an object's point there by at most twice the sum of the robot's
+way and that way out. The slacks s are zero unless the object is blocked; then the penetration remains. The
+weights w are the squares of the speeds that coordinates give to points of bodies, so rotations and
+translations compare. The problem is linear in the neighbourhood of a configuration, and it is solved again
+where it led, until nothing changes (sequential quadratic programming).
 """
 
 from __future__ import annotations
 
 import math
 from collections.abc import Callable, Collection, Iterable, Sequence
-from dataclasses import dataclass
 from typing import Any, TypeAlias
 
 import numpy as np
@@ -33,6 +35,7 @@ from kineverse.model.frame_dependence import FrameDependence
 from kineverse.model.model_view import ModelView
 from kineverse.symbols import Symbol
 
+from .object_gaps import Gaps, align_motion, pair_keys, project_twists
 from .object_limits import ObjectLimits, Rows
 
 SKIN = 1e-6
@@ -52,31 +55,13 @@ _HELD = 1e-7
 _LIGHTEST = 1e-4
 _DEEP = 1e-4
 """Penetration of what does not yield, from which on its side is remembered [m]."""
+_RELEASE = 0.1
+"""Largest speed out of a penetration that was there before a motion [m/s]."""
+_JAM = 0.5
+"""Cosine of the angle between a normal and the motion that it causes, below which a contact jams."""
 
 Residual: TypeAlias = Callable[[], tuple[Array, Array]]
 """Function that returns the error of a hold at the present configuration, (6,), and its Jacobian (6, n)."""
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class Gaps:
-    """Gaps of near pairs of shapes and their derivatives.
-
-    Attributes
-    ----------
-    pairs
-        The pairs as the scene found them, nearest first.
-    index
-        (K,) indices of the gaps among these pairs.
-    distances
-        (K,) gaps [m].
-    rows
-        (K, n) derivatives by the displacement of all columns.
-    """
-
-    pairs: DistanceResults
-    index: npt.NDArray[np.intp]
-    distances: Array
-    rows: Array
 
 
 class ObjectMotion:
@@ -125,6 +110,7 @@ class ObjectMotion:
         self.robot_bodies = tuple(b for b in scene.bodies if is_robot(b))
         self.object_bodies = tuple(b for b in scene.bodies if not is_robot(b) and motion.moves(b))
         self._penetrated: dict[tuple[int, ...], Array] = {}
+        self._before: dict[tuple[int, ...], float] = {}
         self._query = scene.watch(self.robot_bodies, self.object_bodies, per_shape=True)
         self._ignored = np.zeros((len(scene.bodies),) * 2, dtype=bool)
         self._inputs = self._indices(scene.inputs)
@@ -176,8 +162,8 @@ class ObjectMotion:
         """Begin anew at a configuration."""
         self._penetrated.clear()
         self._limits.reset()
-        self.ignore()
         self.place(q)
+        self.ignore()
 
     def place(self, q: Array) -> None:
         """Set the configuration."""
@@ -204,6 +190,13 @@ class ObjectMotion:
             for b in others:
                 if a in number and b in number:
                     self._ignored[number[a], number[b]] = self._ignored[number[b], number[a]] = True
+        self.settle()
+
+    def settle(self) -> None:
+        """End a motion: what is penetrated now comes free slowly."""
+        pairs, index = self.find_near(0.0)
+        keys = pair_keys(pairs) if len(index) else []
+        self._before = {keys[k]: float(pairs.distances[k]) for k in index.tolist()}
 
     def find_near(self, radius: float) -> tuple[DistanceResults, npt.NDArray[np.intp]]:
         """Return the pairs within a radius [m], and the indices of those that are not ignored."""
@@ -223,18 +216,34 @@ class ObjectMotion:
         if self._penetrated:
             index = self._same_side(pairs, index)
         if not len(index):
-            return Gaps(pairs, index, np.zeros(0), np.zeros((0, len(self.columns))))
+            none = np.zeros(0)
+            return Gaps(pairs, index, none, np.zeros((0, len(self.columns))), none.astype(bool))
         self._evaluate_twists()
         twists = self._twists.outputs[0]
         a, b = self.group[pairs.body_indices[index]].T
-        normals = pairs.normals[index]
-        rows = _project(normals, pairs.points_b[index], twists[b])
-        rows -= _project(normals, pairs.points_a[index], twists[a])
-        return Gaps(pairs, index, pairs.distances[index], rows)
+        normals, distances = pairs.normals[index], pairs.distances[index]
+        rows = project_twists(normals, pairs.points_b[index], twists[b])
+        rows -= project_twists(normals, pairs.points_a[index], twists[a])
+        jammed, n = np.zeros(len(index), dtype=bool), self.count
+        for k in np.flatnonzero(distances < 0.0).tolist():
+            of_a, of_b = twists[a[k], :, :n], twists[b[k], :, :n]
+            point, of_object = (pairs.points_b, of_b) if of_b.any() else (pairs.points_a, of_a)
+            jammed[k] = align_motion(normals[k], point[index[k]], of_object) < _JAM
+        return Gaps(pairs, index, distances, rows, jammed)
+
+    def _aims(self, gaps: Gaps, h: float) -> Array:
+        """Return the gaps (K,) that a motion for h [s] is to reach."""
+        # Shapes that nearly touch stay as they are: what is not penetrated does not move by itself.
+        aims = np.where(gaps.distances < 0.0, SKIN, np.minimum(gaps.distances, SKIN))
+        if self._before and len(aims):
+            keys = pair_keys(gaps.pairs)
+            before = np.array([self._before.get(keys[k], 0.0) for k in gaps.index.tolist()])
+            np.minimum(aims, before + _RELEASE * h, out=aims, where=before < 0.0)
+        return aims
 
     def _same_side(self, pairs: DistanceResults, index: npt.NDArray[np.intp]) -> npt.NDArray[np.intp]:
         """Return the indices of pairs without those that are penetrated beyond their middle."""
-        keys = _pair_keys(pairs)
+        keys = pair_keys(pairs)
         inside = {keys[k] for k in index.tolist() if pairs.distances[k] < 0.0}
         self._penetrated = {key: n for key, n in self._penetrated.items() if key in inside}
         kept = [
@@ -248,7 +257,7 @@ class ObjectMotion:
         """Remember the sides from which shapes are penetrated because nothing yields."""
         deep = gaps.index[gaps.distances < -_DEEP]
         if len(deep):
-            keys = _pair_keys(gaps.pairs)
+            keys = pair_keys(gaps.pairs)
             for k in deep.tolist():
                 self._penetrated.setdefault(keys[k], gaps.pairs.normals[k].copy())
 
@@ -283,14 +292,15 @@ class ObjectMotion:
             gaps = self.measure_gaps(radius)
             pulled = None if residual is None else residual()
             limits, beyond = self._limits.position_rows(self.q, h, v)
-            cost = self._cost(h * v, gaps, pulled) + beyond / _HARD
+            aims = self._aims(gaps, h)
+            cost = self._cost(h * v, gaps, aims, pulled) + beyond / _HARD
             better = cost <= least * (1.0 + 1e-9)
             if k == _ROUNDS:
                 break
             if better:
                 least, best = cost, v
                 self._note_penetrated(gaps)
-                found = self._solve(h, v, gaps, rates, limits, pulled)
+                found = self._solve(h, v, gaps, aims, rates, limits, pulled)
             else:
                 # The gaps bend too much, as of bodies that are jammed: half of the way.
                 found = 0.5 * (best + v)
@@ -305,9 +315,9 @@ class ObjectMotion:
         self._limits.finish(self.q, h)
         return v
 
-    def _cost(self, way: Array, gaps: Gaps, pulled: tuple[Array, Array] | None) -> float:
+    def _cost(self, way: Array, gaps: Gaps, aims: Array, pulled: tuple[Array, Array] | None) -> float:
         """Return twice the cost of a motion by some way of the objects (n,)."""
-        depths = np.minimum(gaps.distances, 0.0)
+        depths = np.minimum(gaps.distances - np.minimum(aims, 0.0), 0.0)[~gaps.jammed]
         moved = float(self.weights[: self.count] @ way**2)
         if pulled is not None:
             moved = _HELD * moved + float(pulled[0] @ pulled[0])
@@ -318,6 +328,7 @@ class ObjectMotion:
         h: float,
         v: Array,
         gaps: Gaps,
+        aims: Array,
         rates: Rows,
         limits: Rows,
         pulled: tuple[Array, Array] | None,
@@ -342,10 +353,11 @@ class ObjectMotion:
         matrix, lower, upper = (np.concatenate(both) for both in zip(limits[:3], rates[:3], strict=True))
         concerned, touching = ((M[:, use] != 0.0).any(axis=1) for M in (matrix, G))
         G, d = G[touching], d[touching]
-        # Shapes that nearly touch stay as they are: what is not penetrated does not move by itself.
-        aim = np.where(d < 0.0, SKIN, np.minimum(d, SKIN))
         rows = np.concatenate([matrix[concerned][:, use], G[:, use]])
-        least = np.concatenate([lower[concerned], (aim - d) / h + G @ v])
+        wanted = (aims[touching] - d) / h + G @ v
+        # What is jammed moves nothing, and lets nothing move into it.
+        np.minimum(wanted, 0.0, out=wanted, where=gaps.jammed[touching])
+        least = np.concatenate([lower[concerned], wanted])
         most = np.concatenate([upper[concerned], np.full(len(d), _UNBOUNDED)])
         sense = np.repeat(np.array([0, _SOFT], dtype=np.intc), [len(rows) - len(d), len(d)])
         np.clip(least, -_UNBOUNDED, _UNBOUNDED, out=least)
@@ -373,22 +385,6 @@ def _clip_to_bounds(x: Array, rows: Array, lower: Array, upper: Array) -> None:
         ends = (low / row[k], high / row[k])
         if min(ends) <= max(ends):
             x[k] = min(max(x[k], min(ends)), max(ends))
-
-
-def _pair_keys(pairs: DistanceResults) -> list[tuple[int, ...]]:
-    """Return the numbers of bodies and shapes of pairs."""
-    return [tuple(row) for row in np.hstack([pairs.body_indices, pairs.shape_indices]).tolist()]
-
-
-def _project(normals: Array, points: Array, twists: Array) -> Array:
-    """Return n·(v + ω × p) for each of K points and each column: (K, 3), (K, 3), (K, 6, n) -> (K, n)."""
-    (nx, ny, nz), (px, py, pz) = normals.T, points.T
-    wrench = np.empty((len(normals), 1, 6))
-    wrench[:, 0, :3] = normals
-    wrench[:, 0, 3] = py * nz - pz * ny
-    wrench[:, 0, 4] = pz * nx - px * nz
-    wrench[:, 0, 5] = px * ny - py * nx
-    return np.asarray((wrench @ twists)[:, 0])
 
 
 def _import_daqp() -> Any:
