@@ -79,6 +79,7 @@ def make_scene(arguments: argparse.Namespace, skill: str) -> ManipulationScene:
         an object's.
     """
     from kineverse.experiments.manipulation.robots import SHIPPED, remove_unusable_shapes
+    from kineverse.manipulation.articulated_objects import find_shut_value
     from kineverse.view.sliders import infer_units
 
     begin, end = (None if v is None else parse_value(v) for v in (arguments.start, arguments.to))
@@ -124,15 +125,10 @@ def make_scene(arguments: argparse.Namespace, skill: str) -> ManipulationScene:
     )
 
 
-def find_shut_value(model: kv.Model, coordinate: kv.Symbol) -> float:
-    """Return the limit of a coordinate nearest to its default value; the latter if there is none."""
-    default = model.default_state()[coordinate]
-    finite = [limit for limit in model.limits(coordinate) if math.isfinite(limit)]
-    return min(finite, key=lambda limit: abs(limit - default), default=default)
-
-
 def is_shut(scene: ManipulationScene) -> bool:
     """Return whether the target of a scene is where its object is shut."""
+    from kineverse.manipulation.articulated_objects import find_shut_value
+
     shut = find_shut_value(scene.model, scene.coordinate)
     return scene.target is not None and abs(scene.target - shut) < TOLERANCE
 
