@@ -131,7 +131,7 @@ def test_open_begins_shut_and_close_begins_open(run, asked, tmp_path):
     assert "handle shelf_drawers/" in err
     assert err.count("grasp") == 1
     assert "touch, so the robot begins at" in err  # it would stand in the drawers
-    assert asked[0].target is None
+    assert asked[0].target == kv.load("shelf_drawers").limits(asked[0].what)[1]
     assert asked[0].options == {"hand": "hsr/hand_palm_link", "handle": None, "seconds": 5.0, "seed": 0}
 
     picture = tmp_path / "end.png"
@@ -160,6 +160,9 @@ def test_open_begins_shut_and_close_begins_open(run, asked, tmp_path):
         (["shelf_drawers", "--robot", "hsr@0,0,0", *HSR[2:]], "begins in contact: shelf_drawers/"),
         (["shelf_drawers", *HSR, "--from", "2m"], "--from 2: 'shelf_drawers/upper_drawer' is between 0 and"),
         (["shelf_drawers", *HSR, "--to", "far"], "'far' is not a value"),
+        (["shelf_drawers", *HSR, "--to", "30deg"], "'shelf_drawers/upper_drawer' is in m"),
+        (["shelf_drawers", *HSR, "--robot", "pr2"], "--robot is given twice"),
+        (["shelf_drawers", *HSR, "--picture", "no_such_folder/end.png"], "no_such_folder: No such file"),
         (["shelf_drawers", *HSR, "--hand", "hsr/hnd_palm_link"], "hsr/hand_palm_link"),
         (["shelf_drawers", *HSR, "--handle", "shelf_drawers/frame"], "shelf_drawers/"),
         (["shelf_drawers", *HSR, "--grasp", "tie"], "--world mujoco"),

@@ -8,6 +8,7 @@ import kineverse as kv
 from kineverse.errors import UnknownNameError
 from kineverse.manipulation.articulated_objects import (
     find_articulated_objects,
+    find_shut_value,
     select_objects,
     select_one_of_each_kind,
 )
@@ -35,6 +36,8 @@ def test_names_of_the_kitchen_tell_the_kinds_that_motions_tell():
     ]
     with pytest.raises(UnknownNameError, match="kitchen/oven_door"):
         select_objects([*found.values()], ["kitchen/oven_dor"])
+    with pytest.raises(UnknownNameError, match="Did you mean 'hsr'"):
+        find_articulated_objects(model, robot="hssr")
 
 
 @pytest.mark.parametrize(("lower", "upper"), [(0.0, 1.2), (-1.2, 0.0)])
@@ -58,3 +61,4 @@ def test_kinds_do_not_depend_on_the_pose_of_the_axis(lower, upper):
     kinds = {path: one.kind for path, one in found.items()}
     assert kinds == {"upright/q": "door", "level/q": "flap", "slide/q": "drawer", "cam/q": "linkage"}
     assert all((one.shut, one.opened) == (0.0, lower + upper) for one in found.values())
+    assert all(find_shut_value(model, one.coordinate) == one.shut for one in found.values())

@@ -310,3 +310,8 @@ def test_push_says_what_is_wrong() -> None:
     outcome = push(Session(world), "door", bodies=PUSHER)
     assert not outcome
     assert "contact of" in outcome.reason
+    with pytest.raises(InvalidValueError, match="of the robot"):
+        push(Session(world), "robot/lift", bodies=PUSHER)
+    for wrong in ({"dt": 0.0}, {"dt": np.nan}, {"timeout": 0.0}):
+        with pytest.raises(InvalidValueError, match="time"):
+            Session(world, **wrong)

@@ -116,7 +116,7 @@ def main(argv: Sequence[str] | None = None) -> int:
         arguments = _parse_arguments(words)
     except SystemExit as stop:  # argparse would end the process.
         return stop.code if isinstance(stop.code, int) else ERROR
-    except UnknownNameError as error:
+    except KineverseError as error:
         print(f"kineverse: {format_error(error)}", file=sys.stderr)
         return ERROR
     try:

@@ -6,11 +6,11 @@ import argparse
 import math
 import sys
 import tempfile
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from contextlib import ExitStack, redirect_stdout
 from dataclasses import replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Literal, NamedTuple
+from typing import TYPE_CHECKING, Any, Literal, NamedTuple
 
 from kineverse.cli.arguments import add_model_options, print_notes
 from kineverse.cli.manipulate_output import PhaseLines, report_outcome
@@ -74,7 +74,8 @@ COMMANDS = {
         "open",
         f"""open a door or drawer with a robot that grasps its handle
 
-The object is shut at first, unless --from says otherwise, and is opened to its limit or --to.
+The object is at its default value at first, unless --from says otherwise, and is opened to the limit that
+is farthest from shut, or to --to.
 {_COMMON}  kineverse open kitchen --robot fetch --what kitchen/fridge_door
   kineverse open kitchens/17 --robot hsr --what kitchen/oven_door --world mujoco --json
   kineverse open shelf.urdf --robot arm.urdf --base omni --what drawer --to 20cm""",
@@ -101,6 +102,22 @@ searched if the push does not go through from there. --hand may name any body of
 }
 
 
+class _Once(argparse.Action):
+    """Value of an option that is given once."""
+
+    def __call__(
+        self,
+        parser: argparse.ArgumentParser,
+        namespace: argparse.Namespace,
+        values: str | Sequence[Any] | None,
+        option_string: str | None = None,
+    ) -> None:
+        """Store the value, unless there is one."""
+        if getattr(namespace, self.dest) is not None:
+            raise InvalidValueError(f"{option_string} is given twice; one robot moves one object.")
+        setattr(namespace, self.dest, values)
+
+
 def _add_arguments(parser: argparse.ArgumentParser, skill: str) -> None:
     parser.usage = "%(prog)s MODEL --robot ROBOT[@X,Y,ANGLE] --what COORDINATE [options]"
     parser.add_argument("model", metavar="MODEL", help="name of a shipped model, or path of a file")
@@ -108,9 +125,12 @@ def _add_arguments(parser: argparse.ArgumentParser, skill: str) -> None:
         "--robot",
         metavar="ROBOT[@X,Y,ANGLE]",
         required=True,
+        action=_Once,
         help="the robot, by name or file, and the place of its base",
     )
-    parser.add_argument("--what", metavar="COORDINATE", required=True, help="coordinate of the object")
+    parser.add_argument(
+        "--what", metavar="COORDINATE", required=True, action=_Once, help="coordinate of the object"
+    )
     parser.add_argument(
         "--world", choices=("kinematic", "mujoco"), default="kinematic", help="the world (kinematic)"
     )
@@ -234,6 +254,8 @@ def _act(
         if arguments.noise is not None:
             tracked = TrackedBelief(scene.model, scene.robot, Sensors.parse(arguments.noise))
             print_notes(tracked.remarks)
+            if tracked.sensors.position > 0.0 and tracked.sensors.orientation == 0.0:
+                print_notes(["orientations are seen exactly; 0.5deg in --noise gives them noise, too"])
             belief = tracked
             watchers.append(error)
         recorder = None
@@ -248,7 +270,7 @@ def _act(
             for watch in watchers:
                 watch(step)
 
-        if scene.target is not None and abs(scene.start[scene.coordinate] - scene.target) < TOLERANCE:
+        if abs(scene.start[scene.coordinate] - scene.target) < TOLERANCE:
             outcome = _without_steps(scene, world, True, f"'{scene.coordinate}' is there from the start")
         else:
             act = _push if skill == "push" else _grasp
@@ -307,7 +329,6 @@ def _push(
         return _without_steps(
             scene, world, False, f"{scene.why} --hand may name any body of the robot that is to push."
         )
-    assert scene.target is not None
     with show_activity("compiling the controller; this is kept for the next time"):
         pushing = Pushing(
             scene.model,

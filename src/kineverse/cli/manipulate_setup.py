@@ -46,7 +46,7 @@ class ManipulationScene:
     start
         State of everything.
     target
-        Wanted value [m], [rad]; None for the skill's own.
+        Wanted value [m], [rad].
     gripper
         Gripper that is used; None if the robot has none.
     why
@@ -62,7 +62,7 @@ class ManipulationScene:
     coordinate: kv.Symbol
     unit: str
     start: kv.State
-    target: float | None
+    target: float
     gripper: Gripper | None
     why: str
     pusher: tuple[str, ...]
@@ -79,6 +79,7 @@ def make_scene(arguments: argparse.Namespace, skill: str) -> ManipulationScene:
         an object's.
     """
     from kineverse.experiments.manipulation.robots import SHIPPED, remove_unusable_shapes
+    from kineverse.manipulation.articulated_objects import find_shut_value
     from kineverse.view.sliders import infer_units
 
     begin, end = (None if v is None else parse_value(v) for v in (arguments.start, arguments.to))
@@ -100,14 +101,20 @@ def make_scene(arguments: argparse.Namespace, skill: str) -> ManipulationScene:
 
     coordinate = _find_coordinate(model, arguments.what, named)
     default = model.default_state()
+    values = {str(s): default[s] for s in model.symbols if s in default}
+    unit = infer_units(model, values, [str(coordinate)]).get(str(coordinate)) or ""
+    for option, text in (("--from", arguments.start), ("--to", arguments.to)):
+        _check_unit(option, text, coordinate, unit)
     shut = find_shut_value(model, coordinate)
     lower, upper = model.limits(coordinate)
     if begin is None:
         begin = default[coordinate] if skill == "open" else _open_from(shut, lower, upper)
-    if end is None and skill != "open":
-        end = shut
+    if end is None:
+        end = shut if skill != "open" else max(lower, upper, key=lambda limit: abs(limit - shut))
+    if not math.isfinite(end):
+        raise InvalidValueError(f"'{coordinate}' has no limit at which it is open; say how far: --to VALUE.")
     for option, value in (("--from", begin), ("--to", end)):
-        if value is not None and not lower - 1e-9 <= value <= upper + 1e-9:
+        if not lower - 1e-9 <= value <= upper + 1e-9:
             raise InvalidValueError(
                 f"{option} {value:.4g}: '{coordinate}' is between {lower:.4g} and {upper:.4g}."
             )
@@ -117,24 +124,17 @@ def make_scene(arguments: argparse.Namespace, skill: str) -> ManipulationScene:
         free = {} if place is not None else _base_coordinates(model, joints)
         state = _stand_free(model, named, state, free)
     gripper, why, pusher = _find_pusher(model, named, arguments.hand, skill)
-    values = {str(s): state[s] for s in model.symbols if s in state}
-    unit = infer_units(model, values, [str(coordinate)]).get(str(coordinate)) or ""
     return ManipulationScene(
         model, named, coordinate, unit, state, end, gripper, why, pusher, place is not None
     )
 
 
-def find_shut_value(model: kv.Model, coordinate: kv.Symbol) -> float:
-    """Return the limit of a coordinate nearest to its default value; the latter if there is none."""
-    default = model.default_state()[coordinate]
-    finite = [limit for limit in model.limits(coordinate) if math.isfinite(limit)]
-    return min(finite, key=lambda limit: abs(limit - default), default=default)
-
-
 def is_shut(scene: ManipulationScene) -> bool:
     """Return whether the target of a scene is where its object is shut."""
+    from kineverse.manipulation.articulated_objects import find_shut_value
+
     shut = find_shut_value(scene.model, scene.coordinate)
-    return scene.target is not None and abs(scene.target - shut) < TOLERANCE
+    return abs(scene.target - shut) < TOLERANCE
 
 
 def _open_from(shut: float, lower: float, upper: float) -> float:
@@ -142,6 +142,23 @@ def _open_from(shut: float, lower: float, upper: float) -> float:
     if upper - shut >= shut - lower:
         return min(shut + OPENING, upper)
     return max(shut - OPENING, lower)
+
+
+def _check_unit(option: str, text: str | None, coordinate: kv.Symbol, unit: str) -> None:
+    """Check that a value has a unit of lengths or of angles as its coordinate has; it may have none.
+
+    Raises
+    ------
+    InvalidValueError
+        If it has another one.
+    """
+    written = (text or "").strip()
+    stated = "m" if written.endswith("m") else "rad" if written.endswith(("deg", "°", "rad")) else unit
+    if unit and stated != unit:
+        raise InvalidValueError(
+            f"{option} {written}: '{coordinate}' is in {unit}; write "
+            f"{'30deg or 0.5' if unit == 'rad' else '12cm or 0.12'}, for instance."
+        )
 
 
 def _choose_prefix(arguments: argparse.Namespace, source: str, model: kv.Model) -> tuple[str | None, str]:

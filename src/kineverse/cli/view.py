@@ -134,12 +134,15 @@ def run(arguments: argparse.Namespace) -> int:
     trajectory = _read_trajectory(arguments, model)
     if arguments.plot is not None:
         return _write_plot(arguments, recording)
+    motion = recording or trajectory
+    if motion is not None and arguments.time is not None and arguments.time > motion.duration:
+        print_notes([f"--time {arguments.time:g}: it ends at {motion.duration:.4g} s, which is shown"])
     if assigned:
         print_notes(find_limit_notes(model, complete(model, assigned), arguments.assignments))
     for mesh in show_progress(meshes.list_visual_meshes(model), "reading meshes", "file"):
         meshes.load_mesh(mesh)  # cached for the drawing
     if arguments.picture is not None:
-        return _write_picture(arguments, model, assigned, near, recording or trajectory)
+        return _write_picture(arguments, model, assigned, near, motion)
     options = page_options(arguments)
     with (
         handle_interrupts(),

@@ -67,8 +67,13 @@ def find_articulated_objects(model: ModelView, robot: str = "") -> tuple[Articul
     ------
     MissingDependencyError
         Without the extra ``geometry``.
+    UnknownNameError
+        If nothing of the model is below the prefix.
     """
     own = f"{robot}/"
+    if robot and not any(name.startswith(own) for name in model.frames):
+        prefixes = {name.partition("/")[0] for name in model.frames}
+        raise UnknownNameError(f"No frame begins with '{own}'. {suggest(robot, prefixes, 'prefix')}")
     free = [s for s in model.degrees_of_freedom if not (robot and s.path.startswith(own))]
     defaults = model.default_state()
     found = []
@@ -79,6 +84,13 @@ def find_articulated_objects(model: ModelView, robot: str = "") -> tuple[Articul
             kind = _find_kind(model, coordinate, bodies, limits)
             found.append(ArticulatedObject(coordinate, kind, *limits))
     return tuple(found)
+
+
+def find_shut_value(model: ModelView, coordinate: Symbol) -> float:
+    """Return the limit of a coordinate nearest to its default value, or that value if there is none."""
+    default = model.default_state()[coordinate]
+    finite = [float(limit) for limit in model.limits(coordinate) if math.isfinite(limit)]
+    return min(finite, key=lambda limit: abs(limit - default), default=default)
 
 
 def select_objects(

@@ -9,7 +9,7 @@ from threading import Thread
 from time import perf_counter, thread_time
 
 from kineverse.control import Command
-from kineverse.errors import ShapeError
+from kineverse.errors import InvalidValueError, ShapeError
 from kineverse.expressions import Expression
 from kineverse.lie import Array
 from kineverse.state import State
@@ -71,6 +71,11 @@ class Session:
         Durations of the computations of each step by the name given to :meth:`timed` [s].
     answers
         Whether the world has answered the last step within the time-out.
+
+    Raises
+    ------
+    InvalidValueError
+        For a time of a step, or a time-out, that is not positive.
     """
 
     def __init__(
@@ -82,6 +87,12 @@ class Session:
         on_step: Callable[[Session], object] | None = None,
         timeout: float | None = None,
     ) -> None:
+        if not 0.0 < dt < math.inf:
+            raise InvalidValueError(f"dt= is the time of a step in s, such as 0.02, not {dt!r}.")
+        if timeout is not None and not timeout > 0.0:
+            raise InvalidValueError(
+                f"timeout= is a positive time in s, or None to wait for ever, not {timeout!r}."
+            )
         self.world, self.dt = world, dt
         self._timeout, self.answers = timeout, True
         self.belief = belief or TrueBelief()

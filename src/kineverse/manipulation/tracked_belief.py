@@ -191,8 +191,6 @@ class TrackedBelief:
         tracker.reset({s: start[s] for s in tracker.symbols})
         return tracker
 
-    # -- the step ------------------------------------------------------------------------------------------
-
     def update(self, world: World, commands: State | None = None) -> State:
         """Return the believed state of all coordinates at the present time.
 
@@ -375,8 +373,6 @@ class TrackedBelief:
             values = np.asarray(self._integrate(values, motion, 1.0))
         values = np.clip(values, self._lower, self._upper)
         return State(dict(zip(self._symbols, values.tolist(), strict=True)), stamp=now, source="tracker")
-
-    # -- uncertainty ---------------------------------------------------------------------------------------
 
     def deviation(self, coordinate: Symbol) -> float:
         """Return the standard deviation of a coordinate at the present time [m], [rad].

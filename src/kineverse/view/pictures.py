@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import errno
+import os
 import struct
 import zlib
 from collections.abc import Mapping, Sequence
@@ -47,16 +49,20 @@ def write_png(path: str | Path, pixels: npt.NDArray[np.uint8]) -> None:
 
 
 def check_png_name(path: str | Path) -> None:
-    """Check that the name of a file ends in .png, or has no suffix.
+    """Check that the name of a file ends in .png, or has no suffix, and that its folder exists.
 
     Raises
     ------
     FormatError
         If it has another suffix.
+    FileNotFoundError
+        If there is no such folder.
     """
     suffix = Path(path).suffix
     if suffix.lower() not in ("", ".png"):
         raise FormatError(f"Pictures are written as .png, not {suffix}: '{Path(path).with_suffix('.png')}'.")
+    if not Path(path).parent.is_dir():
+        raise FileNotFoundError(errno.ENOENT, os.strerror(errno.ENOENT), str(Path(path).parent))
 
 
 def encode_png(pixels: npt.NDArray[np.uint8]) -> bytes:

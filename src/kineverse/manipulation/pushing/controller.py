@@ -214,8 +214,6 @@ class Pushing:
         self._margin = math.nan
         self._seen: tuple[PushPair | None, PushPoint, Array] | None = None
 
-    # -- the step ------------------------------------------------------------------------------------------
-
     def done(self, state: State, tolerance: float = 0.02) -> bool:
         """Return True if the coordinate is within a tolerance of the target."""
         return abs(state[self.coordinate] - self.target) < tolerance

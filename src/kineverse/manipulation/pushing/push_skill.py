@@ -8,10 +8,12 @@ from typing import Any
 
 import numpy as np
 
-from kineverse.errors import KineverseError
+from kineverse.errors import InvalidValueError, KineverseError
 from kineverse.geometry import Rule
 from kineverse.geometry.objects import Exclusion
 from kineverse.grasping import find_gripper
+from kineverse.lie import Array
+from kineverse.manipulation.articulated_objects import find_shut_value
 from kineverse.manipulation.outcome import Outcome
 from kineverse.manipulation.session import Session
 from kineverse.planning import Path
@@ -72,7 +74,7 @@ def push(
     what
         The coordinate of the object, as symbol or name.
     target
-        Wanted value [m], [rad]; by default its lower limit, where doors and drawers are shut.
+        Wanted value [m], [rad]; by default the limit nearest to the default value, where furniture is shut.
     bodies
         Bodies of the robot that may touch the object, names or patterns; by default those of its gripper.
     object_frames
@@ -101,10 +103,12 @@ def push(
     Raises
     ------
     UnknownNameError, InvalidValueError
-        As :class:`.Pushing`.
+        For a coordinate of the robot, and as :class:`.Pushing`.
     """
     model, world = session.world.model, session.world
     coordinate = model.symbol(what) if isinstance(what, str) else what
+    if coordinate.path.startswith(f"{world.robot}/"):
+        raise InvalidValueError(f"'{coordinate}' is a coordinate of the robot; name one of an object.")
     first, begin = session.steps, world.time
     while session.deviation(coordinate) > _UNKNOWN:
         if world.time - begin > _LOOK:
@@ -124,7 +128,7 @@ def push(
             coordinate,
             bodies,
             session.state,
-            target=model.limits(coordinate)[0] if target is None else target,
+            target=find_shut_value(model, coordinate) if target is None else target,
             robot=world.robot,
             object_frames=object_frames,
             dt=session.dt,
@@ -199,8 +203,8 @@ class _Run:
         self._seconds, self._tolerance, self._plan = seconds, tolerance, plan
         self._first, self._begin = session.steps, session.world.time
         self._approaches = 0
-        self._changes: list[np.ndarray[Any, np.dtype[np.float64]]] = []
-        self._last: np.ndarray[Any, np.dtype[np.float64]] | None = None
+        self._changes: list[Array] = []
+        self._last: Array | None = None
 
     @property
     def steps(self) -> int:

@@ -22,7 +22,7 @@ def match_bodies(known: Iterable[str], names: str | Iterable[str], argument: str
     for pattern in patterns:
         if not any(matches_pattern(b, (pattern,)) for b in known):
             raise UnknownNameError(
-                f"{argument} No body is named or matched by '{pattern}'. {suggest(pattern, known, 'body')}"
+                f"{argument}: no body is named or matched by '{pattern}'. {suggest(pattern, known, 'body')}"
             )
     if not patterns:
         raise InvalidValueError(f"{argument} lists no body, so nothing may touch the object.")
