@@ -8,15 +8,7 @@ from typing import Any
 import numpy as np
 
 from kineverse.compile import compile  # noqa: A004
-from kineverse.errors import (
-    InfeasibleError,
-    InvalidValueError,
-    KineverseError,
-    NotFiniteError,
-    UnknownNameError,
-    suggest,
-)
-from kineverse.estimation import PlausibilityMonitor, pose_covariance
+from kineverse.errors import InfeasibleError, InvalidValueError, NotFiniteError, UnknownNameError, suggest
 from kineverse.grasping import Grasp, find_gripper, sample_grasps
 from kineverse.lie import Array, inverse
 from kineverse.manipulation.opening import BasePlacement, PlacementSearch
@@ -28,10 +20,11 @@ from kineverse.model.model import Model
 from kineverse.planning import Planner
 from kineverse.worlds import Judge, Sensors
 
-from .joint_learning import JointLearning
-from .part import JointPath, find_joint, free_part, write_joint
+from .joint_learning import JointLearning, LearnedJoint
+from .joint_revision import revise_joint, watch_joint
+from .part import JointPath, find_joint, free_part
 from .part_belief import PartBelief, measure_way
-from .pull import LearnedPull, StraightPull, learn_model, place_beside
+from .pull import LearnedPull, StraightPull, learn_model
 
 OPEN_WAY, OPEN_TURN = 0.25, math.radians(60.0)
 """Opening that is wanted by default [m], [rad]."""
@@ -39,10 +32,8 @@ _LEAST_WAY, _LEAST_TURN = 0.08, math.radians(10.0)
 """Opening from which a part that goes no further counts as open [m], [rad]."""
 _LOOKING, _HELD_LOOKING, _MOST_LOOKING = 0.6, 1.0, 3.0
 """Times of looks before the approach and with the hand closed, and the largest until a part is seen [s]."""
-_REACHES = (0.25, 0.15, 0.08)
-"""Straight ways of the handle that a placement has to allow [m], one after the other."""
-_DISTANCE, _FLOOR_POSITION, _FLOOR_ORIENTATION = 1.0, 1e-3, 2e-3
-"""Distance of the camera, and least standard deviations, for the test of a believed joint [m], [rad]."""
+_REACH = 0.25
+"""Straight way of the handle that a placement should allow [m]."""
 _GRASPS, _PLANNING = 128, 2.0
 _MOST_GRASPS = 3
 _REFIT = 0.5
@@ -53,8 +44,9 @@ _SLIPPED = 0.012
 """Distance of the handle from its place in the hand from which on it has slipped [m]."""
 _LED = 0.06
 """Way of the handle before which the hand does not rely on a joint that was learned [m]."""
-_MOVED, _TURNED = 0.01, math.radians(1.0)
-"""Distance [m] and angle [rad] of furniture from where it was believed that are reported."""
+_FIRM, _SUDDEN = 0.006, 0.8
+"""Distance of the handle from its place in a firm hand [m], and time in which it is torn out of that [s]."""
+_TORN, _SLID = "It was torn out of a firm hand there.", "The handle slipped in the hand."
 
 
 def open_unknown(
@@ -185,17 +177,6 @@ class _Run:
         names = [f for f in markers if f in self.world.model.frames]
         self._truth = compile(self.world.model.fk((names or [handle])[0]))
 
-    def _watch_joint(self) -> None:
-        """Test the believed joint from now on, if there is one."""
-        sensors = self.belief.sensors
-        frames = [name for name in self.belief.seen if name in self.model.frames]
-        if find_joint(self.model, self.part) is None or self.belief.monitor is not None:
-            return
-        position = float(sensors.position_noise(np.asarray(_DISTANCE)))
-        noise = pose_covariance(max(position, _FLOOR_POSITION), max(sensors.orientation, _FLOOR_ORIENTATION))
-        outliers = sensors.outliers > 0.0 or None
-        self.belief.monitor = PlausibilityMonitor(self.model, frames, noise=noise, outliers=outliers)
-
     def __call__(self) -> Outcome:
         """Open the part, and return the outcome."""
         session, world = self.session, self.world
@@ -218,7 +199,7 @@ class _Run:
         learned = self.learning.learned
         turns = bool(learned.fit.motion.kinds[0]) if learned is not None else turn > 0.5 * _LEAST_TURN
         if learned is not None:
-            reason = f"{reason} {self._report_joint()}"
+            reason = f"{reason} {self._report_joint(learned)}"
         if kind:
             self.measures["failure"] = kind
         return Outcome(
@@ -246,7 +227,8 @@ class _Run:
             self.begin + self.seconds,
         )  # fmt: skip
         self._look()
-        self._watch_joint()
+        if self.belief.monitor is None:
+            self.belief.monitor = watch_joint(self.model, self.belief)
         placement = self._place()
         grasp = placement.grasp
         assert grasp is not None
@@ -286,45 +268,42 @@ class _Run:
         """Return a placement from which the handle can be pulled straight, as far as possible."""
         session, why = self.session, ""
         session.phase = "place"
+
+        def plan(placement: BasePlacement) -> bool:
+            nonlocal why
+            state, planner = session.state, self.planner
+            wanted = dict(zip(placement.coordinates, placement.approach.tolist(), strict=True))
+            planner.place(state.updated({s: wanted[s] for s in self.search.standing}))
+            end = np.array([wanted[s] for s in planner.symbols])
+            path = planner.plan(state.vector(planner.symbols), end, seconds=_PLANNING, seed=self.seed)
+            if path.found:
+                self.trajectory = path.trajectory()
+            why = "" if path.found else f" There is no way to the handle: {path.why}"
+            return bool(path.found)
+
         with session.timed("place"):
             grasps = sample_grasps(self.unknown.model, self.gripper, self.unknown.handle, _GRASPS, self.seed)
-            for reach in _REACHES:
-                found = self.search.find(session.state, grasps, reach, samples=self.samples, seed=self.seed)
-                if found:
-                    return found
-                why = why or found.why
-        contacts = any(" at " in reason for reason in found.reasons)
-        raise SkillError("collision" if contacts else "reach", why)
+            found = self.search.find(
+                session.state, grasps, _REACH, accept=plan, samples=self.samples, seed=self.seed
+            )
+        if not found:
+            raise SkillError(found.failure, f"{found.why}{why}")
+        return found
 
     def _approach(self, placement: BasePlacement) -> None:
-        """Bring the hand to the pose before the handle, on a planned path, and then straight to it."""
+        """Put a base that only stands to its place, and bring the hand to the handle."""
         session, search, motion = self.session, self.search, self.motion
-        session.phase = "approach"
-        wanted = dict(zip(placement.coordinates, placement.approach.tolist(), strict=True))
         if search.standing:
-            stands = {s: wanted[s] for s in search.standing}
+            wanted = dict(zip(placement.coordinates, placement.approach.tolist(), strict=True))
             gone = self.world.time - self.begin
             self.belief.reset()
-            session.restart(self.world.state.updated(stands))
+            session.restart(self.world.state.updated({s: wanted[s] for s in search.standing}))
             self.begin = -gone
             motion.until = self.seconds - gone
             self.judge.reset()
             self._look()
-            session.phase = "approach"
-        motion.move_fingers(self.gripper.opened)
-        with session.timed("plan"):
-            self.planner.place(session.state)
-            start = session.state.vector(self.planner.symbols)
-            end = np.array([wanted[s] for s in self.planner.symbols])
-            path = self.planner.plan(start, end, seconds=_PLANNING, seed=self.seed)
-            if not path.found:
-                raise SkillError("collision", f"There is no way to the handle: {path.why}")
-            trajectory = path.trajectory()
-        motion.follow(trajectory)
-        motion.count_turns(placement.line[0])
-        assert placement.grasp is not None
-        rows = placement.line[:, : len(search.moving)] + motion.turns
-        motion.follow_line(placement.grasp.approach, placement.grasp.pose, rows)
+        session.phase = "approach"
+        motion.approach(placement, self.trajectory)
 
     def _pull(self, grasp: Grasp) -> str:
         """Pull until the part is open or goes no further; grasp it anew where the handle slips."""
@@ -339,30 +318,31 @@ class _Run:
                 why = self._pull_once()
             if not why:
                 return self._describe_opening("is open")
+            self._let_go()
+            if why == _TORN and self._is_far_enough():
+                return f"{self._describe_opening('goes no further')} {why}"
             last, way = way, self._opening()[0]
             if way - last < _FOLLOWS:
                 break
-            self._grasp_anew(grasp)
-        opened, turned = self._opening()
+            pose = inverse(self.belief.pose @ self.frame_T_handle) @ self.belief.hand_pose
+            self.motion.follow_line(pose, grasp.pose)
+        opened, _ = self._opening()
         if opened < _FOLLOWS:
             raise SkillError(
                 "other",
                 f"'{self.part}' does not follow the hand: it moved by {1e3 * opened:.0f} mm. {why} It may be "
                 "fixed, locked, or need more force than the grip holds.",
             )
-        if opened >= _LEAST_WAY or turned >= _LEAST_TURN:
+        if self._is_far_enough():
             return self._describe_opening("goes no further")
         raise SkillError("other", self._describe_opening("goes no further") + f" {why}")
 
-    def _grasp_anew(self, grasp: Grasp) -> None:
-        """Open the fingers, look, and bring the hand back to its place on the handle."""
-        session, motion, belief = self.session, self.motion, self.belief
-        session.phase = "grasp anew"
-        belief.release()
-        motion.move_fingers(self.gripper.opened)
+    def _let_go(self) -> None:
+        """Open the fingers, and look where the part is."""
+        self.session.phase = "grasp anew"
+        self.belief.release()
+        self.motion.move_fingers(self.gripper.opened)
         self._wait(_LOOKING)
-        pose = inverse(belief.pose @ self.frame_T_handle) @ belief.hand_pose
-        motion.follow_line(pose, grasp.pose)
 
     def _pull_once(self) -> str:
         """Pull until the part is open, and return why it is not, empty if it is."""
@@ -378,6 +358,7 @@ class _Run:
         pull: StraightPull | LearnedPull = StraightPull(motion, belief, bar_T_hand)
         fitted, known = -math.inf, learning.learned is not None
         best, since = self._opening()[0], self.world.time
+        begun = firm = since
         while True:
             motion.check_time()
             for look in belief.looks:
@@ -402,9 +383,12 @@ class _Run:
             way, turn = self._opening()
             if self._is_open(way, turn):
                 return ""
-            if belief.slip(part_T_hand, self.point) > _SLIPPED:
+            slip = belief.slip(part_T_hand, self.point)
+            if slip > _SLIPPED:
                 session.stop()
-                return "The handle slipped in the hand."
+                return _TORN if now - firm < _SUDDEN and firm - begun > _SUDDEN else _SLID
+            if slip < _FIRM:
+                firm = now
             if way > best + _STALLED:
                 best, since = way, now
                 if way > self.farthest + _FOLLOWS:
@@ -419,6 +403,11 @@ class _Run:
         """Return the believed way of the handle [m] and angle of the part [rad] since the first grasp."""
         return measure_way(self.start, self.belief.relative_pose, self.point)
 
+    def _is_far_enough(self) -> bool:
+        """Return whether a part that goes no further counts as open."""
+        way, turn = self._opening()
+        return way >= _LEAST_WAY or turn >= _LEAST_TURN
+
     def _is_open(self, way: float, turn: float) -> bool:
         learned = self.learning.learned
         if learned is not None and learned.fit.motion.kinds[0]:
@@ -429,51 +418,19 @@ class _Run:
         way, turn = self._opening()
         return f"'{self.part}' {verb}, by {100 * way:.0f} cm and {math.degrees(turn):.0f}°."
 
-    def _report_joint(self) -> str:
+    def _report_joint(self, learned: LearnedJoint) -> str:
         """Write the learned joint into the model if it had another one or none, and say so."""
-        learned, belief = self.learning.learned, self.belief
-        assert learned is not None
         self.measures |= {
             "family": learned.family,
             "decided_way": learned.way,
             "decided_turn": learned.turn,
             "decided_seconds": learned.time,
-            "parent": belief.beside,
+            "parent": self.belief.beside,
         }
         parameters = learned.fit.parameters
         self.measures |= {key: parameters[key] for key in ("axis", "point") if key in parameters}
-        words = f"Its joint is {learned.family}, certain after {100 * learned.way:.1f} cm and "
-        words += f"{math.degrees(learned.turn):.1f}°."
-        if belief.beside != WORLD:
-            before = np.asarray(self.model.fk(belief.beside)({}))
-            away, turned = measure_way(before, belief.reference_pose, np.zeros(3))
-            if away > _MOVED or turned > _TURNED:
-                place_beside(self.model, belief)
-                words += f" '{belief.beside}' stands {100 * away:.0f} cm from where it was believed."
-        verdict = self._judge_belief()
-        self.measures["believed"] = verdict
-        if verdict == "explains":
-            return f"{words} The model's joint explains what was seen, and stays."
-        if verdict == "cannot tell":
-            return f"{words} What was seen does not refute the model's joint, which stays."
-        if verdict == "refuted":
-            words += " It is not as the model had it."
-        try:
-            write_joint(self.model, self.part, learned.fit, belief.beside)
-        except KineverseError as error:
-            return f"{words} It could not be written: {error}"
-        return f"{words} It is in the model now."
-
-    def _judge_belief(self) -> str:
-        """Return the verdict on the model's joint: nothing, explains, cannot tell or refuted."""
-        if self.belief.monitor is None:
-            return "nothing"
-        tag = self.model.history.writers(f"frames/{self.part}")[-1]
-        report = self.belief.monitor.report()
-        if tag in {verdict.tag for verdict in report.implausible}:
-            return "refuted"
-        certain = any(verdict.explains for verdict in report.verdicts if verdict.tag == tag)
-        return "explains" if certain else "cannot tell"
+        self.measures["believed"], words = revise_joint(self.model, self.belief, learned)
+        return words
 
 
 def _ancestors(model: Model, frame: str) -> list[str]:
