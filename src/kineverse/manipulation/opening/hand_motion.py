@@ -284,6 +284,12 @@ class HandMotion:
             if len(steps) == _IDLE and moved < 0.1 * asked + 2.0 * noise:
                 break
 
+    def stand(self, seconds: float) -> None:
+        """Stand for a time [s]."""
+        end = self.session.world.time + seconds
+        while self.session.world.time < end - 1e-9:
+            self.act({})
+
     def _await_readings(self) -> None:
         """Stand until readings of the present arrive; predicted fingers close through what they hold."""
         session = self.session

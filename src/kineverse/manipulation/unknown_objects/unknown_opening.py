@@ -9,8 +9,8 @@ import numpy as np
 
 from kineverse.compile import compile  # noqa: A004
 from kineverse.errors import InfeasibleError, InvalidValueError, NotFiniteError, UnknownNameError, suggest
-from kineverse.grasping import Grasp, find_gripper, sample_grasps
-from kineverse.lie import Array, inverse
+from kineverse.grasping import find_gripper, sample_grasps
+from kineverse.lie import Array
 from kineverse.manipulation.opening import BasePlacement, PlacementSearch
 from kineverse.manipulation.opening.hand_motion import HandMotion
 from kineverse.manipulation.outcome import Outcome, SkillError
@@ -22,31 +22,17 @@ from kineverse.worlds import Judge, Sensors
 
 from .joint_learning import JointLearning, LearnedJoint
 from .joint_revision import revise_joint, watch_joint
-from .part import JointPath, find_joint, free_part
+from .part import find_joint, free_part
 from .part_belief import PartBelief, measure_way
-from .pull import LearnedPull, StraightPull, learn_model
+from .pulling import LEAST_OPENING, LOOKING, PartPulling
 
 OPEN_WAY, OPEN_TURN = 0.25, math.radians(60.0)
 """Opening that is wanted by default [m], [rad]."""
-_LEAST_WAY, _LEAST_TURN = 0.08, math.radians(10.0)
-"""Opening from which a part that goes no further counts as open [m], [rad]."""
-_LOOKING, _HELD_LOOKING, _MOST_LOOKING = 0.6, 1.0, 3.0
-"""Times of looks before the approach and with the hand closed, and the largest until a part is seen [s]."""
+_MOST_LOOKING = 3.0
+"""Largest time until a part is seen [s]."""
 _REACH = 0.25
 """Straight way of the handle that a placement should allow [m]."""
 _GRASPS, _PLANNING = 128, 2.0
-_MOST_GRASPS = 3
-_REFIT = 0.5
-"""Time between two controllers for a learned joint [s]."""
-_FOLLOWS, _STALLED, _PATIENCE = 0.01, 0.004, 1.5
-"""Motion of a part that follows the hand, and its least progress [m] in a time [s]."""
-_SLIPPED = 0.012
-"""Distance of the handle from its place in the hand from which on it has slipped [m]."""
-_LED = 0.06
-"""Way of the handle before which the hand does not rely on a joint that was learned [m]."""
-_FIRM, _SUDDEN = 0.006, 0.8
-"""Distance of the handle from its place in a firm hand [m], and time in which it is torn out of that [s]."""
-_TORN, _SLID = "It was torn out of a firm hand there.", "The handle slipped in the hand."
 
 
 def open_unknown(
@@ -155,8 +141,6 @@ class _Run:
         before = model.default_state()
         before = before.updated({s: v for s, v in session.state.items() if s in before})
         self.unknown = unknown = free_part(model, self.part, handle, before)
-        self.frame_T_handle = np.asarray(unknown.model.fk(handle, self.part)({}))
-        self.point = (self.frame_T_handle @ unknown.handle.pose)[:3, 3]
         rigid = [f for f in model.frames if f == self.part or self.part in _ancestors(model, f)]
         markers = [f for f in rigid if not unknown.model.fk(f, self.part).symbols]
         still = [f for f in _ancestors(model, self.part) if not model.fk(f).symbols]
@@ -172,7 +156,6 @@ class _Run:
         )
         self.learning = JointLearning()
         self.measures: dict[str, Any] = {"grasps": 0}
-        self.farthest = 0.0
         self.first_step, self.begin = session.steps, self.world.time
         names = [f for f in markers if f in self.world.model.frames]
         self._truth = compile(self.world.model.fk((names or [handle])[0]))
@@ -194,10 +177,10 @@ class _Run:
         finally:
             session.belief = believed
         session.stop()
-        way, turn = measure_way(first, self._true_pose(), self.point)
+        way, turn = measure_way(first, self._true_pose(), self.unknown.point)
         self.measures |= {"way": way, "turn": turn}
         learned = self.learning.learned
-        turns = bool(learned.fit.motion.kinds[0]) if learned is not None else turn > 0.5 * _LEAST_TURN
+        turns = bool(learned.fit.motion.kinds[0]) if learned is not None else turn > 0.5 * LEAST_OPENING[1]
         if learned is not None:
             reason = f"{reason} {self._report_joint(learned)}"
         if kind:
@@ -233,36 +216,28 @@ class _Run:
         grasp = placement.grasp
         assert grasp is not None
         self._approach(placement)
-        self.start, self.pulling = self.belief.relative_pose, self.world.time
+        pulling = PartPulling(self.motion, self.belief, self.learning, self.model, self.wanted)
         try:
-            return self._pull(grasp)
+            return pulling.perform(grasp)
         finally:
-            self.measures["pull_seconds"] = self.world.time - self.pulling
+            self.measures |= pulling.measures
             self.belief.release()
-            if not self._is_late():
+            if self.world.time <= self.motion.until:
+                # The arm's retreat is that of a straight pull, whose coordinate stays 0 in the belief: not used.
                 self.motion.release(placement)
-
-    def _is_late(self) -> bool:
-        """Return whether no time is left to let go."""
-        return self.world.time > self.motion.until
-
-    def _wait(self, seconds: float) -> None:
-        end = self.world.time + seconds
-        while self.world.time < end - 1e-9:
-            self.motion.act({})
 
     def _look(self) -> None:
         """Look at the part while the robot stands."""
         self.session.phase = "look"
         begin = self.world.time
-        self._wait(_LOOKING)
+        self.motion.stand(LOOKING)
         while not self.belief.is_seen:
             if self.world.time - begin > _MOST_LOOKING:
                 raise SkillError(
                     "other",
                     f"No marker of '{self.part}' was seen within {_MOST_LOOKING:g} s; it may be hidden.",
                 )
-            self._wait(self.session.dt)
+            self.motion.stand(self.session.dt)
 
     def _place(self) -> BasePlacement:
         """Return a placement from which the handle can be pulled straight, as far as possible."""
@@ -304,119 +279,6 @@ class _Run:
             self._look()
         session.phase = "approach"
         motion.approach(placement, self.trajectory)
-
-    def _pull(self, grasp: Grasp) -> str:
-        """Pull until the part is open or goes no further; grasp it anew where the handle slips."""
-        way = -math.inf
-        for _ in range(_MOST_GRASPS):
-            self.measures["grasps"] += 1
-            if not self.motion.close(grasp):
-                why = "The fingers closed beside the handle."
-            else:
-                if not self.learning.poses:
-                    self.pulling = self.world.time
-                why = self._pull_once()
-            if not why:
-                return self._describe_opening("is open")
-            self._let_go()
-            if why == _TORN and self._is_far_enough():
-                return f"{self._describe_opening('goes no further')} {why}"
-            last, way = way, self._opening()[0]
-            if way - last < _FOLLOWS:
-                break
-            pose = inverse(self.belief.pose @ self.frame_T_handle) @ self.belief.hand_pose
-            self.motion.follow_line(pose, grasp.pose)
-        opened, _ = self._opening()
-        if opened < _FOLLOWS:
-            raise SkillError(
-                "other",
-                f"'{self.part}' does not follow the hand: it moved by {1e3 * opened:.0f} mm. {why} It may be "
-                "fixed, locked, or need more force than the grip holds.",
-            )
-        if self._is_far_enough():
-            return self._describe_opening("goes no further")
-        raise SkillError("other", self._describe_opening("goes no further") + f" {why}")
-
-    def _let_go(self) -> None:
-        """Open the fingers, and look where the part is."""
-        self.session.phase = "grasp anew"
-        self.belief.release()
-        self.motion.move_fingers(self.gripper.opened)
-        self._wait(_LOOKING)
-
-    def _pull_once(self) -> str:
-        """Pull until the part is open, and return why it is not, empty if it is."""
-        session, belief, motion, learning = self.session, self.belief, self.motion, self.learning
-        session.phase = "pull"
-        belief.hold()
-        self._wait(_HELD_LOOKING)
-        part_T_hand = inverse(belief.pose) @ belief.hand_pose
-        bar_T_hand = inverse(self.frame_T_handle) @ part_T_hand
-        if not learning.poses:
-            self.start = belief.relative_pose
-        belief.begin_motion()
-        pull: StraightPull | LearnedPull = StraightPull(motion, belief, bar_T_hand)
-        fitted, known = -math.inf, learning.learned is not None
-        best, since = self._opening()[0], self.world.time
-        begun = firm = since
-        while True:
-            motion.check_time()
-            for look in belief.looks:
-                learning.add(look.pose, look.covariance)
-            belief.looks.clear()
-            way, turn = self._opening()
-            now = self.world.time
-            with session.timed("learn"):
-                if learning.update(way, turn, now - self.pulling):
-                    known = True
-                if known and now - fitted >= _REFIT and way >= _LED and learning.learned is not None:
-                    fit, fitted = learning.learned.fit, now
-                    pull = LearnedPull(
-                        motion, belief, learn_model(self.model, belief, fit), bar_T_hand, self.start,
-                        self.wanted[fit.motion.kinds[0]],
-                    )  # fmt: skip
-                elif learning.likely is not None and isinstance(pull, StraightPull):
-                    pull.likely = JointPath.of_fit(learning.likely, self.start)
-            with session.timed("open"):
-                command = pull.step(way)
-            motion.act(command.speeds)
-            way, turn = self._opening()
-            if self._is_open(way, turn):
-                return ""
-            slip = belief.slip(part_T_hand, self.point)
-            if slip > _SLIPPED:
-                session.stop()
-                return _TORN if now - firm < _SUDDEN and firm - begun > _SUDDEN else _SLID
-            if slip < _FIRM:
-                firm = now
-            if way > best + _STALLED:
-                best, since = way, now
-                if way > self.farthest + _FOLLOWS:
-                    self.farthest = way
-                    self.measures["opened_seconds"] = now - self.pulling
-            elif now - since > _PATIENCE:
-                return f"In the way: {', '.join(command.active[:3]) or 'nothing that the controller knows'}."
-
-    # -- what was found ------------------------------------------------------------------------------------
-
-    def _opening(self) -> tuple[float, float]:
-        """Return the believed way of the handle [m] and angle of the part [rad] since the first grasp."""
-        return measure_way(self.start, self.belief.relative_pose, self.point)
-
-    def _is_far_enough(self) -> bool:
-        """Return whether a part that goes no further counts as open."""
-        way, turn = self._opening()
-        return way >= _LEAST_WAY or turn >= _LEAST_TURN
-
-    def _is_open(self, way: float, turn: float) -> bool:
-        learned = self.learning.learned
-        if learned is not None and learned.fit.motion.kinds[0]:
-            return turn >= self.wanted[1]
-        return way >= self.wanted[0] or turn >= self.wanted[1]
-
-    def _describe_opening(self, verb: str) -> str:
-        way, turn = self._opening()
-        return f"'{self.part}' {verb}, by {100 * way:.0f} cm and {math.degrees(turn):.0f}°."
 
     def _report_joint(self, learned: LearnedJoint) -> str:
         """Write the learned joint into the model if it had another one or none, and say so."""
