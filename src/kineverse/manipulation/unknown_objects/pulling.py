@@ -29,9 +29,6 @@ _SLIPPED = 0.012
 """Distance of the handle from its place in the hand from which on it has slipped [m]."""
 _LED = 0.06
 """Way of the handle before which the hand does not rely on a joint that was learned [m]."""
-_FIRM, _SUDDEN = 0.006, 0.8
-"""Distance of the handle from its place in a firm hand [m], and time in which it is torn out of that [s]."""
-_TORN, _SLID = "It was torn out of a firm hand there.", "The handle slipped in the hand."
 
 
 class PartPulling:
@@ -75,7 +72,7 @@ class PartPulling:
         self.point, self.frame_T_handle = belief.unknown.point, belief.unknown.frame_T_handle
         self.start, self.begin = belief.relative_pose, self.session.world.time
         self._measures: dict[str, Any] = {"grasps": 0}
-        self._farthest = 0.0
+        self._reached = self.begin
 
     @property
     def measures(self) -> dict[str, Any]:
@@ -104,11 +101,10 @@ class PartPulling:
             if not why:
                 return self._describe_opening("is open")
             self._let_go()
-            if why == _TORN and self._is_far_enough():
-                return f"{self._describe_opening('goes no further')} {why}"
             last, way = way, self._opening()[0]
             if way - last < _FOLLOWS:
                 break
+            self._measures["opened_seconds"] = self._reached - self.begin
             pose = inverse(self.belief.pose @ self.frame_T_handle) @ self.belief.hand_pose
             self.motion.follow_line(pose, grasp.pose)
         opened, _ = self._opening()
@@ -143,7 +139,6 @@ class PartPulling:
         pull: StraightPull | LearnedPull = StraightPull(motion, belief, bar_T_hand)
         fitted, known = -math.inf, learning.learned is not None
         best, since = self._opening()[0], self.session.world.time
-        begun = firm = since
         while True:
             motion.check_time()
             for look in belief.looks:
@@ -167,18 +162,14 @@ class PartPulling:
             motion.act(command.speeds)
             way, turn = self._opening()
             if self._is_open(way, turn):
+                self._measures["opened_seconds"] = now - self.begin
                 return ""
-            slip = belief.slip(part_T_hand, self.point)
-            if slip > _SLIPPED:
+            if belief.slip(part_T_hand, self.point) > _SLIPPED:
                 session.stop()
-                return _TORN if now - firm < _SUDDEN and firm - begun > _SUDDEN else _SLID
-            if slip < _FIRM:
-                firm = now
+                return "The handle slipped in the hand."
             if way > best + _STALLED:
                 best, since = way, now
-                if way > self._farthest + _FOLLOWS:
-                    self._farthest = way
-                    self._measures["opened_seconds"] = now - self.begin
+                self._reached = now
             elif now - since > _PATIENCE:
                 return f"In the way: {', '.join(command.active[:3]) or 'nothing that the controller knows'}."
 

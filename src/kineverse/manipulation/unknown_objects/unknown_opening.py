@@ -223,7 +223,7 @@ class _Run:
             self.measures |= pulling.measures
             self.belief.release()
             if self.world.time <= self.motion.until:
-                # The arm's retreat is that of a straight pull, whose coordinate stays 0 in the belief: not used.
+                # The retreat rows are those of a straight pull, whose coordinate stays 0 in the belief.
                 self.motion.release(placement)
 
     def _look(self) -> None:
