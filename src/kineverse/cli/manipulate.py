@@ -15,7 +15,8 @@ from typing import TYPE_CHECKING, Any, Literal, NamedTuple
 from kineverse.cli.arguments import add_model_options, print_notes
 from kineverse.cli.manipulate_output import PhaseLines, report_outcome
 from kineverse.cli.manipulate_setup import TOLERANCE, ManipulationScene, make_scene
-from kineverse.cli.output import join_lines, show_activity
+from kineverse.cli.manipulate_skills import grasp_object, open_as_unknown, push_object, skip_skill
+from kineverse.cli.output import show_activity
 from kineverse.cli.view import (
     add_page_options,
     handle_interrupts,
@@ -33,8 +34,6 @@ if TYPE_CHECKING:
     from kineverse.worlds.recorder import RecordedStep
 
 DONE, NOT_DONE = 0, 1
-_PLACEMENT = 60.0
-"""Largest time of the search for a place of the base [s]."""
 
 _COMMON = """
 MODEL is any model or file, ROBOT any shipped robot or robot file; ROBOT@X,Y,ANGLE places its base. The world
@@ -78,7 +77,8 @@ The object is at its default value at first, unless --from says otherwise, and i
 is farthest from shut, or to --to.
 {_COMMON}  kineverse open kitchen --robot fetch --what kitchen/fridge_door
   kineverse open kitchens/17 --robot hsr --what kitchen/oven_door --world mujoco --json
-  kineverse open shelf.urdf --robot arm.urdf --base omni --what drawer --to 20cm""",
+  kineverse open shelf.urdf --robot arm.urdf --base omni --what drawer --to 20cm
+  kineverse open kitchen --robot hsr --what kitchen/fridge_door --unknown --noise 3mm,0.5deg,30Hz""",
     ),
     "close": ManipulationCommand(
         "close",
@@ -141,6 +141,14 @@ def _add_arguments(parser: argparse.ArgumentParser, skill: str) -> None:
     )
     if skill != "push":
         parser.add_argument("--handle", metavar="FRAME", help="handle of the object; the best one")
+    if skill == "open":
+        parser.add_argument(
+            "--unknown",
+            action="store_true",
+            help="the robot knows the bodies but not the joint of the object; it pulls at the handle and "
+            "learns the joint from what it sees (to 25 cm or 60°, or as far as --to is from the start)",
+        )
+    parser.set_defaults(unknown=False)
     parser.add_argument(
         "--grasp",
         choices=("friction", "tie"),
@@ -251,7 +259,7 @@ def _act(
     error = EstimateError(scene.coordinate)
     with ExitStack() as stack:
         watchers = [PhaseLines(scene), *watchers]
-        if arguments.noise is not None:
+        if arguments.noise is not None and not arguments.unknown:
             tracked = TrackedBelief(scene.model, scene.robot, Sensors.parse(arguments.noise))
             print_notes(tracked.remarks)
             if tracked.sensors.position > 0.0 and tracked.sensors.orientation == 0.0:
@@ -271,100 +279,14 @@ def _act(
                 watch(step)
 
         if abs(scene.start[scene.coordinate] - scene.target) < TOLERANCE:
-            outcome = _without_steps(scene, world, True, f"'{scene.coordinate}' is there from the start")
+            outcome = skip_skill(scene, world, True, f"'{scene.coordinate}' is there from the start")
         else:
-            act = _push if skill == "push" else _grasp
+            act = push_object if skill == "push" else open_as_unknown if arguments.unknown else grasp_object
             outcome = act(arguments, scene, world, belief, look)
             outcome = replace(outcome, measures={**outcome.measures, **error.measures})
         if recorder is not None:
             recorder.write_outcome(outcome)
     return outcome
-
-
-def _grasp(
-    arguments: argparse.Namespace,
-    scene: ManipulationScene,
-    world: World,
-    belief: Belief | None,
-    look: Callable[[RecordedStep], None],
-) -> Outcome:
-    """Open or close the object by its handle."""
-    if scene.gripper is None:
-        return _without_steps(scene, world, False, scene.why)
-
-    from kineverse.grasping import find_handle, find_handles
-    from kineverse.manipulation.opening.grasped_opening import open_object
-    from kineverse.manipulation.session import Session
-
-    if arguments.handle is not None:
-        print(find_handle(scene.model, scene.coordinate, arguments.handle), file=sys.stderr)
-    elif handles := find_handles(scene.model, scene.coordinate):
-        print(handles[0], file=sys.stderr)
-    outcome: Outcome = open_object(
-        Session(world, belief=belief, on_step=look),
-        scene.coordinate,
-        target=scene.target,
-        hand=scene.gripper.hand,
-        handle=arguments.handle,
-        seconds=arguments.seconds,
-        seed=arguments.seed,
-    )
-    return outcome
-
-
-def _push(
-    arguments: argparse.Namespace,
-    scene: ManipulationScene,
-    world: World,
-    belief: Belief | None,
-    look: Callable[[RecordedStep], None],
-) -> Outcome:
-    """Push the object, from where the robot stands or from a place that is searched."""
-    from kineverse.manipulation.pushing.controller import Pushing
-    from kineverse.manipulation.pushing.placement import find_push_start, roll_out
-    from kineverse.manipulation.pushing.push_skill import push
-    from kineverse.manipulation.session import Session
-
-    if not scene.pusher:
-        return _without_steps(
-            scene, world, False, f"{scene.why} --hand may name any body of the robot that is to push."
-        )
-    with show_activity("compiling the controller; this is kept for the next time"):
-        pushing = Pushing(
-            scene.model,
-            scene.coordinate,
-            scene.pusher,
-            scene.start,
-            target=scene.target,
-            robot=scene.robot,
-        )
-        pushing.wait()
-    placed, where = 0, ""
-    if not scene.stays:
-        steps = round(arguments.seconds / 0.02)
-        problem = pushing.first_contact(scene.start) or roll_out(pushing, scene.start, steps)[0]
-        if problem:
-            with show_activity("searching a place for the robot"):
-                found = find_push_start(
-                    pushing, scene.start, seconds=_PLACEMENT, steps=steps, seed=arguments.seed
-                )
-            placed, where = found.samples, f"Another place of the robot: {found.why}"
-            print(f"not from where the robot stands: {problem}. {where}", file=sys.stderr)
-            if found.state is not None:
-                world.reset(found.state)
-                where = ""
-
-    session = Session(world, belief=belief, on_step=look)
-    outcome = push(session, scene.coordinate, seconds=arguments.seconds, pushing=pushing)
-    reason = outcome.reason if outcome or not where else f"{outcome.reason} {where}"
-    return replace(outcome, reason=reason, measures={**outcome.measures, "placed": placed})
-
-
-def _without_steps(scene: ManipulationScene, world: World, done: bool, reason: str) -> Outcome:
-    """Return the outcome of what was not begun."""
-    from kineverse.manipulation.outcome import Outcome
-
-    return Outcome(done, world.state[scene.coordinate], join_lines(reason), world.name, 0.0, 0)
 
 
 def _view(

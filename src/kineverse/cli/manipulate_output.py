@@ -78,12 +78,24 @@ def report_outcome(
         state = "shut" if is_shut(scene) else "done"
         verdict = f"{state} at {at}, after {format_number(outcome.seconds, 4)} s in the {world.name} world"
     print(f"{scene.coordinate}: {join_lines(verdict)}")
+    if "family" in outcome.measures:
+        print(f"learned joint: {_describe_joint(outcome.measures)}")
     if outcome.steps:
         rows = [("steps", str(outcome.steps))]
         rows += [(name, _format_measure(value)) for name, value in _plain(outcome.measures).items()]
         print(format_table(("measure", "value"), rows))
     if arguments.record is not None:
         print(f"recording: {arguments.record}")
+
+
+def _describe_joint(measures: Mapping[str, Any]) -> str:
+    """Return a learned joint in words: family, axis, and a point on it."""
+    words = str(measures["family"])
+    for key, link in (("axis", "axis"), ("point", "through")):
+        if key in measures:
+            words += f", {link} [{', '.join(f'{v:.3f}' for v in np.ravel(measures[key]))}]"
+    certain = f"certain after {100 * measures['decided_way']:.1f} cm"
+    return f"{words} in {measures['parent']}, {certain} and {math.degrees(measures['decided_turn']):.1f}°"
 
 
 def _plain(value: Any) -> Any:

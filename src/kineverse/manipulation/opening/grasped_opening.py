@@ -338,12 +338,7 @@ class _Run:
         return bool(path.found)
 
     def _approach(self, placement: BasePlacement) -> None:
-        """Bring the hand to the pose before the handle, on the planned path, and then straight to it."""
-        session, motion = self.session, self.motion
-        session.phase = "approach"
+        """Put the base to its place, and bring the hand to the handle."""
+        self.session.phase = "approach"
         self._put_base(dict(zip(placement.coordinates, placement.approach.tolist(), strict=True)))
-        motion.follow(self._trajectory)
-        motion.move_fingers(self.gripper.opened)
-        motion.count_turns(placement.line[0])
-        assert placement.grasp is not None
-        motion.follow_line(placement.grasp.approach, placement.grasp.pose, motion.rows(placement.line))
+        self.motion.approach(placement, self._trajectory)

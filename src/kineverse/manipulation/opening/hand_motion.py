@@ -132,6 +132,14 @@ class HandMotion:
         inside = {s: min(max(state[s], a), b) for s, (a, b) in self._limits.items()}
         return state.updated({s: v for s, v in inside.items() if v != state[s]})
 
+    def approach(self, placement: BasePlacement, trajectory: Trajectory) -> None:
+        """Bring the hand along a trajectory before the handle, and then straight to the grasp."""
+        assert placement.grasp is not None
+        self.follow(trajectory)
+        self.move_fingers(self.gripper.opened)
+        self.count_turns(placement.line[0])
+        self.follow_line(placement.grasp.approach, placement.grasp.pose, self.rows(placement.line))
+
     def follow(self, trajectory: Trajectory) -> None:
         """Follow a trajectory."""
         session = self.session
@@ -245,7 +253,8 @@ class HandMotion:
         tasks = list(tasks)
         still: list[Symbol | str] = [*self.search.standing, *self.gripper.joints]
         if not any(isinstance(task, Hold) for task in tasks):
-            still.append(self.handle.coordinate)
+            moving = {*self.search.moving}
+            still += [s for s in self.model.symbols_of(self.handle.frame) if s not in moving]
         with self.session.timed("plan"):
             controller = Controller(self.model, tasks, dt=self.session.dt, still=still, **options)
             controller.wait()
@@ -274,6 +283,12 @@ class HandMotion:
             asked = sum(one for _, one in steps)
             if len(steps) == _IDLE and moved < 0.1 * asked + 2.0 * noise:
                 break
+
+    def stand(self, seconds: float) -> None:
+        """Stand for a time [s]."""
+        end = self.session.world.time + seconds
+        while self.session.world.time < end - 1e-9:
+            self.act({})
 
     def _await_readings(self) -> None:
         """Stand until readings of the present arrive; predicted fingers close through what they hold."""

@@ -9,8 +9,9 @@ from typing import Self
 
 import numpy as np
 
-from kineverse.articulations import Floating
+from kineverse.articulations import Fixed, Floating
 from kineverse.compile import compile  # noqa: A004
+from kineverse.errors import InvalidValueError, suggest
 from kineverse.estimation import Fit
 from kineverse.grasping import Handle, find_handle
 from kineverse.lie import Array, inverse, log_se3, pose_difference, to_quaternion
@@ -54,6 +55,16 @@ class UnknownPart:
     origin: Array
     floating: tuple[Symbol, ...]
 
+    @property
+    def frame_T_handle(self) -> Array:
+        """Pose (4, 4) of the handle's body in the part."""
+        return np.asarray(self.model.fk(self.handle.frame, self.frame)({}))
+
+    @property
+    def point(self) -> Array:
+        """Middle (3,) of the handle, in the frame of the part [m]."""
+        return np.asarray((self.frame_T_handle @ self.handle.pose)[:3, 3])
+
     def values(self, parent_T_frame: Array) -> dict[Symbol, float]:
         """Return the coordinates of the part for its pose (4, 4) in the parent."""
         off = inverse(self.origin) @ parent_T_frame
@@ -96,6 +107,32 @@ def free_part(model: Model, frame: str, handle: str, state: State) -> UnknownPar
         edit.remove(tag)
         edit.attach(frame, name, translation(*(float(v) * pull for v in outward)), tag)
     return UnknownPart(copy, frame, found, parent, parent_T_frame, copy.articulations[name].coordinates)
+
+
+def forget_joint(model: Model, frame: str, state: State) -> Model:
+    """Return a copy of a model in which a part is fixed where a state has it, as if its joint was unknown.
+
+    Raises
+    ------
+    InvalidValueError
+        For a frame that no joint with coordinates places directly.
+    EditError
+        If something else in the model needs the joint.
+    """
+    joint = find_joint(model, frame)
+    if joint is None:
+        movable = [a.child for a in model.articulations.values() if a.coordinates]
+        raise InvalidValueError(
+            f"No joint moves '{frame}' directly, so none can be forgotten. {suggest(frame, movable, 'part')}"
+        )
+    name = next(n for n, record in model.articulations.items() if record is joint)
+    pose = model.fk(frame, joint.parent)
+    origin = Pose.from_matrix(np.asarray(pose(State({s: state[s] for s in pose.symbols}))))
+    copy = model.copy()
+    with copy.edit() as edit:
+        tag = copy.history.writers(f"articulations/{name}")[-1]
+        edit.replace(tag, Fixed(name=name, parent=joint.parent, child=frame, origin=origin))
+    return copy
 
 
 def find_joint(model: ModelView, frame: str) -> Articulation | None:

@@ -8,17 +8,9 @@ from typing import Any
 import numpy as np
 
 from kineverse.compile import compile  # noqa: A004
-from kineverse.errors import (
-    InfeasibleError,
-    InvalidValueError,
-    KineverseError,
-    NotFiniteError,
-    UnknownNameError,
-    suggest,
-)
-from kineverse.estimation import PlausibilityMonitor, pose_covariance
-from kineverse.grasping import Grasp, find_gripper, sample_grasps
-from kineverse.lie import Array, inverse
+from kineverse.errors import InfeasibleError, InvalidValueError, NotFiniteError, UnknownNameError, suggest
+from kineverse.grasping import find_gripper, sample_grasps
+from kineverse.lie import Array
 from kineverse.manipulation.opening import BasePlacement, PlacementSearch
 from kineverse.manipulation.opening.hand_motion import HandMotion
 from kineverse.manipulation.outcome import Outcome, SkillError
@@ -28,33 +20,19 @@ from kineverse.model.model import Model
 from kineverse.planning import Planner
 from kineverse.worlds import Judge, Sensors
 
-from .joint_learning import JointLearning
-from .part import JointPath, find_joint, free_part, write_joint
+from .joint_learning import JointLearning, LearnedJoint
+from .joint_revision import revise_joint, watch_joint
+from .part import find_joint, free_part
 from .part_belief import PartBelief, measure_way
-from .pull import LearnedPull, StraightPull, learn_model, place_beside
+from .pulling import LEAST_OPENING, LOOKING, PartPulling
 
 OPEN_WAY, OPEN_TURN = 0.25, math.radians(60.0)
 """Opening that is wanted by default [m], [rad]."""
-_LEAST_WAY, _LEAST_TURN = 0.08, math.radians(10.0)
-"""Opening from which a part that goes no further counts as open [m], [rad]."""
-_LOOKING, _HELD_LOOKING, _MOST_LOOKING = 0.6, 1.0, 3.0
-"""Times of looks before the approach and with the hand closed, and the largest until a part is seen [s]."""
-_REACHES = (0.25, 0.15, 0.08)
-"""Straight ways of the handle that a placement has to allow [m], one after the other."""
-_DISTANCE, _FLOOR_POSITION, _FLOOR_ORIENTATION = 1.0, 1e-3, 2e-3
-"""Distance of the camera, and least standard deviations, for the test of a believed joint [m], [rad]."""
+_MOST_LOOKING = 3.0
+"""Largest time until a part is seen [s]."""
+_REACH = 0.25
+"""Straight way of the handle that a placement should allow [m]."""
 _GRASPS, _PLANNING = 128, 2.0
-_MOST_GRASPS = 3
-_REFIT = 0.5
-"""Time between two controllers for a learned joint [s]."""
-_FOLLOWS, _STALLED, _PATIENCE = 0.01, 0.004, 1.5
-"""Motion of a part that follows the hand, and its least progress [m] in a time [s]."""
-_SLIPPED = 0.012
-"""Distance of the handle from its place in the hand from which on it has slipped [m]."""
-_LED = 0.06
-"""Way of the handle before which the hand does not rely on a joint that was learned [m]."""
-_MOVED, _TURNED = 0.01, math.radians(1.0)
-"""Distance [m] and angle [rad] of furniture from where it was believed that are reported."""
 
 
 def open_unknown(
@@ -163,8 +141,6 @@ class _Run:
         before = model.default_state()
         before = before.updated({s: v for s, v in session.state.items() if s in before})
         self.unknown = unknown = free_part(model, self.part, handle, before)
-        self.frame_T_handle = np.asarray(unknown.model.fk(handle, self.part)({}))
-        self.point = (self.frame_T_handle @ unknown.handle.pose)[:3, 3]
         rigid = [f for f in model.frames if f == self.part or self.part in _ancestors(model, f)]
         markers = [f for f in rigid if not unknown.model.fk(f, self.part).symbols]
         still = [f for f in _ancestors(model, self.part) if not model.fk(f).symbols]
@@ -180,21 +156,9 @@ class _Run:
         )
         self.learning = JointLearning()
         self.measures: dict[str, Any] = {"grasps": 0}
-        self.farthest = 0.0
         self.first_step, self.begin = session.steps, self.world.time
         names = [f for f in markers if f in self.world.model.frames]
         self._truth = compile(self.world.model.fk((names or [handle])[0]))
-
-    def _watch_joint(self) -> None:
-        """Test the believed joint from now on, if there is one."""
-        sensors = self.belief.sensors
-        frames = [name for name in self.belief.seen if name in self.model.frames]
-        if find_joint(self.model, self.part) is None or self.belief.monitor is not None:
-            return
-        position = float(sensors.position_noise(np.asarray(_DISTANCE)))
-        noise = pose_covariance(max(position, _FLOOR_POSITION), max(sensors.orientation, _FLOOR_ORIENTATION))
-        outliers = sensors.outliers > 0.0 or None
-        self.belief.monitor = PlausibilityMonitor(self.model, frames, noise=noise, outliers=outliers)
 
     def __call__(self) -> Outcome:
         """Open the part, and return the outcome."""
@@ -213,12 +177,12 @@ class _Run:
         finally:
             session.belief = believed
         session.stop()
-        way, turn = measure_way(first, self._true_pose(), self.point)
+        way, turn = measure_way(first, self._true_pose(), self.unknown.point)
         self.measures |= {"way": way, "turn": turn}
         learned = self.learning.learned
-        turns = bool(learned.fit.motion.kinds[0]) if learned is not None else turn > 0.5 * _LEAST_TURN
+        turns = bool(learned.fit.motion.kinds[0]) if learned is not None else turn > 0.5 * LEAST_OPENING[1]
         if learned is not None:
-            reason = f"{reason} {self._report_joint()}"
+            reason = f"{reason} {self._report_joint(learned)}"
         if kind:
             self.measures["failure"] = kind
         return Outcome(
@@ -246,234 +210,89 @@ class _Run:
             self.begin + self.seconds,
         )  # fmt: skip
         self._look()
-        self._watch_joint()
+        if self.belief.monitor is None:
+            self.belief.monitor = watch_joint(self.model, self.belief)
         placement = self._place()
         grasp = placement.grasp
         assert grasp is not None
         self._approach(placement)
-        self.start, self.pulling = self.belief.relative_pose, self.world.time
+        pulling = PartPulling(self.motion, self.belief, self.learning, self.model, self.wanted)
         try:
-            return self._pull(grasp)
+            return pulling.perform(grasp)
         finally:
-            self.measures["pull_seconds"] = self.world.time - self.pulling
+            self.measures |= pulling.measures
             self.belief.release()
-            if not self._is_late():
+            if self.world.time <= self.motion.until:
+                # The retreat rows are those of a straight pull, whose coordinate stays 0 in the belief.
                 self.motion.release(placement)
-
-    def _is_late(self) -> bool:
-        """Return whether no time is left to let go."""
-        return self.world.time > self.motion.until
-
-    def _wait(self, seconds: float) -> None:
-        end = self.world.time + seconds
-        while self.world.time < end - 1e-9:
-            self.motion.act({})
 
     def _look(self) -> None:
         """Look at the part while the robot stands."""
         self.session.phase = "look"
         begin = self.world.time
-        self._wait(_LOOKING)
+        self.motion.stand(LOOKING)
         while not self.belief.is_seen:
             if self.world.time - begin > _MOST_LOOKING:
                 raise SkillError(
                     "other",
                     f"No marker of '{self.part}' was seen within {_MOST_LOOKING:g} s; it may be hidden.",
                 )
-            self._wait(self.session.dt)
+            self.motion.stand(self.session.dt)
 
     def _place(self) -> BasePlacement:
         """Return a placement from which the handle can be pulled straight, as far as possible."""
         session, why = self.session, ""
         session.phase = "place"
+
+        def plan(placement: BasePlacement) -> bool:
+            nonlocal why
+            state, planner = session.state, self.planner
+            wanted = dict(zip(placement.coordinates, placement.approach.tolist(), strict=True))
+            planner.place(state.updated({s: wanted[s] for s in self.search.standing}))
+            end = np.array([wanted[s] for s in planner.symbols])
+            path = planner.plan(state.vector(planner.symbols), end, seconds=_PLANNING, seed=self.seed)
+            if path.found:
+                self.trajectory = path.trajectory()
+            why = "" if path.found else f" There is no way to the handle: {path.why}"
+            return bool(path.found)
+
         with session.timed("place"):
             grasps = sample_grasps(self.unknown.model, self.gripper, self.unknown.handle, _GRASPS, self.seed)
-            for reach in _REACHES:
-                found = self.search.find(session.state, grasps, reach, samples=self.samples, seed=self.seed)
-                if found:
-                    return found
-                why = why or found.why
-        contacts = any(" at " in reason for reason in found.reasons)
-        raise SkillError("collision" if contacts else "reach", why)
+            found = self.search.find(
+                session.state, grasps, _REACH, accept=plan, samples=self.samples, seed=self.seed
+            )
+        if not found:
+            raise SkillError(found.failure, f"{found.why}{why}")
+        return found
 
     def _approach(self, placement: BasePlacement) -> None:
-        """Bring the hand to the pose before the handle, on a planned path, and then straight to it."""
+        """Put a base that only stands to its place, and bring the hand to the handle."""
         session, search, motion = self.session, self.search, self.motion
-        session.phase = "approach"
-        wanted = dict(zip(placement.coordinates, placement.approach.tolist(), strict=True))
         if search.standing:
-            stands = {s: wanted[s] for s in search.standing}
+            wanted = dict(zip(placement.coordinates, placement.approach.tolist(), strict=True))
             gone = self.world.time - self.begin
             self.belief.reset()
-            session.restart(self.world.state.updated(stands))
+            session.restart(self.world.state.updated({s: wanted[s] for s in search.standing}))
             self.begin = -gone
             motion.until = self.seconds - gone
             self.judge.reset()
             self._look()
-            session.phase = "approach"
-        motion.move_fingers(self.gripper.opened)
-        with session.timed("plan"):
-            self.planner.place(session.state)
-            start = session.state.vector(self.planner.symbols)
-            end = np.array([wanted[s] for s in self.planner.symbols])
-            path = self.planner.plan(start, end, seconds=_PLANNING, seed=self.seed)
-            if not path.found:
-                raise SkillError("collision", f"There is no way to the handle: {path.why}")
-            trajectory = path.trajectory()
-        motion.follow(trajectory)
-        motion.count_turns(placement.line[0])
-        assert placement.grasp is not None
-        rows = placement.line[:, : len(search.moving)] + motion.turns
-        motion.follow_line(placement.grasp.approach, placement.grasp.pose, rows)
+        session.phase = "approach"
+        motion.approach(placement, self.trajectory)
 
-    def _pull(self, grasp: Grasp) -> str:
-        """Pull until the part is open or goes no further; grasp it anew where the handle slips."""
-        way = -math.inf
-        for _ in range(_MOST_GRASPS):
-            self.measures["grasps"] += 1
-            if not self.motion.close(grasp):
-                why = "The fingers closed beside the handle."
-            else:
-                if not self.learning.poses:
-                    self.pulling = self.world.time
-                why = self._pull_once()
-            if not why:
-                return self._describe_opening("is open")
-            last, way = way, self._opening()[0]
-            if way - last < _FOLLOWS:
-                break
-            self._grasp_anew(grasp)
-        opened, turned = self._opening()
-        if opened < _FOLLOWS:
-            raise SkillError(
-                "other",
-                f"'{self.part}' does not follow the hand: it moved by {1e3 * opened:.0f} mm. {why} It may be "
-                "fixed, locked, or need more force than the grip holds.",
-            )
-        if opened >= _LEAST_WAY or turned >= _LEAST_TURN:
-            return self._describe_opening("goes no further")
-        raise SkillError("other", self._describe_opening("goes no further") + f" {why}")
-
-    def _grasp_anew(self, grasp: Grasp) -> None:
-        """Open the fingers, look, and bring the hand back to its place on the handle."""
-        session, motion, belief = self.session, self.motion, self.belief
-        session.phase = "grasp anew"
-        belief.release()
-        motion.move_fingers(self.gripper.opened)
-        self._wait(_LOOKING)
-        pose = inverse(belief.pose @ self.frame_T_handle) @ belief.hand_pose
-        motion.follow_line(pose, grasp.pose)
-
-    def _pull_once(self) -> str:
-        """Pull until the part is open, and return why it is not, empty if it is."""
-        session, belief, motion, learning = self.session, self.belief, self.motion, self.learning
-        session.phase = "pull"
-        belief.hold()
-        self._wait(_HELD_LOOKING)
-        part_T_hand = inverse(belief.pose) @ belief.hand_pose
-        bar_T_hand = inverse(self.frame_T_handle) @ part_T_hand
-        if not learning.poses:
-            self.start = belief.relative_pose
-        belief.begin_motion()
-        pull: StraightPull | LearnedPull = StraightPull(motion, belief, bar_T_hand)
-        fitted, known = -math.inf, learning.learned is not None
-        best, since = self._opening()[0], self.world.time
-        while True:
-            motion.check_time()
-            for look in belief.looks:
-                learning.add(look.pose, look.covariance)
-            belief.looks.clear()
-            way, turn = self._opening()
-            now = self.world.time
-            with session.timed("learn"):
-                if learning.update(way, turn, now - self.pulling):
-                    known = True
-                if known and now - fitted >= _REFIT and way >= _LED and learning.learned is not None:
-                    fit, fitted = learning.learned.fit, now
-                    pull = LearnedPull(
-                        motion, belief, learn_model(self.model, belief, fit), bar_T_hand, self.start,
-                        self.wanted[fit.motion.kinds[0]],
-                    )  # fmt: skip
-                elif learning.likely is not None and isinstance(pull, StraightPull):
-                    pull.likely = JointPath.of_fit(learning.likely, self.start)
-            with session.timed("open"):
-                command = pull.step(way)
-            motion.act(command.speeds)
-            way, turn = self._opening()
-            if self._is_open(way, turn):
-                return ""
-            if belief.slip(part_T_hand, self.point) > _SLIPPED:
-                session.stop()
-                return "The handle slipped in the hand."
-            if way > best + _STALLED:
-                best, since = way, now
-                if way > self.farthest + _FOLLOWS:
-                    self.farthest = way
-                    self.measures["opened_seconds"] = now - self.pulling
-            elif now - since > _PATIENCE:
-                return f"In the way: {', '.join(command.active[:3]) or 'nothing that the controller knows'}."
-
-    # -- what was found ------------------------------------------------------------------------------------
-
-    def _opening(self) -> tuple[float, float]:
-        """Return the believed way of the handle [m] and angle of the part [rad] since the first grasp."""
-        return measure_way(self.start, self.belief.relative_pose, self.point)
-
-    def _is_open(self, way: float, turn: float) -> bool:
-        learned = self.learning.learned
-        if learned is not None and learned.fit.motion.kinds[0]:
-            return turn >= self.wanted[1]
-        return way >= self.wanted[0] or turn >= self.wanted[1]
-
-    def _describe_opening(self, verb: str) -> str:
-        way, turn = self._opening()
-        return f"'{self.part}' {verb}, by {100 * way:.0f} cm and {math.degrees(turn):.0f}°."
-
-    def _report_joint(self) -> str:
+    def _report_joint(self, learned: LearnedJoint) -> str:
         """Write the learned joint into the model if it had another one or none, and say so."""
-        learned, belief = self.learning.learned, self.belief
-        assert learned is not None
         self.measures |= {
             "family": learned.family,
             "decided_way": learned.way,
             "decided_turn": learned.turn,
             "decided_seconds": learned.time,
-            "parent": belief.beside,
+            "parent": self.belief.beside,
         }
         parameters = learned.fit.parameters
         self.measures |= {key: parameters[key] for key in ("axis", "point") if key in parameters}
-        words = f"Its joint is {learned.family}, certain after {100 * learned.way:.1f} cm and "
-        words += f"{math.degrees(learned.turn):.1f}°."
-        if belief.beside != WORLD:
-            before = np.asarray(self.model.fk(belief.beside)({}))
-            away, turned = measure_way(before, belief.reference_pose, np.zeros(3))
-            if away > _MOVED or turned > _TURNED:
-                place_beside(self.model, belief)
-                words += f" '{belief.beside}' stands {100 * away:.0f} cm from where it was believed."
-        verdict = self._judge_belief()
-        self.measures["believed"] = verdict
-        if verdict == "explains":
-            return f"{words} The model's joint explains what was seen, and stays."
-        if verdict == "cannot tell":
-            return f"{words} What was seen does not refute the model's joint, which stays."
-        if verdict == "refuted":
-            words += " It is not as the model had it."
-        try:
-            write_joint(self.model, self.part, learned.fit, belief.beside)
-        except KineverseError as error:
-            return f"{words} It could not be written: {error}"
-        return f"{words} It is in the model now."
-
-    def _judge_belief(self) -> str:
-        """Return the verdict on the model's joint: nothing, explains, cannot tell or refuted."""
-        if self.belief.monitor is None:
-            return "nothing"
-        tag = self.model.history.writers(f"frames/{self.part}")[-1]
-        report = self.belief.monitor.report()
-        if tag in {verdict.tag for verdict in report.implausible}:
-            return "refuted"
-        certain = any(verdict.explains for verdict in report.verdicts if verdict.tag == tag)
-        return "explains" if certain else "cannot tell"
+        self.measures["believed"], words = revise_joint(self.model, self.belief, learned)
+        return words
 
 
 def _ancestors(model: Model, frame: str) -> list[str]:

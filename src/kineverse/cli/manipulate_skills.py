@@ -1,0 +1,147 @@
+"""Skills of ``kineverse open``, ``close`` and ``push``, called with the options of the command line."""
+
+from __future__ import annotations
+
+import argparse
+import sys
+from collections.abc import Callable
+from dataclasses import replace
+from typing import TYPE_CHECKING
+
+from kineverse.cli.manipulate_setup import ManipulationScene
+from kineverse.cli.output import join_lines, show_activity
+from kineverse.errors import InvalidValueError
+
+if TYPE_CHECKING:
+    from kineverse.manipulation.belief import Belief
+    from kineverse.manipulation.outcome import Outcome
+    from kineverse.worlds import World
+    from kineverse.worlds.recorder import RecordedStep
+
+_PLACEMENT = 60.0
+"""Largest time of the search for a place of the base [s]."""
+
+
+def grasp_object(
+    arguments: argparse.Namespace,
+    scene: ManipulationScene,
+    world: World,
+    belief: Belief | None,
+    look: Callable[[RecordedStep], None],
+) -> Outcome:
+    """Open or close the object by its handle."""
+    if scene.gripper is None:
+        return skip_skill(scene, world, False, scene.why)
+
+    from kineverse.grasping import find_handle, find_handles
+    from kineverse.manipulation.opening.grasped_opening import open_object
+    from kineverse.manipulation.session import Session
+
+    if arguments.handle is not None:
+        print(find_handle(scene.model, scene.coordinate, arguments.handle), file=sys.stderr)
+    elif handles := find_handles(scene.model, scene.coordinate):
+        print(handles[0], file=sys.stderr)
+    outcome: Outcome = open_object(
+        Session(world, belief=belief, on_step=look),
+        scene.coordinate,
+        target=scene.target,
+        hand=scene.gripper.hand,
+        handle=arguments.handle,
+        seconds=arguments.seconds,
+        seed=arguments.seed,
+    )
+    return outcome
+
+
+def open_as_unknown(
+    arguments: argparse.Namespace,
+    scene: ManipulationScene,
+    world: World,
+    belief: Belief | None,
+    look: Callable[[RecordedStep], None],
+) -> Outcome:
+    """Open the object as if its joint was unknown."""
+    if scene.gripper is None:
+        return skip_skill(scene, world, False, scene.why)
+
+    from kineverse.grasping import find_handle
+    from kineverse.manipulation import Session, open_unknown
+    from kineverse.manipulation.unknown_objects import forget_joint
+    from kineverse.manipulation.unknown_objects.unknown_opening import OPEN_TURN, OPEN_WAY
+    from kineverse.worlds import Sensors
+
+    model, coordinate, start = scene.model, scene.coordinate, scene.start
+    handle = find_handle(model, coordinate, arguments.handle)
+    print(handle, file=sys.stderr)
+    part = next((a.child for a in model.articulations.values() if coordinate in a.coordinates), None)
+    if part is None:
+        raise InvalidValueError(f"--unknown: '{coordinate}' is of no joint, so no part belongs to it.")
+    far = abs(scene.target - start[coordinate])
+    outcome: Outcome = open_unknown(
+        Session(world, on_step=look),
+        handle.frame,
+        model=forget_joint(model, part, start),
+        part=part,
+        sensors=None if arguments.noise is None else Sensors.parse(arguments.noise),
+        hand=scene.gripper.hand,
+        seconds=arguments.seconds,
+        seed=arguments.seed,
+        way=OPEN_WAY if far is None else far,
+        turn=OPEN_TURN if far is None else far,
+    )
+    return outcome
+
+
+def push_object(
+    arguments: argparse.Namespace,
+    scene: ManipulationScene,
+    world: World,
+    belief: Belief | None,
+    look: Callable[[RecordedStep], None],
+) -> Outcome:
+    """Push the object, from where the robot stands or from a place that is searched."""
+    from kineverse.manipulation.pushing.controller import Pushing
+    from kineverse.manipulation.pushing.placement import find_push_start, roll_out
+    from kineverse.manipulation.pushing.push_skill import push
+    from kineverse.manipulation.session import Session
+
+    if not scene.pusher:
+        return skip_skill(
+            scene, world, False, f"{scene.why} --hand may name any body of the robot that is to push."
+        )
+    with show_activity("compiling the controller; this is kept for the next time"):
+        pushing = Pushing(
+            scene.model,
+            scene.coordinate,
+            scene.pusher,
+            scene.start,
+            target=scene.target,
+            robot=scene.robot,
+        )
+        pushing.wait()
+    placed, where = 0, ""
+    if not scene.stays:
+        steps = round(arguments.seconds / 0.02)
+        problem = pushing.first_contact(scene.start) or roll_out(pushing, scene.start, steps)[0]
+        if problem:
+            with show_activity("searching a place for the robot"):
+                found = find_push_start(
+                    pushing, scene.start, seconds=_PLACEMENT, steps=steps, seed=arguments.seed
+                )
+            placed, where = found.samples, f"Another place of the robot: {found.why}"
+            print(f"not from where the robot stands: {problem}. {where}", file=sys.stderr)
+            if found.state is not None:
+                world.reset(found.state)
+                where = ""
+
+    session = Session(world, belief=belief, on_step=look)
+    outcome = push(session, scene.coordinate, seconds=arguments.seconds, pushing=pushing)
+    reason = outcome.reason if outcome or not where else f"{outcome.reason} {where}"
+    return replace(outcome, reason=reason, measures={**outcome.measures, "placed": placed})
+
+
+def skip_skill(scene: ManipulationScene, world: World, done: bool, reason: str) -> Outcome:
+    """Return the outcome of what was not begun."""
+    from kineverse.manipulation.outcome import Outcome
+
+    return Outcome(done, world.state[scene.coordinate], join_lines(reason), world.name, 0.0, 0)
