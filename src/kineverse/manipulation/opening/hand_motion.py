@@ -229,8 +229,10 @@ class HandMotion:
         assert grasp is not None
         self.move_fingers(self.gripper.opened)
         pose = inverse(self._bar(state)) @ self._hand(state)
+        end = dict(zip(placement.coordinates, placement.retreat[-1].tolist(), strict=True))
+        gone = state.updated({**end, self.handle.coordinate: float(placement.values[-1])})
         away = pose.copy()
-        away[:3, 3] += grasp.approach[:3, 3] - grasp.pose[:3, 3]
+        away[:3, 3] += (inverse(self._bar(gone)) @ self._hand(gone))[:3, 3] - grasp.pose[:3, 3]
         self.session.phase = "retract"
         # An object that stopped on the way was not looked at here.
         arrived = abs(state[self.handle.coordinate] - placement.values[-1]) < _ARRIVED

@@ -86,7 +86,7 @@ class HandPaths:
             center = np.nan_to_num(_CENTERING * (self._middle - Q)) * self.ease
             step = self._step(J, e, center, np.tile(self.ease, (len(Q), 1)), error)
             # A coordinate at its limit takes no part: the others go on without it.
-            outward = ((Q <= self.lower) & (step < 0.0)) | ((Q >= self.upper) & (step > 0.0))
+            outward = ((self.lower >= Q) & (step < 0.0)) | ((self.upper <= Q) & (step > 0.0))
             stuck = outward.any(axis=1)
             if stuck.any():
                 free = np.where(outward[stuck], 0.0, self.ease)
@@ -97,7 +97,7 @@ class HandPaths:
 
     @staticmethod
     def _step(J: Array, e: Array, center: Array, ease: Array, error: Array) -> Array:
-        """Return damped Newton steps (N, n) for weights (N, n), with those to the middle in the null space."""
+        """Return damped Newton steps (N, n) for weights (N, n), centred in the null space."""
         WJt = ease[:, :, None] * np.swapaxes(J, 1, 2)
         damped = J @ WJt + (_DAMPING + 1e-3 * np.minimum(error, 0.5) ** 2)[:, None, None] * np.eye(6)
         rest = e - (J @ center[:, :, None])[:, :, 0]
