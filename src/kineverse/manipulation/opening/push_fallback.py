@@ -14,7 +14,7 @@ from kineverse.state import State
 
 from .hand_motion import HandMotion
 
-_SAMPLES = 80
+_SAMPLES = 240
 """Largest number of sampled starts. A limit of time would let results depend on other processes."""
 _PLANNING = 1.0
 """Largest time to plan the way to a start [s]."""
