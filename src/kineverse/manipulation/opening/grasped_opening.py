@@ -228,29 +228,39 @@ class _Run:
         """Move the object to the target with one grasp after the other, or raise SkillError."""
         self.motion.look()
         self._check_start()
-        for _ in range(_MOST_GRASPS):
-            if self.left <= self.tolerance / 2:
-                return
+        failure: SkillError | None = None
+        while failure is None and self.grasps < _MOST_GRASPS and self.left > self.tolerance / 2:
             try:
                 placement = self._place()
-            except SkillError as failure:
-                if self.left <= self.tolerance:
-                    return
-                self._push(failure)
-                return
-            assert placement.grasp is not None
-            self.grasps += 1
-            self._approach(placement)
-            try:
-                if self.motion.close(placement.grasp):
-                    move_held(self.motion, placement, self.tolerance)
-            except SlipError as slip:
-                self.slips.append(str(slip))
-            self.motion.release(placement)
-            self._check_progress()
+            except SkillError as error:
+                failure = error
+            else:
+                self._move(placement)
         if self.left > self.tolerance:
             what = self.handle.coordinate
-            raise SkillError("reach", f"After {self.grasps} grasps '{what}' is not at the target.")
+            self._push(
+                failure or SkillError("reach", f"After {self.grasps} grasps '{what}' is not at the target.")
+            )
+
+    def _move(self, placement: BasePlacement) -> None:
+        """Move the object with one grasp as far as the way of a placement leads."""
+        assert placement.grasp is not None
+        self.grasps += 1
+        self._approach(placement)
+        before, stall = self.left, None
+        try:
+            if self.motion.close(placement.grasp):
+                move_held(self.motion, placement, self.tolerance)
+        except SlipError as slip:
+            self.slips.append(str(slip))
+        except SkillError as error:
+            if error.kind == "time":
+                raise
+            stall = error
+        self.motion.release(placement)
+        if stall is not None and self.left > (1.0 - _LEAST_PROGRESS) * before:
+            raise stall
+        self._check_progress()
 
     @property
     def left(self) -> float:
@@ -288,7 +298,12 @@ class _Run:
         if len(self.slips) < _MOST_SLIPS:
             self._rest = self.left
         elif self.left > (1.0 - _LEAST_PROGRESS) * self._rest:
-            raise SkillError("other", "It moves too hard for the force of the fingers.")
+            value = float(self.session.state[self.handle.coordinate])
+            raise SkillError(
+                "other",
+                f"It does not move on from {value:.3f} though it was pulled {len(self.slips)} times: it is "
+                "locked or jammed, or moves too hard for the force of the fingers.",
+            )
 
     def _check_start(self) -> None:
         """Raise SkillError if the robot touches something before anything is done."""

@@ -162,7 +162,7 @@ class HandMotion:
         session = self.session
         # The initial values are of no run: a controller with others would be compiled for these alone.
         wanted, rate = Target("hand/pose", np.eye(4)), Target("hand/rate", np.zeros(6))
-        posture, goals = (None, []) if rows is None else self.posture()
+        posture, follow, goals = (None, None, []) if rows is None else self.posture()
         error = same_pose(self._bar @ wanted.expression, self._hand)
         goal = Goal(error, gain=FOLLOWING, rate=rate.expression, name="hand")
         controller = self.controller([goal, *goals])
@@ -181,8 +181,11 @@ class HandMotion:
             with session.timed("line"):
                 controller.set(wanted, pose)
                 controller.set(rate, speed if k < steps else 0.0 * speed)
-                if posture is not None and rows is not None:
-                    controller.set(posture, row_at(rows, share))
+                if posture is not None and follow is not None and rows is not None:
+                    # A base that lags would lead the arm along another way than the checked one.
+                    row, next_row = row_at(rows, share), row_at(rows, min(1.0, (k + 1) / steps))
+                    controller.set(posture, row)
+                    controller.set(follow, (next_row - row) / session.dt)
                 command = controller.step(self.state)
             if k > steps and command.residuals["hand"] < settled:
                 break
@@ -196,14 +199,22 @@ class HandMotion:
         away = self.session.state.vector(moving) - row[: len(moving)]
         self.turns = np.where(turning, 2 * math.pi * np.round(away / (2 * math.pi)), 0.0)
 
-    def posture(self) -> tuple[Target, list[Goal]]:
-        """Return a target for the arm (n,), and the goals that keep the arm near to it."""
+    def posture(self) -> tuple[Target, Target, list[Goal]]:
+        """Return targets for the arm (n,) and its speeds, and the goals that keep the arm near to them."""
         posture = Target("arm/posture", np.zeros(len(self.search.moving)))
+        speeds = Target("arm/speeds", np.zeros(len(self.search.moving)))
         goals = [
-            Goal(s, posture.expression[k], gain=FOLLOWING, weight=_POSTURE, name=f"posture {s}")
+            Goal(
+                s,
+                posture.expression[k],
+                gain=FOLLOWING,
+                weight=_POSTURE,
+                rate=speeds.expression[k],
+                name=f"posture {s}",
+            )
             for k, s in enumerate(self.search.moving)
         ]
-        return posture, goals
+        return posture, speeds, goals
 
     def close(self, grasp: Grasp) -> bool:
         """Close the fingers until they stand still, and return True if they stand around the bar."""
@@ -237,8 +248,10 @@ class HandMotion:
         assert grasp is not None
         self.move_fingers(self.gripper.opened)
         pose = inverse(self._bar(state)) @ self._hand(state)
+        end = dict(zip(placement.coordinates, placement.retreat[-1].tolist(), strict=True))
+        gone = state.updated({**end, self.handle.coordinate: float(placement.values[-1])})
         away = pose.copy()
-        away[:3, 3] += grasp.approach[:3, 3] - grasp.pose[:3, 3]
+        away[:3, 3] += (inverse(self._bar(gone)) @ self._hand(gone))[:3, 3] - grasp.pose[:3, 3]
         self.session.phase = "retract"
         # An object that stopped on the way was not looked at here.
         arrived = abs(state[self.handle.coordinate] - placement.values[-1]) < _ARRIVED

@@ -26,7 +26,8 @@ class HandPaths:
     """Damped Newton steps of many configurations at once, within the limits of the coordinates.
 
     A step is ``W Jᵀ (J W Jᵀ + λ)⁻¹ e`` with the error e of position and rotation vector, and a step to the
-    middle of limits in the null space (Nakamura 1991). Coordinates outside of their limits are clipped.
+    middle of limits in the null space (Nakamura 1991). Coordinates outside of their limits are clipped, and
+    those that a step would lead out of them rest in it.
 
     Parameters
     ----------
@@ -82,14 +83,25 @@ class HandPaths:
             error = np.abs(e).max(axis=1)
             if k == iterations or (error < TOLERANCE / 10).all():
                 break
-            WJt = self.ease[:, None] * np.swapaxes(J, 1, 2)
-            damped = J @ WJt + (_DAMPING + 1e-3 * np.minimum(error, 0.5) ** 2)[:, None, None] * np.eye(6)
             center = np.nan_to_num(_CENTERING * (self._middle - Q)) * self.ease
-            e = e - (J @ center[:, :, None])[:, :, 0]
-            step = center + (WJt @ np.linalg.solve(damped, e[:, :, None]))[:, :, 0]
+            step = self._step(J, e, center, np.tile(self.ease, (len(Q), 1)), error)
+            # A coordinate at its limit takes no part: the others go on without it.
+            outward = ((self.lower >= Q) & (step < 0.0)) | ((self.upper <= Q) & (step > 0.0))
+            stuck = outward.any(axis=1)
+            if stuck.any():
+                free = np.where(outward[stuck], 0.0, self.ease)
+                step[stuck] = self._step(J[stuck], e[stuck], center[stuck] * (free > 0.0), free, error[stuck])
             step *= np.minimum(1.0, _LONGEST / np.maximum(np.abs(step).max(axis=1), 1e-9))[:, None]
             Q = np.clip(Q + step, self.lower, self.upper)
         return Q, error
+
+    @staticmethod
+    def _step(J: Array, e: Array, center: Array, ease: Array, error: Array) -> Array:
+        """Return damped Newton steps (N, n) for weights (N, n), centred in the null space."""
+        WJt = ease[:, :, None] * np.swapaxes(J, 1, 2)
+        damped = J @ WJt + (_DAMPING + 1e-3 * np.minimum(error, 0.5) ** 2)[:, None, None] * np.eye(6)
+        rest = e - (J @ center[:, :, None])[:, :, 0]
+        return np.asarray(center + (WJt @ np.linalg.solve(damped, rest[:, :, None]))[:, :, 0])
 
     def follow(self, Q: Array, base: Array, targets: Array) -> tuple[Array, Array]:
         """Return configurations (N, K, n) along poses (N, K, 4, 4), and how many (N,) are reached.

@@ -20,7 +20,7 @@ _LATE = 0.1
 """Distance from the way at which the reference begins to wait [m], [rad]."""
 _MARGIN = 0.002
 """Least distance of bodies while the object moves [m]; placements keep more."""
-_SLIPPED, _SIGMAS = 0.01, 4.0
+_SLIPPED, _SIGMAS = 0.008, 4.0
 """Distance of the bar from its place in the hand from which on it has slipped [m], and the standard
 deviations of its estimate that are added."""
 _STALLED, _PATIENCE, _RESTING = 1e-3, 4.0, 0.5
@@ -66,7 +66,7 @@ def move_held(motion: HandMotion, placement: BasePlacement, tolerance: float) ->
     moving = motion.search.moving
     rows = motion.rows(placement.way)
     values = placement.values
-    posture, goals = motion.posture()
+    posture, arm_speeds, goals = motion.posture()
     wanted = Target("opening/object", np.zeros(1))
     tasks: list[Task] = [hold, Goal(coordinate, wanted.expression[0], gain=FOLLOWING, name="object")]
     tasks += goals
@@ -76,6 +76,7 @@ def move_held(motion: HandMotion, placement: BasePlacement, tolerance: float) ->
     share, speed, length = 0.0, 0.0, abs(target - values[0])
     best, since = 0.0, session.world.time
     controller.set(grasped, held)
+    controller.set(arm_speeds, np.zeros(len(moving)))  # the way waits for the arm
     places = np.linspace(values[0], target, len(values)).tolist()
     motion.refer([bar(session.state.updated({coordinate: v})) @ held for v in places])
     within, enough = 0, _SETTLED if session.deviation(coordinate) else 1

@@ -3,10 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections import Counter
-from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import dataclass
-from functools import cached_property
+from collections.abc import Callable, Iterator, Sequence
 from heapq import heappop, heappush
 from itertools import count
 from time import perf_counter
@@ -15,49 +12,34 @@ import numpy as np
 import numpy.typing as npt
 
 from kineverse.errors import InvalidValueError
-from kineverse.geometry import Rule, Scene
-from kineverse.geometry.prepared_query import PreparedQuery
+from kineverse.geometry import Scene
 from kineverse.grasping import Grasp, Gripper
 from kineverse.lie import Array
 from kineverse.manipulation.pushing.scene import find_overlapping_links, furniture_rules
 from kineverse.model.model_view import ModelView
 from kineverse.state import State
-from kineverse.symbols import Symbol
 
 from .base_placement import NO_WAY, BasePlacement
 from .hand_paths import HandPaths
 from .placement_samples import PlacementSamples, find_planar_base
+from .way_check import Candidate, WayCheck, interpolate_poses
+from .way_contacts import OWN_MARGIN, WayContacts
 
 _STEP = 0.05
 """Distance of neighbouring values of the object along its way [m], [rad]."""
-_LINE = 5
-"""Number of configurations on the straight way to the handle."""
-_OWN_MARGIN, _RANDOM_STATES = 0.003, 24
-"""Least distance of the robot's own links [m]; pairs that are nearer in all of some states do not count."""
+_RANDOM_STATES = 24
+"""Number of random states in which links that are always near to each other are sought."""
 _START_ITERATIONS = 30
-_BETWEEN = 4
-"""Number of samples between neighbouring configurations that are checked."""
 _STARTS = 4
 """Arms that are tried for each base."""
 _MIDDLES = (0.5, 0.5, 0.25, 0.5, 0.0)
 """Shares of the object's way from which the arms of successive batches set out to both ends."""
 _WHOLE = 300
 """Number of bases after which a way to a part of the motion is taken."""
-_LEAST_SHARE, _SHORTER = 0.2, 0.15
-"""Least share of the motion that one grasp is for, and by how much it is shortened where that helps."""
+_LEAST_SHARE = 0.2
+"""Least share of the motion that one grasp is for."""
 _MOST_CHECKS, _MOST_REFUSED = 150, 3
 """Most ways that are checked for contacts after a batch, and most that :func:`find` lets be refused."""
-
-
-@dataclass(slots=True, eq=False)
-class _Candidate:
-    """Way of an arm that reaches, until the value with the index ``end``."""
-
-    choice: int
-    base: Array
-    back: Array
-    way: Array
-    end: int
 
 
 class PlacementSearch:
@@ -105,10 +87,10 @@ class PlacementSearch:
             *furniture_rules(bodies, self.own),
         )
         self.scene = Scene(model, rules=rules)
-        near = self.scene.find_always_colliding(self._random_states(state), _OWN_MARGIN)
+        near = self.scene.find_always_colliding(self._random_states(state), OWN_MARGIN)
         rules = (*rules, *near)
         self.scene = Scene(model, rules=rules)
-        self._hand = {b for b in self.own if b in gripper.bodies or not model.speeds_of(b, gripper.hand)}
+        self.contacts = WayContacts(model, self.scene, gripper, self.own, others, margin)
 
     def _random_states(self, state: State) -> Iterator[State]:
         """Yield states with random arms."""
@@ -162,60 +144,6 @@ class PlacementSearch:
             search.add(batch, _MIDDLES[number % len(_MIDDLES)])
         return found or search.nothing
 
-    def blocked_bases(self, state: State, places: Array) -> npt.NDArray[np.bool_]:
-        """Return flags (B,) of places (B, 3) of the base at which its bodies are too near to something."""
-        found = np.zeros(len(places), dtype=bool)
-        if self._base_watch is not None:
-            for k, place in enumerate(places.tolist()):
-                self.scene.update(state.updated(dict(zip(self.base, place, strict=True))))
-                found[k] = len(self._base_watch()) > 0
-        return found
-
-    @cached_property
-    def _base_watch(self) -> PreparedQuery | None:
-        carried = [b for b in self.own if {*self.model.symbols_of(b)} <= {*self.base}]
-        return self.scene.watch(carried, self.others, self.margin) if carried else None
-
-    def first_contact(self, grasp: Grasp, state: State, columns: Sequence[Symbol], rows: Array) -> int | None:
-        """Return the index of the first row of values (N, n) at which the robot comes too near to something.
-
-        The scene is placed there.
-        """
-        self.scene.update(state.updated(dict(zip(columns, rows[0].tolist(), strict=True))))
-        around = self._watch(grasp.handle.frame)
-        found = [
-            watch.first_within(columns, rows, radius)
-            for watch, radius in ((around, self.margin), (self._own_watch, _OWN_MARGIN))
-        ]
-        first = min((k for k in found if k is not None), default=None)
-        if first is not None:
-            self.scene.update(state.updated(dict(zip(columns, rows[first].tolist(), strict=True))))
-        return first
-
-    def touching(self, grasp: Grasp) -> tuple[str, str]:
-        """Return the pair of bodies that is too near in the scene, the robot's first."""
-        pair = [*self._watch(grasp.handle.frame)(self.margin), *self._own_watch(_OWN_MARGIN)][0]
-        return (pair.b, pair.a) if pair.b in self._hand else (pair.a, pair.b)
-
-    def is_of_hand(self, body: str) -> bool:
-        """Return True if a body is rigid with the hand or one of its fingers."""
-        return body in self._hand
-
-    def _watch(self, frame: str) -> PreparedQuery:
-        """Return the query of the robot's distance from everything else, but of the hand from the handle."""
-        if frame not in self._watches:
-            allowed = [Rule(b, frame, False, "grasped") for b in self.gripper.bodies]
-            self._watches[frame] = self.scene.watch(self.own, self.others, self.margin, rules=allowed)
-        return self._watches[frame]
-
-    @cached_property
-    def _watches(self) -> dict[str, PreparedQuery]:
-        return {}
-
-    @cached_property
-    def _own_watch(self) -> PreparedQuery:
-        return self.scene.watch(self.own, self.own, _OWN_MARGIN)
-
 
 class _Search:
     """Search for one grasped motion: candidates, the best first, and why the others failed."""
@@ -230,7 +158,7 @@ class _Search:
         random: np.random.Generator,
     ) -> None:
         self.owner, self.state, self.grasps, self.random = owner, state, grasps, random
-        self.begin, self.reasons, self.tried = perf_counter(), Counter[str](), 0
+        self.begin, self.tried = perf_counter(), 0
         self.accept, self.refused = accept, 0
         self.coordinate = grasps[0].handle.coordinate
         start = float(state[self.coordinate])
@@ -241,9 +169,9 @@ class _Search:
         self.handles = np.array([handle(state.updated({self.coordinate: v})) for v in self.values])
         self.poses = np.array([grasp.pose for grasp in grasps])
         self.approaches = np.array([grasp.approach for grasp in grasps])
-        # The hand is rigid with the handle: what it hits does not depend on the base.
-        self.free = np.full(len(grasps), self.last)
-        self.heap: list[tuple[int, float, int, _Candidate]] = []
+        self.check = WayCheck(owner.contacts, owner.paths, state, grasps, self.values, self.handles)
+        self.free, self.reasons = self.check.free, self.check.reasons
+        self.heap: list[tuple[int, float, int, Candidate]] = []
         self.number = count()
 
     @property
@@ -271,7 +199,8 @@ class _Search:
         value = float(self.values[middle])
 
         def blocked(places: Array) -> npt.NDArray[np.bool_]:
-            return self.owner.blocked_bases(self.state.updated({self.coordinate: value}), places)
+            at = self.state.updated({self.coordinate: value})
+            return self.owner.contacts.blocked_bases(at, self.owner.base, places)
 
         Q, base = samples.draw(self.random, self.state, hands, outside, _STARTS, blocked)
         Q, error = paths.solve(Q, base, hands, _START_ITERATIONS)
@@ -293,13 +222,13 @@ class _Search:
             return
         score = self.owner.samples.cost(self.state, way, back[:, -1], ends) + 0.02 * choice
         for k in np.flatnonzero(good):
-            self._push(_Candidate(int(choice[k]), base[k], back[k], way[k], int(ends[k])), float(score[k]))
+            self._push(Candidate(int(choice[k]), base[k], back[k], way[k], int(ends[k])), float(score[k]))
 
     def _count(self, good: npt.NDArray[np.bool_], reason: str) -> npt.NDArray[np.bool_]:
         self.reasons[reason] += int((~good).sum()) // _STARTS
         return good
 
-    def _push(self, candidate: _Candidate, score: float) -> None:
+    def _push(self, candidate: Candidate, score: float) -> None:
         heappush(self.heap, (-candidate.end, score, next(self.number), candidate))
 
     # -- checks --------------------------------------------------------------------------------------------
@@ -330,71 +259,15 @@ class _Search:
                 self._push(candidate, score)
         return None
 
-    def _check(self, candidate: _Candidate) -> BasePlacement | None:
+    def _check(self, candidate: Candidate) -> BasePlacement | None:
         """Return the placement of a candidate without contacts; otherwise shorten its way."""
-        owner, end, base = self.owner, candidate.end, candidate.base
-        grasp = self.grasps[candidate.choice]
-        back, way, values = candidate.back, candidate.way[: end + 1], self.values
-        opened = owner.gripper.opened
-        home = [self.state.vector(owner.moving)[None]] if owner.standing else []
-        parts = (back, *home)
-        for Q in parts:
-            if self._find_contact(grasp, self._rows(Q, base, opened, np.full(len(Q), values[0]))) is not None:
-                body = self._note(grasp)
-                if owner.is_of_hand(body) and Q is back:
-                    self.free[candidate.choice] = -1
-                candidate.end = -1
-                return None
-        first = self._find_contact(
-            grasp, self._rows(way, base, owner.gripper.values_at(grasp.thickness), values[: end + 1])
-        )
-        if first is not None:
-            candidate.end = first // _BETWEEN - 1
-            if owner.is_of_hand(self._note(grasp)):
-                self.free[candidate.choice] = min(int(self.free[candidate.choice]), candidate.end)
+        retreat = self.check.find_retreat(candidate)
+        if retreat is None:
             return None
-        line = interpolate_poses(
-            self.handles[end] @ grasp.pose[None], self.handles[end] @ grasp.approach[None]
-        )
-        away, reached = owner.paths.follow(way[-1:], base[None], line)
-        rows = self._rows(away[0], base, opened, np.full(_LINE, values[end]))
-        blocked = reached[0] < _LINE
-        if blocked:
-            self.reasons["no straight retreat"] += 1
-        elif self._find_contact(grasp, rows) is not None:
-            self._note(grasp)
-            blocked = True
-        if blocked:
-            candidate.end = end - max(1, round(_SHORTER * self.last))
-            return None
-        full = [np.hstack([a, np.tile(base, (len(a), 1))]) for a in (back[::-1], way, away[0])]
+        end, base = candidate.end, candidate.base
+        parts = (candidate.back[::-1], candidate.way[: end + 1], retreat)
+        full = [np.hstack([a, np.tile(base, (len(a), 1))]) for a in parts]
         return BasePlacement(
-            grasp, owner.coordinates, full[0][0], full[0], values[: end + 1], full[1], full[2],
-            self.tried, self.reasons, perf_counter() - self.begin,
+            self.grasps[candidate.choice], self.owner.coordinates, full[0][0], full[0],
+            self.values[: end + 1], full[1], full[2], self.tried, self.reasons, perf_counter() - self.begin,
         )  # fmt: skip
-
-    def _rows(self, Q: Array, base: Array, fingers: Mapping[Symbol, float], values: Array) -> Array:
-        """Return rows of everything that moves (N, n), with some between neighbouring ones."""
-        fixed = [*base, *(fingers[s] for s in self.owner.gripper.joints)]
-        full = np.hstack([Q, np.tile(fixed, (len(Q), 1)), values[:, None]])
-        share = np.arange(_BETWEEN) / _BETWEEN
-        dense = full[:-1, None] + share[:, None] * (full[1:] - full[:-1])[:, None]
-        return np.vstack([dense.reshape(-1, full.shape[1]), full[-1:]])
-
-    def _find_contact(self, grasp: Grasp, rows: Array) -> int | None:
-        columns = (*self.owner.coordinates, *self.owner.gripper.joints, self.coordinate)
-        return self.owner.first_contact(grasp, self.state, columns, rows)
-
-    def _note(self, grasp: Grasp) -> str:
-        """Count the contact in the scene, and return the robot's body."""
-        one, other = self.owner.touching(grasp)
-        self.reasons[f"{one} at {other}"] += 1
-        return one
-
-
-def interpolate_poses(a: Array, b: Array) -> Array:
-    """Return poses (N, L, 4, 4) on the straight way between poses of one orientation, a first."""
-    share = np.linspace(0.0, 1.0, _LINE)
-    poses = np.repeat(a[:, None], _LINE, axis=1)
-    poses[:, :, :3, 3] += share[:, None] * (b - a)[:, None, :3, 3]
-    return poses

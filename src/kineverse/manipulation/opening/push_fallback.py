@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import math
+
 from kineverse.errors import InvalidValueError
 from kineverse.manipulation.outcome import SkillError
 from kineverse.manipulation.pushing.controller import Pushing
@@ -12,8 +14,8 @@ from kineverse.state import State
 
 from .hand_motion import HandMotion
 
-_SAMPLES, _SEARCHING = 120, 60.0
-"""Largest number of sampled starts, and largest time of their search [s]."""
+_SAMPLES = 240
+"""Largest number of sampled starts. A limit of time would let results depend on other processes."""
 _PLANNING = 1.0
 """Largest time to plan the way to a start [s]."""
 _PUSHING = 10.0
@@ -63,7 +65,7 @@ class PushFallback:
                 )
                 self.pushing.wait()
                 found = find_push_start(
-                    self.pushing, state, samples=_SAMPLES, seconds=_SEARCHING, seed=seed, accept=self._plan
+                    self.pushing, state, samples=_SAMPLES, seconds=math.inf, seed=seed, accept=self._plan
                 )
             except InvalidValueError as error:
                 raise SkillError("reach", f"It cannot be pushed: {error}") from error
