@@ -76,7 +76,7 @@ def open_as_unknown(
     part = next((a.child for a in model.articulations.values() if coordinate in a.coordinates), None)
     if part is None:
         raise InvalidValueError(f"--unknown: '{coordinate}' is of no joint, so no part belongs to it.")
-    far = abs(scene.target - start[coordinate])
+    far = None if arguments.to is None else abs(scene.target - start[coordinate])
     outcome: Outcome = open_unknown(
         Session(world, on_step=look),
         handle.frame,
