@@ -2,10 +2,15 @@ import numpy as np
 import pytest
 
 import kineverse as kv
+from kineverse.control import Goal, same_pose
 from kineverse.errors import InvalidValueError, UnknownNameError
 from kineverse.estimation import identify, pose_covariance
+from kineverse.grasping import find_gripper
 from kineverse.lie import inverse, quaternion, retract, rotation_z, transform, translation
 from kineverse.manipulation import Session, open_unknown
+from kineverse.manipulation.opening import PlacementSearch
+from kineverse.manipulation.opening.hand_motion import HandMotion
+from kineverse.manipulation.unknown_objects import forget_joint
 from kineverse.manipulation.unknown_objects.joint_learning import JointLearning
 from kineverse.manipulation.unknown_objects.part import JointPath, free_part, write_joint
 from kineverse.manipulation.unknown_objects.part_belief import PoseMean
@@ -23,12 +28,25 @@ def make_model():
     return model
 
 
-def forget_joint(model, joint=kv.Fixed, **options):
+def believe_that_it_slides(model):
     tag = f"joint {DOOR}"
     old = model.history.operation(tag)
-    new = joint(name=old.name, parent=old.parent, child=old.child, origin=old.origin, **options)
+    slide = kv.Prismatic(
+        name=old.name,
+        parent=old.parent,
+        child=old.child,
+        origin=old.origin,
+        axis=(1, 0, 0),
+        lower=0,
+        upper=0.3,
+    )
     with model.edit() as edit:
-        edit.replace(tag, new)
+        edit.replace(tag, slide)
+
+
+@pytest.fixture(scope="module")
+def truth():
+    return make_model()
 
 
 def look(pose, random, outliers=0.05):
@@ -47,17 +65,17 @@ def rail(way):
 
 @pytest.mark.parametrize(("path", "family"), [(hinge, "revolute"), (rail, "prismatic")])
 def test_family_is_known_before_8_cm_with_outliers(path, family):
-    known = 0
-    for seed in range(10):
+    for seed in range(2):
         random, learning = np.random.default_rng(seed), JointLearning()
-        for way in [*np.zeros(20), *np.arange(0.0, 0.15, 0.05 / 30)]:
+        for way in [*np.zeros(20), *np.arange(0.0, 0.09, 0.05 / 30)]:
             seen = look(path(way), random)
             if np.linalg.norm(seen[:3, 3] - path(way)[:3, 3]) < 0.06:  # a part in a hand is near it
                 learning.add(seen, np.diag(NOISE**2))
             learning.update(way, way / 0.38 if family == "revolute" else 0.0, 0.0)
         found = learning.learned
-        known += found is not None and found.family == family and found.way < 0.08
-    assert known >= 9
+        assert found is not None
+        assert found.family == family
+        assert found.way < 0.08
 
 
 def test_mean_of_poses_leaves_a_first_outlier_out():
@@ -70,8 +88,8 @@ def test_mean_of_poses_leaves_a_first_outlier_out():
     assert not mean.add(translation(np.array([2.0, 2.0, 0.5])))
 
 
-def test_free_part_is_where_it_is_seen_and_is_pulled_along_the_normal():
-    model = make_model()
+def test_free_part_is_where_it_is_seen_and_is_pulled_along_the_normal(truth):
+    model = truth
     unknown = free_part(model, DOOR, HANDLE, model.default_state())
     seen = retract(unknown.origin, np.array([0.02, -0.01, 0.03, 0.1, 0.2, -0.3]))
     state = unknown.model.default_state().updated(unknown.values(seen))
@@ -82,9 +100,8 @@ def test_free_part_is_where_it_is_seen_and_is_pulled_along_the_normal():
     np.testing.assert_allclose(shift, [0.1, 0.0, 0.0], atol=1e-12)
 
 
-def test_learned_joint_replaces_the_attachment_without_limits():
-    random, model, truth = np.random.default_rng(1), make_model(), make_model()
-    forget_joint(model)
+def test_learned_joint_replaces_the_attachment_without_limits(truth):
+    random, model = np.random.default_rng(1), forget_joint(truth, DOOR, truth.default_state())
     door = truth.fk(DOOR, "shelf_door/body")
     angles = np.linspace(0.0, 1.0, 60)
     poses = np.array([look(door({DOOR: q}), random, 0.0) for q in angles])
@@ -106,32 +123,43 @@ def run(model, world_model, part=None, seed=1, **options):
     return open_unknown(Session(world), HANDLE, model=model, part=part, sensors=sensors, **options)
 
 
-def test_door_that_was_believed_to_slide_is_relearned_and_opened():
-    model, truth = make_model(), make_model()
-    forget_joint(model, kv.Prismatic, axis=(1.0, 0.0, 0.0), lower=0.0, upper=0.3)
-    outcome = run(model, truth)
+def test_door_that_was_believed_to_slide_is_relearned_and_opened(truth):
+    model = truth.copy()
+    believe_that_it_slides(model)
+    outcome = run(model, truth, turn=np.radians(25))
     assert outcome, outcome.reason
-    assert outcome.value == pytest.approx(np.radians(60), abs=0.05)
+    assert outcome.value == pytest.approx(np.radians(25), abs=0.05)
     assert outcome.measures["believed"] == "refuted"
     assert outcome.measures["decided_turn"] < np.radians(10)
     assert outcome.measures["opened_seconds"] < 15
     assert model.articulations[DOOR].kind == "revolute"
 
 
-def test_door_that_nothing_moves_is_said_not_to_follow():
-    model, truth = make_model(), make_model()
-    forget_joint(model)
-    with truth.edit() as edit:
+def test_door_that_nothing_moves_is_said_not_to_follow(truth):
+    model, locked = forget_joint(truth, DOOR, truth.default_state()), truth.copy()
+    with locked.edit() as edit:
         edit.constrain("lock", 0, kv.position(DOOR).derivative(), 0)
-    outcome = run(model, truth, part=DOOR)
+    outcome = run(model, locked, part=DOOR)
     assert not outcome
     assert "does not follow the hand" in outcome.reason
     assert outcome.measures["failure"] == "other"
     assert model.articulations[DOOR].kind == "fixed"
 
 
-def test_wrong_arguments_name_the_mistake():
-    model = make_model()
+def test_robot_alone_moves_on_lines_relative_to_a_part_that_floats(truth):
+    session = Session(KinematicWorld(truth, "hsr"))
+    unknown = free_part(truth, DOOR, HANDLE, session.state)
+    gripper = find_gripper(truth, "hsr")
+    search = PlacementSearch(unknown.model, gripper, unknown.model.default_state())
+    motion = HandMotion(session, gripper, unknown.handle, search, None, None, 1.0)
+    goal = Goal(same_pose(unknown.model.fk(HANDLE), unknown.model.fk(gripper.hand)), name="hand")
+    assert {s.path.partition("/")[0] for s in motion.controller([goal]).speeds} == {"hsr"}
+
+
+def test_wrong_arguments_name_the_mistake(truth):
+    model = truth
+    with pytest.raises(InvalidValueError, match="none can be forgotten"):
+        forget_joint(model, "shelf_door/body", model.default_state())
     with pytest.raises(UnknownNameError, match="door_handle"):
         open_unknown(Session(KinematicWorld(model, "hsr")), "shelf_door/handle", model=model)
     session = Session(KinematicWorld(model, "hsr"))
