@@ -13,6 +13,12 @@ from kineverse.errors import InfeasibleError, InvalidValueError, NotFiniteError
 from kineverse.grasping import Grasp, Gripper, Handle, find_gripper, find_handle, sample_grasps
 from kineverse.manipulation.outcome import Outcome, SkillError, SlipError
 from kineverse.manipulation.session import Session
+from kineverse.manipulation.skill_arguments import (
+    check_positive,
+    check_target,
+    find_object_coordinate,
+    limit_tolerance,
+)
 from kineverse.model.model_view import ModelView
 from kineverse.planning import Planner, Trajectory
 from kineverse.state import State
@@ -90,10 +96,10 @@ def open_object(
         Without a gripper or a handle, for a coordinate of the robot, or a target out of limits.
     """
     world, model = session.world, session.world.model
-    coordinate = model.symbol(what) if isinstance(what, str) else what
-    if coordinate.path.startswith(f"{world.robot}/"):
-        raise InvalidValueError(f"'{coordinate}' is a coordinate of the robot; name one of an object.")
-    goal = _choose_target(model, coordinate, session.state, target)
+    coordinate = find_object_coordinate(session, what)
+    seconds = check_positive("seconds", seconds)
+    goal = _choose_target(model, coordinate, session.state, check_target(target))
+    tolerance = limit_tolerance(model, coordinate, tolerance)
     found = find_handle(model, coordinate, handle)
     opener = _find_opener(model, find_gripper(model, world.robot, hand), session.state)
     run = _Run(session, opener, found, goal, seconds, tolerance, placements, seed)

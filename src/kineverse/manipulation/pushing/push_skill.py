@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from kineverse.errors import InvalidValueError, KineverseError
+from kineverse.errors import KineverseError
 from kineverse.geometry import Rule
 from kineverse.geometry.objects import Exclusion
 from kineverse.grasping import find_gripper
@@ -16,6 +16,12 @@ from kineverse.lie import Array
 from kineverse.manipulation.articulated_objects import find_shut_value
 from kineverse.manipulation.outcome import Outcome
 from kineverse.manipulation.session import Session
+from kineverse.manipulation.skill_arguments import (
+    check_positive,
+    check_target,
+    find_object_coordinate,
+    limit_tolerance,
+)
 from kineverse.planning import Path
 from kineverse.state import State
 from kineverse.symbols import Symbol
@@ -106,9 +112,9 @@ def push(
         For a coordinate of the robot, and as :class:`.Pushing`.
     """
     model, world = session.world.model, session.world
-    coordinate = model.symbol(what) if isinstance(what, str) else what
-    if coordinate.path.startswith(f"{world.robot}/"):
-        raise InvalidValueError(f"'{coordinate}' is a coordinate of the robot; name one of an object.")
+    coordinate = find_object_coordinate(session, what)
+    seconds, target = check_positive("seconds", seconds), check_target(target)
+    tolerance = limit_tolerance(model, coordinate, tolerance)
     first, begin = session.steps, world.time
     while session.deviation(coordinate) > _UNKNOWN:
         if world.time - begin > _LOOK:
@@ -121,6 +127,11 @@ def push(
         session.phase = "look"
         session.stop()
     if pushing is None:
+        target = find_shut_value(model, coordinate) if target is None else target
+        if abs(session.state[coordinate] - target) < tolerance / 2:
+            value, reason = world.state[coordinate], f"'{coordinate}' is there from the start"
+            done = abs(value - target) < tolerance
+            return Outcome(done, value, reason, world.name, world.time - begin, session.steps - first)
         if bodies is None:
             bodies = find_gripper(model, world.robot).bodies
         pushing = Pushing(
@@ -128,7 +139,7 @@ def push(
             coordinate,
             bodies,
             session.state,
-            target=find_shut_value(model, coordinate) if target is None else target,
+            target=target,
             robot=world.robot,
             object_frames=object_frames,
             dt=session.dt,

@@ -1,0 +1,54 @@
+"""Checks of the arguments that all skills have: object, target, time and tolerance."""
+
+from __future__ import annotations
+
+import math
+from typing import Any
+
+from kineverse._checks import as_tolerance, finite_number
+from kineverse.errors import InvalidValueError
+from kineverse.model.model_view import ModelView
+from kineverse.symbols import Symbol
+
+from .session import Session
+
+
+def find_object_coordinate(session: Session, what: Symbol | str) -> Symbol:
+    """Return the coordinate of an object by symbol or name.
+
+    Raises
+    ------
+    UnknownNameError
+        If the model does not have it.
+    InvalidValueError
+        For a coordinate of the robot, and what is neither symbol nor name.
+    """
+    if not isinstance(what, (str, Symbol)):
+        raise InvalidValueError(f"what= is the coordinate of an object, by symbol or name, not {what!r:.60}.")
+    coordinate = session.world.model.symbol(str(what))
+    if coordinate.path.startswith(f"{session.world.robot}/"):
+        raise InvalidValueError(f"'{coordinate}' is a coordinate of the robot; name one of an object.")
+    return coordinate
+
+
+def check_positive(name: str, given: Any) -> float:
+    """Return a positive finite number, or raise InvalidValueError with the name of its argument."""
+    number = finite_number(given)
+    if number is None or number <= 0.0:
+        raise InvalidValueError(f"{name}= is a positive finite number, not {given!r:.60}.")
+    return number
+
+
+def check_target(given: Any) -> float | None:
+    """Return a wanted value [m], [rad], or None for the default, or raise InvalidValueError."""
+    number = None if given is None else finite_number(given)
+    if given is not None and number is None:
+        raise InvalidValueError(f"target= is a finite number [m], [rad], not {given!r:.60}.")
+    return number
+
+
+def limit_tolerance(model: ModelView, coordinate: Symbol, given: Any) -> float:
+    """Return a tolerance of a target [m], [rad], at most a tenth of the coordinate's range."""
+    tolerance = as_tolerance(given, "tolerance=")
+    lower, upper = (float(v) for v in model.limits(coordinate))
+    return min(tolerance, 0.1 * (upper - lower)) if math.isfinite(upper - lower) else tolerance
