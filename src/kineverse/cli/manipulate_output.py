@@ -79,6 +79,8 @@ def report_outcome(
         verdict = f"{state} at {at}, after {format_number(outcome.seconds, 4)} s in the {world.name} world"
     print(f"{scene.coordinate}: {join_lines(verdict)}")
     if "family" in outcome.measures:
+        if outcome:
+            print(outcome.reason)
         print(f"learned joint: {_describe_joint(outcome.measures)}")
     if outcome.steps:
         rows = [("steps", str(outcome.steps))]

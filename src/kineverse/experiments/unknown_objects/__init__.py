@@ -94,10 +94,10 @@ def run(progress: Progress, options: Options) -> Report:
         for seed in range(options.seed, options.seed + count)
     ]
     trials = run_jobs(open_one, jobs, progress, "unknown-objects", "opening", options.processes)
-    return report_trials(trials, options.seed, count)
+    return report_openings(trials, options.seed, count)
 
 
-def report_trials(trials: list[Trial], seed: int, count: int) -> Report:
+def report_openings(trials: list[Trial], seed: int, count: int) -> Report:
     """Return the report on the trials of some seeds."""
     seeds = f"seed {seed}" if count == 1 else f"seeds {seed} to {seed + count - 1}"
     title = "Family known before 10° or 8 cm, open within 15 s; the other figures are the worst of all trials"

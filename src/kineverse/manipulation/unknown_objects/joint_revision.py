@@ -33,7 +33,7 @@ def watch_joint(model: Model, belief: PartBelief) -> PlausibilityMonitor | None:
     return PlausibilityMonitor(model, frames, noise=noise, outliers=sensors.outliers > 0.0 or None)
 
 
-def judge_joint(model: Model, belief: PartBelief) -> str:
+def judge_believed_joint(model: Model, belief: PartBelief) -> str:
     """Return the verdict on a model's joint: nothing, explains, cannot tell or refuted."""
     if belief.monitor is None:
         return "nothing"
@@ -58,7 +58,7 @@ def revise_joint(model: Model, belief: PartBelief, learned: LearnedJoint) -> tup
         if away > _MOVED or turned > _TURNED:
             place_beside(model, belief)
             words += f" '{belief.beside}' stands {100 * away:.0f} cm from where it was believed."
-    verdict = judge_joint(model, belief)
+    verdict = judge_believed_joint(model, belief)
     if verdict == "explains":
         return verdict, f"{words} The model's joint explains what was seen, and stays."
     if verdict == "cannot tell":

@@ -114,9 +114,10 @@ class PartPulling:
                 f"'{self.part}' does not follow the hand: it moved by {1e3 * opened:.0f} mm. {why} It may "
                 "be fixed, locked, or need more force than the grip holds.",
             )
+        words = f"{self._describe_opening('goes no further')} {why}"
         if self._is_far_enough():
-            return self._describe_opening("goes no further")
-        raise SkillError("other", self._describe_opening("goes no further") + f" {why}")
+            return words
+        raise SkillError("other", words)
 
     def _let_go(self) -> None:
         """Open the fingers, and look where the part is."""
