@@ -22,7 +22,7 @@ from kineverse.state import State
 from .base_placement import NO_WAY, BasePlacement
 from .hand_paths import HandPaths
 from .placement_samples import PlacementSamples, find_planar_base
-from .way_check import Candidate, WayCheck, interpolate_poses
+from .way_check import CandidateWay, WayCheck, interpolate_poses
 from .way_contacts import OWN_MARGIN, WayContacts
 
 _STEP = 0.05
@@ -171,7 +171,7 @@ class _Search:
         self.approaches = np.array([grasp.approach for grasp in grasps])
         self.check = WayCheck(owner.contacts, owner.paths, state, grasps, self.values, self.handles)
         self.free, self.reasons = self.check.free, self.check.reasons
-        self.heap: list[tuple[int, float, int, Candidate]] = []
+        self.heap: list[tuple[int, float, int, CandidateWay]] = []
         self.number = count()
 
     @property
@@ -222,13 +222,13 @@ class _Search:
             return
         score = self.owner.samples.cost(self.state, way, back[:, -1], ends) + 0.02 * choice
         for k in np.flatnonzero(good):
-            self._push(Candidate(int(choice[k]), base[k], back[k], way[k], int(ends[k])), float(score[k]))
+            self._push(CandidateWay(int(choice[k]), base[k], back[k], way[k], int(ends[k])), float(score[k]))
 
     def _count(self, good: npt.NDArray[np.bool_], reason: str) -> npt.NDArray[np.bool_]:
         self.reasons[reason] += int((~good).sum()) // _STARTS
         return good
 
-    def _push(self, candidate: Candidate, score: float) -> None:
+    def _push(self, candidate: CandidateWay, score: float) -> None:
         heappush(self.heap, (-candidate.end, score, next(self.number), candidate))
 
     # -- checks --------------------------------------------------------------------------------------------
@@ -259,7 +259,7 @@ class _Search:
                 self._push(candidate, score)
         return None
 
-    def _check(self, candidate: Candidate) -> BasePlacement | None:
+    def _check(self, candidate: CandidateWay) -> BasePlacement | None:
         """Return the placement of a candidate without contacts; otherwise shorten its way."""
         retreat = self.check.find_retreat(candidate)
         if retreat is None:

@@ -33,7 +33,7 @@ _SWEEP = 8
 
 
 @dataclass(slots=True, eq=False)
-class Candidate:
+class CandidateWay:
     """Way of an arm that reaches, until the value with the index ``end``.
 
     Attributes
@@ -102,7 +102,7 @@ class WayCheck:
             *paths.moving, *paths.still, *gripper.joints, handle.coordinate,
         )  # fmt: skip
 
-    def find_retreat(self, candidate: Candidate) -> Array | None:
+    def find_retreat(self, candidate: CandidateWay) -> Array | None:
         """Return a retreat (L, n) of a candidate without contacts; otherwise shorten its way."""
         if self._is_blocked_before(candidate) or self._is_blocked_along(candidate):
             return None
@@ -112,7 +112,7 @@ class WayCheck:
             candidate.end -= max(1, round(_SHORTER * last))
         return retreat
 
-    def _is_blocked_before(self, candidate: Candidate) -> bool:
+    def _is_blocked_before(self, candidate: CandidateWay) -> bool:
         """Return True, and drop the candidate, if something is in the way until the fingers are closed."""
         grasp, base, opened = self.grasps[candidate.choice], candidate.base, self._gripper.opened
         back, still = candidate.back, self.paths.still
@@ -130,7 +130,7 @@ class WayCheck:
                 return True
         return False
 
-    def _is_blocked_along(self, candidate: Candidate) -> bool:
+    def _is_blocked_along(self, candidate: CandidateWay) -> bool:
         """Return True, and shorten the way of the candidate, if something is in it."""
         grasp, end, base = self.grasps[candidate.choice], candidate.end, candidate.base
         closed = self._gripper.values_at(grasp.thickness)
@@ -143,7 +143,7 @@ class WayCheck:
             return True
         return False
 
-    def _retreat(self, candidate: Candidate) -> Array | None:
+    def _retreat(self, candidate: CandidateWay) -> Array | None:
         """Return the first straight retreat (L, n) without contacts; the longest of them if none is whole.
 
         It is the reversed approach, or deviates from it along the bar, between the fingers.
