@@ -102,7 +102,7 @@ def test_ctrl_c_prints_the_table_so_far(run, asked, fails, tmp_path):
         (["--noise", "3furlongs"], "3furlongs"),
         (["--speed", "-1"], "--speed is between 0 and 100"),
         (["--seed", "-1"], "--seed is a number from 0 on"),
-        (["--picture", "/nowhere/x.png"], "/nowhere/x.png"),
+        (["--picture", "/nowhere/x.png"], "/nowhere"),
     ],
 )
 def test_mistakes_are_reported_in_one_line(run, asked, words, message):
