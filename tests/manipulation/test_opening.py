@@ -243,3 +243,16 @@ def test_an_object_that_is_never_seen_is_not_opened(model):
     assert not outcome
     assert "not seen" in outcome.reason
     assert world.state[DRAWER] == 0.1
+
+
+def test_drawer_opens_by_estimates_from_noisy_poses(model):
+    sensors = Sensors.parse("3mm+3mm/m,0.5deg,30Hz,drop=0.1,encoders=0.0002")
+    world = KinematicWorld(model, "hsr", sensors=sensors)
+    world.reset(start(model))
+    error = EstimateError(model.symbol(DRAWER))
+    session = Session(world, belief=TrackedBelief(model, "hsr", sensors), on_step=error)
+    outcome = open_object(session, DRAWER)
+    assert outcome, outcome.reason
+    assert outcome.measures["penetration"] < 5e-4
+    assert error.measures["estimate_mean"] < 0.003
+    assert outcome.measures["grasp_error"] < max(5e-4, 1.5 * error.measures["estimate_largest"])

@@ -133,6 +133,11 @@ def test_tracking_rejects_outliers():
     assert len(wrong.symmetric_difference(simulation.kitchen_tracker.estimate.outliers)) <= 2
 
 
+def test_the_track_of_hidden_markers_is_consistent():
+    _, qualities, _ = simulate(20.0, seed=1, sensor=SensorModel(0.03, hidden=0.5))
+    assert 0.6 < average(qualities[36:]).nees < 1.5
+
+
 def test_hidden_markers_become_uncertain_and_a_new_sensor_model_is_used():
     simulation, *_ = simulate(1.5)
     sure = simulation.kitchen_tracker.uncertainty_lengths()
@@ -157,7 +162,7 @@ def test_uncertainty_paths_pass_the_tracked_positions_and_have_their_lengths(che
 # -- identification --------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("name", ["chest"])  # the stool is the example of docs/demo.md
+@pytest.mark.parametrize("name", list(MECHANISMS))
 def test_an_unknown_mechanism_is_identified_and_then_tracked(name, chest):
     simulation, _, off = chest if name == "chest" else simulate(10.0, mechanism=name)
     mechanism, learner = simulation.mechanism, simulation.learner
@@ -170,6 +175,13 @@ def test_an_unknown_mechanism_is_identified_and_then_tracked(name, chest):
     assert sigmas < 2.2
     # The mean error of a marker is 1.6 standard deviations of one coordinate.
     assert np.mean(off[-20:]) < 1.2 * simulation.sensor.noise
+
+
+def test_an_unknown_mechanism_is_identified_despite_outliers():
+    simulation, *_ = simulate(8.0, seed=2, sensor=SensorModel(0.03, outliers=0.2))
+    best = simulation.learner.result.best
+    assert (best.family, simulation.learner.result.is_ambiguous) == ("revolute", False)
+    assert axis_error(best, *simulation.mechanism.axis)[0] < math.radians(9.0)
 
 
 def test_the_gate_rejects_outliers_and_keeps_inliers():

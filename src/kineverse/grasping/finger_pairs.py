@@ -7,7 +7,7 @@ from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 
 from kineverse.formats.srdf.description import Srdf
-from kineverse.model.frame import WORLD
+from kineverse.model.frame import WORLD, is_of_robot
 from kineverse.model.model_view import ModelView
 from kineverse.symbols import Symbol
 
@@ -60,7 +60,7 @@ class Palm:
 
 def robot_frames(model: ModelView, robot: str) -> tuple[str, ...]:
     """Return the frames of a robot in the order of the model: those below its prefix, or all."""
-    return tuple(name for name in model.frames if not robot or name.startswith(f"{robot}/"))
+    return tuple(name for name in model.frames if is_of_robot(name, robot))
 
 
 def find_palms(model: ModelView, robot: str, srdf: Srdf | None = None) -> list[tuple[int, Palm]]:

@@ -15,6 +15,7 @@ from kineverse.geometry import Scene
 from kineverse.geometry.objects import collision_shapes, matches_pattern
 from kineverse.lie import Array
 from kineverse.model.body import Body
+from kineverse.model.frame import is_of_robot
 from kineverse.model.model_view import ModelView
 from kineverse.state import State
 
@@ -288,7 +289,7 @@ def _frames_of_robot(model: ModelView, gripper: Gripper) -> dict[str, None]:
     """Return the frames of the gripper's robot: those below its prefix, or all that stand on its base."""
     top = path_to_root(model, gripper.hand)[-1]
     if gripper.robot:
-        return dict.fromkeys(f for f in model.frames if f.startswith(f"{gripper.robot}/"))
+        return dict.fromkeys(f for f in model.frames if is_of_robot(f, gripper.robot))
     return dict.fromkeys(f for f in model.frames if path_to_root(model, f)[-1] == top)
 
 

@@ -13,6 +13,7 @@ from kineverse.errors import UnknownNameError, suggest
 from kineverse.geometry.objects import collision_shapes, matches_pattern
 from kineverse.geometry.shapes import solid_from_geometry
 from kineverse.lie import Array, inverse, rotation_angle
+from kineverse.model.frame import is_of_robot
 from kineverse.model.frame_dependence import moved_frames
 from kineverse.model.model_view import ModelView
 from kineverse.symbols import Symbol
@@ -70,11 +71,10 @@ def find_articulated_objects(model: ModelView, robot: str = "") -> tuple[Articul
     UnknownNameError
         If nothing of the model is below the prefix.
     """
-    own = f"{robot}/"
-    if robot and not any(name.startswith(own) for name in model.frames):
+    if not any(is_of_robot(name, robot) for name in model.frames):
         prefixes = {name.partition("/")[0] for name in model.frames}
-        raise UnknownNameError(f"No frame begins with '{own}'. {suggest(robot, prefixes, 'prefix')}")
-    free = [s for s in model.degrees_of_freedom if not (robot and s.path.startswith(own))]
+        raise UnknownNameError(f"No frame begins with '{robot}/'. {suggest(robot, prefixes, 'prefix')}")
+    free = [s for s in model.degrees_of_freedom if not (robot and is_of_robot(s.path, robot))]
     defaults = model.default_state()
     found = []
     for coordinate, frames in moved_frames(model, free).items():

@@ -12,6 +12,7 @@ from kineverse.control import Command
 from kineverse.errors import InvalidValueError, ShapeError
 from kineverse.expressions import Expression
 from kineverse.lie import Array
+from kineverse.model.frame import is_of_robot
 from kineverse.state import State
 from kineverse.symbols import Symbol
 from kineverse.worlds import Observation, World
@@ -172,8 +173,8 @@ class Session:
 
     def _advance(self, speeds: Speeds) -> None:
         """Advance the world by a step, and update the belief."""
-        robot = f"{self.world.robot}/"
-        self.commands = {s: v for s, v in speeds.items() if s.path.startswith(robot)}
+        robot = self.world.robot
+        self.commands = {s: v for s, v in speeds.items() if is_of_robot(s.path, robot)}
         self._wait(lambda: self.world.apply(self.commands, self.dt, stamp=self.state.stamp))
         self._wait(lambda: self._update(speeds))
         self.steps += 1

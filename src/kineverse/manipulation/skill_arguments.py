@@ -7,13 +7,13 @@ from typing import Any
 
 from kineverse._checks import as_tolerance, finite_number
 from kineverse.errors import InvalidValueError
+from kineverse.model.frame import is_of_robot
 from kineverse.model.model_view import ModelView
 from kineverse.symbols import Symbol
+from kineverse.worlds import World
 
-from .session import Session
 
-
-def find_object_coordinate(session: Session, what: Symbol | str) -> Symbol:
+def find_object_coordinate(world: World, what: Symbol | str) -> Symbol:
     """Return the coordinate of an object by symbol or name.
 
     Raises
@@ -25,8 +25,8 @@ def find_object_coordinate(session: Session, what: Symbol | str) -> Symbol:
     """
     if not isinstance(what, (str, Symbol)):
         raise InvalidValueError(f"what= is the coordinate of an object, by symbol or name, not {what!r:.60}.")
-    coordinate = session.world.model.symbol(str(what))
-    if coordinate.path.startswith(f"{session.world.robot}/"):
+    coordinate = world.model.symbol(str(what))
+    if is_of_robot(coordinate.path, world.robot):
         raise InvalidValueError(f"'{coordinate}' is a coordinate of the robot; name one of an object.")
     return coordinate
 

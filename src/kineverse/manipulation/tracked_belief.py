@@ -18,6 +18,7 @@ from kineverse.compile import compile  # noqa: A004
 from kineverse.errors import InvalidValueError, UnknownNameError, suggest
 from kineverse.estimation import ObservedPose, Outliers, Tracker, pose_covariance
 from kineverse.lie import Array, inverse
+from kineverse.model.frame import is_of_robot
 from kineverse.model.model_view import ModelView
 from kineverse.state import State
 from kineverse.symbols import Symbol
@@ -26,7 +27,6 @@ from kineverse.worlds.sensor_sampler import (
     find_camera,
     find_marked_frames,
     find_robot_base,
-    is_of_robot,
 )
 
 from .base_filter import BaseFilter, motion_of, place

@@ -102,3 +102,8 @@ def _is_transform(part: Any) -> bool:
     if isinstance(part, (list, tuple)):
         return len(part) == 4 and all(isinstance(row, (list, tuple)) and len(row) == 4 for row in part)
     return isinstance(part, Pose) or getattr(part, "shape", None) == (4, 4)
+
+
+def is_of_robot(name: str, robot: str) -> bool:
+    """Return whether a frame, or the path of a coordinate, is below the prefix of a robot."""
+    return not robot or name == robot or name.startswith(f"{robot}/")

@@ -8,6 +8,7 @@ from typing import NamedTuple
 import numpy as np
 import numpy.typing as npt
 
+from kineverse.model.frame import is_of_robot
 from kineverse.model.frame_dependence import moved_frames
 from kineverse.model.model_view import ModelView
 from kineverse.state import State
@@ -102,7 +103,7 @@ class SkillStills:
     def _weigh(self, part: Drawable, moved: set[str]) -> float:
         if part.frame in moved:
             return _MOVED
-        return _ROBOT if part.frame.startswith(f"{self._robot}/") else 0.0
+        return _ROBOT if is_of_robot(part.frame, self._robot) else 0.0
 
 
 def _choose_camera(

@@ -30,12 +30,11 @@ from kineverse.geometry import Rule, Scene
 from kineverse.geometry.prepared_query import PreparedQuery
 from kineverse.grasping.gripper import Gripper
 from kineverse.lie import Array, inverse, rotation_angle
+from kineverse.model.frame import is_of_robot
 from kineverse.model.frame_dependence import FrameDependence
 from kineverse.model.model_view import ModelView
 from kineverse.state import State, StateLike
 from kineverse.symbols import Symbol
-
-from .sensor_sampler import is_of_robot
 
 CONTACT_GAP = 1e-3
 """Largest gap of a contact of a push [m]."""

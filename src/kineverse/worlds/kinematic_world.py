@@ -24,12 +24,13 @@ from kineverse.geometry import Scene
 from kineverse.geometry.results import DistanceResult
 from kineverse.grasping.gripper import Gripper, find_grippers
 from kineverse.lie import Array
+from kineverse.model.frame import is_of_robot
 from kineverse.model.model_view import ModelView
 from kineverse.state import State, StateLike
 
 from .kinematic_grip import TOUCH, KinematicGrip
 from .object_motion import ObjectMotion
-from .sensor_sampler import SensorSampler, is_of_robot
+from .sensor_sampler import SensorSampler
 from .sensors import Sensors
 from .world import Contact, Observation
 

@@ -14,6 +14,7 @@ from kineverse.errors import InvalidValueError, UnknownNameError, suggest
 from kineverse.formats.mjcf.mujoco_api import mujoco
 from kineverse.grasping.gripper import Gripper, find_grippers
 from kineverse.lie import Array
+from kineverse.model.frame import is_of_robot
 from kineverse.model.model_view import ModelView
 from kineverse.state import State, StateLike
 from kineverse.symbols import Symbol
@@ -24,7 +25,7 @@ from .mujoco_coordinates import MujocoCoordinates
 from .mujoco_floor import add_floor
 from .mujoco_gripper import GripperDrive
 from .mujoco_servos import BANDWIDTH, JointServos, SpeedMap
-from .sensor_sampler import SensorSampler, is_of_robot
+from .sensor_sampler import SensorSampler
 from .sensors import Sensors
 from .world import Contact, Observation
 

@@ -8,9 +8,9 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from kineverse.lie import Array
+from kineverse.model.frame import is_of_robot
 
 from .recording import RunRecording, ValuesOverTime, read_run_recording
-from .sensor_sampler import is_of_robot
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes

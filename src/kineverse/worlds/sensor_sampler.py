@@ -15,7 +15,7 @@ from kineverse.compile import compile as compile_expressions
 from kineverse.errors import InvalidValueError, UnknownNameError, suggest
 from kineverse.lie import Array, inverse, quaternion, retract, rotation_z, transform
 from kineverse.model.body import is_empty_body
-from kineverse.model.frame import WORLD
+from kineverse.model.frame import WORLD, is_of_robot
 from kineverse.model.frame_dependence import FrameDependence
 from kineverse.model.model_view import ModelView
 from kineverse.state import State
@@ -211,11 +211,6 @@ class SensorSampler:
             known = not math.isnan(contact.force)
             if contact.force >= sensors.touch_force if known else contact.distance <= sensors.touch_gap:
                 yield from (name for name in (contact.a, contact.b) if is_of_robot(name, self._robot))
-
-
-def is_of_robot(name: str, robot: str) -> bool:
-    """Return whether a frame, or the path of a coordinate, is below the prefix of a robot."""
-    return not robot or name == robot or name.startswith(f"{robot}/")
 
 
 def find_marked_frames(model: ModelView, robot: str) -> tuple[str, ...]:

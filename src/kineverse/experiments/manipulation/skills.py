@@ -14,10 +14,10 @@ from kineverse.grasping import find_gripper, find_handle
 from kineverse.manipulation import Outcome, Session, open_object
 from kineverse.manipulation.pushing.controller import Pushing
 from kineverse.manipulation.pushing.trials import try_push
+from kineverse.model.frame import is_of_robot
 from kineverse.model.model import Model
 from kineverse.state import State
 from kineverse.worlds import Judge, World
-from kineverse.worlds.sensor_sampler import is_of_robot
 
 from .robots import RobotSource
 from .setting import TrialSetting, TrialWatch, list_series

@@ -19,6 +19,7 @@ from kineverse.manipulation.skill_arguments import (
     find_object_coordinate,
     limit_tolerance,
 )
+from kineverse.model.frame import is_of_robot
 from kineverse.model.model_view import ModelView
 from kineverse.planning import Planner, Trajectory
 from kineverse.state import State
@@ -96,7 +97,7 @@ def open_object(
         Without a gripper or a handle, for a coordinate of the robot, or a target out of limits.
     """
     world, model = session.world, session.world.model
-    coordinate = find_object_coordinate(session, what)
+    coordinate = find_object_coordinate(world, what)
     seconds = check_positive("seconds", seconds)
     goal = _choose_target(model, coordinate, session.state, check_target(target))
     tolerance = limit_tolerance(model, coordinate, tolerance)
@@ -147,8 +148,8 @@ class _Opener:
 
     def grasps(self, handle: Handle, state: State, seed: int) -> tuple[Grasp, ...]:
         """Return the grasps of a handle where everything but the robot is as in a state."""
-        robot = f"{self.gripper.robot}/"
-        others = tuple(v for s, v in state.items() if not s.path.startswith(robot))
+        robot = self.gripper.robot
+        others = tuple(v for s, v in state.items() if not robot or not is_of_robot(s.path, robot))
         key = handle.frame, handle.coordinate, seed, others
         if key not in self._grasps:
             found = sample_grasps(self.model, self.gripper, handle, _GRASPS, seed, state=state)

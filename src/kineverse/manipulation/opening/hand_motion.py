@@ -12,6 +12,7 @@ import numpy.typing as npt
 
 from kineverse.control import Command, Controller, Goal, Hold, Target, same_pose
 from kineverse.control.tasks import Task
+from kineverse.geometry import Rule
 from kineverse.grasping import Grasp, Gripper, Handle
 from kineverse.lie import Array, inverse
 from kineverse.manipulation.hand_reference import HandReference
@@ -105,6 +106,12 @@ class HandMotion:
             return 0.0
         slope = self._slope(session.state)
         return deviation * float(np.linalg.norm(slope))
+
+    @property
+    def holding_rules(self) -> tuple[Rule, ...]:
+        """Rules of a scene in which the hand holds the handle."""
+        held = (Rule(b, self.handle.frame, False, "grasped") for b in self.gripper.bodies)
+        return (*self.search.scene.rules, *held)
 
     def look(self) -> None:
         """Stand until the handle is known well, or raise SkillError if it is not seen."""

@@ -7,7 +7,7 @@ import numpy as np
 from kineverse.compile import compile  # noqa: A004
 from kineverse.control import Goal, Hold, Target, same_pose
 from kineverse.control.tasks import Task
-from kineverse.geometry import Rule, Scene
+from kineverse.geometry import Scene
 from kineverse.lie import inverse
 from kineverse.manipulation.outcome import SkillError, SlipError
 
@@ -70,8 +70,7 @@ def move_held(motion: HandMotion, placement: BasePlacement, tolerance: float) ->
     wanted = Target("opening/object", np.zeros(1))
     tasks: list[Task] = [hold, Goal(coordinate, wanted.expression[0], gain=FOLLOWING, name="object")]
     tasks += goals
-    rules = [Rule(b, motion.handle.frame, False, "grasped") for b in motion.gripper.bodies]
-    scene = Scene(motion.model, rules=[*motion.search.scene.rules, *rules])
+    scene = Scene(motion.model, rules=motion.holding_rules)
     controller = motion.controller(tasks, scene=scene, margin=_MARGIN)
     share, speed, length = 0.0, 0.0, abs(target - values[0])
     best, since = 0.0, session.world.time

@@ -15,7 +15,8 @@ from kineverse.errors import InvalidValueError
 from kineverse.geometry import Scene
 from kineverse.grasping import Grasp, Gripper
 from kineverse.lie import Array
-from kineverse.manipulation.pushing.scene import find_overlapping_links, furniture_rules
+from kineverse.manipulation.collision_rules import find_overlapping_links, furniture_rules
+from kineverse.model.frame import is_of_robot
 from kineverse.model.model_view import ModelView
 from kineverse.state import State
 
@@ -75,9 +76,8 @@ class PlacementSearch:
         self.samples = PlacementSamples(model, self.moving, self.standing, self.base)
         self.paths = HandPaths(model, gripper.hand, self.moving, self.standing, self.samples.eases[0])
         self.scene = Scene(model)
-        prefix = f"{gripper.robot}/" if gripper.robot else ""
         bodies = self.scene.bodies
-        self.own = tuple(b for b in bodies if b.startswith(prefix) and prefix)
+        self.own = tuple(b for b in bodies if gripper.robot and is_of_robot(b, gripper.robot))
         others = tuple(b for b in bodies if b not in self.own)
         if not others:
             raise InvalidValueError("The model has nothing but the robot, so there is nothing to hold.")

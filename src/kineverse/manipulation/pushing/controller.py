@@ -28,6 +28,8 @@ from kineverse.errors import InvalidValueError, KineverseError
 from kineverse.geometry import Rule, Scene
 from kineverse.geometry.objects import Exclusion
 from kineverse.lie import Array
+from kineverse.manipulation.collision_rules import find_overlapping_links, furniture_rules, match_bodies
+from kineverse.model.frame import is_of_robot
 from kineverse.model.frame_dependence import FrameDependence
 from kineverse.model.model_view import ModelView
 from kineverse.state import State, StateLike
@@ -39,7 +41,6 @@ from .contact_points import PushPoint, PushSurface, find_push_tool
 from .nearest_pair import PairFinder, PushPair, PushView, make_view
 from .press import PushPress, TipAnchor
 from .program import LOST, NEAR, PRESS, TOUCHING, PushProgram
-from .scene import find_overlapping_links, furniture_rules, match_bodies
 
 _APART = 4e-3
 """Gap between pusher and object away from the contact [m]."""
@@ -146,7 +147,7 @@ class Pushing:
         plain = Scene(model, rules=self.rules, leave_out=self.leave_out)
         self.pusher = match_bodies(plain.bodies, bodies, "bodies=")
         self.robot = self.pusher[0].split("/")[0] if robot is None else robot
-        own = tuple(b for b in plain.bodies if b.startswith(f"{self.robot}/"))
+        own = tuple(b for b in plain.bodies if is_of_robot(b, self.robot))
         moved = plain.bodies_moved_by([coordinate])
         self.object_bodies = tuple(b for b in moved if b not in own)
         if not self.object_bodies:

@@ -14,6 +14,7 @@ from kineverse.control import Goal, Hold, InverseKinematics, Target
 from kineverse.control.tasks import Task
 from kineverse.errors import KineverseError
 from kineverse.expressions.expression import array
+from kineverse.model.frame import is_of_robot
 from kineverse.state import State
 from kineverse.symbols import Symbol
 
@@ -157,7 +158,7 @@ class _Sampler:
         axis = world_T_hand[:3, :3] @ tool.axis
         self._point = Target("push/start/point", np.zeros(3))
         self._facing = Target("push/start/facing", np.array([1.0, 0.0, 0.0]))
-        still = [s for s in model.degrees_of_freedom if not s.path.startswith(f"{pushing.robot}/")]
+        still = [s for s in model.degrees_of_freedom if not is_of_robot(s.path, pushing.robot)]
         exact: list[Task] = [Hold(tip, self._point.expression, name="tip")]
         if axis.gradient():
             exact.append(Goal(axis, self._facing.expression, name="facing", weight=0.1))
@@ -171,7 +172,7 @@ class _Sampler:
         ]
         self._tried = 0
         self._base: InverseKinematics | None = None
-        root = next(b for b in pushing.scene.bodies if b.startswith(f"{pushing.robot}/"))
+        root = next(b for b in pushing.scene.bodies if is_of_robot(b, pushing.robot))
         pose = model.fk(root)
         if pose.symbols:
             self._planar = Target("push/start/base", np.array([0.0, 0.0, 1.0, 0.0]))

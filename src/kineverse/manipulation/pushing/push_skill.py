@@ -112,7 +112,7 @@ def push(
         For a coordinate of the robot, and as :class:`.Pushing`.
     """
     model, world = session.world.model, session.world
-    coordinate = find_object_coordinate(session, what)
+    coordinate = find_object_coordinate(world, what)
     seconds, target = check_positive("seconds", seconds), check_target(target)
     tolerance = limit_tolerance(model, coordinate, tolerance)
     first, begin = session.steps, world.time

@@ -12,6 +12,7 @@ from kineverse.geometry.objects import Exclusion
 from kineverse.grasping import find_gripper
 from kineverse.manipulation.outcome import Outcome
 from kineverse.manipulation.session import Session
+from kineverse.manipulation.skill_arguments import find_object_coordinate
 from kineverse.state import State
 from kineverse.symbols import Symbol
 from kineverse.worlds import World
@@ -122,7 +123,7 @@ def try_push(
         As for :func:`.push`.
     """
     model = world.model
-    coordinate = model.symbol(what) if isinstance(what, str) else what
+    coordinate = find_object_coordinate(world, what)
     bodies = find_gripper(model, world.robot).bodies if bodies is None else bodies
     pushing = Pushing(
         model,

@@ -14,7 +14,7 @@ from kineverse.model.model import Model
 from .joint_learning import LearnedJoint
 from .part import find_joint, write_joint
 from .part_belief import PartBelief, measure_way
-from .pull import place_beside
+from .pull_controllers import place_beside
 
 _DISTANCE, _FLOOR_POSITION, _FLOOR_ORIENTATION = 1.0, 1e-3, 2e-3
 """Distance of the camera, and least standard deviations, for the test of a believed joint [m], [rad]."""

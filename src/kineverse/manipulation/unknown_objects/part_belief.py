@@ -11,11 +11,11 @@ import numpy as np
 from kineverse.compile import compile  # noqa: A004
 from kineverse.estimation import PlausibilityMonitor, pose_covariance
 from kineverse.lie import Array, inverse, pose_difference, retract, rotation_angle, skew
-from kineverse.model.frame import WORLD
+from kineverse.model.frame import WORLD, is_of_robot
 from kineverse.state import State
 from kineverse.symbols import Symbol
 from kineverse.worlds import Observation, Sensors, World
-from kineverse.worlds.sensor_sampler import find_camera, is_of_robot
+from kineverse.worlds.sensor_sampler import find_camera
 
 from .part import JointPath, UnknownPart
 

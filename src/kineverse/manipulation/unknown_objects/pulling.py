@@ -14,7 +14,7 @@ from kineverse.model.model import Model
 from .joint_learning import JointLearning
 from .part import JointPath
 from .part_belief import PartBelief, measure_way
-from .pull import LearnedPull, StraightPull, learn_model
+from .pull_controllers import LearnedPull, StraightPull, learn_model
 
 LEAST_OPENING = 0.08, math.radians(10.0)
 """Opening from which a part that goes no further counts as open [m], [rad]."""

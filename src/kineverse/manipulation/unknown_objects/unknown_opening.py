@@ -15,6 +15,7 @@ from kineverse.manipulation.opening import BasePlacement, PlacementSearch
 from kineverse.manipulation.opening.hand_motion import HandMotion
 from kineverse.manipulation.outcome import Outcome, SkillError
 from kineverse.manipulation.session import Session
+from kineverse.manipulation.skill_arguments import check_positive
 from kineverse.model.frame import WORLD
 from kineverse.model.model import Model
 from kineverse.planning import Planner
@@ -103,8 +104,7 @@ def open_unknown(
         that is not positive.
     """
     for name, value in (("way", way), ("turn", turn), ("seconds", seconds)):
-        if not (math.isfinite(value) and value > 0.0):
-            raise InvalidValueError(f"{name}= is a positive number, not {value!r}.")
+        check_positive(name, value)
     for name in (handle, *(n for n in (part, beside) if n is not None)):
         if name not in model.frames:
             raise UnknownNameError(f"There is no frame '{name}'. {suggest(name, model.frames, 'frame')}")

@@ -1,4 +1,4 @@
-"""Bodies and collision rules of pushes: who may touch, and which pairs mean nothing."""
+"""Bodies and collision rules of skills: which pairs may touch, and which mean nothing."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Pulling of a held part: straight while nobody knows how it moves, then along the joint that was learned."""
+"""Controllers of pulls: straight while the joint is unknown, then along the joint that was learned."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from kineverse.control import Controller, Goal, Hold, Target, same_pose
 from kineverse.control.command import Command
 from kineverse.errors import InvalidValueError
 from kineverse.estimation import Fit
-from kineverse.geometry import Rule, Scene
+from kineverse.geometry import Scene
 from kineverse.lie import Array, adjoint, exp_se3, inverse
 from kineverse.manipulation.opening.hand_motion import HandMotion
 from kineverse.model.frame import WORLD
@@ -178,7 +178,6 @@ def _make_controller(
     motion: HandMotion, model: ModelView, tasks: list[Hold | Goal], still: list[Symbol]
 ) -> Controller:
     """Return a controller with rows for near bodies, in which the hand may touch the handle."""
-    rules = [Rule(b, motion.handle.frame, False, "grasped") for b in motion.gripper.bodies]
     with motion.session.timed("plan"):
-        scene = Scene(model, rules=[*motion.search.scene.rules, *rules])
+        scene = Scene(model, rules=motion.holding_rules)
         return Controller(model, tasks, dt=motion.session.dt, still=still, scene=scene, margin=_MARGIN)
