@@ -41,7 +41,8 @@ _NEAR = 0.6
 """Distance from the bar up to which shapes are looked at [m]."""
 _REACH = 0.05
 """Distance up to which the clearance of a grasp counts [m]."""
-_CLOSING = 14
+_CLOSING, _AWAY = 14, np.array([0.1, 0.25, 0.5, 1.0])
+"""Number of gaps of fingers that close, and parts of the way to the pose before the approach."""
 _ADVANCES, _TOUCHING = 20, 1e-4
 """Most steps in which fingers close, and the distance at which one touches [m]."""
 
@@ -230,6 +231,8 @@ class _Surroundings:
         self._contacts = watch(self._hand.bodies, list(obstacles), _REACH)
         others = [name for name in obstacles if name != _BAR]
         self._others = watch(self._hand.bodies, others, _REACH) if others else None
+        self._to_bar = [watch(finger, [_BAR], math.inf) for finger in gripper.fingers]
+        self._closing = self._hand.row(gripper.closed) - self._hand.row(gripper.opened)
 
     def find_contact(self, grasp: Grasp) -> tuple[str, str] | None:
         """Return the bodies of hand and object that come too near to each other, or None."""
@@ -251,11 +254,8 @@ class _Surroundings:
         gap = min(grasp.thickness + 2 * _SLACK, gripper.width)
         for _ in range(_ADVANCES):
             pose, approach = _place_hand(gripper, frame_T_grasp, gap)
-            self._hand.place(gripper.values_at(gap), pose)
-            one, other = (
-                min(self._hand.scene.distance(body, _BAR).distance for body in finger)
-                for finger in gripper.fingers
-            )
+            row = self._hand.row(gripper.values_at(gap), pose)[None]
+            one, other = (to_bar.least_distance(self._hand.coordinates, row) for to_bar in self._to_bar)
             if max(abs(one), abs(other)) < _TOUCHING:
                 return replace(grasp, pose=pose, approach=approach, thickness=gap)
             gap -= one + other
@@ -273,13 +273,11 @@ class _Surroundings:
     def _rows(self, grasp: Grasp) -> Array:
         """Return configurations (n, m) at the hold, and then on the way there: the first ones often touch."""
         gripper = grasp.gripper
+        rows = np.tile(self._hand.row(gripper.opened, grasp.pose), (_CLOSING + len(_AWAY), 1))
         gaps = np.linspace(grasp.thickness + _SLACK, gripper.width, _CLOSING)
-        rows = [self._hand.row(gripper.values_at(gap), grasp.pose) for gap in gaps]
-        for part in (0.1, 0.25, 0.5, 1.0):
-            pose = grasp.pose.copy()
-            pose[:3, 3] += part * (grasp.approach - grasp.pose)[:3, 3]
-            rows.append(self._hand.row(gripper.opened, pose))
-        return np.array(rows)
+        rows[:_CLOSING] += gripper.pads.parts_at(gaps)[:, None] * self._closing
+        rows[_CLOSING:, :3] += _AWAY[:, None] * (grasp.approach - grasp.pose)[:3, 3]
+        return rows
 
 
 _OBJECT, _BAR = "object/", "object/the bar"

@@ -13,6 +13,7 @@ from kineverse.formats.srdf.description import Srdf
 from kineverse.lie import Array
 from kineverse.model.body import Body, Shape, Sphere
 from kineverse.model.model_view import ModelView
+from kineverse.model.version_cache import cached_for_version
 from kineverse.symbols import Symbol
 
 from .finger_pairs import Branch, Palm, find_palms, hand_frame, path_to_root
@@ -131,7 +132,13 @@ def find_gripper(model: ModelView, robot: str, hand: str | None = None, srdf: Sr
 
 
 def _search(model: ModelView, robot: str, srdf: Srdf | None) -> tuple[tuple[Gripper, ...], list[str]]:
-    """Return the grippers, and for each link without one the reason."""
+    """Return the grippers, and for each link without one the reason; those without a description are kept."""
+    if srdf is not None:
+        return _search_anew(model, robot, srdf)
+    return cached_for_version(model, ("grippers", robot), lambda: _search_anew(model, robot, None))
+
+
+def _search_anew(model: ModelView, robot: str, srdf: Srdf | None) -> tuple[tuple[Gripper, ...], list[str]]:
     found: list[tuple[tuple[float, ...], Gripper]] = []
     why: list[str] = []
     for rank, palm in find_palms(model, robot, srdf):

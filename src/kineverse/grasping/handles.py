@@ -14,6 +14,7 @@ from kineverse.geometry import Scene
 from kineverse.lie import Array
 from kineverse.model.frame_dependence import FrameDependence
 from kineverse.model.model_view import ModelView
+from kineverse.model.version_cache import cached_for_version
 from kineverse.state import State
 from kineverse.symbols import Symbol
 
@@ -123,8 +124,16 @@ def find_handle(
 def _search(
     model: ModelView, coordinate: Symbol | str, decomposed: Iterable[str]
 ) -> tuple[tuple[Handle, ...], str]:
-    """Return the handles, and a sentence on why there is none."""
+    """Return the handles, and a sentence on why there is none; those of whole meshes are kept."""
     symbol = coordinate if isinstance(coordinate, Symbol) else model.symbol(coordinate)
+    if patterns := tuple(decomposed):
+        return _search_anew(model, symbol, patterns)
+    return cached_for_version(model, ("handles", symbol), lambda: _search_anew(model, symbol, ()))
+
+
+def _search_anew(
+    model: ModelView, symbol: Symbol, decomposed: tuple[str, ...]
+) -> tuple[tuple[Handle, ...], str]:
     motion = FrameDependence(model, [symbol])
     moved = [name for name in model.frames if motion.moves(name)]
     if not moved:

@@ -70,18 +70,18 @@ class Pads:
     closed: Mapping[Symbol, float]
     stroke: Array
 
-    def part_at(self, gap: float) -> float:
-        """Return the part of the motion at which the pads have a gap [m], or the nearest end of it."""
-        return float(np.interp(-gap, -self.stroke[:, 1], self.stroke[:, 0]))
+    def parts_at(self, gaps: Array) -> Array:
+        """Return the parts of the motion at which the pads have gaps (n,) [m], or the nearest ends of it."""
+        return np.interp(-gaps, -self.stroke[:, 1], self.stroke[:, 0])
 
     def values_at(self, gap: float) -> dict[Symbol, float]:
         """Return the values of the joints at which the pads have a gap [m], within what they can."""
-        part = self.part_at(gap)
+        part = float(self.parts_at(np.array(gap)))
         return {s: self.opened[s] + part * (self.closed[s] - self.opened[s]) for s in self.opened}
 
     def middle_at(self, gap: float) -> Array:
         """Return the middle (3,) between the pads when they have a gap [m]."""
-        part = self.part_at(gap)
+        part = float(self.parts_at(np.array(gap)))
         return np.array([np.interp(part, self.stroke[:, 0], self.stroke[:, k]) for k in (2, 3, 4)])
 
 

@@ -137,6 +137,7 @@ class Model(ModelView):
         diff = edit._diff(self._version + 1, changes, reruns)
         self._history.begin()
         self._version += 1
+        self._derived = {}
         return diff
 
     def include(

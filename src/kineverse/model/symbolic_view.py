@@ -6,7 +6,7 @@ Numeric queries are in :mod:`kineverse.model.model_view`.
 from __future__ import annotations
 
 import threading
-from collections.abc import ItemsView, Iterator, Mapping, Sequence, ValuesView
+from collections.abc import Hashable, ItemsView, Iterator, Mapping, Sequence, ValuesView
 from typing import TYPE_CHECKING, Any, Literal
 
 import casadi as ca
@@ -134,6 +134,7 @@ class SymbolicView:
         self._checker: ConstraintChecker | None = None
         self._integrator: StateIntegrator | None = None
         self._equalities: EqualityConstraints | None = None
+        self._derived: dict[Hashable, Any] = {}
 
     def _invalidate(self, changes: Sequence[tuple[Cell, Any, Any]]) -> None:
         """Invalidate the caches that changes affect."""
@@ -142,6 +143,7 @@ class SymbolicView:
             self._pending += changes
         self._all_symbols = None
         self._integrator = None
+        self._derived = {}
         if RATES in kinds:
             self._rates = None
             self._carried_constraints.clear()

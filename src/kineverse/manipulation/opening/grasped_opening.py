@@ -5,7 +5,6 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping
 from typing import Any
-from weakref import WeakKeyDictionary
 
 import numpy as np
 
@@ -21,6 +20,7 @@ from kineverse.manipulation.skill_arguments import (
 )
 from kineverse.model.frame import is_of_robot
 from kineverse.model.model_view import ModelView
+from kineverse.model.version_cache import cached_for_version
 from kineverse.planning import Planner, Trajectory
 from kineverse.state import State
 from kineverse.symbols import Symbol
@@ -102,7 +102,10 @@ def open_object(
     goal = _choose_target(model, coordinate, session.state, check_target(target))
     tolerance = limit_tolerance(model, coordinate, tolerance)
     found = find_handle(model, coordinate, handle)
-    opener = _find_opener(model, find_gripper(model, world.robot, hand), session.state)
+    gripper = find_gripper(model, world.robot, hand)
+    opener = cached_for_version(
+        model, ("opener", gripper.hand), lambda: _Opener(model, gripper, session.state)
+    )
     run = _Run(session, opener, found, goal, seconds, tolerance, placements, seed)
     reason, kind = "", ""
     try:
@@ -134,7 +137,7 @@ class _Opener:
     """Everything that openings of one model have in common: placements and the planner of ways."""
 
     def __init__(self, model: ModelView, gripper: Gripper, state: State) -> None:
-        self.model, self.gripper, self.version = model, gripper, model.version
+        self.model, self.gripper = model, gripper
         self.search = PlacementSearch(model, gripper, state)
         self._planner: Planner | None = None
         self._grasps: dict[tuple[object, ...], tuple[Grasp, ...]] = {}
@@ -155,17 +158,6 @@ class _Opener:
             found = sample_grasps(self.model, self.gripper, handle, _GRASPS, seed, state=state)
             self._grasps = {**dict([*self._grasps.items()][-_KEPT:]), key: found}
         return self._grasps[key]
-
-
-_OPENERS: WeakKeyDictionary[ModelView, dict[str, _Opener]] = WeakKeyDictionary()
-
-
-def _find_opener(model: ModelView, gripper: Gripper, state: State) -> _Opener:
-    kept = _OPENERS.setdefault(model, {})
-    found = kept.get(gripper.hand)
-    if found is None or found.version != model.version:
-        found = kept[gripper.hand] = _Opener(model, gripper, state)
-    return found
 
 
 def _choose_target(model: ModelView, coordinate: Symbol, state: State, target: float | None) -> float:
