@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections import Counter
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
 from typing import TYPE_CHECKING, Any, TypeAlias
 
 import numpy as np
@@ -58,6 +58,11 @@ class State(Mapping[Symbol, float]):
 
     __slots__ = ("_by_name", "_values", "source", "stamp")
 
+    _by_name: dict[str, Symbol | None]
+    _values: dict[Symbol, float]
+    source: str
+    stamp: float | None
+
     def __init__(
         self, values: StateLike | None = None, *, stamp: float | None = None, source: str = ""
     ) -> None:
@@ -67,26 +72,30 @@ class State(Mapping[Symbol, float]):
             if symbol in known:
                 raise duplicate_value_error(symbol)
             known[symbol] = _number(symbol, value)
-        self._values = known
-        self._by_name: dict[str, Symbol | None] = {str(s): s for s in known}
-        if len(self._by_name) < len(known):
-            # A parameter may have the name of another symbol; then the name is ambiguous.
-            counts = Counter(map(str, known))
-            self._by_name = {name: s if counts[name] == 1 else None for name, s in self._by_name.items()}
+        self._set(known, _symbols_by_name(known), stamp, source)
+
+    def _set(
+        self,
+        values: dict[Symbol, float],
+        by_name: dict[str, Symbol | None],
+        stamp: float | None,
+        source: str,
+    ) -> None:
         if stamp is not None and not _is_number(stamp):
             raise InvalidValueError(f"The stamp of a state is a time in seconds, not {stamp!r}.")
-        self.stamp = stamp
-        self.source = source  # from here on immutable
+        write = object.__setattr__
+        write(self, "_values", values)
+        write(self, "_by_name", by_name)
+        write(self, "stamp", stamp)
+        write(self, "source", source)
 
     def __setattr__(self, name: str, value: Any) -> None:
-        if hasattr(self, "source"):
-            raise ExpressionError("States are immutable; use updated({symbol: number}, stamp=...).")
-        object.__setattr__(self, name, value)
+        raise ExpressionError("States are immutable; use updated({symbol: number}, stamp=...).")
 
     if not TYPE_CHECKING:  # a type checker reports unknown attributes itself
 
         def __getattr__(self, name):
-            if name in State.__slots__:  # not set yet, while __setattr__ checks for it
+            if name in State.__slots__:  # not set yet
                 raise AttributeError(name)
             if name in self._by_name:
                 raise UnknownAttributeError(f"A state has no {name!r}. Its value is state[{name!r}].")
@@ -213,11 +222,17 @@ class State(Mapping[Symbol, float]):
         )
 
     def _with(self, values: Mapping[Symbol, float], stamp: float | None, source: str | None) -> State:
-        return State(
-            {**self._values, **values},
-            stamp=self.stamp if stamp is None else stamp,
-            source=self.source if source is None else source,
+        # All values have been checked already.
+        every = {**self._values, **values}
+        by_name = self._by_name if len(every) == len(self._values) else _symbols_by_name(every)
+        found = State.__new__(State)
+        found._set(
+            every,
+            by_name,
+            self.stamp if stamp is None else stamp,
+            self.source if source is None else source,
         )
+        return found
 
     def _unknown(self, key: object) -> KineverseError:
         symbol = _symbol(key)
@@ -256,6 +271,16 @@ class State(Mapping[Symbol, float]):
         return html_table(
             ", ".join(about), ("symbol", "value"), [(str(s), f"{v:g}") for s, v in self.items()]
         )
+
+
+def _symbols_by_name(symbols: Collection[Symbol]) -> dict[str, Symbol | None]:
+    """Return the symbol of each name, None where several have it."""
+    found: dict[str, Symbol | None] = {str(s): s for s in symbols}
+    if len(found) < len(symbols):
+        # A parameter may have the name of another symbol; then the name is ambiguous.
+        counts = Counter(map(str, symbols))
+        found = {name: s if counts[name] == 1 else None for name, s in found.items()}
+    return found
 
 
 def _items(values: object) -> Iterable[tuple[Any, Any]]:

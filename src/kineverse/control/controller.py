@@ -226,7 +226,9 @@ class Controller:
         )
 
     def reset(self, speeds: StateLike | None = None) -> None:
-        """Forget the last commands: the next step starts from given speeds, by default from rest."""
+        """Forget the last commands and solutions: the next step starts from given speeds, or from rest."""
+        self._solver.reset()
+        self._relaxed.reset()
         known = as_state(speeds or {}, self.speeds)
         self._last[:] = [known.given(s) or 0.0 for s in self.speeds]
         if len(self._before):

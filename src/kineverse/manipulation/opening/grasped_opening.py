@@ -3,11 +3,12 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
+from collections.abc import Hashable, Mapping
 from typing import Any
 
 import numpy as np
 
+from kineverse.control import Controller
 from kineverse.errors import InfeasibleError, InvalidValueError, NotFiniteError
 from kineverse.grasping import Grasp, Gripper, Handle, find_gripper, find_handle, sample_grasps
 from kineverse.manipulation.outcome import Outcome, SkillError, SlipError
@@ -134,11 +135,12 @@ def open_object(
 
 
 class _Opener:
-    """Everything that openings of one model have in common: placements and the planner of ways."""
+    """Everything that openings of one model have in common: placements, planner and controllers."""
 
     def __init__(self, model: ModelView, gripper: Gripper, state: State) -> None:
         self.model, self.gripper = model, gripper
         self.search = PlacementSearch(model, gripper, state)
+        self.controllers: dict[Hashable, tuple[Controller, Any]] = {}
         self._planner: Planner | None = None
         self._grasps: dict[tuple[object, ...], tuple[Grasp, ...]] = {}
 
@@ -202,8 +204,9 @@ class _Run:
         self.judge = Judge(self.model, session.world.robot, self.gripper, handle=handle.frame)
         self.judge.update(session.world.state)
         self.motion = HandMotion(
-            session, self.gripper, handle, opener.search, opener.planner, self.judge, self.begin + seconds
-        )
+            session, self.gripper, handle, opener.search, opener.planner, self.judge, self.begin + seconds,
+            opener.controllers,
+        )  # fmt: skip
 
     @property
     def measures(self) -> dict[str, Any]:

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import math
 from collections import deque
-from collections.abc import Iterable, Mapping
-from typing import Any
+from collections.abc import Callable, Hashable, Iterable, Mapping
+from typing import Any, TypeVar
 
 import numpy as np
 import numpy.typing as npt
@@ -18,6 +18,7 @@ from kineverse.lie import Array, inverse
 from kineverse.manipulation.hand_reference import HandReference
 from kineverse.manipulation.outcome import SkillError
 from kineverse.manipulation.session import Session
+from kineverse.model.frame import is_of_robot
 from kineverse.planning import Planner, Trajectory, TrajectoryFollower
 from kineverse.state import State
 from kineverse.symbols import Symbol
@@ -52,6 +53,10 @@ _ARRIVED = 0.05
 """Distance from the end of a way up to which the retreat there is meant [m], [rad]."""
 _BESIDE = 0.008
 """Difference of the gap of closed fingers to the thickness of the bar that says that it is not there [m]."""
+_KEPT = 8
+"""Number of controllers that are kept."""
+
+Targets = TypeVar("Targets")
 
 
 class HandMotion:
@@ -71,6 +76,8 @@ class HandMotion:
         Judge that measures all steps.
     until
         Time in the world at which SkillError is raised [s].
+    controllers
+        Controllers of earlier motions of this hand by :meth:`find_controller`, which are used again.
 
     Attributes
     ----------
@@ -87,11 +94,13 @@ class HandMotion:
         planner: Planner,
         judge: Judge,
         until: float,
+        controllers: dict[Hashable, tuple[Controller, Any]] | None = None,
     ) -> None:
         self.session, self.gripper, self.handle = session, gripper, handle
         self.search, self.planner, self.judge, self.until = search, planner, judge, until
         self.model = search.model
         self.turns: Array = np.zeros(len(search.moving))
+        self.controllers = {} if controllers is None else controllers
         self._hand, self._bar = self.model.fk(gripper.hand), self.model.fk(handle.frame)
         self._slope = self._bar[:3, 3].partial([handle.coordinate])
         limits = {s: self.model.limits(s) for s in (*search.moving, handle.coordinate)}
@@ -137,7 +146,8 @@ class HandMotion:
         """
         state = self.session.state
         inside = {s: min(max(state[s], a), b) for s, (a, b) in self._limits.items()}
-        return state.updated({s: v for s, v in inside.items() if v != state[s]})
+        moved = {s: v for s, v in inside.items() if v != state[s]}
+        return state.updated(moved) if moved else state
 
     def approach(self, placement: BasePlacement, trajectory: Trajectory) -> None:
         """Bring the hand along a trajectory before the handle, and then straight to the grasp."""
@@ -150,8 +160,13 @@ class HandMotion:
     def follow(self, trajectory: Trajectory) -> None:
         """Follow a trajectory."""
         session = self.session
-        follower = TrajectoryFollower(trajectory)
-        controller = self.controller(follower.tasks, posture=0.0)
+
+        def make() -> tuple[Controller, TrajectoryFollower]:
+            found = TrajectoryFollower(trajectory)
+            return self.controller(found.tasks, posture=0.0), found
+
+        controller, follower = self.find_controller(("follow", trajectory.symbols), make)
+        follower.trajectory = trajectory
         begin = session.world.time
         times = np.linspace(0.0, trajectory.duration, _REFERENCES)
         self.refer([self._hand(session.state.updated(trajectory.at(t))) for t in times.tolist()])
@@ -167,12 +182,16 @@ class HandMotion:
     def follow_line(self, start: Array, end: Array, rows: Array | None = None) -> None:
         """Move the hand straight from a pose relative to the handle to another one, near to arms (L, n)."""
         session = self.session
-        # The initial values are of no run: a controller with others would be compiled for these alone.
-        wanted, rate = Target("hand/pose", np.eye(4)), Target("hand/rate", np.zeros(6))
-        posture, follow, goals = (None, None, []) if rows is None else self.posture()
-        error = same_pose(self._bar @ wanted.expression, self._hand)
-        goal = Goal(error, gain=FOLLOWING, rate=rate.expression, name="hand")
-        controller = self.controller([goal, *goals])
+
+        def make() -> tuple[Controller, tuple[Target, Target, Target | None, Target | None]]:
+            # The initial values are of no run: a controller with others would be compiled for these alone.
+            wanted, rate = Target("hand/pose", np.eye(4)), Target("hand/rate", np.zeros(6))
+            posture, follow, goals = (None, None, []) if rows is None else self.posture()
+            error = same_pose(wanted.expression, self._hand)
+            goal = Goal(error, gain=FOLLOWING, rate=rate.expression, name="hand")
+            return self.controller([goal, *goals]), (wanted, rate, posture, follow)
+
+        controller, (wanted, rate, posture, follow) = self.find_controller(("line", rows is None), make)
         way = end[:3, 3] - start[:3, 3]
         steps = max(2, math.ceil(float(np.linalg.norm(way)) / (_LINE_SPEED * session.dt)))
         speed = np.concatenate([end[:3, :3].T @ way / (steps * session.dt), np.zeros(3)])
@@ -186,14 +205,15 @@ class HandMotion:
             self.refer_to(share)
             pose[:3, 3] = start[:3, 3] + share * (end[:3, 3] - start[:3, 3])
             with session.timed("line"):
-                controller.set(wanted, pose)
+                state = self.state
+                controller.set(wanted, self._bar(state) @ pose)
                 controller.set(rate, speed if k < steps else 0.0 * speed)
                 if posture is not None and follow is not None and rows is not None:
                     # A base that lags would lead the arm along another way than the checked one.
                     row, next_row = row_at(rows, share), row_at(rows, min(1.0, (k + 1) / steps))
                     controller.set(posture, row)
                     controller.set(follow, (next_row - row) / session.dt)
-                command = controller.step(self.state)
+                command = controller.step(state)
             if k > steps and command.residuals["hand"] < settled:
                 break
             self.act(command.speeds, command)
@@ -269,16 +289,37 @@ class HandMotion:
         return configurations[:, : len(self.search.moving)] + self.turns
 
     def controller(self, tasks: Iterable[Task], **options: Any) -> Controller:
-        """Return a controller of the robot's coordinates, and of the object's if tasks are about it."""
+        """Return a controller of the robot's coordinates, and of objects' if something is held."""
         tasks = list(tasks)
         still: list[Symbol | str] = [*self.search.standing, *self.gripper.joints]
         if not any(isinstance(task, Hold) for task in tasks):
-            moving = {*self.search.moving}
-            still += [s for s in self.model.symbols_of(self.handle.frame) if s not in moving]
+            moving, robot = {*self.search.moving}, self.gripper.robot
+            others = (s for s in self.model.degrees_of_freedom if s not in moving)
+            still += [s for s in others if not is_of_robot(s.path, robot)]
         with self.session.timed("plan"):
             controller = Controller(self.model, tasks, dt=self.session.dt, still=still, **options)
             controller.wait()
         return controller
+
+    def find_controller(
+        self, key: Hashable, make: Callable[[], tuple[Controller, Targets]]
+    ) -> tuple[Controller, Targets]:
+        """Return a controller at rest and the targets of its tasks, those of an earlier motion if there are.
+
+        Parameters
+        ----------
+        key
+            Everything that the tasks depend on beside the robot, the hand and the time of a step.
+        make
+            Function that makes the controller.
+        """
+        key = key, self.session.dt
+        found = self.controllers.pop(key) if key in self.controllers else make()
+        self.controllers[key] = found  # the last one is the one used last
+        if len(self.controllers) > _KEPT:
+            del self.controllers[next(iter(self.controllers))]
+        found[0].reset()
+        return found
 
     def move_fingers(self, values: Mapping[Symbol, float]) -> None:
         """Move the fingers to values, or until they stand still."""

@@ -5,8 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from kineverse.compile import compile  # noqa: A004
-from kineverse.control import Goal, Hold, Target, same_pose
-from kineverse.control.tasks import Task
+from kineverse.control import Controller, Goal, Hold, Target, same_pose
 from kineverse.geometry import Scene
 from kineverse.lie import inverse
 from kineverse.manipulation.outcome import SkillError, SlipError
@@ -55,9 +54,6 @@ def move_held(motion: HandMotion, placement: BasePlacement, tolerance: float) ->
     session.phase = "move"
     state = session.state
     held = inverse(bar(state)) @ hand(state)
-    # The initial values are of no run: a controller with others would be compiled for these alone.
-    grasped = Target("grasp/pose", np.eye(4))
-    hold = Hold(same_pose(bar @ grasped.expression, hand), gain=FOLLOWING, name="grasp")
     middle = motion.gripper.grasp_pose[:, 3]
     uncertain = [session.deviation(x) for x in ((bar @ held - hand) @ middle)[:3]]
     slipped = _SLIPPED + _SIGMAS * float(np.linalg.norm(uncertain))
@@ -66,12 +62,19 @@ def move_held(motion: HandMotion, placement: BasePlacement, tolerance: float) ->
     moving = motion.search.moving
     rows = motion.rows(placement.way)
     values = placement.values
-    posture, arm_speeds, goals = motion.posture()
-    wanted = Target("opening/object", np.zeros(1))
-    tasks: list[Task] = [hold, Goal(coordinate, wanted.expression[0], gain=FOLLOWING, name="object")]
-    tasks += goals
-    scene = Scene(motion.model, rules=motion.holding_rules)
-    controller = motion.controller(tasks, scene=scene, margin=_MARGIN)
+
+    def make() -> tuple[Controller, tuple[Target, Target, Target, Target]]:
+        # The initial values are of no run: a controller with others would be compiled for these alone.
+        grasped, wanted = Target("grasp/pose", np.eye(4)), Target("opening/object", np.zeros(1))
+        posture, arm_speeds, goals = motion.posture()
+        hold = Hold(same_pose(bar @ grasped.expression, hand), gain=FOLLOWING, name="grasp")
+        goal = Goal(coordinate, wanted.expression[0], gain=FOLLOWING, name="object")
+        scene = Scene(motion.model, rules=motion.holding_rules)
+        found = motion.controller([hold, goal, *goals], scene=scene, margin=_MARGIN)
+        return found, (grasped, wanted, posture, arm_speeds)
+
+    key = "held", motion.handle.frame, coordinate
+    controller, (grasped, wanted, posture, arm_speeds) = motion.find_controller(key, make)
     share, speed, length = 0.0, 0.0, abs(target - values[0])
     best, since = 0.0, session.world.time
     controller.set(grasped, held)
