@@ -9,8 +9,8 @@ import numpy as np
 
 from kineverse.compile import compile  # noqa: A004
 from kineverse.errors import InfeasibleError, InvalidValueError, NotFiniteError, UnknownNameError, suggest
-from kineverse.grasping import find_gripper, sample_grasps
-from kineverse.lie import Array
+from kineverse.grasping import Grasp, find_gripper, sample_grasps
+from kineverse.lie import Array, inverse
 from kineverse.manipulation.opening import BasePlacement, PlacementSearch
 from kineverse.manipulation.opening.hand_motion import HandMotion
 from kineverse.manipulation.outcome import Outcome, SkillError
@@ -23,9 +23,10 @@ from kineverse.worlds import Judge, Sensors
 
 from .joint_learning import JointLearning, LearnedJoint
 from .joint_revision import revise_joint, watch_joint
-from .part import find_joint, free_part
+from .part import JointPath, UnknownPart, find_joint, free_part
 from .part_belief import PartBelief, measure_way
-from .pulling import LEAST_OPENING, LOOKING, PartPulling
+from .pull_controllers import point_speed
+from .pulling import LEAST_OPENING, LOOKING, ArmEndError, PartPulling
 
 OPEN_WAY, OPEN_TURN = 0.25, math.radians(60.0)
 """Opening that is wanted by default [m], [rad]."""
@@ -34,6 +35,12 @@ _MOST_LOOKING = 3.0
 _REACH = 0.25
 """Straight way of the handle that a placement should allow [m]."""
 _GRASPS, _PLANNING = 128, 2.0
+_MOST_PLACES = 3
+"""Largest number of places of the robot, or of its hand."""
+_FURTHER = 1.1
+"""Share of the rest of an opening that a further placement should lead along the learned joint."""
+_CLOSED_WAY, _CLOSED_TURN = 0.03, math.radians(6.0)
+"""Motion back [m], [rad] after which a part that was open is not."""
 
 
 def open_unknown(
@@ -181,6 +188,9 @@ class _Run:
         self.measures |= {"way": way, "turn": turn}
         learned = self.learning.learned
         turns = bool(learned.fit.motion.kinds[0]) if learned is not None else turn > 0.5 * LEAST_OPENING[1]
+        if not kind and (way < self.claimed[0] - _CLOSED_WAY or turn < self.claimed[1] - _CLOSED_TURN):
+            kind = "other"
+            reason += f" It is not open in truth: by {100 * way:.0f} cm and {math.degrees(turn):.0f}°."
         if learned is not None:
             reason = f"{reason} {self._report_joint(learned)}"
         if kind:
@@ -202,29 +212,78 @@ class _Run:
         robot = self.world.robot
         self.judge = Judge(self.world.model, robot, self.gripper, handle=unknown.handle.frame)
         self.judge.update(self.world.state)
-        with session.timed("place"):
-            self.search = PlacementSearch(unknown.model, self.gripper, session.state)
-            self.planner = Planner(unknown.model, self.search.moving, rules=self.search.scene.rules)
-        self.motion = HandMotion(
-            session, self.gripper, unknown.handle, self.search, self.planner, self.judge,
-            self.begin + self.seconds,
-        )  # fmt: skip
+        self._prepare(unknown)
         self._look()
         if self.belief.monitor is None:
             self.belief.monitor = watch_joint(self.model, self.belief)
-        placement = self._place()
-        grasp = placement.grasp
+        self.pulling = PartPulling(session, self.belief, self.learning, self.model, self.wanted)
+        failure: SkillError | None = None
+        try:
+            for _ in range(_MOST_PLACES):
+                try:
+                    placement = self._place(_REACH if failure is None else self._prepare_further())
+                except SkillError as error:
+                    raise SkillError(failure.kind, f"{failure} {error}") if failure else error from error
+                try:
+                    return self._pull(placement)
+                except ArmEndError as error:
+                    failure = error
+            assert failure is not None
+            raise failure
+        finally:
+            self.measures |= self.pulling.measures
+
+    def _prepare(self, unknown: UnknownPart) -> None:
+        """Prepare motions of the hand at a part."""
+        session = self.session
+        with session.timed("place"):
+            self.search = PlacementSearch(unknown.model, self.gripper, session.state)
+            self.planner = Planner(unknown.model, self.search.moving, rules=self.search.scene.rules)
+        until = self.begin + self.seconds
+        self.motion = HandMotion(
+            session, self.gripper, unknown.handle, self.search, self.planner, self.judge, until
+        )
+        self.unknown = unknown
+
+    def _prepare_further(self) -> float:
+        """Prepare motions along the learned joint, and return the way of the handle that is left [m]."""
+        learned = self.learning.learned
+        assert learned is not None
+        path = JointPath.of_fit(learned.fit, self.pulling.start)
+        path.project(self.belief.relative_pose)
+        self._prepare(self.unknown.pulled_along(path.twist()))
+        kind = learned.fit.motion.kinds[0]
+        scale = point_speed(path.twist(), self.unknown.point)
+        return _FURTHER * scale * (self.wanted[kind] - self.pulling.opening[kind])
+
+    def _pull(self, placement: BasePlacement) -> str:
+        """Take the handle, pull, let go, and return how far the part is open."""
+        grasp, motion = placement.grasp, self.motion
         assert grasp is not None
         self._approach(placement)
-        pulling = PartPulling(self.motion, self.belief, self.learning, self.model, self.wanted)
         try:
-            return pulling.perform(grasp)
+            reason = self.pulling.perform(motion, grasp)
+            self.claimed = self.pulling.opening
         finally:
-            self.measures |= pulling.measures
             self.belief.release()
-            if self.world.time <= self.motion.until:
-                # The retreat rows are those of a straight pull, whose coordinate stays 0 in the belief.
-                self.motion.release(placement)
+            if self.world.time <= motion.until:
+                self._retract(grasp)
+        return reason
+
+    def _retract(self, grasp: Grasp) -> None:
+        """Open the fingers, take the hand straight back, and look at the part.
+
+        Where the part is after an unknown motion, the retreat of the placement has not been checked.
+        """
+        motion, belief = self.motion, self.belief
+        self.session.phase = "release"
+        motion.move_fingers(self.gripper.opened)
+        self.session.phase = "retract"
+        pose = inverse(belief.pose @ self.unknown.frame_T_handle) @ belief.hand_pose
+        away = pose.copy()
+        away[:3, 3] += grasp.approach[:3, 3] - grasp.pose[:3, 3]
+        motion.follow_line(pose, away)
+        motion.stand(LOOKING)
 
     def _look(self) -> None:
         """Look at the part while the robot stands."""
@@ -239,8 +298,8 @@ class _Run:
                 )
             self.motion.stand(self.session.dt)
 
-    def _place(self) -> BasePlacement:
-        """Return a placement from which the handle can be pulled straight, as far as possible."""
+    def _place(self, way: float) -> BasePlacement:
+        """Return a placement from which the handle can be pulled by a way [m], or as far as possible."""
         session, why = self.session, ""
         session.phase = "place"
 
@@ -257,9 +316,16 @@ class _Run:
             return bool(path.found)
 
         with session.timed("place"):
-            grasps = sample_grasps(self.unknown.model, self.gripper, self.unknown.handle, _GRASPS, self.seed)
+            grasps = sample_grasps(
+                self.unknown.model,
+                self.gripper,
+                self.unknown.handle,
+                _GRASPS,
+                self.seed,
+                state=session.state,
+            )
             found = self.search.find(
-                session.state, grasps, _REACH, accept=plan, samples=self.samples, seed=self.seed
+                session.state, grasps, way, accept=plan, samples=self.samples, seed=self.seed
             )
         if not found:
             raise SkillError(found.failure, f"{found.why}{why}")
@@ -273,6 +339,7 @@ class _Run:
             gone = self.world.time - self.begin
             self.belief.reset()
             session.restart(self.world.state.updated({s: wanted[s] for s in search.standing}))
+            self.pulling.rebase(gone + self.begin)
             self.begin = -gone
             motion.until = self.seconds - gone
             self.judge.reset()
