@@ -33,6 +33,8 @@ _SLIPPED = 0.012
 """Distance of the handle from its place in the hand from which on it has slipped [m]."""
 _LED = 0.06
 """Way of the handle before which the hand does not rely on a joint that was learned [m]."""
+_ENDING = 0.5
+"""Time without progress where the arm is expected to end [s]."""
 _AHEAD, _AHEAD_STEPS = 0.03, 4
 """Way of the handle that an arm must be able to go on [m], and its number of poses."""
 
@@ -156,7 +158,10 @@ class PartPulling:
         self.motion.stand(LOOKING)
 
     def _pull_once(self) -> tuple[str, str]:
-        """Pull until the part is open; return why it is not, empty if it is, and the kind of the arm's end."""
+        """Pull until the part is open.
+
+        Return why it is not, empty if it is, and the kind of failure if the part could go on.
+        """
         session, belief, motion, learning = self.session, self.belief, self.motion, self.learning
         session.phase = "pull"
         belief.hold()
@@ -202,7 +207,7 @@ class PartPulling:
             if way > best + _STALLED:
                 best, since = way, now
                 self._reached = now
-            elif now - since > _PATIENCE:
+            elif now - since > (_ENDING if isinstance(pull, LearnedPull) and pull.ends else _PATIENCE):
                 return self._explain_stall(pull, command, part_T_hand)
 
     def _explain_stall(

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 from typing import Any
 
 import numpy as np
@@ -21,6 +22,7 @@ from kineverse.model.model import Model
 from kineverse.planning import Planner
 from kineverse.worlds import Judge, Sensors
 
+from .hinge_hypotheses import guess_hinges, least_share
 from .joint_learning import JointLearning, LearnedJoint
 from .joint_revision import revise_joint, watch_joint
 from .part import JointPath, UnknownPart, find_joint, free_part
@@ -35,6 +37,8 @@ _MOST_LOOKING = 3.0
 _REACH = 0.25
 """Straight way of the handle that a placement should allow [m]."""
 _GRASPS, _PLANNING = 128, 2.0
+_SEARCHES, _ENOUGH = 3, 0.99
+"""Number of searches of a first place, and share of possible motions from which on it is taken."""
 _MOST_PLACES = 3
 """Largest number of places of the robot, or of its hand."""
 _FURTHER = 1.1
@@ -221,7 +225,7 @@ class _Run:
         try:
             for _ in range(_MOST_PLACES):
                 try:
-                    placement = self._place(_REACH if failure is None else self._prepare_further())
+                    placement = self._place_first() if failure is None else self._place_further()
                 except SkillError as error:
                     raise SkillError(failure.kind, f"{failure} {error}") if failure else error from error
                 try:
@@ -245,8 +249,35 @@ class _Run:
         )
         self.unknown = unknown
 
-    def _prepare_further(self) -> float:
-        """Prepare motions along the learned joint, and return the way of the handle that is left [m]."""
+    def _place_first(self) -> BasePlacement:
+        """Return a placement for a straight pull, from which the arm follows possible hinges, too."""
+        session, unknown = self.session, self.unknown
+        with session.timed("place"):
+            twists = guess_hinges(unknown, self.search, session.state)
+        found: list[tuple[float, BasePlacement]] = []
+
+        def accept(placement: BasePlacement) -> bool:
+            share = least_share(
+                unknown, self.search, placement, session.state, twists, _REACH, self.wanted[1]
+            )
+            found.append((share, placement))
+            return share > _ENOUGH and self._plan(placement)
+
+        why = ""
+        for k in range(_SEARCHES if twists else 1):
+            result = self._search(_REACH, accept, self.seed + k)
+            if result:
+                return result
+            why = why or result.why
+            if not found:
+                raise SkillError(result.failure, why)
+        for _, placement in sorted(found, key=lambda pair: -pair[0]):
+            if self._plan(placement):
+                return placement
+        raise SkillError("collision", f"{why}{self._barrier}")
+
+    def _place_further(self) -> BasePlacement:
+        """Return a placement along the learned joint."""
         learned = self.learning.learned
         assert learned is not None
         path = JointPath.of_fit(learned.fit, self.pulling.start)
@@ -254,7 +285,11 @@ class _Run:
         self._prepare(self.unknown.pulled_along(path.twist()))
         kind = learned.fit.motion.kinds[0]
         scale = point_speed(path.twist(), self.unknown.point)
-        return _FURTHER * scale * (self.wanted[kind] - self.pulling.opening[kind])
+        rest = self.wanted[kind] - self.pulling.opening[kind]
+        found = self._search(_FURTHER * scale * rest, self._plan, self.seed)
+        if not found:
+            raise SkillError(found.failure, f"{found.why}{self._barrier}")
+        return found
 
     def _pull(self, placement: BasePlacement) -> str:
         """Take the handle, pull, let go, and return how far the part is open."""
@@ -298,38 +333,28 @@ class _Run:
                 )
             self.motion.stand(self.session.dt)
 
-    def _place(self, way: float) -> BasePlacement:
-        """Return a placement from which the handle can be pulled by a way [m], or as far as possible."""
-        session, why = self.session, ""
+    def _search(self, way: float, accept: Callable[[BasePlacement], bool], seed: int) -> BasePlacement:
+        """Search a placement from which the handle can be pulled by a way [m], or as far as possible."""
+        session, self._barrier = self.session, ""
         session.phase = "place"
-
-        def plan(placement: BasePlacement) -> bool:
-            nonlocal why
-            state, planner = session.state, self.planner
-            wanted = dict(zip(placement.coordinates, placement.approach.tolist(), strict=True))
-            planner.place(state.updated({s: wanted[s] for s in self.search.standing}))
-            end = np.array([wanted[s] for s in planner.symbols])
-            path = planner.plan(state.vector(planner.symbols), end, seconds=_PLANNING, seed=self.seed)
-            if path.found:
-                self.trajectory = path.trajectory()
-            why = "" if path.found else f" There is no way to the handle: {path.why}"
-            return bool(path.found)
-
         with session.timed("place"):
-            grasps = sample_grasps(
-                self.unknown.model,
-                self.gripper,
-                self.unknown.handle,
-                _GRASPS,
-                self.seed,
-                state=session.state,
+            model, handle = self.unknown.model, self.unknown.handle
+            grasps = sample_grasps(model, self.gripper, handle, _GRASPS, seed, state=session.state)
+            return self.search.find(
+                session.state, grasps, way, accept=accept, samples=self.samples, seed=seed
             )
-            found = self.search.find(
-                session.state, grasps, way, accept=plan, samples=self.samples, seed=self.seed
-            )
-        if not found:
-            raise SkillError(found.failure, f"{found.why}{why}")
-        return found
+
+    def _plan(self, placement: BasePlacement) -> bool:
+        """Plan the way to the pose before the handle, and return whether there is one."""
+        session, planner = self.session, self.planner
+        wanted = dict(zip(placement.coordinates, placement.approach.tolist(), strict=True))
+        planner.place(session.state.updated({s: wanted[s] for s in self.search.standing}))
+        end = np.array([wanted[s] for s in planner.symbols])
+        path = planner.plan(session.state.vector(planner.symbols), end, seconds=_PLANNING, seed=self.seed)
+        self._barrier = "" if path.found else f" There is no way to the handle: {path.why}"
+        if path.found:
+            self.trajectory = path.trajectory()
+        return bool(path.found)
 
     def _approach(self, placement: BasePlacement) -> None:
         """Put a base that only stands to its place, and bring the hand to the handle."""
