@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Self
 
 import numpy as np
@@ -19,13 +19,15 @@ from kineverse.model.articulation import Articulation
 from kineverse.model.body import Pose
 from kineverse.model.model import Model
 from kineverse.model.model_view import ModelView
-from kineverse.spatial import translation
+from kineverse.spatial import axis_angle, translation
 from kineverse.state import State
 from kineverse.symbols import Symbol, position
 
 _ROTATION_ARM = np.array([1.0, 1.0, 1.0, 0.3, 0.3, 0.3])
 """Lengths that make rotations comparable to distances [m]."""
 _STEPS, _DIFFERENCE = 3, 1e-5
+_STRAIGHT = 1e-3
+"""Turn by way of the handle from which on a motion is a rotation [rad/m]."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -35,11 +37,12 @@ class UnknownPart:
     Attributes
     ----------
     model
-        Copy of a model in which the part floats, and is pulled along the outward normal of its handle.
+        Copy of a model in which the part floats, and is pulled: at first along the outward normal of its
+        handle.
     frame
         Frame of the part.
     handle
-        The handle; its coordinate is the one of the straight pull [m].
+        The handle; its coordinate is the way of its middle by the pull [m].
     parent
         Frame in which the part floats.
     origin
@@ -71,6 +74,23 @@ class UnknownPart:
         numbers = [*off[:3, 3], *to_quaternion(off[:3, :3])]
         return {**dict(zip(self.floating, map(float, numbers), strict=True)), self.handle.coordinate: 0.0}
 
+    def pulled_along(self, twist: Array) -> UnknownPart:
+        """Return the part in a copy of its model where the pull follows a twist (6,) in axes of the part."""
+        v, w = twist[:3], twist[3:]
+        v, w = np.array([v, w]) / np.linalg.norm(v + np.cross(w, self.point))
+        pull, turn = self.handle.coordinate, float(np.linalg.norm(w))
+        motion = translation(*(float(x) * pull for x in v))
+        if turn > _STRAIGHT:
+            pivot, rise = np.cross(w, v) / turn**2, v @ w / turn**2 * w
+            there, back = translation(*pivot.tolist()), translation(*(-pivot).tolist())
+            along = translation(*(float(x) * pull for x in rise))
+            motion = along @ there @ axis_angle(w / turn, turn * pull) @ back
+        copy = self.model.copy()
+        with copy.edit() as edit:
+            edit.remove(_pull_tag(self.frame))
+            edit.attach(self.frame, f"{self.frame}/seen", motion, _pull_tag(self.frame))
+        return replace(self, model=copy)
+
 
 def free_part(model: Model, frame: str, handle: str, state: State) -> UnknownPart:
     """Return a part as something that floats, in a copy of a model.
@@ -95,7 +115,7 @@ def free_part(model: Model, frame: str, handle: str, state: State) -> UnknownPar
     pose = model.fk(frame, parent)
     parent_T_frame = np.asarray(pose(State({s: state[s] for s in pose.symbols})))
     name, pull = f"{frame}/seen", position(f"{frame}/pull")
-    tag = f"pull {frame}"
+    tag = _pull_tag(frame)
     with copy.edit() as edit:
         floating = Floating(name=name, parent=parent, child=name, origin=Pose.from_matrix(parent_T_frame))
         edit.apply(floating)
@@ -107,6 +127,10 @@ def free_part(model: Model, frame: str, handle: str, state: State) -> UnknownPar
         edit.remove(tag)
         edit.attach(frame, name, translation(*(float(v) * pull for v in outward)), tag)
     return UnknownPart(copy, frame, found, parent, parent_T_frame, copy.articulations[name].coordinates)
+
+
+def _pull_tag(frame: str) -> str:
+    return f"pull {frame}"
 
 
 def forget_joint(model: Model, frame: str, state: State) -> Model:

@@ -160,12 +160,14 @@ class PartBelief:
         self.path: JointPath | None = None
         self._beside: str | None = None
         self._world_T_hand = np.eye(4)
+        self._earlier = self._stamp = 0.0
         self.reset()
 
     @property
     def is_seen(self) -> bool:
-        """Presence of the part: True if it was seen often enough to be believed."""
-        return self.still.count >= _FIRST
+        """Presence of the part, and of what it moves in: True if they were seen often enough."""
+        mean = self._references.get(self._beside or WORLD)
+        return self.still.count >= _FIRST and (mean is None or mean.count >= _FIRST)
 
     @property
     def beside(self) -> str:
@@ -231,8 +233,9 @@ class PartBelief:
         self.held, self.path, self.still = None, None, PoseMean(_STATIC_LOOKS)
 
     def reset(self) -> None:
-        """Forget all looks."""
-        self.held, self.path, self.looks, self._beside = None, None, [], None
+        """Forget all looks, as the time of the world begins anew."""
+        self.held, self.path, self.looks = None, None, []
+        self._earlier, self._stamp = self._earlier + self._stamp, 0.0
         self.observation: Observation | None = None
         self.still = PoseMean(_STATIC_LOOKS)
         self._references = {name: PoseMean(_STATIC_LOOKS) for name in self._ancestors}
@@ -240,6 +243,7 @@ class PartBelief:
     def update(self, world: World, commands: State | None = None) -> State:
         """Return the state of the model of the part after reading the sensors."""
         self.observation = seen = world.observe()
+        self._stamp = seen.stamp
         joints = {s: v for s, v in seen.joints.items() if s in self._symbols}
         self._state = self._state.updated(joints)
         self._world_T_hand = self._hand(self._state.vector(self._hand.inputs))
@@ -249,7 +253,7 @@ class PartBelief:
                 mean.add(seen.poses[name])
         if self.monitor is not None and seen.poses:
             known = {name: pose for name, pose in seen.poses.items() if name in self.monitor.frames}
-            self.monitor.update(known, at=seen.stamp)
+            self.monitor.update(known, at=self._earlier + seen.stamp)
         if any(name in seen.poses for name in self._marker_T_part):
             self._look(seen)
         if self.path is not None and self.held is not None and self.held.pose is not None:

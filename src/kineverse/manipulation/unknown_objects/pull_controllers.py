@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import math
+
 import numpy as np
 
 from kineverse.control import Controller, Goal, Hold, Target, same_pose
@@ -10,7 +12,7 @@ from kineverse.errors import InvalidValueError
 from kineverse.estimation import Fit
 from kineverse.geometry import Scene
 from kineverse.lie import Array, adjoint, exp_se3, inverse
-from kineverse.manipulation.opening.hand_motion import HandMotion
+from kineverse.manipulation.opening.hand_motion import HandMotion, row_at
 from kineverse.model.frame import WORLD
 from kineverse.model.model import Model
 from kineverse.model.model_view import ModelView
@@ -32,6 +34,8 @@ _STRAIGHT = 0.035
 """Way of the handle after which the likeliest joint counts as much as its normal for the direction [m]."""
 _RAMP = 0.5
 """Time in which the pull begins [s]."""
+_STEP = 0.03
+"""Way of the handle between two arms that are found for a learned joint [m]."""
 _MARGIN = 0.002
 """Least distance of bodies while the part moves [m]."""
 
@@ -132,10 +136,35 @@ class LearnedPull:
         speed = PATH_SPEED / point_speed(twist, motion.handle.pose[:3, 3])
         goal = Goal(self.coordinate, end, speed=speed, name="object")
         still: list[Symbol] = [*motion.search.standing, *motion.gripper.joints]
-        self._controller = _make_controller(motion, model, [hold, goal], still)
+        self._posture, self._speeds, goals = motion.posture()
+        self._controller = _make_controller(motion, model, [hold, goal, *goals], still)
+        self._lead = path.direction * speed / _GAIN
+        self._find_arms(path.start + path.direction * opened, unknown.frame_T_handle @ bar_T_hand)
+
+    def _find_arms(self, end: float, part_T_hand: Array) -> None:
+        """Find arms along the path to a value, as far as there are any.
+
+        Without them the arm drifts to its limits and slows down.
+        """
+        search, state = self.motion.search, self.motion.session.state
+        count = max(2, math.ceil(abs(end - self.path.value) / (abs(self._lead) * _GAIN / PATH_SPEED) / _STEP))
+        self._values = np.linspace(self.path.value, end, count)
+        hands = [self.belief.reference_pose @ self.path.pose(v) @ part_T_hand for v in self._values.tolist()]
+        arm, base = state.vector(search.moving), state.vector(search.standing)
+        ways, reached = search.paths.follow(arm[None], base[None], np.array(hands)[None])
+        self._arms = ways[0, : reached[0]] if reached[0] else arm[None]
+        self._controller.set(self._speeds, np.zeros(len(arm)))
+
+    @property
+    def ends(self) -> bool:
+        """Whether the arm is expected to end before the part is open."""
+        return len(self._arms) < len(self._values)
 
     def step(self, way: float) -> Command:
         """Return the command of a step, after a way of the handle [m]."""
+        ahead = (self.path.value + self._lead - self._values[0]) / (self._values[-1] - self._values[0])
+        share = ahead * (len(self._values) - 1) / max(1, len(self._arms) - 1)
+        self._controller.set(self._posture, row_at(self._arms, min(max(share, 0.0), 1.0)))
         return self._controller.step(self.motion.session.state | State({self.coordinate: self.path.value}))
 
 

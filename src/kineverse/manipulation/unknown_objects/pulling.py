@@ -5,19 +5,23 @@ from __future__ import annotations
 import math
 from typing import Any
 
+import numpy as np
+
+from kineverse.control import Command
 from kineverse.grasping import Grasp
-from kineverse.lie import inverse
+from kineverse.lie import Array, inverse
 from kineverse.manipulation.opening.hand_motion import HandMotion
 from kineverse.manipulation.outcome import SkillError
+from kineverse.manipulation.session import Session
 from kineverse.model.model import Model
 
 from .joint_learning import JointLearning
 from .part import JointPath
 from .part_belief import PartBelief, measure_way
-from .pull_controllers import LearnedPull, StraightPull, learn_model
+from .pull_controllers import LearnedPull, StraightPull, learn_model, point_speed
 
 LEAST_OPENING = 0.08, math.radians(10.0)
-"""Opening from which a part that goes no further counts as open [m], [rad]."""
+"""Opening from which a part at its own stop counts as open [m], [rad]."""
 LOOKING, _HELD_LOOKING = 0.6, 1.0
 """Times of looks at a part that stands, and with the hand closed [s]."""
 _MOST_GRASPS = 3
@@ -29,6 +33,14 @@ _SLIPPED = 0.012
 """Distance of the handle from its place in the hand from which on it has slipped [m]."""
 _LED = 0.06
 """Way of the handle before which the hand does not rely on a joint that was learned [m]."""
+_ENDING = 0.5
+"""Time without progress where the arm is expected to end [s]."""
+_AHEAD, _AHEAD_STEPS = 0.03, 4
+"""Way of the handle that an arm must be able to go on [m], and its number of poses."""
+
+
+class ArmEndError(SkillError):
+    """End of the arm's way, or something in it, before the part is open."""
 
 
 class PartPulling:
@@ -36,8 +48,8 @@ class PartPulling:
 
     Parameters
     ----------
-    motion
-        Motions of the hand.
+    session
+        Robot in a world.
     belief
         Belief about the part.
     learning
@@ -61,53 +73,68 @@ class PartPulling:
 
     def __init__(
         self,
-        motion: HandMotion,
+        session: Session,
         belief: PartBelief,
         learning: JointLearning,
         model: Model,
         wanted: tuple[float, float],
     ) -> None:
-        self.motion, self.belief, self.learning, self.model = motion, belief, learning, model
-        self.session, self.wanted, self.part = motion.session, wanted, belief.unknown.frame
+        self.session, self.belief, self.learning, self.model = session, belief, learning, model
+        self.wanted, self.part = wanted, belief.unknown.frame
         self.point, self.frame_T_handle = belief.unknown.point, belief.unknown.frame_T_handle
         self.start, self.begin = belief.relative_pose, self.session.world.time
         self._measures: dict[str, Any] = {"grasps": 0}
         self._reached = self.begin
+        self.motion: HandMotion
 
     @property
     def measures(self) -> dict[str, Any]:
         """Number of grasps, time since the first one, and that until the part moved no further [s]."""
         return {**self._measures, "pull_seconds": self.session.world.time - self.begin}
 
-    def perform(self, grasp: Grasp) -> str:
-        """Pull until the part is open or goes no further, and return how far that is, or raise SkillError.
+    def perform(self, motion: HandMotion, grasp: Grasp) -> str:
+        """Pull until the part is open or at its own stop, and return how far that is.
 
         A handle that slips is grasped anew.
 
         Parameters
         ----------
+        motion
+            Motions of the hand.
         grasp
             Where the open hand is on the handle.
+
+        Raises
+        ------
+        ArmEndError
+            If the arm cannot go on with a part whose joint is known; the hand is open then.
+        SkillError
+            If the part does not follow, or stops before it is open.
         """
-        way = -math.inf
+        self.motion = motion
+        way = self.opening[0] if self.learning.poses else -math.inf
         for _ in range(_MOST_GRASPS):
             self._measures["grasps"] += 1
+            barrier = ""
             if not self.motion.close(grasp):
                 why = "The fingers closed beside the handle."
             else:
                 if not self.learning.poses:
                     self.begin = self.session.world.time
-                why = self._pull_once()
+                why, barrier = self._pull_once()
             if not why:
                 return self._describe_opening("is open")
             self._let_go()
-            last, way = way, self._opening()[0]
+            last, way = way, self.opening[0]
+            if barrier and way >= _FOLLOWS:
+                kind = ArmEndError if self.learning.learned is not None else SkillError
+                raise kind(barrier, f"{self._describe_opening('was pulled')} {why}")
             if way - last < _FOLLOWS:
                 break
             self._measures["opened_seconds"] = self._reached - self.begin
             pose = inverse(self.belief.pose @ self.frame_T_handle) @ self.belief.hand_pose
             self.motion.follow_line(pose, grasp.pose)
-        opened, _ = self._opening()
+        opened, _ = self.opening
         if opened < _FOLLOWS:
             raise SkillError(
                 "other",
@@ -115,9 +142,13 @@ class PartPulling:
                 "be fixed, locked, or need more force than the grip holds.",
             )
         words = f"{self._describe_opening('goes no further')} {why}"
-        if self._is_far_enough():
-            return words
+        if opened >= LEAST_OPENING[0] or self.opening[1] >= LEAST_OPENING[1]:
+            return f"{words} The arm could go on, so this is its stop."
         raise SkillError("other", words)
+
+    def rebase(self, gone: float) -> None:
+        """Count times from a reset of the world on, which was at a time [s]."""
+        self.begin, self._reached = self.begin - gone, self._reached - gone
 
     def _let_go(self) -> None:
         """Open the fingers, and look where the part is."""
@@ -126,8 +157,11 @@ class PartPulling:
         self.motion.move_fingers(self.motion.gripper.opened)
         self.motion.stand(LOOKING)
 
-    def _pull_once(self) -> str:
-        """Pull until the part is open, and return why it is not, empty if it is."""
+    def _pull_once(self) -> tuple[str, str]:
+        """Pull until the part is open.
+
+        Return why it is not, empty if it is, and the kind of failure if the part could go on.
+        """
         session, belief, motion, learning = self.session, self.belief, self.motion, self.learning
         session.phase = "pull"
         belief.hold()
@@ -139,13 +173,13 @@ class PartPulling:
         belief.begin_motion()
         pull: StraightPull | LearnedPull = StraightPull(motion, belief, bar_T_hand)
         fitted, known = -math.inf, learning.learned is not None
-        best, since = self._opening()[0], self.session.world.time
+        best, since = self.opening[0], self.session.world.time
         while True:
             motion.check_time()
             for look in belief.looks:
                 learning.add(look.pose, look.covariance)
             belief.looks.clear()
-            way, turn = self._opening()
+            way, turn = self.opening
             now = self.session.world.time
             with session.timed("learn"):
                 if learning.update(way, turn, now - self.begin):
@@ -161,27 +195,46 @@ class PartPulling:
             with session.timed("open"):
                 command = pull.step(way)
             motion.act(command.speeds)
-            way, turn = self._opening()
+            way, turn = self.opening
             if self._is_open(way, turn):
                 self._measures["opened_seconds"] = now - self.begin
-                return ""
+                return "", ""
             if belief.slip(part_T_hand, self.point) > _SLIPPED:
                 session.stop()
-                return "The handle slipped in the hand."
+                ends = isinstance(pull, LearnedPull) and not self._can_go_on(pull, part_T_hand)
+                why = "The handle slipped in the hand"
+                return (f"{why} where the arm ends.", "reach") if ends else (f"{why}.", "")
             if way > best + _STALLED:
                 best, since = way, now
                 self._reached = now
-            elif now - since > _PATIENCE:
-                return f"In the way: {', '.join(command.active[:3]) or 'nothing that the controller knows'}."
+            elif now - since > (_ENDING if isinstance(pull, LearnedPull) and pull.ends else _PATIENCE):
+                return self._explain_stall(pull, command, part_T_hand)
 
-    def _opening(self) -> tuple[float, float]:
-        """Return the believed way of the handle [m] and angle of the part [rad] since the first grasp."""
+    def _explain_stall(
+        self, pull: StraightPull | LearnedPull, command: Command, part_T_hand: Array
+    ) -> tuple[str, str]:
+        """Return what is in the way, and its kind if that is not the part itself."""
+        words = f"In the way: {', '.join(command.active[:3]) or 'nothing that the controller knows'}."
+        if any(name.startswith("contact of") for name in command.active[:3]):
+            return words, "collision"
+        if isinstance(pull, LearnedPull) and not self._can_go_on(pull, part_T_hand):
+            return f"The arm ends there. {words}", "reach"
+        return words, ""
+
+    def _can_go_on(self, pull: LearnedPull, part_T_hand: Array) -> bool:
+        """Return whether the arm reaches the next poses of the handle along a learned joint."""
+        path, search, state = pull.path, self.motion.search, self.session.state
+        step = path.direction * _AHEAD / point_speed(path.twist(), self.point) / _AHEAD_STEPS
+        values = path.value + step * np.arange(_AHEAD_STEPS + 1)
+        hands = [self.belief.reference_pose @ path.pose(v) @ part_T_hand for v in values.tolist()]
+        arm, base = state.vector(search.moving)[None], state.vector(search.standing)[None]
+        _, reached = search.paths.follow(arm, base, np.array(hands)[None])
+        return int(reached[0]) == len(hands)
+
+    @property
+    def opening(self) -> tuple[float, float]:
+        """Believed way of the handle [m] and angle of the part [rad] since the first grasp."""
         return measure_way(self.start, self.belief.relative_pose, self.point)
-
-    def _is_far_enough(self) -> bool:
-        """Return whether a part that goes no further counts as open."""
-        way, turn = self._opening()
-        return way >= LEAST_OPENING[0] or turn >= LEAST_OPENING[1]
 
     def _is_open(self, way: float, turn: float) -> bool:
         learned = self.learning.learned
@@ -190,5 +243,5 @@ class PartPulling:
         return way >= self.wanted[0] or turn >= self.wanted[1]
 
     def _describe_opening(self, verb: str) -> str:
-        way, turn = self._opening()
+        way, turn = self.opening
         return f"'{self.part}' {verb}, by {100 * way:.0f} cm and {math.degrees(turn):.0f}°."

@@ -3,14 +3,15 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 from typing import Any
 
 import numpy as np
 
 from kineverse.compile import compile  # noqa: A004
 from kineverse.errors import InfeasibleError, InvalidValueError, NotFiniteError, UnknownNameError, suggest
-from kineverse.grasping import find_gripper, sample_grasps
-from kineverse.lie import Array
+from kineverse.grasping import Grasp, find_gripper, sample_grasps
+from kineverse.lie import Array, inverse
 from kineverse.manipulation.opening import BasePlacement, PlacementSearch
 from kineverse.manipulation.opening.hand_motion import HandMotion
 from kineverse.manipulation.outcome import Outcome, SkillError
@@ -21,11 +22,13 @@ from kineverse.model.model import Model
 from kineverse.planning import Planner
 from kineverse.worlds import Judge, Sensors
 
+from .hinge_hypotheses import guess_hinges, least_share
 from .joint_learning import JointLearning, LearnedJoint
 from .joint_revision import revise_joint, watch_joint
-from .part import find_joint, free_part
+from .part import JointPath, UnknownPart, find_joint, free_part
 from .part_belief import PartBelief, measure_way
-from .pulling import LEAST_OPENING, LOOKING, PartPulling
+from .pull_controllers import point_speed
+from .pulling import LEAST_OPENING, LOOKING, ArmEndError, PartPulling
 
 OPEN_WAY, OPEN_TURN = 0.25, math.radians(60.0)
 """Opening that is wanted by default [m], [rad]."""
@@ -34,6 +37,14 @@ _MOST_LOOKING = 3.0
 _REACH = 0.25
 """Straight way of the handle that a placement should allow [m]."""
 _GRASPS, _PLANNING = 128, 2.0
+_SEARCHES, _ENOUGH = 3, 0.99
+"""Number of searches of a first place, and share of possible motions from which on it is taken."""
+_MOST_PLACES = 3
+"""Largest number of places of the robot, or of its hand."""
+_FURTHER = 1.1
+"""Share of the rest of an opening that a further placement should lead along the learned joint."""
+_CLOSED_WAY, _CLOSED_TURN = 0.03, math.radians(6.0)
+"""Motion back [m], [rad] after which a part that was open is not."""
 
 
 def open_unknown(
@@ -181,6 +192,9 @@ class _Run:
         self.measures |= {"way": way, "turn": turn}
         learned = self.learning.learned
         turns = bool(learned.fit.motion.kinds[0]) if learned is not None else turn > 0.5 * LEAST_OPENING[1]
+        if not kind and (way < self.claimed[0] - _CLOSED_WAY or turn < self.claimed[1] - _CLOSED_TURN):
+            kind = "other"
+            reason += f" It is not open in truth: by {100 * way:.0f} cm and {math.degrees(turn):.0f}°."
         if learned is not None:
             reason = f"{reason} {self._report_joint(learned)}"
         if kind:
@@ -202,29 +216,109 @@ class _Run:
         robot = self.world.robot
         self.judge = Judge(self.world.model, robot, self.gripper, handle=unknown.handle.frame)
         self.judge.update(self.world.state)
-        with session.timed("place"):
-            self.search = PlacementSearch(unknown.model, self.gripper, session.state)
-            self.planner = Planner(unknown.model, self.search.moving, rules=self.search.scene.rules)
-        self.motion = HandMotion(
-            session, self.gripper, unknown.handle, self.search, self.planner, self.judge,
-            self.begin + self.seconds,
-        )  # fmt: skip
+        self._prepare(unknown)
         self._look()
         if self.belief.monitor is None:
             self.belief.monitor = watch_joint(self.model, self.belief)
-        placement = self._place()
-        grasp = placement.grasp
+        self.pulling = PartPulling(session, self.belief, self.learning, self.model, self.wanted)
+        failure: SkillError | None = None
+        try:
+            for _ in range(_MOST_PLACES):
+                try:
+                    placement = self._place_first() if failure is None else self._place_further()
+                except SkillError as error:
+                    raise SkillError(failure.kind, f"{failure} {error}") if failure else error from error
+                try:
+                    return self._pull(placement)
+                except ArmEndError as error:
+                    failure = error
+            assert failure is not None
+            raise failure
+        finally:
+            self.measures |= self.pulling.measures
+
+    def _prepare(self, unknown: UnknownPart) -> None:
+        """Prepare motions of the hand at a part."""
+        session = self.session
+        with session.timed("place"):
+            self.search = PlacementSearch(unknown.model, self.gripper, session.state)
+            self.planner = Planner(unknown.model, self.search.moving, rules=self.search.scene.rules)
+        until = self.begin + self.seconds
+        self.motion = HandMotion(
+            session, self.gripper, unknown.handle, self.search, self.planner, self.judge, until
+        )
+        self.unknown = unknown
+
+    def _place_first(self) -> BasePlacement:
+        """Return a placement for a straight pull, from which the arm follows possible hinges, too."""
+        session, unknown = self.session, self.unknown
+        with session.timed("place"):
+            twists = guess_hinges(unknown, self.search, session.state)
+        found: list[tuple[float, BasePlacement]] = []
+
+        def accept(placement: BasePlacement) -> bool:
+            share = least_share(
+                unknown, self.search, placement, session.state, twists, _REACH, self.wanted[1]
+            )
+            found.append((share, placement))
+            return share > _ENOUGH and self._plan(placement)
+
+        why = ""
+        for k in range(_SEARCHES if twists else 1):
+            result = self._search(_REACH, accept, self.seed + k)
+            if result:
+                return result
+            why = why or result.why
+            if not found:
+                raise SkillError(result.failure, why)
+        for _, placement in sorted(found, key=lambda pair: -pair[0]):
+            if self._plan(placement):
+                return placement
+        raise SkillError("collision", f"{why}{self._barrier}")
+
+    def _place_further(self) -> BasePlacement:
+        """Return a placement along the learned joint."""
+        learned = self.learning.learned
+        assert learned is not None
+        path = JointPath.of_fit(learned.fit, self.pulling.start)
+        path.project(self.belief.relative_pose)
+        self._prepare(self.unknown.pulled_along(path.twist()))
+        kind = learned.fit.motion.kinds[0]
+        scale = point_speed(path.twist(), self.unknown.point)
+        rest = self.wanted[kind] - self.pulling.opening[kind]
+        found = self._search(_FURTHER * scale * rest, self._plan, self.seed)
+        if not found:
+            raise SkillError(found.failure, f"{found.why}{self._barrier}")
+        return found
+
+    def _pull(self, placement: BasePlacement) -> str:
+        """Take the handle, pull, let go, and return how far the part is open."""
+        grasp, motion = placement.grasp, self.motion
         assert grasp is not None
         self._approach(placement)
-        pulling = PartPulling(self.motion, self.belief, self.learning, self.model, self.wanted)
         try:
-            return pulling.perform(grasp)
+            reason = self.pulling.perform(motion, grasp)
+            self.claimed = self.pulling.opening
         finally:
-            self.measures |= pulling.measures
             self.belief.release()
-            if self.world.time <= self.motion.until:
-                # The retreat rows are those of a straight pull, whose coordinate stays 0 in the belief.
-                self.motion.release(placement)
+            if self.world.time <= motion.until:
+                self._retract(grasp)
+        return reason
+
+    def _retract(self, grasp: Grasp) -> None:
+        """Open the fingers, take the hand straight back, and look at the part.
+
+        Where the part is after an unknown motion, the retreat of the placement has not been checked.
+        """
+        motion, belief = self.motion, self.belief
+        self.session.phase = "release"
+        motion.move_fingers(self.gripper.opened)
+        self.session.phase = "retract"
+        pose = inverse(belief.pose @ self.unknown.frame_T_handle) @ belief.hand_pose
+        away = pose.copy()
+        away[:3, 3] += grasp.approach[:3, 3] - grasp.pose[:3, 3]
+        motion.follow_line(pose, away)
+        motion.stand(LOOKING)
 
     def _look(self) -> None:
         """Look at the part while the robot stands."""
@@ -239,31 +333,28 @@ class _Run:
                 )
             self.motion.stand(self.session.dt)
 
-    def _place(self) -> BasePlacement:
-        """Return a placement from which the handle can be pulled straight, as far as possible."""
-        session, why = self.session, ""
+    def _search(self, way: float, accept: Callable[[BasePlacement], bool], seed: int) -> BasePlacement:
+        """Search a placement from which the handle can be pulled by a way [m], or as far as possible."""
+        session, self._barrier = self.session, ""
         session.phase = "place"
-
-        def plan(placement: BasePlacement) -> bool:
-            nonlocal why
-            state, planner = session.state, self.planner
-            wanted = dict(zip(placement.coordinates, placement.approach.tolist(), strict=True))
-            planner.place(state.updated({s: wanted[s] for s in self.search.standing}))
-            end = np.array([wanted[s] for s in planner.symbols])
-            path = planner.plan(state.vector(planner.symbols), end, seconds=_PLANNING, seed=self.seed)
-            if path.found:
-                self.trajectory = path.trajectory()
-            why = "" if path.found else f" There is no way to the handle: {path.why}"
-            return bool(path.found)
-
         with session.timed("place"):
-            grasps = sample_grasps(self.unknown.model, self.gripper, self.unknown.handle, _GRASPS, self.seed)
-            found = self.search.find(
-                session.state, grasps, _REACH, accept=plan, samples=self.samples, seed=self.seed
+            model, handle = self.unknown.model, self.unknown.handle
+            grasps = sample_grasps(model, self.gripper, handle, _GRASPS, seed, state=session.state)
+            return self.search.find(
+                session.state, grasps, way, accept=accept, samples=self.samples, seed=seed
             )
-        if not found:
-            raise SkillError(found.failure, f"{found.why}{why}")
-        return found
+
+    def _plan(self, placement: BasePlacement) -> bool:
+        """Plan the way to the pose before the handle, and return whether there is one."""
+        session, planner = self.session, self.planner
+        wanted = dict(zip(placement.coordinates, placement.approach.tolist(), strict=True))
+        planner.place(session.state.updated({s: wanted[s] for s in self.search.standing}))
+        end = np.array([wanted[s] for s in planner.symbols])
+        path = planner.plan(session.state.vector(planner.symbols), end, seconds=_PLANNING, seed=self.seed)
+        self._barrier = "" if path.found else f" There is no way to the handle: {path.why}"
+        if path.found:
+            self.trajectory = path.trajectory()
+        return bool(path.found)
 
     def _approach(self, placement: BasePlacement) -> None:
         """Put a base that only stands to its place, and bring the hand to the handle."""
@@ -273,6 +364,7 @@ class _Run:
             gone = self.world.time - self.begin
             self.belief.reset()
             session.restart(self.world.state.updated({s: wanted[s] for s in search.standing}))
+            self.pulling.rebase(gone + self.begin)
             self.begin = -gone
             motion.until = self.seconds - gone
             self.judge.reset()
