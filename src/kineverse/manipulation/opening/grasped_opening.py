@@ -222,6 +222,7 @@ class _Run:
             last[name] = max((m[name] for m in found if not math.isnan(m[name])), default=math.nan)
         for name in _SUMS:
             last[name] = sum(m[name] for m in found)
+        last["excepted"] = tuple(dict.fromkeys(pair for m in found for pair in m["excepted"]))
         return last
 
     @property
