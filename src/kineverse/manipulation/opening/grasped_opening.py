@@ -278,7 +278,7 @@ class _Run:
     def _push(self, failure: SkillError) -> None:
         """Push the object on where no grasp leads, or raise SkillError with both reasons."""
         fallback = PushFallback(self.motion, self.target, self.tolerance)
-        self.pushed_from = float(self.session.state[self.handle.coordinate])
+        value = float(self.session.state[self.handle.coordinate])
         try:
             start = fallback.find_start(self.seed)
             self._put_base(start)
@@ -286,6 +286,8 @@ class _Run:
         except SkillError as error:
             kind = error.kind if error.kind == "time" else failure.kind
             raise SkillError(kind, f"{failure} {error}") from error
+        finally:
+            self.pushed_from = value if fallback.begun else None
 
     def _put_base(self, wanted: Mapping[Symbol, float]) -> None:
         """Put a base that only stands to its place, by a reset of the world."""
