@@ -300,6 +300,8 @@ def test_symbolic_links_do_not_lead_out_of_a_package(put, tmp_path):
         ("robot.srdf", "Load the URDF"),
         ("model.config", "Load the .sdf that it names"),
         ("notes.txt", "this version reads URDF"),
+        ("run.sh", "not '.sh'. Recordings of runs (.mcap) are for kineverse view"),
+        ("run.mcap", "Play it with kineverse view"),
     ],
 )
 def test_error_for_other_files_suggests_a_remedy(put, name, expected):

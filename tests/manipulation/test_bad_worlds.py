@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import re
 import sys
 import threading
@@ -10,7 +11,7 @@ from pathlib import Path
 import pytest
 
 import kineverse as kv
-from kineverse.errors import KineverseError
+from kineverse.errors import InvalidValueError, KineverseError, UnknownNameError
 from kineverse.manipulation import Session, SkillError, TrueBelief, open_object, push
 from kineverse.worlds import KinematicWorld
 
@@ -149,7 +150,7 @@ def change(edit, what):
     [
         ("no gripper", "'robot' has no gripper"),
         ("no handle", "'room/drawer' moves no handle"),
-        ("out of reach", "bases goes through; failed: .* out of reach"),
+        ("out of reach", "arms of a robot .* goes through; failed: .* out of reach"),
     ],
 )
 def test_open_without_what_it_needs_says_what_is_missing_and_moves_nothing(what, says):
@@ -162,8 +163,44 @@ def test_open_without_what_it_needs_says_what_is_missing_and_moves_nothing(what,
     try:
         outcome = open_object(Session(world), DRAWER, target=0.3, placements=50)
         assert not outcome
+        assert not outcome.measures["pushed"]
         reason = outcome.reason
     except KineverseError as error:
         reason = str(error)
     assert re.search(says, reason), reason
     assert dict(world.state) == dict(begin)
+
+
+def test_beliefs_know_the_deviation_of_their_own_coordinates_only():
+    model = pusher()
+    world = KinematicWorld(model, "robot")
+    world.reset(before_drawer(model))
+    session = Session(world)
+    assert session.deviation(DRAWER) == session.belief.deviation(model.symbol(DRAWER)) == 0.0
+    for what in (kv.position("room/drawers"), 2.0 * kv.position("room/drawers")):
+        with pytest.raises(UnknownNameError, match=f"'room/drawers'. Did you mean '{DRAWER}'"):
+            session.deviation(what)
+
+
+@pytest.mark.parametrize(
+    ("speeds", "error", "says"),
+    [
+        ({"robot/x:velocty": 0.1}, UnknownNameError, "'robot/x:velocity'"),
+        ({kv.position("robot/w").derivative(): 0.1}, UnknownNameError, "'robot/x:velocity'"),
+        ({"robot/x": 0.1}, UnknownNameError, "Did you mean 'robot/x:velocity'"),
+        ({"robot/x:velocity": math.nan}, InvalidValueError, "'robot/x:velocity' is nan; .* stops the robot"),
+        ({"room/drawer:velocity": math.nan}, InvalidValueError, "'room/drawer:velocity' is nan"),
+        ({"robot/x:velocity": "fast"}, InvalidValueError, "'robot/x:velocity' is 'fast'"),
+        (None, InvalidValueError, "from symbols or names to numbers"),
+    ],
+)
+def test_speeds_that_cannot_be_commanded_are_named(speeds, error, says):
+    model = pusher()
+    world = KinematicWorld(model, "robot")
+    world.reset(before_drawer(model))
+    session = Session(world)
+    with pytest.raises(error, match=says):
+        session.act(speeds)
+    assert world.time == 0.0
+    session.act({"robot/x:velocity": 0.1})
+    assert session.state["robot/x"] > before_drawer(model)["robot/x"]

@@ -8,6 +8,8 @@ import numpy as np
 import pytest
 from pusher import BALL, gripper, pusher
 
+import kineverse as kv
+from cupboards import box
 from kineverse.errors import InvalidValueError, UnknownNameError
 from kineverse.grasping import Gripper
 from kineverse.model.model import Model
@@ -34,7 +36,9 @@ def judge(model: Model, hand: Gripper) -> Judge:
 
 def run(judge: Judge, rows: list[dict[str, float]], speeds=None, **given) -> dict:
     """Return the measures of states, one each 20 ms, with commanded speeds by state from the second on."""
-    home = judge.model.default_state().updated({"robot/finger": 0.05})
+    home = judge.model.default_state()
+    if "robot/finger" in home:
+        home = home.updated({"robot/finger": 0.05})
     judge.reset()
     for k, row in enumerate(rows):
         commanded = None if speeds is None or k == 0 else speeds[k - 1]
@@ -133,3 +137,32 @@ def test_bad_input_is_refused(judge, model):
         Judge(model, "robot", handle="room/door_handel")
     with pytest.raises(UnknownNameError, match="robot"):
         Judge(model, "robto")
+
+
+def test_what_overlaps_at_the_begin_is_listed_and_not_counted():
+    """A drawer is shut inside of a solid box, and a link folds into its neighbour at the begin of a run."""
+    model = kv.Model()
+    slide, drawer, fold = (kv.position(name) for name in ("robot/x", "room/drawer", "robot/fold"))
+    with model.edit() as edit:
+        edit.add_frame("room/case", "world", kv.translation(0, 0, 0), body=box(0.4, 0.4, 0.4))
+        edit.add_frame("room/front", "world", kv.translation(drawer, 0, 0), body=box(0.2, 0.2, 0.2))
+        edit.add_frame("robot/link", "world", kv.translation(slide + 3, 0, 0), body=box(0.2, 0.2, 0.2))
+        edit.add_frame(
+            "robot/tip", "world", kv.translation(slide + 3.05 + fold, 0, 0), body=box(0.2, 0.2, 0.2)
+        )
+        for s, lower, upper in ((slide, -5, 0), (drawer, 0, 0.9), (fold, 0, 0.9)):
+            edit.constrain(f"{s}/range", lower, s, upper)
+    judge = Judge(model, "robot")
+    inside = [{"room/drawer": 0.5, "robot/fold": 0.0}, {"room/drawer": 0.0, "robot/fold": 0.1}]
+    found = run(judge, inside)
+    assert {frozenset(pair) for pair in found["excepted"]} == {
+        frozenset({"room/case", "room/front"}),
+        frozenset({"robot/link", "robot/tip"}),
+    }
+    assert found["penetration"] == 0.0
+    # A link that folds into its neighbour on the way counts, as does the robot in furniture from the begin.
+    folds = run(judge, [{"robot/fold": 0.5}, {"robot/fold": 0.1}])
+    assert folds["excepted"] == (("room/case", "room/front"),)
+    assert folds["penetrating"] == ("robot/link", "robot/tip")
+    assert folds["penetration"] == pytest.approx(0.05, abs=1e-6)
+    assert run(judge, [{"robot/x": -3.0, "robot/fold": 0.5}])["penetration"] == pytest.approx(0.3, abs=1e-6)

@@ -50,6 +50,10 @@ _ADVICE = {
     ),
     ".erb": "is a template. Expand it first: erb model.sdf.erb > model.sdf",
     ".config": "is the manifest of a model. Load the .sdf that it names.",
+    ".mcap": (
+        "is a recording, not a model. Play it with kineverse view, or read it with "
+        "kineverse.worlds.read_run_recording(path)."
+    ),
     ".launch": "is a launch file. Load the description that it starts.",
 }
 
@@ -66,7 +70,10 @@ def unsupported_format_error(path: Path) -> FormatError:
     advice = _ADVICE.get(path.suffix.lower())
     if advice is not None:
         return FormatError(f"{path}: {advice}")
-    return FormatError(f"{path}: this version reads {READ}, not '{''.join(path.suffixes) or path.name}'.")
+    return FormatError(
+        f"{path}: this version reads {READ}, not '{''.join(path.suffixes) or path.name}'. "
+        "Recordings of runs (.mcap) are for kineverse view."
+    )
 
 
 MOST_REMEMBERED = 16

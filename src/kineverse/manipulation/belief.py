@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+from collections.abc import Collection
 from typing import Protocol
 
+from kineverse.errors import UnknownNameError, suggest
 from kineverse.state import State
 from kineverse.symbols import Symbol
 from kineverse.worlds import Observation, World
@@ -34,7 +36,13 @@ class Belief(Protocol):
         """
 
     def deviation(self, coordinate: Symbol) -> float:
-        """Return the standard deviation of a coordinate [m], [rad]; 0 if it is known exactly."""
+        """Return the standard deviation of a coordinate [m], [rad]; 0 if it is known exactly.
+
+        Raises
+        ------
+        UnknownNameError
+            For a coordinate that the state does not have.
+        """
 
 
 class TrueBelief:
@@ -42,13 +50,39 @@ class TrueBelief:
 
     observation = None
 
+    def __init__(self) -> None:
+        self._state: State = State({})
+
     def update(self, world: World, commands: State | None = None) -> State:
         """Return the true state."""
-        return world.state
+        self._state = world.state
+        return self._state
 
     def deviation(self, coordinate: Symbol) -> float:
-        """Return 0."""
+        """Return 0.
+
+        Raises
+        ------
+        UnknownNameError
+            For a coordinate that the state of the last update does not have.
+        """
+        check_believed(self._state, coordinate)
         return 0.0
+
+
+def check_believed(state: Collection[Symbol], coordinate: Symbol) -> None:
+    """Check that the coordinates of a state have one.
+
+    Raises
+    ------
+    UnknownNameError
+        If not, with similar ones.
+    """
+    if coordinate not in state:
+        raise UnknownNameError(
+            f"The belief says nothing about '{coordinate}'. "
+            f"{suggest(str(coordinate), map(str, state), 'coordinate')}"
+        )
 
 
 class BelievedStep(Protocol):

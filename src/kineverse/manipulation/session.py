@@ -8,8 +8,9 @@ from contextlib import contextmanager, suppress
 from threading import Thread
 from time import perf_counter, thread_time
 
+from kineverse._checks import finite_number
 from kineverse.control import Command
-from kineverse.errors import InvalidValueError, ShapeError
+from kineverse.errors import InvalidValueError, ShapeError, UnknownNameError, suggest
 from kineverse.expressions import Expression
 from kineverse.lie import Array
 from kineverse.model.frame import is_of_robot
@@ -96,6 +97,7 @@ class Session:
             )
         self.world, self.dt = world, dt
         self._timeout, self.answers = timeout, True
+        self._speeds: dict[object, Symbol] = {name: s for s in world.model.speeds for name in (s, str(s))}
         self.belief = belief or TrueBelief()
         self._on_step = on_step
         self.state: State = self.belief.update(world)
@@ -142,7 +144,9 @@ class Session:
         self.cpu.setdefault(name, []).append(thread_time() - cpu)
         self.wall.setdefault(name, []).append(perf_counter() - wall)
 
-    def act(self, speeds: Speeds, command: Command | None = None) -> None:
+    def act(
+        self, speeds: Mapping[Symbol, float] | Mapping[str, float], command: Command | None = None
+    ) -> None:
         """Command speeds for one step, and update the belief. Speeds of objects are not sent.
 
         The belief gets them all.
@@ -150,18 +154,22 @@ class Session:
         Parameters
         ----------
         speeds
-            Speeds of the robot, and possibly those planned for objects [m/s], [rad/s]; none to stop.
+            Speeds of the robot, and possibly those planned for objects, by symbol or name [m/s], [rad/s];
+            none to stop.
         command
             The controller's command that has these speeds, for pages.
 
         Raises
         ------
+        UnknownNameError, InvalidValueError
+            For speeds that the model does not have, and those that are not finite. Then nothing has changed.
         SkillError
             If the world does not answer within the time-out, stands still, or has not been observed for more
             than :data:`STALE`. Worlds refuse commands from then on, and their robots stop.
         """
+        resolved = self._resolve(speeds)
         before, self.command = self.world.time, command
-        self._advance(speeds)
+        self._advance(resolved)
         now, stamp = self.world.time, self.state.stamp
         if now <= before:
             raise SkillError("other", f"The world '{self.world.name}' stands still at {now:g} s.")
@@ -170,6 +178,28 @@ class Session:
                 "other",
                 f"The world '{self.world.name}' was observed last at {stamp:.3f} s, {now - stamp:.3f} s ago.",
             )
+
+    def _resolve(self, speeds: Mapping[Symbol, float] | Mapping[str, float]) -> Speeds:
+        """Return finite speeds by symbol."""
+        if not isinstance(speeds, Mapping):
+            raise InvalidValueError(f"Speeds are a mapping from symbols or names to numbers, not {speeds!r}.")
+        resolved: dict[Symbol, float] = {}
+        for key, value in speeds.items():
+            speed = self._speeds.get(key)
+            if speed is None and isinstance(key, Symbol) and not is_of_robot(key.path, self.world.robot):
+                speed = key  # of an object that only the skill's own model has
+            if speed is None:
+                known = map(str, self.world.model.speeds)
+                raise UnknownNameError(
+                    f"The model has no free speed '{key}'. {suggest(str(key), known, 'speed')}"
+                )
+            number = finite_number(value)
+            if number is None:
+                raise InvalidValueError(
+                    f"The speed '{key}' is {value!r}; it must be a finite number. act({{}}) stops the robot."
+                )
+            resolved[speed] = number
+        return resolved
 
     def _advance(self, speeds: Speeds) -> None:
         """Advance the world by a step, and update the belief."""

@@ -30,6 +30,7 @@ from kineverse.worlds.sensor_sampler import (
 )
 
 from .base_filter import BaseFilter, motion_of, place
+from .belief import check_believed
 
 _LEAST_POSITION, _LEAST_ORIENTATION = 1e-4, 1e-4
 """Smallest stated noise of poses [m], [rad], for sensors without any."""
@@ -396,9 +397,5 @@ class TrackedBelief:
             return math.sqrt(float(self._spread[self._encoded.index(coordinate)]))
         if self._base is not None and coordinate in self._base.coordinates:
             return float(self._filter.deviations[self._base.coordinates.index(coordinate)])
-        if coordinate not in self._place:
-            raise UnknownNameError(
-                f"The belief says nothing about '{coordinate}'. "
-                f"{suggest(str(coordinate), map(str, self._place), 'coordinate')}"
-            )
+        check_believed(self._place, coordinate)
         return 0.0 if coordinate in self._exact else math.inf

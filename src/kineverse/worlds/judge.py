@@ -40,6 +40,8 @@ CONTACT_GAP = 1e-3
 """Largest gap of a contact of a push [m]."""
 
 _STILL = 5e-3
+_RESTING = 1e-4
+"""Depth up to which bodies that touch rest on each other [m]."""
 
 
 class Judge:
@@ -66,7 +68,8 @@ class Judge:
     ----------
     excepted
         Pairs of bodies whose penetration does not count: those of the robot, and those of furniture, that
-        overlap in every one of 201 sampled states, and those of the gripper with the handle.
+        overlap in every one of 201 sampled states or at the begin of the run; those of furniture that overlap
+        in the default state, such as a drawer in a solid box; and those of the gripper with the handle.
 
     Raises
     ------
@@ -96,11 +99,15 @@ class Judge:
                 f"No body of the model is below '{robot}'. {suggest(robot, prefixes, 'prefix')}"
             )
         self._make_limits()
-        own = set(self._own)
-        always = [rule for rule in self._scene.find_always_colliding() if (rule.a in own) == (rule.b in own)]
-        self._always = tuple((rule.a, rule.b) for rule in always)
-        self._gripping: set[str] = set()
         self._penetrations = self._scene.watch(radius=0.0)
+        own = set(self._own)
+        always = [(rule.a, rule.b) for rule in self._scene.find_always_colliding()]
+        always = [(a, b) for a, b in always if (a in own) == (b in own)]
+        self._scene.update(model.default_state())
+        shut = [(a, b) for a, b in self._find_overlapping() if a not in own]
+        self._always = tuple(dict.fromkeys((*always, *shut)))
+        self._first_overlapping: tuple[tuple[str, str], ...] = ()
+        self._gripping: set[str] = set()
         self._touches: PreparedQuery | None = None
         if handle is not None:
             self._watch_handle(handle, contact_gap)
@@ -117,7 +124,8 @@ class Judge:
     def excepted(self) -> tuple[tuple[str, str], ...]:
         """Pairs of bodies whose penetration does not count."""
         bodies = () if self.gripper is None else self.gripper.bodies
-        return (*self._always, *((a, b) for b in sorted(self._gripping) for a in bodies))
+        gripping = ((a, b) for b in sorted(self._gripping) for a in bodies)
+        return tuple(dict.fromkeys((*self._always, *self._first_overlapping, *gripping)))
 
     @property
     def measures(self) -> dict[str, Any]:
@@ -213,6 +221,9 @@ class Judge:
         searches = self._steps % self._every == 0
         if searches or self._touches is not None:
             self._scene.update(values[self._scene_values])
+        if self._first is None:
+            self._first_overlapping = self._find_overlapping()
+            self._select_pairs()
         if searches:
             self._measure_penetration()
         if self._touches is not None:
@@ -264,6 +275,12 @@ class Judge:
         group = [b for b in bodies if motion.moving_ancestors(b) == motion.moving_ancestors(handle)]
         rules = [Rule(a, b, True) for a in self._own for b in group if a != b]
         self._touches = self._scene.watch(self._own, group, gap, rules=rules)
+
+    def _find_overlapping(self) -> tuple[tuple[str, str], ...]:
+        """Return the pairs of the robot, and of furniture, that overlap where the scene is."""
+        own = set(self._own)
+        pairs = [(pair.a, pair.b) for pair in self._penetrations() if pair.distance < -_RESTING]
+        return tuple((a, b) for a, b in pairs if (a in own) == (b in own))
 
     def _select_pairs(self) -> None:
         """Set the flags of excepted pairs."""

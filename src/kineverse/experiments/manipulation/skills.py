@@ -9,12 +9,10 @@ from time import process_time
 from typing import Any
 
 from kineverse.errors import KineverseError
-from kineverse.geometry import Scene
 from kineverse.grasping import find_gripper, find_handle
 from kineverse.manipulation import Outcome, Session, open_object
 from kineverse.manipulation.pushing.controller import Pushing
 from kineverse.manipulation.pushing.trials import try_push
-from kineverse.model.frame import is_of_robot
 from kineverse.model.model import Model
 from kineverse.state import State
 from kineverse.worlds import Judge, World
@@ -164,7 +162,7 @@ def run_push_trial(
     """
 
     def act(watch: TrialWatch) -> Outcome:
-        judge = PushJudge(model, world, case.what, start, watch)
+        judge = PushJudge(model, world, case.what, watch)
         found = try_push(
             world,
             start,
@@ -191,28 +189,17 @@ class PushJudge:
         The model, and its world.
     what
         The coordinate of the object.
-    start
-        State at the beginning.
     watch
         The watch of the trial.
     """
 
-    def __init__(self, model: Model, world: World, what: str, start: State, watch: TrialWatch) -> None:
+    def __init__(self, model: Model, world: World, what: str, watch: TrialWatch) -> None:
         try:
             handle = find_handle(model, what).frame
         except KineverseError:
             handle = None
-        # Shapes of a robot, or of furniture, that overlap before anything is done say nothing of a push.
-        plain = Scene(model)
-        rules = [
-            rule
-            for state in (start, model.default_state())
-            for rule in plain.find_always_colliding([state])
-            if is_of_robot(rule.a, world.robot) == is_of_robot(rule.b, world.robot)
-        ]
-        self._overlapping = tuple(dict.fromkeys((rule.a, rule.b) for rule in rules))
         gripper = find_gripper(model, world.robot)
-        self._judge = Judge(model, world.robot, gripper, handle, scene=Scene(model, rules=rules))
+        self._judge = Judge(model, world.robot, gripper, handle)
         self._watch, self._pushing, self._force = watch, False, 0.0
         self._session: Session | None = None
 
@@ -232,6 +219,4 @@ class PushJudge:
     @property
     def measures(self) -> dict[str, Any]:
         """Measures of the judge; ``peak_force`` [N] in a world that has it."""
-        measures = self._judge.measures
-        excepted = (*self._overlapping, *measures["excepted"])
-        return {**measures, "excepted": excepted, "peak_force": self._force or math.nan}
+        return {**self._judge.measures, "peak_force": self._force or math.nan}

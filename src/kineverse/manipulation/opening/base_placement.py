@@ -36,6 +36,8 @@ class BasePlacement:
         Number of samples by the reason of their failure.
     seconds
         Duration of the search [s].
+    stands
+        Whether the robot has no mobile base, so that each sample is an arm instead of a base.
     """
 
     grasp: Grasp | None
@@ -48,6 +50,7 @@ class BasePlacement:
     samples: int
     reasons: Counter[str]
     seconds: float
+    stands: bool = False
 
     def __bool__(self) -> bool:
         return self.grasp is not None
@@ -61,5 +64,8 @@ class BasePlacement:
     def why(self) -> str:
         """Text with the number of samples and the reasons of failures."""
         failed = ", ".join(f"{n} {reason}" for reason, n in self.reasons.most_common(6) if n)
-        found = f"Found after {self.samples} bases" if self else f"None of {self.samples} bases goes through"
+        what = "arms of a robot without a mobile base" if self.stands else "bases"
+        found = (
+            f"Found after {self.samples} {what}" if self else f"None of {self.samples} {what} goes through"
+        )
         return f"{found}; failed: {failed}." if failed else f"{found}."

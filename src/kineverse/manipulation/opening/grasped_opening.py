@@ -217,6 +217,7 @@ class _Run:
             last[name] = max((m[name] for m in found if not math.isnan(m[name])), default=math.nan)
         for name in _SUMS:
             last[name] = sum(m[name] for m in found)
+        last["excepted"] = tuple(dict.fromkeys(pair for m in found for pair in m["excepted"]))
         return last
 
     @property
@@ -272,7 +273,7 @@ class _Run:
     def _push(self, failure: SkillError) -> None:
         """Push the object on where no grasp leads, or raise SkillError with both reasons."""
         fallback = PushFallback(self.motion, self.target, self.tolerance)
-        self.pushed_from = float(self.session.state[self.handle.coordinate])
+        value = float(self.session.state[self.handle.coordinate])
         try:
             start = fallback.find_start(self.seed)
             self._put_base(start)
@@ -280,6 +281,8 @@ class _Run:
         except SkillError as error:
             kind = error.kind if error.kind == "time" else failure.kind
             raise SkillError(kind, f"{failure} {error}") from error
+        finally:
+            self.pushed_from = value if fallback.begun else None
 
     def _put_base(self, wanted: Mapping[Symbol, float]) -> None:
         """Put a base that only stands to its place, by a reset of the world."""

@@ -180,7 +180,7 @@ class _Search:
         none = np.zeros((0, len(self.owner.coordinates)))
         return BasePlacement(
             None, self.owner.coordinates, none, none, self.values, none, none, self.tried, self.reasons,
-            perf_counter() - self.begin,
+            perf_counter() - self.begin, not self.owner.base,
         )  # fmt: skip
 
     # -- sampling ------------------------------------------------------------------------------------------

@@ -33,11 +33,16 @@ class PushFallback:
         Wanted value [m], [rad].
     tolerance
         Largest distance from it [m], [rad].
+
+    Attributes
+    ----------
+    begun
+        Whether the robot stood at the start of the push.
     """
 
     def __init__(self, motion: HandMotion, target: float, tolerance: float) -> None:
         self.motion, self.target, self.tolerance = motion, target, tolerance
-        self.samples = 0
+        self.samples, self.begun = 0, False
         self._trajectory: Trajectory | None = None
 
     def find_start(self, seed: int) -> State:
@@ -95,6 +100,7 @@ class PushFallback:
         motion.judge.allow(self.pushing.object_bodies)
         session.phase = "approach"
         motion.follow(self._trajectory)
+        self.begun = True
 
         def look(pushing: Pushing) -> None:
             motion.judge.update(session.world.state, session.commands, pushing=session.phase == "push")

@@ -9,6 +9,7 @@ from dataclasses import dataclass
 from time import perf_counter
 
 import numpy as np
+import numpy.typing as npt
 
 from kineverse.control import Goal, Hold, InverseKinematics, Target
 from kineverse.control.tasks import Task
@@ -29,6 +30,8 @@ _NEARBY = 0.12
 _NEAREST, _FARTHEST = 0.35, 1.1
 _SIDE, _TURN = math.radians(70.0), math.radians(45.0)
 _MARGIN = 0.01
+_STARTS = 4
+"""Number of arms from which inverse kinematics decides whether an arm that stands reaches a point."""
 _CANDIDATES = 1.0
 """Largest difference of the score of contact points to the best one."""
 
@@ -82,7 +85,8 @@ def find_push_start(
 
     A sample is a contact point and a pose of the base in front of it. Inverse kinematics brings the pusher to
     the point, collisions included, and the push is rolled out from there. The first one without lost contacts
-    and penetration is taken. Robots without a mobile base are sampled over their arms alone.
+    and penetration is taken. Robots without a mobile base are sampled over their arms alone, at those points
+    that are within reach.
 
     Parameters
     ----------
@@ -101,6 +105,9 @@ def find_push_start(
     """
     begin, reasons = perf_counter(), Counter[str]()
     sampler = _Sampler(pushing, state, np.random.default_rng(seed))
+    if sampler.unreachable:
+        reasons["out of reach"] = sampler.unreachable
+        return PushStart(None, sampler.unreachable, reasons, 0, perf_counter() - begin)
     for k in range(samples):
         if perf_counter() - begin > seconds:
             return PushStart(None, k, reasons, 0, perf_counter() - begin)
@@ -148,7 +155,13 @@ _DEEPEST = 4e-4
 
 
 class _Sampler:
-    """Sampler of start states: a contact point, a base in front of it, and inverse kinematics."""
+    """Sampler of start states: a contact point, a base in front of it, and inverse kinematics.
+
+    Attributes
+    ----------
+    unreachable
+        Number of contact points if a robot without a mobile base reaches none of them, otherwise 0.
+    """
 
     def __init__(self, pushing: Pushing, state: State, generator: np.random.Generator) -> None:
         self._pushing, self._state, self._generator = pushing, state, generator
@@ -181,6 +194,11 @@ class _Sampler:
         self._points = pushing.surface.at(state)
         score = pushing.choice.score(self._points)
         good = np.flatnonzero(score > score.max() - _CANDIDATES)
+        self.unreachable = 0
+        if self._base is None:
+            free = InverseKinematics(model, [nearby], still=still, tolerance=_NEARBY)
+            near = self._select_reachable(free, good)
+            good, self.unreachable = (near, 0) if len(near) else (good, len(good))
         weights = np.exp(2.0 * (score[good] - score.max()))
         self._candidates, self._weights = good, weights / weights.sum()
 
@@ -202,15 +220,36 @@ class _Sampler:
                 return "base not there"
             values |= {s: found.best[s] for s in self._base.coordinates}
         at = state.updated(values)
-        targets = self._point.values(point + _STANDOFF * normal) | self._facing.values(-normal)
         solver = self._solvers[self._tried % len(self._solvers)]
         self._tried += 1
-        known = {s: v for s, v in targets.items() if s in solver.inputs}
-        reached = solver.solve(dict(at) | known, starts=2, seed=int(random.integers(2**31)))
+        reached = solver.solve(
+            dict(at) | self._targets(k, solver), starts=2, seed=int(random.integers(2**31))
+        )
         if not reached.solved:
             (obstacle,) = [name for name, _ in reached.obstacles.most_common(1)] or ["out of reach"]
             return obstacle
         return at.updated({s: reached.best[s] for s in self._solvers[0].coordinates})
+
+    def _select_reachable(
+        self, solver: InverseKinematics, chosen: npt.NDArray[np.intp]
+    ) -> npt.NDArray[np.intp]:
+        """Return those of some contact points (indices) that an arm reaches from where it stands."""
+        points = self._points.points[chosen] + _STANDOFF * self._points.normals[chosen]
+        near, unknown = np.zeros(len(chosen), dtype=bool), np.ones(len(chosen), dtype=bool)
+        while unknown.any():
+            i = int(np.argmax(unknown))
+            found = solver.solve(dict(self._state) | self._targets(int(chosen[i]), solver), starts=_STARTS)
+            near[i], unknown[i] = found.solved, False
+            # What is around a point that is far out of reach is so, too.
+            around = found.residuals["tip"] - math.sqrt(3.0) * _NEARBY
+            unknown &= np.linalg.norm(points - points[i], axis=1) > around
+        return chosen[near]
+
+    def _targets(self, k: int, solver: InverseKinematics) -> dict[Symbol, float]:
+        """Return the values of the targets at a contact point for a solver."""
+        point, normal = self._points.points[k], self._points.normals[k]
+        values = self._point.values(point + _STANDOFF * normal) | self._facing.values(-normal)
+        return {s: v for s, v in values.items() if s in solver.inputs}
 
     def _arm(self) -> dict[Symbol, float]:
         """Return random values of the coordinates between base and pusher, in every other sample."""
