@@ -33,6 +33,7 @@ from kineverse.lie import Array, inverse, rotation_angle
 from kineverse.model.frame import is_of_robot
 from kineverse.model.frame_dependence import FrameDependence
 from kineverse.model.model_view import ModelView
+from kineverse.model.version_cache import cached_for_version
 from kineverse.state import State, StateLike
 from kineverse.symbols import Symbol
 
@@ -97,8 +98,10 @@ class Judge:
             )
         self._make_limits()
         own = set(self._own)
-        always = [rule for rule in self._scene.find_always_colliding() if (rule.a in own) == (rule.b in own)]
-        self._always = tuple((rule.a, rule.b) for rule in always)
+        find = self._scene.find_always_colliding
+        # Scenes without rules of their own find the same.
+        always = find() if scene else cached_for_version(model, "always colliding", find)
+        self._always = tuple((rule.a, rule.b) for rule in always if (rule.a in own) == (rule.b in own))
         self._gripping: set[str] = set()
         self._penetrations = self._scene.watch(radius=0.0)
         self._touches: PreparedQuery | None = None
