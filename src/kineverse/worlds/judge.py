@@ -33,6 +33,7 @@ from kineverse.lie import Array, inverse, rotation_angle
 from kineverse.model.frame import is_of_robot
 from kineverse.model.frame_dependence import FrameDependence
 from kineverse.model.model_view import ModelView
+from kineverse.model.version_cache import cached_for_version
 from kineverse.state import State, StateLike
 from kineverse.symbols import Symbol
 
@@ -101,8 +102,10 @@ class Judge:
         self._make_limits()
         self._penetrations = self._scene.watch(radius=0.0)
         own = set(self._own)
-        always = [(rule.a, rule.b) for rule in self._scene.find_always_colliding()]
-        always = [(a, b) for a, b in always if (a in own) == (b in own)]
+        find = self._scene.find_always_colliding
+        # Scenes without rules of their own find the same.
+        rules = find() if scene else cached_for_version(model, "always colliding", find)
+        always = [(rule.a, rule.b) for rule in rules if (rule.a in own) == (rule.b in own)]
         self._scene.update(model.default_state())
         shut = [(a, b) for a, b in self._find_overlapping() if a not in own]
         self._always = tuple(dict.fromkeys((*always, *shut)))

@@ -10,6 +10,7 @@ from typing import Any, TypeVar
 import numpy as np
 import numpy.typing as npt
 
+from kineverse.compile import compile  # noqa: A004
 from kineverse.control import Command, Controller, Goal, Hold, Target, same_pose
 from kineverse.control.tasks import Task
 from kineverse.geometry import Rule
@@ -191,6 +192,7 @@ class HandMotion:
             goal = Goal(error, gain=FOLLOWING, rate=rate.expression, name="hand")
             return self.controller([goal, *goals]), (wanted, rate, posture, follow)
 
+        bar = compile(self._bar, tier="interpreter")  # some hundred calls
         controller, (wanted, rate, posture, follow) = self.find_controller(("line", rows is None), make)
         way = end[:3, 3] - start[:3, 3]
         steps = max(2, math.ceil(float(np.linalg.norm(way)) / (_LINE_SPEED * session.dt)))
@@ -206,7 +208,7 @@ class HandMotion:
             pose[:3, 3] = start[:3, 3] + share * (end[:3, 3] - start[:3, 3])
             with session.timed("line"):
                 state = self.state
-                controller.set(wanted, self._bar(state) @ pose)
+                controller.set(wanted, bar(state.vector(bar.inputs)) @ pose)
                 controller.set(rate, speed if k < steps else 0.0 * speed)
                 if posture is not None and follow is not None and rows is not None:
                     # A base that lags would lead the arm along another way than the checked one.

@@ -82,14 +82,9 @@ class PlacementSearch:
         if not others:
             raise InvalidValueError("The model has nothing but the robot, so there is nothing to hold.")
         self.others = others
-        rules = (
-            *find_overlapping_links(self.scene, self.own, state),
-            *furniture_rules(bodies, self.own),
-        )
-        self.scene = Scene(model, rules=rules)
-        near = self.scene.find_always_colliding(self._random_states(state), OWN_MARGIN)
-        rules = (*rules, *near)
-        self.scene = Scene(model, rules=rules)
+        add_rules = self.scene.collision_world.add_rules
+        add_rules((*find_overlapping_links(self.scene, self.own, state), *furniture_rules(bodies, self.own)))
+        add_rules(self.scene.find_always_colliding(self._random_states(state), OWN_MARGIN))
         self.contacts = WayContacts(model, self.scene, gripper, self.own, others, margin)
 
     def _random_states(self, state: State) -> Iterator[State]:

@@ -183,9 +183,13 @@ class WayCheck:
 
     def _sweep(self, grasp: Grasp, Q: Array, base: Array, index: int) -> Array:
         """Return rows (N, n) of fingers that close from open to the handle at a value of the object."""
-        gaps = np.linspace(self._gripper.width, grasp.thickness, _SWEEP)
-        values = self.values[index : index + 1]
-        return np.vstack([self._rows(Q[None], base, self._gripper.values_at(g), values) for g in gaps])
+        gripper = self._gripper
+        row = self._rows(Q[None], base, gripper.opened, self.values[index : index + 1])
+        rows = np.tile(row, (_SWEEP, 1))
+        fingers = [gripper.values_at(g) for g in np.linspace(gripper.width, grasp.thickness, _SWEEP)]
+        begin = len(Q) + len(base)
+        rows[:, begin : begin + len(gripper.joints)] = [[f[s] for s in gripper.joints] for f in fingers]
+        return rows
 
     def _rows(self, Q: Array, base: Array, fingers: Mapping[Symbol, float], values: Array) -> Array:
         """Return rows of everything that moves (N, n), with some between neighbouring ones."""
