@@ -1,3 +1,5 @@
+from types import SimpleNamespace
+
 import numpy as np
 import pytest
 
@@ -6,15 +8,17 @@ from kineverse.control import Goal, same_pose
 from kineverse.errors import InvalidValueError, UnknownNameError
 from kineverse.estimation import identify, pose_covariance
 from kineverse.grasping import find_gripper
-from kineverse.lie import inverse, quaternion, retract, rotation_z, transform, translation
+from kineverse.lie import inverse, pose_difference, quaternion, retract, rotation_z, transform, translation
 from kineverse.manipulation import Session, open_unknown
 from kineverse.manipulation.opening import PlacementSearch
 from kineverse.manipulation.opening.hand_motion import HandMotion
 from kineverse.manipulation.unknown_objects import forget_joint
+from kineverse.manipulation.unknown_objects.hinge_hypotheses import guess_hinges
 from kineverse.manipulation.unknown_objects.joint_learning import JointLearning
 from kineverse.manipulation.unknown_objects.part import JointPath, free_part, write_joint
-from kineverse.manipulation.unknown_objects.part_belief import PoseMean
-from kineverse.worlds import KinematicWorld, Sensors
+from kineverse.manipulation.unknown_objects.part_belief import PartBelief, PoseMean, measure_way
+from kineverse.manipulation.unknown_objects.pulling import ArmEndError, PartPulling
+from kineverse.worlds import KinematicWorld, Observation, Sensors
 
 DOOR, HANDLE = "shelf_door/door", "shelf_door/door_handle"
 NOISE = np.array([0.0045] * 3 + [0.0087] * 3)
@@ -26,6 +30,16 @@ def make_model():
         edit.include("shelf_door", "shelf_door")
         edit.attach("shelf_door/shelf", parent="world", transform=kv.translation(1, 0, 0.7))
     return model
+
+
+@pytest.fixture(scope="module")
+def floating(truth):
+    return free_part(truth, DOOR, HANDLE, truth.default_state())
+
+
+@pytest.fixture(scope="module")
+def search(truth, floating):
+    return PlacementSearch(floating.model, find_gripper(truth, "hsr"), floating.model.default_state())
 
 
 def believe_that_it_slides(model):
@@ -88,9 +102,8 @@ def test_mean_of_poses_leaves_a_first_outlier_out():
     assert not mean.add(translation(np.array([2.0, 2.0, 0.5])))
 
 
-def test_free_part_is_where_it_is_seen_and_is_pulled_along_the_normal(truth):
-    model = truth
-    unknown = free_part(model, DOOR, HANDLE, model.default_state())
+def test_free_part_is_where_it_is_seen_and_is_pulled_along_the_normal(floating):
+    unknown = floating
     seen = retract(unknown.origin, np.array([0.02, -0.01, 0.03, 0.1, 0.2, -0.3]))
     state = unknown.model.default_state().updated(unknown.values(seen))
     np.testing.assert_allclose(unknown.model.fk(DOOR, unknown.parent)(state), seen, atol=1e-12)
@@ -98,6 +111,27 @@ def test_free_part_is_where_it_is_seen_and_is_pulled_along_the_normal(truth):
     handle = unknown.model.fk(HANDLE)
     shift = (inverse(handle(state) @ unknown.handle.pose) @ handle(pulled) @ unknown.handle.pose)[:3, 3]
     np.testing.assert_allclose(shift, [0.1, 0.0, 0.0], atol=1e-12)
+
+
+def test_pull_along_a_learned_twist_moves_the_part_as_its_hinge_does(truth, floating):
+    door = truth.fk(DOOR, "shelf_door/body")
+    here, ahead = door({DOOR: 0.4}), door({DOOR: 0.4 + 1e-6})
+    further = floating.pulled_along(pose_difference(ahead, here) / 1e-6)
+    state = further.model.default_state().updated(further.values(here))
+    pull = further.handle.coordinate
+    moved = further.model.fk(DOOR, further.parent)(state.updated({pull: 0.2}))
+    way, turn = measure_way(here, moved, further.point)
+    radius = way / (2.0 * np.sin(turn / 2.0))
+    assert radius * turn == pytest.approx(0.2, abs=1e-6)
+    np.testing.assert_allclose(moved, door({DOOR: 0.4 + turn}), atol=1e-6)
+
+
+def test_hinge_of_a_door_is_guessed_at_the_edge_far_from_its_handle(truth, floating, search):
+    (twist,) = guess_hinges(floating, search, floating.model.default_state())
+    door = truth.fk(DOOR, "shelf_door/body")
+    true = pose_difference(door({DOOR: 1e-6}), door({DOOR: 0.0})) / 1e-6
+    np.testing.assert_allclose(twist[3:], true[3:], atol=1e-6)
+    np.testing.assert_allclose(twist[:3], true[:3], atol=0.05)
 
 
 def test_learned_joint_replaces_the_attachment_without_limits(truth):
@@ -146,11 +180,52 @@ def test_door_that_nothing_moves_is_said_not_to_follow(truth):
     assert model.articulations[DOOR].kind == "fixed"
 
 
-def test_robot_alone_moves_on_lines_relative_to_a_part_that_floats(truth):
+def test_looks_at_a_part_that_slips_through_the_hand_are_those_of_its_joint(truth, floating):
+    """The hand stands still while the part moves by 4 cm: all that is learned is of the markers."""
+    state, door = truth.default_state(), truth.fk(DOOR)
+    world = SimpleNamespace(robot="hsr", angle=0.0, time=0.0)
+    world.observe = lambda: Observation(world.time, state, {DOOR: door({DOOR: world.angle})})
+    belief = PartBelief(floating, world, state, "hsr/hand_palm_link", [DOOR], [], Sensors())
+    for world.time in np.arange(10) / 30:
+        belief.update(world)
+    assert belief.is_seen
+    belief.hold()
+    belief.begin_motion()
+    place = inverse(belief.pose) @ belief.hand_pose
+    angles = np.linspace(0.0, 0.04 / 0.38, 60)
+    for world.angle in angles:
+        world.time += 1 / 30
+        belief.update(world)
+    np.testing.assert_allclose([look.pose for look in belief.looks], [door({DOOR: q}) for q in angles])
+    assert belief.slip(place, floating.point) > 0.02
+
+
+@pytest.mark.parametrize(
+    ("why", "kind", "error"), [("The arm ends.", "reach", ArmEndError), ("It slipped.", "", None)]
+)
+def test_end_of_an_arm_is_not_the_stop_of_a_part(monkeypatch, why, kind, error):
+    motion = SimpleNamespace(close=lambda grasp: True, follow_line=lambda a, b: None)
+    pulling = PartPulling.__new__(PartPulling)
+    pulling.session = SimpleNamespace(world=SimpleNamespace(time=0.0))
+    pulling.learning = SimpleNamespace(poses=1, learned=object())
+    pulling.belief = SimpleNamespace(pose=np.eye(4), hand_pose=np.eye(4))
+    pulling.frame_T_handle, pulling.part, pulling.begin, pulling._reached = np.eye(4), DOOR, 0.0, 0.0
+    pulling._measures = {"grasps": 0}
+    monkeypatch.setattr(PartPulling, "opening", (0.3, 0.8))
+    monkeypatch.setattr(PartPulling, "_pull_once", lambda self: (why, kind))
+    monkeypatch.setattr(PartPulling, "_let_go", lambda self: None)
+    grasp = SimpleNamespace(pose=np.eye(4))
+    if error is None:
+        assert "this is its stop" in pulling.perform(motion, grasp)
+        return
+    with pytest.raises(error, match="was pulled") as caught:
+        pulling.perform(motion, grasp)
+    assert caught.value.kind == "reach"
+
+
+def test_robot_alone_moves_on_lines_relative_to_a_part_that_floats(truth, floating, search):
     session = Session(KinematicWorld(truth, "hsr"))
-    unknown = free_part(truth, DOOR, HANDLE, session.state)
-    gripper = find_gripper(truth, "hsr")
-    search = PlacementSearch(unknown.model, gripper, unknown.model.default_state())
+    unknown, gripper = floating, search.contacts.gripper
     motion = HandMotion(session, gripper, unknown.handle, search, None, None, 1.0)
     goal = Goal(same_pose(unknown.model.fk(HANDLE), unknown.model.fk(gripper.hand)), name="hand")
     assert {s.path.partition("/")[0] for s in motion.controller([goal]).speeds} == {"hsr"}
@@ -163,6 +238,10 @@ def test_wrong_arguments_name_the_mistake(truth):
     with pytest.raises(UnknownNameError, match="door_handle"):
         open_unknown(Session(KinematicWorld(model, "hsr")), "shelf_door/handle", model=model)
     session = Session(KinematicWorld(model, "hsr"))
+    with pytest.raises(InvalidValueError, match="is a frame of the robot 'hsr', not a handle"):
+        open_unknown(session, "hsr/hand_palm_link", model=model)
+    with pytest.raises(UnknownNameError, match="no hand closes around it"):
+        free_part(model, DOOR, DOOR, model.default_state())
     with pytest.raises(InvalidValueError, match="way="):
         open_unknown(session, HANDLE, model=model, way=-1.0)
     with pytest.raises(InvalidValueError, match="is not below the part"):

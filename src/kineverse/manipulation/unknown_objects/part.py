@@ -11,7 +11,7 @@ import numpy as np
 
 from kineverse.articulations import Fixed, Floating
 from kineverse.compile import compile  # noqa: A004
-from kineverse.errors import InvalidValueError, suggest
+from kineverse.errors import InvalidValueError, UnknownNameError, suggest
 from kineverse.estimation import Fit
 from kineverse.grasping import Handle, find_handle
 from kineverse.lie import Array, inverse, log_se3, pose_difference, to_quaternion
@@ -120,7 +120,13 @@ def free_part(model: Model, frame: str, handle: str, state: State) -> UnknownPar
         floating = Floating(name=name, parent=parent, child=name, origin=Pose.from_matrix(parent_T_frame))
         edit.apply(floating)
         edit.attach(frame, name, translation(pull, 0, 0), tag)
-    found = find_handle(copy, pull, handle)
+    try:
+        found = find_handle(copy, pull, handle)
+    except UnknownNameError as error:
+        raise UnknownNameError(
+            f"'{handle}' has no slim shape that stands out of '{frame}', so no hand closes around it. "
+            "Name the body of a handle."
+        ) from error
     frame_T_handle = copy.fk(handle, frame)({})
     outward = frame_T_handle[:3, :3] @ found.pose[:3, 0]
     with copy.edit() as edit:

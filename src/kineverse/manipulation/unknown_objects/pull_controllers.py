@@ -36,6 +36,8 @@ _RAMP = 0.5
 """Time in which the pull begins [s]."""
 _STEP = 0.03
 """Way of the handle between two arms that are found for a learned joint [m]."""
+_QUICK = 0.5
+"""Speed from which on joints take their whole part [m/s], [rad/s]."""
 _MARGIN = 0.002
 """Least distance of bodies while the part moves [m]."""
 
@@ -151,6 +153,8 @@ class LearnedPull:
         self._values = np.linspace(self.path.value, end, count)
         hands = [self.belief.reference_pose @ self.path.pose(v) @ part_T_hand for v in self._values.tolist()]
         arm, base = state.vector(search.moving), state.vector(search.standing)
+        # Slow joints, such as a torso's, would hold up the motion.
+        search.paths.ease = search.samples.eases[0] * np.minimum(1.0, search.samples.speeds / _QUICK)
         ways, reached = search.paths.follow(arm[None], base[None], np.array(hands)[None])
         self._arms = ways[0, : reached[0]] if reached[0] else arm[None]
         self._controller.set(self._speeds, np.zeros(len(arm)))

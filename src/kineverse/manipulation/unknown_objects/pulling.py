@@ -13,6 +13,7 @@ from kineverse.lie import Array, inverse
 from kineverse.manipulation.opening.hand_motion import HandMotion
 from kineverse.manipulation.outcome import SkillError
 from kineverse.manipulation.session import Session
+from kineverse.model.frame import is_of_robot
 from kineverse.model.model import Model
 
 from .joint_learning import JointLearning
@@ -217,7 +218,9 @@ class PartPulling:
         words = f"In the way: {', '.join(command.active[:3]) or 'nothing that the controller knows'}."
         if any(name.startswith("contact of") for name in command.active[:3]):
             return words, "collision"
-        if isinstance(pull, LearnedPull) and not self._can_go_on(pull, part_T_hand):
+        robot = self.session.world.robot
+        limited = any(is_of_robot(n, robot) and n.endswith("/position") for n in command.active)
+        if limited or (isinstance(pull, LearnedPull) and not self._can_go_on(pull, part_T_hand)):
             return f"The arm ends there. {words}", "reach"
         return words, ""
 

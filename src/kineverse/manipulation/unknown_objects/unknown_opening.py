@@ -17,7 +17,7 @@ from kineverse.manipulation.opening.hand_motion import HandMotion
 from kineverse.manipulation.outcome import Outcome, SkillError
 from kineverse.manipulation.session import Session
 from kineverse.manipulation.skill_arguments import check_positive
-from kineverse.model.frame import WORLD
+from kineverse.model.frame import WORLD, is_of_robot
 from kineverse.model.model import Model
 from kineverse.planning import Planner
 from kineverse.worlds import Judge, Sensors
@@ -119,6 +119,13 @@ def open_unknown(
     for name in (handle, *(n for n in (part, beside) if n is not None)):
         if name not in model.frames:
             raise UnknownNameError(f"There is no frame '{name}'. {suggest(name, model.frames, 'frame')}")
+    robot = session.world.robot
+    for name, what in ((handle, "a handle"), (beside, "what a part moves in")):
+        if name is not None and is_of_robot(name, robot):
+            others = [f for f in model.frames if not is_of_robot(f, robot)]
+            raise InvalidValueError(
+                f"'{name}' is a frame of the robot '{robot}', not {what}. {suggest(name, others, 'frame')}"
+            )
     wanted = way, turn
     return _Run(session, model, handle, part, beside, sensors, wanted, hand, seconds, placements, seed)()
 
