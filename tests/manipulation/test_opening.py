@@ -1,3 +1,4 @@
+import re
 import sys
 from pathlib import Path
 
@@ -10,6 +11,7 @@ from kineverse.grasping import find_gripper, find_handle, sample_grasps
 from kineverse.manipulation import PlacementSearch, Session, TrackedBelief, open_object
 from kineverse.manipulation.belief import EstimateError
 from kineverse.manipulation.opening.hand_paths import HandPaths
+from kineverse.manipulation.opening.placement_samples import PlacementSamples, find_planar_base
 from kineverse.worlds import KinematicWorld, MujocoWorld, Sensors
 
 sys.path.insert(0, str(Path(__file__).parents[1] / "worlds"))
@@ -21,11 +23,11 @@ DRAWER, DOOR = "shelf_drawers/upper_drawer", "shelf_door/door"
 START = {"hsr/base/x": -1.5}
 
 
-def make_model(furniture):
+def make_model(furniture, height=0.7):
     model = kv.load("hsr")
     with model.edit() as edit:
         edit.include(furniture, furniture)
-        edit.attach(f"{furniture}/shelf", parent="world", transform=kv.translation(1, 0, 0.7))
+        edit.attach(f"{furniture}/shelf", parent="world", transform=kv.translation(1, 0, height))
     return model
 
 
@@ -150,6 +152,7 @@ def test_placement_says_how_far_it_leads_and_how_the_hand_goes_away(at_the_door)
     refused = search.find(state, grasps, 1.2, accept=lambda p: False)
     assert not refused
     assert refused.failure == "collision"
+    assert not search.find_too_high(state, handle.coordinate, found.values)
 
 
 def test_joints_at_their_limits_leave_the_rest_of_a_step_to_the_others():
@@ -213,6 +216,34 @@ def test_locked_drawer_is_said_not_to_move():
     assert not outcome
     assert "does not move on" in outcome.reason
     assert outcome.measures["failure"] == "other"
+
+
+def test_drawer_above_the_hand_is_said_to_be_too_high():
+    model = make_model("shelf_drawers", height=2.0)
+    world = KinematicWorld(model, "hsr")
+    world.reset(start(model))
+    outcome = open_object(Session(world), DRAWER)
+    assert not outcome
+    assert outcome.measures["failure"] == "reach"
+    assert outcome.measures["placements"] >= 200
+    assert "Too high" in outcome.reason
+    # The arm is straight up: lift, flex and hand end at their limits.
+    up = {"hsr/arm_lift_joint": 0.69, "hsr/arm_flex_joint": 0.0, "hsr/wrist_flex_joint": 0.0}
+    hand = float(model.fk("hsr/hand_palm_link")(start(model).updated(up))[2, 3])
+    reach = float(re.search(r"reaches (\S+) m", outcome.reason)[1])
+    assert hand + 0.09 < reach < hand + 0.16
+
+
+def test_base_of_a_whole_arm_stands_in_a_part_of_the_samples():
+    least = {}
+    for robot, hand in (("hsr", "hsr/hand_palm_link"), ("pr2", "pr2/r_gripper_palm_link")):
+        model = kv.load(robot)
+        own = [s for s in model.symbols_of(hand) if s in model.degrees_of_freedom]
+        base = find_planar_base(model, own)
+        samples = PlacementSamples(model, own, (), base)
+        least[robot] = min(ease[own.index(base[0])] for ease in samples.eases)
+        assert all(ease[own.index(s)] > 0 for ease in samples.eases for s in own if s not in base)
+    assert least["pr2"] == 0.0 < least["hsr"]
 
 
 def test_start_in_contact_is_refused(model):

@@ -36,11 +36,15 @@ from .push_fallback import PushFallback
 _GRASPS = 96
 _PLANNING = 2.0
 """Largest time to plan the way to the handle [s]."""
+_PROOF = 200
+"""Largest number of sampled bases that are to prove that an object is too high."""
 _MOST_GRASPS = 4
 _KEPT = 15
 """Number of sets of grasps that are kept."""
 _MOST_SLIPS, _LEAST_PROGRESS = 2, 0.1
 """Number of slips from which on a grasp has to take an object further, by a share of the rest."""
+_HEIGHTS = 12
+"""Number of values at which the height of an object is compared with that of the hand."""
 _LARGEST = ("limit_violation", "penetration", "grasp_error", "grasp_rotation", "jitter", "reversals")
 _SUMS = ("contact_losses", "distance", "hand_distance")
 """Measures of the parts of a run: the largest, or the sum."""
@@ -231,6 +235,7 @@ class _Run:
         """Move the object to the target with one grasp after the other, or raise SkillError."""
         self.motion.look()
         self._check_start()
+        self._check_height()
         failure: SkillError | None = None
         while failure is None and self.grasps < _MOST_GRASPS and self.left > self.tolerance / 2:
             try:
@@ -321,10 +326,27 @@ class _Run:
             pair = touching[0]
             raise SkillError("collision", f"The robot begins in contact: '{pair.a}' at '{pair.b}'.")
 
+    def _check_height(self) -> None:
+        """Raise SkillError if the hand is too low to touch the object on all its way, by grasp or by push."""
+        state, search, coordinate = self.session.state, self.opener.search, self.handle.coordinate
+        here = float(state[coordinate])
+        last = self.target - math.copysign(min(self.tolerance, self.left), self.target - here)
+        why = search.find_too_high(state, coordinate, np.linspace(here, last, _HEIGHTS))
+        found = self._search(min(self.samples, _PROOF)) if why else None
+        if found is not None and not (found and found.values[-1] == self.target):
+            raise SkillError("reach", f"{why} None of {found.samples} bases leads to {self.target:.3f}.")
+
     # -- phases --------------------------------------------------------------------------------------------
 
     def _place(self) -> BasePlacement:
         """Return a placement that leads as far as possible, and plan the way to the handle."""
+        found = self._search(self.samples)
+        if not found:
+            raise SkillError(found.failure, f"{found.why}{self._barrier}")
+        return found
+
+    def _search(self, samples: int) -> BasePlacement:
+        """Search a placement among the most sampled bases that are allowed, and count them."""
         session, search = self.session, self.opener.search
         session.phase = "place"
         with session.timed("place"):
@@ -337,12 +359,10 @@ class _Run:
                 grasps,
                 self.target,
                 accept=self._plan,
-                samples=self.samples,
+                samples=samples,
                 seed=self.seed + self.grasps,
             )
         self.placements += found.samples
-        if not found:
-            raise SkillError(found.failure, f"{found.why}{self._barrier}")
         return found
 
     def _plan(self, placement: BasePlacement) -> bool:

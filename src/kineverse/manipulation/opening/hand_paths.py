@@ -103,6 +103,25 @@ class HandPaths:
         rest = e - (J @ center[:, :, None])[:, :, 0]
         return np.asarray(center + (WJt @ np.linalg.solve(damped, rest[:, :, None]))[:, :, 0])
 
+    def find_heights(self, Q: Array, base: Array, points: Array) -> tuple[Array, Array]:
+        """Return the heights (N,) of the highest of some points of the hand, and their derivatives (N, n).
+
+        Parameters
+        ----------
+        Q
+            Configurations (N, n).
+        base
+            Values (m,) of the coordinates that stand still.
+        points
+            Points (k, 3) in the frame of the hand [m].
+        """
+        poses, J = self._f.batch(np.hstack([Q, np.tile(base, (len(Q), 1))]))
+        heights = poses[:, 2, :3] @ points.T + poses[:, 2, 3:]
+        highest = np.argmax(heights, axis=1)
+        r = (poses[:, :3, :3] @ points[highest][:, :, None])[:, :, 0]
+        slopes = J[:, 2] + J[:, 3] * r[:, 1:2] - J[:, 4] * r[:, :1]
+        return heights.max(axis=1), np.asarray(slopes)
+
     def follow(self, Q: Array, base: Array, targets: Array) -> tuple[Array, Array]:
         """Return configurations (N, K, n) along poses (N, K, 4, 4), and how many (N,) are reached.
 

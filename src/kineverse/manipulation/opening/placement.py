@@ -19,8 +19,10 @@ from kineverse.manipulation.collision_rules import find_overlapping_links, furni
 from kineverse.model.frame import is_of_robot
 from kineverse.model.model_view import ModelView
 from kineverse.state import State
+from kineverse.symbols import Symbol
 
 from .base_placement import NO_WAY, BasePlacement
+from .hand_height import find_highest_passage, find_highest_reach
 from .hand_paths import HandPaths
 from .placement_samples import PlacementSamples, find_planar_base
 from .way_check import CandidateWay, WayCheck, interpolate_poses
@@ -86,6 +88,7 @@ class PlacementSearch:
         add_rules((*find_overlapping_links(self.scene, self.own, state), *furniture_rules(bodies, self.own)))
         add_rules(self.scene.find_always_colliding(self._random_states(state), OWN_MARGIN))
         self.contacts = WayContacts(model, self.scene, gripper, self.own, others, margin)
+        self._reach: float | None = None
 
     def _random_states(self, state: State) -> Iterator[State]:
         """Yield states with random arms."""
@@ -94,6 +97,27 @@ class PlacementSearch:
         lower, upper = np.array([self.model.limits(s) for s in bounded]).reshape(-1, 2).T
         for _ in range(_RANDOM_STATES):
             yield state.updated(dict(zip(bounded, random.uniform(lower, upper).tolist(), strict=True)))
+
+    def find_too_high(self, state: State, coordinate: Symbol, values: Array) -> str:
+        """Return why an object on its way is out of reach above the hand; empty if it is not.
+
+        Parameters
+        ----------
+        state
+            State of everything.
+        coordinate, values
+            Coordinate of the object, and its values (N,) on the way [m], [rad].
+        """
+        moved = [b for b in self.scene.bodies_moved_by([coordinate]) if b in self.others]
+        value, lowest = find_highest_passage(self.scene, moved, state, coordinate, values)
+        if self._reach is None:
+            self._reach = find_highest_reach(self.scene, self.paths, self.gripper, state)
+        if lowest <= self._reach:
+            return ""
+        return (
+            f"Too high: at {value:.3f} '{coordinate}' is nowhere lower than {lowest:.2f} m, and "
+            f"'{self.gripper.hand}' reaches {self._reach:.2f} m at most."
+        )
 
     def find(
         self,
