@@ -64,7 +64,7 @@ def least_share(
     Parameters
     ----------
     unknown, search
-        The part, and the search of the placement.
+        Part, and search of the placement.
     placement
         The placement, which was found for a straight pull.
     state

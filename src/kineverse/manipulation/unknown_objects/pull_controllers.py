@@ -161,7 +161,7 @@ class LearnedPull:
 
     @property
     def ends(self) -> bool:
-        """Whether the arm is expected to end before the part is open."""
+        """End of the arm before the part is open: True if it is expected."""
         return len(self._arms) < len(self._values)
 
     def step(self, way: float) -> Command:

@@ -22,6 +22,7 @@ from kineverse.model.model import Model
 from kineverse.planning import Planner
 from kineverse.worlds import Judge, Sensors
 
+from .hand_retreat import find_retreat
 from .hinge_hypotheses import guess_hinges, least_share
 from .joint_learning import JointLearning, LearnedJoint
 from .joint_revision import revise_joint, watch_joint
@@ -120,11 +121,11 @@ def open_unknown(
         if name not in model.frames:
             raise UnknownNameError(f"There is no frame '{name}'. {suggest(name, model.frames, 'frame')}")
     robot = session.world.robot
-    for name, what in ((handle, "a handle"), (beside, "what a part moves in")):
-        if name is not None and is_of_robot(name, robot):
+    for given, what in ((handle, "a handle"), (beside, "what a part moves in")):
+        if given is not None and is_of_robot(given, robot):
             others = [f for f in model.frames if not is_of_robot(f, robot)]
             raise InvalidValueError(
-                f"'{name}' is a frame of the robot '{robot}', not {what}. {suggest(name, others, 'frame')}"
+                f"'{given}' is a frame of the robot '{robot}', not {what}. {suggest(given, others, 'frame')}"
             )
     wanted = way, turn
     return _Run(session, model, handle, part, beside, sensors, wanted, hand, seconds, placements, seed)()
@@ -163,15 +164,8 @@ class _Run:
         markers = [f for f in rigid if not unknown.model.fk(f, self.part).symbols]
         still = [f for f in _ancestors(model, self.part) if not model.fk(f).symbols]
         references = still if beside is None else [beside]
-        self.belief = PartBelief(
-            unknown,
-            self.world,
-            before,
-            self.gripper.hand,
-            markers,
-            references,
-            sensors or Sensors(),
-        )
+        stated = sensors or Sensors()
+        self.belief = PartBelief(unknown, self.world, before, self.gripper.hand, markers, references, stated)
         self.learning = JointLearning()
         self.measures: dict[str, Any] = {"grasps": 0}
         self.first_step, self.begin = session.steps, self.world.time
@@ -313,7 +307,7 @@ class _Run:
         return reason
 
     def _retract(self, grasp: Grasp) -> None:
-        """Open the fingers, take the hand straight back, and look at the part.
+        """Open the fingers, take the hand back, and look at the part.
 
         Where the part is after an unknown motion, the retreat of the placement has not been checked.
         """
@@ -321,10 +315,9 @@ class _Run:
         self.session.phase = "release"
         motion.move_fingers(self.gripper.opened)
         self.session.phase = "retract"
-        pose = inverse(belief.pose @ self.unknown.frame_T_handle) @ belief.hand_pose
-        away = pose.copy()
-        away[:3, 3] += grasp.approach[:3, 3] - grasp.pose[:3, 3]
-        motion.follow_line(pose, away)
+        handle = belief.pose @ self.unknown.frame_T_handle
+        retreat = find_retreat(motion, grasp, handle, belief.hand_pose)
+        motion.follow_line(inverse(handle) @ belief.hand_pose, inverse(handle) @ retreat.end, retreat.arms)
         motion.stand(LOOKING)
 
     def _look(self) -> None:
