@@ -113,6 +113,8 @@ def test_without_a_gripper_it_is_not_done_and_says_why(run, files):
         answer = json.loads(out)
         assert (status, answer["done"], answer["seconds"]) == (1, False, 0)
         assert "no gripper" in answer["reason"]
+        assert "--hand" in answer["reason"]
+        assert ("kineverse push" in answer["reason"]) == (skill == "open")
 
 
 def test_what_is_there_from_the_start_is_done(run, files):

@@ -106,9 +106,7 @@ def push_object(
     from kineverse.manipulation.session import Session
 
     if not scene.pusher:
-        return skip_skill(
-            scene, world, False, f"{scene.why} --hand may name any body of the robot that is to push."
-        )
+        return skip_skill(scene, world, False, scene.why)
     with show_activity("compiling the controller; this is kept for the next time"):
         pushing = Pushing(
             scene.model,
