@@ -29,7 +29,7 @@ _NEXT_STEP = (
     "kineverse push ... --hand BODY --to VALUE.",
     "Name the body of the robot that is to push by --hand BODY.",
 )
-"""What to do without a gripper: before grasps, and before pushes."""
+"""Advice without a gripper: for grasps, and for pushes."""
 _MOST_NOTES = 3
 _DEEPEST = 2e-4
 _RING, _RINGS, _DIRECTIONS = 0.25, 16, 12
