@@ -113,6 +113,17 @@ def test_without_a_gripper_it_is_not_done_and_says_why(run, files):
         answer = json.loads(out)
         assert (status, answer["done"], answer["seconds"]) == (1, False, 0)
         assert "no gripper" in answer["reason"]
+        assert "--hand" in answer["reason"]
+        assert ("kineverse push" in answer["reason"]) == (skill == "open")
+
+
+def test_without_a_handle_it_is_not_done_and_says_how_else(run, files):
+    for more in ((), ("--unknown",)):
+        status, out, _ = run("open", "box.urdf", *HSR[:2], "--what", "drawer", "--json", *more)
+        answer = json.loads(out)
+        assert (status, answer["done"], answer["steps"]) == (1, False, 0)
+        assert "moves no handle" in answer["reason"]
+        assert "kineverse push" in answer["reason"]
 
 
 def test_what_is_there_from_the_start_is_done(run, files):

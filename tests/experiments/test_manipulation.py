@@ -26,6 +26,7 @@ from kineverse.experiments.table1_open.programs import LeaderFollower, SpeedScal
 from kineverse.experiments.table1_push.objects import find_kitchens, make_push_setup
 from kineverse.geometry import Rule, Scene
 from kineverse.manipulation import Outcome, TrackedBelief, TrueBelief
+from kineverse.manipulation.start_state import find_free_state
 from kineverse.worlds import read_run_recording
 
 
@@ -284,6 +285,14 @@ def test_start_in_aisle_is_free_where_the_middle_is_not():
     middle = {"pr2/base/y": 0.0, "pr2/base/angle": math.pi / 2}
     assert near(start.updated(middle))
     assert not near(start)
+    states = [start.updated(middle), start]
+    found, contact = find_free_state(model, "pr2", states, 0.02, [Rule("*", "kitchen/floor")])
+    assert found is start
+    assert "pr2/" in contact
+    assert find_free_state(model, "pr2", states[:1], 0.02) == (
+        None,
+        find_free_state(model, "pr2", states, 0.02)[1],
+    )
 
 
 def test_trial_watch_keeps_commands_of_the_last_session_and_records(tmp_path):

@@ -212,10 +212,14 @@ def test_retreats_go_aside_where_the_arm_does_not_reach_straight_back(door, monk
 def test_locked_drawer_is_said_not_to_move():
     world = KinematicWorld(pusher(locked=True), "robot")
     world.reset(world.model.default_state().updated({"robot/finger": 0.05, "robot/z": 2.0}))
-    outcome = open_object(Session(world), "room/drawer")
+    moving = []
+    watched = Session(world, on_step=lambda session: moving.append(session.phase == "move"))
+    outcome = open_object(watched, "room/drawer")
     assert not outcome
     assert "does not move on" in outcome.reason
+    assert "room/drawer/lock" in outcome.reason
     assert outcome.measures["failure"] == "other"
+    assert watched.dt * sum(moving) < 2.0  # nothing moves, and the controller knows that nothing will
 
 
 def test_drawer_above_the_hand_is_said_to_be_too_high():

@@ -343,6 +343,22 @@ def test_free_and_turned_bodies_keep_their_state() -> None:
     assert any("globe" in remark and "no inertia" in remark for remark in world.remarks)
 
 
+def test_bodies_without_collision_shapes_touch_with_what_is_seen_of_them() -> None:
+    """The collision scene of a controller has these shapes, too."""
+    model, ball = kv.load("hsr"), cube(1.0, (0.1, 0.1, 0.1))
+    with model.edit() as edit:
+        edit.apply(kv.Prismatic(name="seen", parent="world", child="seen", axis=(1, 0, 0), lower=0, upper=1))
+        edit.apply(SetBody("seen", Body(visuals=ball.collisions, inertia=ball.inertia)))
+    world = MujocoWorld(model, "hsr", gripper("hsr"), floor=False)
+    assert not any("nothing can touch" in remark for remark in world.remarks)
+    # The floor, which the model does not have, is not held by fingers that press it.
+    assert world._drive is not None
+    world._drive.pressed = lambda data: "floor"  # type: ignore[method-assign]
+    assert world.held is None
+    world._drive.pressed = lambda data: "seen"  # type: ignore[method-assign]
+    assert world.held == "seen"
+
+
 @pytest.mark.parametrize(("lowest", "floor"), [(0.0, True), (0.0, False), (-0.3, True)])
 def test_a_box_falls_to_the_floor_unless_furniture_reaches_below_it(lowest: float, floor: bool) -> None:
     model = kv.load("fetch")

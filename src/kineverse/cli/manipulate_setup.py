@@ -6,6 +6,7 @@ import argparse
 import math
 import re
 import sys
+from collections.abc import Iterator
 from dataclasses import dataclass
 from itertools import product
 from pathlib import Path
@@ -23,6 +24,12 @@ OPENING = 0.4
 """Distance from shut at which closing and pushing begin [m], [rad]."""
 TOLERANCE = 0.02
 """Distance from the target within which an object is there [m], [rad]."""
+_NEXT_STEP = (
+    "Name a hand with two opposed fingers by --hand FRAME, or move the object with any body of the robot: "
+    "kineverse push ... --hand BODY --to VALUE.",
+    "Name the body of the robot that is to push by --hand BODY.",
+)
+"""Advice without a gripper: for grasps, and for pushes."""
 _MOST_NOTES = 3
 _DEEPEST = 2e-4
 _RING, _RINGS, _DIRECTIONS = 0.25, 16, 12
@@ -232,36 +239,29 @@ def _stand_free(model: kv.Model, robot: str, state: kv.State, base: dict[kv.Symb
     InvalidValueError
         If it touches something everywhere, or has no base that could be placed.
     """
-    from kineverse.geometry import Scene
+    from kineverse.manipulation.start_state import find_free_state
 
-    scene = Scene(model)
-    others = [body for body in scene.bodies if not body.startswith(f"{robot}/")]
-    if not others or len(others) == len(scene.bodies):
-        return state
-    watch = scene.watch(f"{robot}/*", others, radius=0.0)
-
-    def contact(at: kv.State) -> str:
-        scene.update(at)
-        deepest = next(iter(watch()), None)
-        touches = deepest is not None and deepest.distance < -_DEEPEST
-        return f"{deepest.a} and {deepest.b}" if deepest is not None and touches else ""
-
-    problem = contact(state)
-    if not problem:
-        return state
-    x, y = [*base][:2] or (None, None)
-    if x is not None and y is not None:
-        for ring, turn in product(range(1, _RINGS + 1), range(_DIRECTIONS)):
-            angle, radius = math.tau * turn / _DIRECTIONS, _RING * ring
-            place = {x: state[x] + radius * math.cos(angle), y: state[y] + radius * math.sin(angle)}
-            if not contact(state.updated(place)):
-                where = ", ".join(f"{value:.2f}" for value in place.values())
-                print(f"start: {problem} touch, so the robot begins at {where}", file=sys.stderr)
-                return state.updated(place)
+    found, problem = find_free_state(model, robot, _list_places(state, base), -_DEEPEST)
+    if found is not None:
+        if problem:
+            where = ", ".join(f"{found[s]:.2f}" for s in [*base][:2])
+            print(f"start: {problem} touch, so the robot begins at {where}", file=sys.stderr)
+        return found
     raise InvalidValueError(
         f"The robot '{robot}' begins in contact: {problem}. Give its base another place: "
         "--robot ROBOT@X,Y,ANGLE."
     )
+
+
+def _list_places(state: kv.State, base: dict[kv.Symbol, float]) -> Iterator[kv.State]:
+    """Yield a state, and those with the base on rings around its place."""
+    yield state
+    if len(base) < 2:
+        return
+    x, y = [*base][:2]
+    for ring, turn in product(range(1, _RINGS + 1), range(_DIRECTIONS)):
+        angle, radius = math.tau * turn / _DIRECTIONS, _RING * ring
+        yield state.updated({x: state[x] + radius * math.cos(angle), y: state[y] + radius * math.sin(angle)})
 
 
 def _find_coordinate(model: kv.Model, name: str, robot: str) -> kv.Symbol:
@@ -304,7 +304,7 @@ def _find_pusher(
         gripper = find_gripper(model, robot, hand)
     except UnknownNameError as error:
         if hand is None:
-            return None, str(error), ()
+            return None, f"{error} {_NEXT_STEP[skill == 'push']}", ()
         if skill == "push" and hand in model.bodies and hand.startswith(f"{robot}/"):
             print(f"pusher: {hand}", file=sys.stderr)
             return None, "", (hand,)

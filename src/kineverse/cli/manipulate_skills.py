@@ -10,9 +10,10 @@ from typing import TYPE_CHECKING
 
 from kineverse.cli.manipulate_setup import ManipulationScene
 from kineverse.cli.output import join_lines, show_activity
-from kineverse.errors import InvalidValueError
+from kineverse.errors import InvalidValueError, UnknownNameError
 
 if TYPE_CHECKING:
+    from kineverse.grasping import Handle
     from kineverse.manipulation.belief import Belief
     from kineverse.manipulation.outcome import Outcome
     from kineverse.worlds import World
@@ -33,14 +34,12 @@ def grasp_object(
     if scene.gripper is None:
         return skip_skill(scene, world, False, scene.why)
 
-    from kineverse.grasping import find_handle, find_handles
     from kineverse.manipulation.opening.grasped_opening import open_object
     from kineverse.manipulation.session import Session
 
-    if arguments.handle is not None:
-        print(find_handle(scene.model, scene.coordinate, arguments.handle), file=sys.stderr)
-    elif handles := find_handles(scene.model, scene.coordinate):
-        print(handles[0], file=sys.stderr)
+    handle, why = _find_handle(arguments, scene)
+    if handle is None:
+        return skip_skill(scene, world, False, why)
     outcome: Outcome = open_object(
         Session(world, belief=belief, on_step=look),
         scene.coordinate,
@@ -64,15 +63,15 @@ def open_as_unknown(
     if scene.gripper is None:
         return skip_skill(scene, world, False, scene.why)
 
-    from kineverse.grasping import find_handle
     from kineverse.manipulation import Session, open_unknown
     from kineverse.manipulation.unknown_objects import forget_joint
     from kineverse.manipulation.unknown_objects.unknown_opening import OPEN_TURN, OPEN_WAY
     from kineverse.worlds import Sensors
 
     model, coordinate, start = scene.model, scene.coordinate, scene.start
-    handle = find_handle(model, coordinate, arguments.handle)
-    print(handle, file=sys.stderr)
+    handle, why = _find_handle(arguments, scene)
+    if handle is None:
+        return skip_skill(scene, world, False, why)
     part = next((a.child for a in model.articulations.values() if coordinate in a.coordinates), None)
     if part is None:
         raise InvalidValueError(f"--unknown: '{coordinate}' is of no joint, so no part belongs to it.")
@@ -106,9 +105,7 @@ def push_object(
     from kineverse.manipulation.session import Session
 
     if not scene.pusher:
-        return skip_skill(
-            scene, world, False, f"{scene.why} --hand may name any body of the robot that is to push."
-        )
+        return skip_skill(scene, world, False, scene.why)
     with show_activity("compiling the controller; this is kept for the next time"):
         pushing = Pushing(
             scene.model,
@@ -138,6 +135,26 @@ def push_object(
     outcome = push(session, scene.coordinate, seconds=arguments.seconds, pushing=pushing)
     reason = outcome.reason if outcome or not where else f"{outcome.reason} {where}"
     return replace(outcome, reason=reason, measures={**outcome.measures, "placed": placed})
+
+
+def _find_handle(arguments: argparse.Namespace, scene: ManipulationScene) -> tuple[Handle | None, str]:
+    """Return the handle that is named, or the best one, and print it; or None, and why there is none.
+
+    Raises
+    ------
+    UnknownNameError
+        For a named handle that the object does not have.
+    """
+    from kineverse.grasping import find_handle
+
+    try:
+        handle = find_handle(scene.model, scene.coordinate, arguments.handle)
+    except UnknownNameError as error:
+        if arguments.handle is not None:
+            raise
+        return None, f"{error} Without one it can be pushed: kineverse push ... --to VALUE."
+    print(handle, file=sys.stderr)
+    return handle, ""
 
 
 def skip_skill(scene: ManipulationScene, world: World, done: bool, reason: str) -> Outcome:

@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from kineverse.cli.arguments import add_model_options, load_model, parse_length
-from kineverse.cli.output import format_table, show_activity
+from kineverse.cli.output import show_activity
 from kineverse.cli.plan_arguments import (
     FrameTarget,
     Request,
@@ -25,6 +25,7 @@ from kineverse.cli.plan_arguments import (
     parse_frame_target,
     parse_request,
 )
+from kineverse.cli.plan_output import path_to_json, print_path
 from kineverse.cli.view import (
     add_page_options,
     handle_interrupts,
@@ -34,7 +35,6 @@ from kineverse.cli.view import (
     print_mesh_problems,
 )
 from kineverse.errors import InvalidValueError
-from kineverse.expressions.printing import format_number
 
 if TYPE_CHECKING:
     import kineverse as kv
@@ -64,7 +64,6 @@ examples:
 FOUND, NOT_FOUND = 0, 1
 _MOST_STARTS = 8
 _GOALS = 32
-_COLUMNS = 6
 _GHOSTS = 4
 
 
@@ -207,9 +206,9 @@ def run(arguments: argparse.Namespace) -> int:
     if arguments.save is not None and trajectory is not None:
         trajectory.save(arguments.save)
     if arguments.json:
-        print(json.dumps(_to_json(path, preparation), allow_nan=False))
+        print(json.dumps(path_to_json(path, preparation), allow_nan=False))
     else:
-        _print_path(arguments, path, preparation)
+        print_path(arguments, path, preparation)
     if arguments.picture is not None:
         _write_picture(arguments.picture, problem, path)
     if arguments.view:
@@ -324,71 +323,6 @@ def _state(problem: _Problem, q: Any) -> kv.State:
     if q is None:
         return problem.state
     return problem.state.updated(dict(zip(problem.planner.symbols, q.tolist(), strict=True)))
-
-
-def _print_path(arguments: argparse.Namespace, path: Path, preparation: float) -> None:
-    """Print what was found."""
-    goal = " ".join(arguments.to)
-    if not path.found:
-        print(f"{goal}: not found. {path.why}")
-        if not arguments.move:
-            print(f"  moves      {_list_moving(path)}; --move names others")
-        return
-    clearance = path.clearance()
-    near = "nothing within 50 cm" if math.isinf(clearance) else f"{format_number(1e3 * clearance, 4)} mm"
-    print(f"{goal}: found")
-    for name, value in (
-        ("moves", _list_moving(path)),
-        ("points", str(len(path))),
-        ("length", f"{format_number(path.length, 4)} (rad, m)"),
-        ("duration", f"{format_number(float(path.times[-1]), 4)} s"),
-        ("clearance", near),
-        ("planned", _format_time(path.seconds)),
-        ("prepared", _format_time(preparation)),
-    ):
-        print(f"  {name:<9}  {value}")
-    if arguments.verbose:
-        print(_format_way(path))
-    if arguments.save is not None:
-        print(f"trajectory: {arguments.save}")
-
-
-def _list_moving(path: Path) -> str:
-    more = f" and {len(path.symbols) - 3} more" if len(path.symbols) > 3 else ""
-    return ", ".join(map(str, path.symbols[:3])) + more
-
-
-def _format_time(seconds: float) -> str:
-    return f"{format_number(1e3 * seconds, 3)} ms" if seconds < 1 else f"{format_number(seconds, 3)} s"
-
-
-def _format_way(path: Path) -> str:
-    """Return a table of the positions at some points of a path."""
-    chosen = np.unique(np.linspace(0, len(path) - 1, _COLUMNS).round().astype(int))
-    head = ["time [s]", *(format_number(float(t), 3) for t in path.times[chosen])]
-    rows = [
-        [str(symbol), *(format_number(float(v), 4) for v in column[chosen])]
-        for symbol, column in zip(path.symbols, path.points.T, strict=True)
-    ]
-    return format_table(head, rows, "<" + ">" * len(chosen))
-
-
-def _to_json(path: Path, preparation: float) -> dict[str, Any]:
-    """Return a path as plain data."""
-    clearance = path.clearance() if path.found else math.inf
-    return {
-        "found": path.found,
-        "why": path.why,
-        "coordinates": [str(symbol) for symbol in path.symbols],
-        "points": path.points.tolist(),
-        "times": path.times.tolist() if path.found else None,
-        "length": path.length,
-        "clearance": clearance if math.isfinite(clearance) else None,
-        "seconds": path.seconds,
-        "preparation_seconds": preparation,
-        # The end, as 'kineverse reach' writes it: --from takes the file.
-        "positions": dict(zip(map(str, path.symbols), path.points[-1].tolist(), strict=True)),
-    }
 
 
 def _moved_frame(problem: _Problem) -> str:

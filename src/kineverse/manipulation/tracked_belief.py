@@ -23,11 +23,7 @@ from kineverse.model.model_view import ModelView
 from kineverse.state import State
 from kineverse.symbols import Symbol
 from kineverse.worlds import Observation, Sensors, World
-from kineverse.worlds.sensor_sampler import (
-    find_camera,
-    find_marked_frames,
-    find_robot_base,
-)
+from kineverse.worlds.sensor_sampler import find_camera, find_marked_frames, find_robot_base
 
 from .base_filter import BaseFilter, motion_of, place
 from .belief import check_believed

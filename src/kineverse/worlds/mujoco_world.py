@@ -205,7 +205,8 @@ class MujocoWorld:
         """Frame of the body that both fingers press, or that is tied to them; None if there is none."""
         if self._drive is None:
             return None
-        return self._drive.tied or self._drive.pressed(self._data)
+        held = self._drive.tied or self._drive.pressed(self._data)
+        return held if held in self.model.frames else None  # fingers may press the floor
 
     @property
     def refused(self) -> int:

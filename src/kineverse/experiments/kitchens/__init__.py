@@ -24,9 +24,10 @@ from kineverse.experiments.manipulation.trial_pool import run_jobs
 from kineverse.experiments.manipulation.trials import Trial
 from kineverse.experiments.registry import Options, Progress
 from kineverse.experiments.report import Report
-from kineverse.geometry import Rule, Scene
+from kineverse.geometry import Rule
 from kineverse.grasping import find_handle
 from kineverse.manipulation import find_articulated_objects
+from kineverse.manipulation.start_state import find_free_state
 from kineverse.model.model import Model
 from kineverse.state import State
 from kineverse.symbols import Symbol
@@ -144,17 +145,15 @@ def start_in_aisle(robot: RobotSource, model: Model) -> State:
     NoSolutionError
         If there is no such place.
     """
-    scene = Scene(model)
-    floor = f"{KITCHEN}/floor"
-    rules = [Rule(f"{robot.prefix}/*", f"{robot.prefix}/*")]
-    rules += [Rule("*", floor)] if floor in model.frames else []
-    near = scene.watch(f"{robot.prefix}/*", "*", radius=_CLEARANCE, rules=rules)
-    for offset, angle in product(_OFFSETS, (math.pi / 2, -math.pi / 2)):
-        base = {f"{robot.prefix}/base/y": offset, f"{robot.prefix}/base/angle": angle}
-        state = robot.start_state(model).updated(base)
-        scene.update(state)
-        if not len(near()):
-            return state
+    floor, begin = f"{KITCHEN}/floor", robot.start_state(model)
+    states = (
+        begin.updated({f"{robot.prefix}/base/y": offset, f"{robot.prefix}/base/angle": angle})
+        for offset, angle in product(_OFFSETS, (math.pi / 2, -math.pi / 2))
+    )
+    rules = [Rule("*", floor)] if floor in model.frames else []
+    found, _ = find_free_state(model, robot.prefix, states, _CLEARANCE, rules)
+    if found is not None:
+        return found
     raise NoSolutionError(f"The {robot.name} stands free nowhere along the aisle.")
 
 

@@ -88,7 +88,8 @@ def to_mjcf(
         If True, constraints that MJCF cannot represent are errors. Otherwise they are left out, with a
         remark.
     visuals
-        False to leave out the visual shapes.
+        False to leave out the visual shapes. Those of a body without others are its collision shapes, as in a
+        scene of distances.
 
     Raises
     ------
@@ -126,10 +127,12 @@ def to_mjcf(
 
 
 def _drop_visuals(description: RobotDescription) -> None:
-    """Remove the visual shapes of all bodies."""
-    description.world_body = replace(description.world_body, visuals=())
+    """Remove the visual shapes of all bodies; where there are no others, they become those that collide."""
+    body = description.world_body
+    description.world_body = replace(body, visuals=(), collisions=body.collisions or body.visuals)
     for link in description.links:
-        link.body = replace(link.body, visuals=())
+        body = link.body
+        link.body = replace(body, visuals=(), collisions=body.collisions or body.visuals)
 
 
 class MjcfWriter:

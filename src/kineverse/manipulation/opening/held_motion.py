@@ -24,7 +24,9 @@ _SLIPPED, _SIGMAS = 0.008, 4.0
 deviations of its estimate that are added."""
 _STALLED, _PATIENCE, _RESTING = 1e-3, 4.0, 0.5
 """Least progress of the object [m], [rad] in a time [s], and in one at the end of the way."""
-
+_LOCKED, _STANDING = 1.5, 1e-3
+"""Time [s] after which an object that has not moved yet is not waited for, if the controller plans no speed
+beyond some [m/s], [rad/s] for it either: its own constraints hold it."""
 _SETTLED = 10
 """Number of steps for which an estimate is at the target when a motion ends."""
 
@@ -120,7 +122,9 @@ def move_held(motion: HandMotion, placement: BasePlacement, tolerance: float) ->
         resting = session.world.time - since
         if share == 1.0 and rest < 0.75 * tolerance and resting > _RESTING:
             return
-        if resting > _PATIENCE:
+        planned = abs(float(command.speeds.get(coordinate.derivative(), np.inf)))
+        held_fast = best == 0.0 and share < 1.0 and planned < _STANDING
+        if resting > (_LOCKED if held_fast else _PATIENCE):
             stops = ", ".join(command.active[:3]) or "nothing that the controller knows; it may be locked"
             raise SkillError(
                 "collision" if "contact" in stops else "other",
