@@ -116,7 +116,8 @@ class Judge:
             self._watch_handle(handle, contact_gap)
             self._gripping.add(handle)
         self._select_pairs()
-        self._place = compile([model.fk(name)[:3, 3] for name in self._followed()])
+        # A few calls a step: compiling C takes longer than all of them.
+        self._place = compile([model.fk(name)[:3, 3] for name in self._followed()], tier="interpreter")
         self._place_values = self._indices(self._place.inputs)
         self._in_hand: dict[str, tuple[CompiledFunction[Array], npt.NDArray[np.intp]]] = {}
         self.reset()
@@ -354,7 +355,7 @@ class Judge:
             self._held = None
             return
         if held not in self._in_hand:
-            relative = compile(self.model.fk(held, self.gripper.hand))
+            relative = compile(self.model.fk(held, self.gripper.hand), tier="interpreter")
             self._in_hand[held] = relative, self._indices(relative.inputs)
             if held not in self._gripping:
                 self._gripping.add(held)

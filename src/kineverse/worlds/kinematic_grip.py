@@ -93,7 +93,7 @@ class KinematicGrip:
         self._at = np.array([motion.symbols.index(s) for s in gripper.joints], dtype=np.intp)
         self._closing = np.array([np.sign(gripper.closed[s] - gripper.opened[s]) for s in gripper.joints])
         self._range = np.array([model.limits(s) for s in gripper.joints]).reshape(-1, 2)
-        self._hand_pose = compile(model.fk(gripper.hand))
+        self._hand_pose = compile(model.fk(gripper.hand), tier="interpreter")  # a few calls a step
         place = {s: k for k, s in enumerate(motion.symbols)}
         self._hand_inputs = np.array([place[s] for s in self._hand_pose.inputs], dtype=np.intp)
         number = {b: k for k, b in enumerate(motion.scene.bodies)}

@@ -6,11 +6,13 @@ import math
 from collections import deque
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import replace
+from functools import cached_property
 from typing import NamedTuple
 
 import numpy as np
 
 from kineverse._checks import finite_number
+from kineverse.compile import CompiledFunction
 from kineverse.compile import compile as compile_expressions
 from kineverse.errors import InvalidValueError, UnknownNameError, suggest
 from kineverse.lie import Array, inverse, quaternion, retract, rotation_z, transform
@@ -83,10 +85,18 @@ class SensorSampler:
         base = find_robot_base(model, robot)
         self._base, self._planar = base.coordinates, base.is_planar
         self._encoded = tuple(s for s in self._joints if s not in set(self._base))
-        self._poses = compile_expressions([model.fk(name) for name in (self.camera, *self.marked)])
-        self._camera_pose = compile_expressions(model.fk(self.camera))
+        # Compiled for the first picture: many worlds are never observed.
+        self._seen = [model.fk(name) for name in (self.camera, *self.marked)]
         self._sight = LineOfSight(model, self.camera, own, self.marked) if sensors.sight else None
         self.reset()
+
+    @cached_property
+    def _poses(self) -> CompiledFunction[tuple[Array, ...]]:
+        return compile_expressions(self._seen)
+
+    @cached_property
+    def _camera_pose(self) -> CompiledFunction[Array]:
+        return compile_expressions(self._seen[0])
 
     def reset(self) -> None:
         """Begin anew, with the noise of the same seed and nothing on its way."""

@@ -59,7 +59,7 @@ def move_held(motion: HandMotion, placement: BasePlacement, tolerance: float) ->
     middle = motion.gripper.grasp_pose[:, 3]
     uncertain = [session.deviation(x) for x in ((bar @ held - hand) @ middle)[:3]]
     slipped = _SLIPPED + _SIGMAS * float(np.linalg.norm(uncertain))
-    poses = compile([bar, hand])
+    poses = compile([bar, hand], tier="interpreter")  # a call a step
     target = float(placement.values[-1])
     moving = motion.search.moving
     rows = motion.rows(placement.way)
