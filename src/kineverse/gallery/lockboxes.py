@@ -179,6 +179,35 @@ def draw_lockbox(
     return Lockbox(MappingProxyType(drawn), {names[-1]: 1.0})
 
 
+def draw_tangled_lockbox(parts: int, seed: int) -> Lockbox:
+    """Return a random box with up to three conditions a part on any others, on either side.
+
+    Locks may depend on each other in circles, and half of them block both directions, so that the box may
+    have no solution.
+
+    Parameters
+    ----------
+    parts
+        Number of parts.
+    seed
+        Seed of the random numbers.
+    """
+    rng = np.random.default_rng(seed)
+    names = [f"part_{k}" for k in range(parts)]
+    drawn = {}
+    for k, name in enumerate(names):
+        others = [j for j in rng.permutation(parts).tolist() if j != k]
+        groups: list[tuple[Condition, ...]] = []
+        for j in others[: int(rng.integers(4))]:
+            condition = Condition(names[j], round(float(rng.uniform(0.2, 0.8)), 1), bool(rng.random() < 0.5))
+            if groups and rng.random() < 0.3:
+                groups[-1] += (condition,)
+            else:
+                groups.append((condition,))
+        drawn[name] = Slider(groups=tuple(groups), blocks="both" if rng.random() < 0.5 else "forward")
+    return Lockbox(MappingProxyType(drawn), {names[-1]: 1.0})
+
+
 def _threshold(rng: np.random.Generator) -> float:
     return round(float(rng.uniform(0.2, 0.8)), 2)
 
