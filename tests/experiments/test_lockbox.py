@@ -13,7 +13,7 @@ from kineverse.experiments.lockbox import (
     run_planner,
 )
 from kineverse.experiments.lockbox.exhaustive_search import can_be_opened
-from kineverse.experiments.lockbox.unlocking_runs import LOCK_RULES, open_box
+from kineverse.experiments.lockbox.unlocking_runs import LOCK_RULES, run_unlocking
 from kineverse.gallery.lockboxes import THESIS, Condition, Lockbox, Slider, make_rings
 
 
@@ -58,7 +58,7 @@ def test_report_of_few_boxes():
         for one in run_planner(job)
     ]
     assert not any(one.wrong for one in planned)
-    thesis = {rule: open_box(THESIS, rule, 160) for rule in LOCK_RULES}
+    thesis = {rule: run_unlocking(THESIS, rule, 160) for rule in LOCK_RULES}
     report = make_lockbox_report(thesis, explored, planned, 0)
     opened = {row["rule"]: (row["opened"], row["of"]) for row in report.numbers["explorer"]}
     assert opened["and"] == (1, 1)

@@ -13,7 +13,7 @@ import pytest
 from kineverse.cli.reproduce import format_report
 from kineverse.errors import FormatError, InvalidValueError, UnknownNameError
 from kineverse.experiments import Options, kitchens, reproduce, table1_open, table1_push
-from kineverse.experiments.lockbox.unlocking_runs import RULES, open_box
+from kineverse.experiments.lockbox.unlocking_runs import RULES, run_unlocking
 from kineverse.experiments.manipulation import setting, skills
 from kineverse.experiments.manipulation.film import draw_vectors, find_telling_moment
 from kineverse.experiments.manipulation.robots import SHIPPED, find_data, find_robots
@@ -194,7 +194,7 @@ def test_leader_follower_opens_the_drawer_within_the_papers_tolerance():
 
 @pytest.mark.parametrize("rule", RULES)
 def test_open_box_thesis_needs_trends_of_and(rule):
-    found = open_box(THESIS, rule)
+    found = run_unlocking(THESIS, rule)
     assert found.done == (rule == "and")
     if rule == "and":
         assert found.order[:3] == ("f", "e", "d")
@@ -204,7 +204,7 @@ def test_open_box_thesis_needs_trends_of_and(rule):
 
 
 def test_open_box_random_boxes_with_trends():
-    assert all(open_box(draw_lockbox(10, seed), "and", 400).done for seed in range(3))
+    assert all(run_unlocking(draw_lockbox(10, seed), "and", 400).done for seed in range(3))
 
 
 def test_make_push_setup_opens_the_object_and_takes_the_papers_start():

@@ -19,6 +19,7 @@ from kineverse.expressions.expression import (
     NO_NODES,
     Expression,
     ExpressionLike,
+    array,
     as_expression,
     binary,
     from_casadi,
@@ -37,6 +38,8 @@ Claims: TypeAlias = dict[tuple[Symbol, Way], Expression]
 _SHUT = 1e-6
 """Speed [m/s] or distance [m] up to which a lock counts as shut."""
 _TINY = 1e-9
+_DAMPING = 0.01
+"""Weight of the speeds of keys, so that one that nothing needs any more stops."""
 _SWEEPS = 3
 """Passes of demand over locks that depend on each other in circles; one is enough for others."""
 
@@ -131,10 +134,11 @@ def unlock(
     There is a goal for each coordinate, and one for each side of a lock c that the way there depends on:
     ``Σ D(c)[q̇]·q̇ / |D(c)| = rate``, with D(c) the trend of the lock's bound. It has weight 0 unless the lock
     is shut and demanded. The goals are demanded until they are reached, and the keys of a demanded lock that
-    is shut are demanded in turn. A lock counts as shut until its keys are a margin beyond their thresholds,
-    so that it does not chatter. If locks want a key on different sides, the one with the fewest unmet
-    conditions wins, and one that is open keeps its keys until the coordinate that it held is where it was
-    demanded.
+    is shut are demanded in turn; keys that nothing needs stand still.
+
+    A lock counts as shut until its keys are a margin beyond their thresholds, so that it does not chatter. If
+    locks want a key on different sides, the one with the fewest unmet conditions wins, and one that is open
+    keeps its keys until the coordinate that it held is where it was demanded.
 
     Parameters
     ----------
@@ -162,26 +166,29 @@ def unlock(
         if not (finite_number(number) or 0.0) > 0:
             raise InvalidValueError(f"The {what} of unlocking is a positive number, not {number!r}.")
     goals = _check_goals(model, goal)
-    sides = find_lock_sides(model, goals)
-    margins = {key: _margin(model, key, margin) for side in sides for key in side.trend}
-    sides = [side.behind(margins) for side in sides]
+    found = _sort_sides(find_lock_sides(model, goals), goals)
+    margins = {key: _margin(model, key, margin) for side in found for key in side.trend}
+    order = [side.behind(margins) for side in found]
     tasks = [Goal(q, value, name=f"reach {q}", gain=2.0, weight=10.0) for q, value in goals.items()]
     wanted: Claims = {}
     for q, value in goals.items():
         wanted[q, 1] = _is_less(q, value - tolerance)
         wanted[q, -1] = _is_less(value + tolerance, q)
-    order = _sort_sides(sides, goals)
     shut = [_is_less(side.room, _SHUT) for side in order]
     needs = _pass_demand(order, shut, wanted) if demand else [as_expression(1.0)] * len(order)
     states = list(zip(order, shut, needs, strict=True))
-    scores = [_score(*state, number) for number, state in enumerate(states)]
-    claims = _collect_claims(order, scores)
+    scores = [_score(*pair, number) for number, pair in enumerate(zip(found, order, needs, strict=True))]
+    claims = _collect_claims(found, order, scores)
     for (side, is_shut, need), score in zip(states, scores, strict=True):
         trend = {q: slope * _wins(q, slope, score, claims) for q, slope in side.trend.items()}
         length = sqrt(sum((s * s for s in trend.values()), as_expression(_TINY**2)))
         # A quantity of value 0 that changes along the unit vector of the trend.
         along = as_expression(0.0).with_gradient({q.derivative(): s / length for q, s in trend.items()})
         tasks.append(Goal(along, name=f"unlock {side.name}", rate=rate, weight=need * is_shut))
+    keys = dict.fromkeys(key for side in order for key in side.trend if key not in goals)
+    if keys:
+        still = array([key.derivative() for key in keys])
+        tasks.append(Goal(still, name="stand still", weight=_DAMPING))
     return tuple(tasks)
 
 
@@ -195,19 +202,24 @@ def _margin(model: ModelView, key: Symbol, most: float) -> float:
     return min([most, *(0.05 * (high - low) for low, high in ends)])
 
 
-def _score(side: LockSide, is_shut: Expression, need: Expression, number: int) -> Expression:
+def _score(side: LockSide, behind: LockSide, need: Expression, number: int) -> Expression:
     """Return the priority of a side: 1 if its lock is open, less the more of its conditions are unmet."""
-    unmet = sum((_is_less(_TINY, absolute(s)) for s in side.trend.values()), as_expression(0.0))
-    return need * (1 + 1e-4 * number) / (1 + is_shut * unmet)
+    unmet = sum((_is_less(_TINY, absolute(s)) for s in behind.trend.values()), as_expression(0.0))
+    return need * (1 + 1e-4 * number) / (1 + _is_less(side.room, _SHUT) * unmet)
 
 
-def _collect_claims(sides: list[LockSide], scores: list[Expression]) -> Claims:
-    """Return the highest score that wants each coordinate in each direction."""
+def _collect_claims(sides: list[LockSide], behind: list[LockSide], scores: list[Expression]) -> Claims:
+    """Return the highest score that wants each coordinate in each direction.
+
+    A shut lock claims the keys that it lacks, an open one all of its keys.
+    """
     claims: Claims = {}
-    for side, score in zip(sides, scores, strict=True):
+    for side, back, score in zip(sides, behind, scores, strict=True):
+        is_open = 1 - _is_less(side.room, _SHUT)
         for q, slope in side.trend.items():
+            wanted = back.trend[q] + is_open * slope
             for way in (1, -1):
-                own = score * _is_less(_TINY, way * slope)
+                own = score * _is_less(_TINY, way * wanted)
                 claims[q, way] = _larger(claims[q, way], own) if (q, way) in claims else own
     return claims
 

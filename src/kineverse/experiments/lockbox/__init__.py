@@ -28,7 +28,7 @@ from kineverse.reasoning import interlocks, plan_unlocking, plan_violations
 
 from .exhaustive_search import can_be_opened
 from .figure import FIGURE_SIZE, draw_boxes
-from .unlocking_runs import LOCK_RULES, Rule, UnlockingRun, open_box
+from .unlocking_runs import LOCK_RULES, Rule, UnlockingRun, run_unlocking
 
 OPTIONS = ("quick", "seed", "count", "processes")
 
@@ -104,7 +104,7 @@ class PlannerResult:
 def run(progress: Progress, options: Options) -> Report:
     """Open boxes by trends and plan their opening; ``quick`` takes few and small boxes."""
     count = options.count or (QUICK_COUNT if options.quick else COUNT)
-    thesis = {rule: open_box(THESIS, rule) for rule in LOCK_RULES}
+    thesis = {rule: run_unlocking(THESIS, rule) for rule in LOCK_RULES}
     explored = run_jobs(
         run_explorer,
         list_explorer_jobs(count, options.seed, options.quick),
@@ -153,7 +153,7 @@ def _spread(k: int, largest: int) -> int:
 def run_explorer(job: ExplorerJob) -> list[ExplorerResult]:
     """Open one random box."""
     box = draw_lockbox(job.parts, job.seed, negated=job.negated)
-    found = open_box(box, job.rule, 400 + _STEPS_A_PART * job.parts)
+    found = run_unlocking(box, job.rule, 400 + _STEPS_A_PART * job.parts)
     solvable: bool | None = True
     if job.negated and not found.done:
         verdict = plan_unlocking(make_lockbox_model(box, None), box.goal).verdict

@@ -51,7 +51,7 @@ class UnlockingRun:
     cpu: tuple[float, ...]
 
 
-def open_box(box: Lockbox, rule: Rule = "and", steps: int = STEPS) -> UnlockingRun:
+def run_unlocking(box: Lockbox, rule: Rule = "and", steps: int = STEPS) -> UnlockingRun:
     """Open a box by the tasks of :func:`kineverse.control.unlock`.
 
     Parameters
