@@ -158,18 +158,24 @@ def make_graph(
 
     whole = [((1 << len(own)) - 1) << begin for own, begin in zip(cells, first, strict=True)]
     masks = [(rule, sum(whole[place[s]] & ~bits(s, side) for s, side in rule.box.items())) for rule in rules]
+    held: dict[Symbol, list[tuple[MoveRule, int]]] = {symbol: [] for symbol in coordinates}
+    entered: dict[Symbol, list[tuple[MoveRule, int]]] = {symbol: [] for symbol in coordinates}
+    for rule, mask in masks:
+        if rule.way != "enter" and rule.coordinate is not None:
+            held[rule.coordinate].append((rule, mask))
+        elif rule.way == "enter":
+            for symbol in rule.box.keys() - {rule.coordinate}:
+                entered[symbol].append((rule, mask))
     steps = []
     for k, symbol in enumerate(coordinates):
-        held = [(r, m) for r, m in masks if r.coordinate == symbol and r.way != "enter"]
-        entry = [(r, m) for r, m in masks if r.way == "enter" and r.coordinate != symbol and symbol in r.box]
         both = []
         for way, name in ((1, "up"), (-1, "down")):
-            about = [(r, m) for r, m in held if r.way == name]
+            about = [(r, m) for r, m in held[symbol] if r.way == name]
             both.append(
                 tuple(
                     None
                     if symbol in still
-                    else _make_step(cells[k], n, way, whole[k], first[k], about, entry)
+                    else _make_step(cells[k], n, way, whole[k], first[k], about, entered[symbol])
                     for n in range(len(cells[k]))
                 )
             )
