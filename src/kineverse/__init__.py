@@ -120,6 +120,16 @@ model.registry.register_collection(
         prefix="kitchen",
     ),
 )
+model.registry.register_collection(
+    "lockboxes",
+    model.registry.ModelCollection(
+        "kineverse.gallery.lockboxes:example_boxes",
+        "kineverse.gallery.lockboxes:lockbox_operations",
+        summary="one for each seed from 0 on",
+        accept="kineverse.gallery.lockboxes:has_lockbox",
+        prefix="lockbox",
+    ),
+)
 model.registry.register_service("read_mesh", "kineverse.geometry.mesh_files:read_mesh")
 
 

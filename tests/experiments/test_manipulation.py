@@ -13,7 +13,7 @@ import pytest
 from kineverse.cli.reproduce import format_report
 from kineverse.errors import FormatError, InvalidValueError, UnknownNameError
 from kineverse.experiments import Options, kitchens, reproduce, table1_open, table1_push
-from kineverse.experiments.ablations.locks import RULES, THESIS, UPPER, draw_box, unlock
+from kineverse.experiments.lockbox.unlocking_runs import RULES, run_unlocking
 from kineverse.experiments.manipulation import setting, skills
 from kineverse.experiments.manipulation.film import draw_vectors, find_telling_moment
 from kineverse.experiments.manipulation.robots import SHIPPED, find_data, find_robots
@@ -24,6 +24,7 @@ from kineverse.experiments.manipulation.trials import Moment, Trial, count_objec
 from kineverse.experiments.table1_open.objects import OBJECTS, make_opening_setup
 from kineverse.experiments.table1_open.programs import LeaderFollower, SpeedScale, open_by_program
 from kineverse.experiments.table1_push.objects import find_kitchens, make_push_setup
+from kineverse.gallery.lockboxes import THESIS, draw_lockbox
 from kineverse.geometry import Rule, Scene
 from kineverse.manipulation import Outcome, TrackedBelief, TrueBelief
 from kineverse.manipulation.start_state import find_free_state
@@ -193,8 +194,8 @@ def test_leader_follower_opens_the_drawer_within_the_papers_tolerance():
 
 
 @pytest.mark.parametrize("rule", RULES)
-def test_unlock_thesis_box_needs_trends_of_and(rule):
-    found = unlock(THESIS, "a", UPPER, rule)
+def test_open_box_thesis_needs_trends_of_and(rule):
+    found = run_unlocking(THESIS, rule)
     assert found.done == (rule == "and")
     if rule == "and":
         assert found.order[:3] == ("f", "e", "d")
@@ -203,8 +204,8 @@ def test_unlock_thesis_box_needs_trends_of_and(rule):
         assert found.order == {"product": ("f", "e", "d"), "none": ()}[rule]
 
 
-def test_unlock_random_boxes_with_trends():
-    assert all(unlock(*draw_box(10, seed), "and", 400).done for seed in range(3))
+def test_open_box_random_boxes_with_trends():
+    assert all(run_unlocking(draw_lockbox(10, seed), "and", 400).done for seed in range(3))
 
 
 def test_make_push_setup_opens_the_object_and_takes_the_papers_start():

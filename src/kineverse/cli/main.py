@@ -27,6 +27,7 @@ from kineverse.cli import (
     reach,
     reproduce,
     spheres,
+    unlock,
     validate,
     view,
 )
@@ -53,7 +54,7 @@ def _by_name(*modules: ModuleType) -> dict[str, Any]:
 
 
 COMMANDS: dict[str, CommandModule] = {
-    **_by_name(info, fk, reach, plan),
+    **_by_name(info, fk, reach, plan, unlock),
     **manipulate.COMMANDS,
     **_by_name(
         view,
@@ -85,6 +86,7 @@ examples:
   kineverse fk kitchen kitchen/fridge_door_handle --set kitchen/fridge_door=30deg
   kineverse reach fetch fetch/gripper_link --pose 0.7 0.2 0.9
   kineverse plan shelf_door --to shelf_door/door=80deg
+  kineverse unlock lockboxes/thesis --goal lockbox/a=1.2
   kineverse push kitchen --robot hsr --what kitchen/fridge_door
   kineverse view kitchen                              move it in the browser
   kineverse convert kitchen kitchen.kv.json           write it in another format

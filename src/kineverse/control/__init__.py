@@ -7,6 +7,7 @@ from .inverse_kinematics import InverseKinematics, inverse_kinematics
 from .targets import Target
 from .task_functions import look_at, same_orientation, same_pose, same_position
 from .tasks import Goal, Hold, Keep, Task
+from .unlocking import unlock
 
 __all__ = [
     "Command",
@@ -23,4 +24,5 @@ __all__ = [
     "same_orientation",
     "same_pose",
     "same_position",
+    "unlock",
 ]

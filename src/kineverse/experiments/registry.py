@@ -90,6 +90,7 @@ EXPERIMENTS: Mapping[str, str] = MappingProxyType(
         "table1-open": "grasped objects are opened, also by the papers' two programs (2022 paper, Table I)",
         "table1-push": "twelve objects of a kitchen are pushed shut (both papers, Table I)",
         "unknown-objects": "a door and a drawer whose joints nobody described are opened (--count 10)",
+        "lockbox": "parts that lock each other, opened by trends and by plans (thesis behind the 2020 paper)",
         "ablations": "pushes and locks without augmented gradients, and with each rule of trends",
         "estimation-grid": "hinges and sliders learned from noisy poses, against the Cramér-Rao bound",
     }

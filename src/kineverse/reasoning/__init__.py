@@ -8,6 +8,8 @@ from .certify import contradictions
 from .find_interlocks import interlocks
 from .interlock import Hold, Interlock, Interlocks, Undecided
 from .opening_order import opening_order
+from .plan_check import plan_violations
+from .unlocking_plan import UnlockingPlan, UnlockingStep, plan_unlocking
 
 __all__ = [
     "Hold",
@@ -16,9 +18,13 @@ __all__ = [
     "Interval",
     "IntervalBox",
     "Undecided",
+    "UnlockingPlan",
+    "UnlockingStep",
     "contradictions",
     "interlocks",
     "opening_order",
+    "plan_unlocking",
+    "plan_violations",
 ]
 
 

@@ -59,7 +59,7 @@ class Case:
         before: Mapping[int, AbstractValue] | None = None,
         narrowed: frozenset[Symbol] = frozenset(),
     ) -> None:
-        self._domain = domain
+        self.domain = domain
         self._axes = dict(axes or {})
         self._signs = dict(signs or {})
         self._found: dict[int, int | None] = {}
@@ -103,7 +103,7 @@ class Case:
         """Return the interval of a symbol or of a linear form."""
         known = self._axes.get(axis)
         if len(axis) == 1:
-            return known if known is not None else self._domain.limits_of(axis[0][0])
+            return known if known is not None else self.domain.limits_of(axis[0][0])
         total = self._sum({((s, 1),): f for s, f in axis})
         return total if known is None else total.intersection(known)
 
@@ -116,7 +116,7 @@ class Case:
         """Return the conditions of the case, without those implied by the limits."""
         sides = {}
         for axis, side in self._axes.items():
-            limit = self._domain.limits_of(axis[0][0]) if len(axis) == 1 else Interval()
+            limit = self.domain.limits_of(axis[0][0]) if len(axis) == 1 else Interval()
             low = side.lower == limit.lower and side.lower_closed == limit.lower_closed
             high = side.upper == limit.upper and side.upper_closed == limit.upper_closed
             sides[linear_form_expression(axis)] = Interval(
@@ -171,10 +171,10 @@ class Case:
     def _on_spheres(self, value: AbstractValue) -> AbstractValue:
         """Return the value refined by the unit length of quaternions."""
         p = value.polynomial
-        if p is None or p.degree < 2 or not self._domain.spheres:
+        if p is None or p.degree < 2 or not self.domain.spheres:
             return value
-        p = self._domain.reduce(p)
-        low, high = self._domain.form_range(p) or value.range
+        p = self.domain.reduce(p)
+        low, high = self.domain.form_range(p) or value.range
         span = (max(low, value.range[0]), min(high, value.range[1]))
         return AbstractValue(span, p, p.symbols, value.doubtful)
 
@@ -268,7 +268,7 @@ class Case:
 
         def ranges(low: float, high: float) -> tuple[RealInterval, RealInterval | None]:
             span = Interval(_exact(low), _exact(high), not math.isinf(low), not math.isinf(high))
-            inner = Case((term,), self._domain, {**self._axes, axis: span}, self._signs, order)
+            inner = Case((term,), self.domain, {**self._axes, axis: span}, self._signs, order)
             rates = root_isolation.slope_ranges(order, inner.values, inner.sign, symbol)
             return inner.value(term).range, rates[term.index]
 
@@ -311,7 +311,7 @@ class Case:
                 known = sign if sign == 0 else _sign_of(at(_inner_point(side.intersection(inner))))
                 signs = {**self._signs, term.index: known}
                 axes, narrowed = {**self._axes, axis: side}, frozenset(s for s, _ in axis)
-                cases.append(Case(self._roots, self._domain, axes, signs, self._order, self.values, narrowed))
+                cases.append(Case(self._roots, self.domain, axes, signs, self._order, self.values, narrowed))
         return [case for case in cases if not case.is_empty]
 
 

@@ -6,6 +6,8 @@ import math
 from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass, field
 
+import casadi as ca
+
 from kineverse.expressions.expression import Expression, as_expression
 from kineverse.expressions.gradient import partial
 from kineverse.expressions.substitution import apply_substitution
@@ -100,6 +102,19 @@ def _collect_regions(
     unknown: list[tuple[str, IntervalBox]],
 ) -> None:
     slack, opposite, blocks, forces = side
+    if start.sign(factor) == 1:
+        parts = _nonnegative_factors(start, slack)
+        if len(parts) > 1:
+            # A product of these is 0 where one of them is, so that n conditions make n cases, and not 2ⁿ.
+            doubts: list[tuple[str, IntervalBox]] = []
+            found = Region()
+            for part in parts:
+                own = Case((factor, part), start.domain)
+                _collect_regions(own, factor, (part, opposite, found, forces), doubts)
+            if not doubts:
+                blocks.boxes += found.boxes
+                blocks.reported += found.reported
+                return
 
     def ask(case: Case) -> int | str | Unclear:
         factor_sign = case.sign(factor)
@@ -127,6 +142,26 @@ def _collect_regions(
             blocks.add(case.box(), reported)
             if answer < 0:
                 forces.add(case.box(), reported)
+
+
+def _nonnegative_factors(case: Case, term: Term) -> list[Term]:
+    """Return the factors of a product without constants if all are finite and >= 0, else the term."""
+    found: dict[int, Term] = {}
+    positive, stack = True, [term]
+    while stack:
+        part = stack.pop()
+        if part.op in (ca.OP_MUL, ca.OP_NEG):
+            positive = positive != (part.op == ca.OP_NEG)
+            stack += part.args
+            continue
+        value = case.value(part)
+        if value.number is not None and value.number != 0:
+            positive = positive == (value.number > 0)
+        elif value.void or value.doubtful or value.range[0] < 0 or math.isinf(value.range[1]):
+            return [term]
+        else:
+            found[part.index] = part
+    return list(found.values()) if positive else [term]
 
 
 def _ramp_reason(case: Case, terms: tuple[Term, ...]) -> str | None:

@@ -13,6 +13,8 @@ from dataclasses import replace
 
 import numpy as np
 
+from kineverse.experiments.lockbox.figure import FIGURE_SIZE, draw_boxes
+from kineverse.experiments.lockbox.unlocking_runs import RULES, Rule, UnlockingRun, run_unlocking
 from kineverse.experiments.manipulation.columns import QUALITY, ROW, TIMES, Column
 from kineverse.experiments.manipulation.robots import find_data, find_robots
 from kineverse.experiments.manipulation.setting import SettingOptions, make_settings
@@ -29,9 +31,7 @@ from kineverse.experiments.report import Figure, Report, ReportTable
 from kineverse.experiments.table1_push import PushJob, run_push
 from kineverse.experiments.table1_push.objects import OBJECTS, SHIPPED_KITCHEN
 from kineverse.experiments.table1_push.report import OBJECT_COLUMNS
-
-from .figure import FIGURE_SIZE, draw_boxes
-from .locks import RULES, THESIS, UPPER, Rule, UnlockingRun, draw_box, unlock
+from kineverse.gallery.lockboxes import THESIS, draw_lockbox
 
 OPTIONS = ("quick", "data", "seed", "count", "robot", "processes", *SettingOptions)
 
@@ -47,7 +47,7 @@ def run(progress: Progress, options: Options) -> Report:
     settings = make_settings(options)
     robots = find_robots(options.robot, find_data(options.data, options.quick))
     boxes = options.count or (QUICK_BOXES if options.quick else BOXES)
-    thesis = {rule: unlock(THESIS, "a", UPPER, rule) for rule in RULES}
+    thesis = {rule: run_unlocking(THESIS, rule) for rule in RULES}
     runs = run_boxes(boxes, options.seed, progress)
     if options.quick and not options.robot:
         robots = robots[:1]
@@ -74,7 +74,7 @@ def run_boxes(count: int, seed: int, progress: Progress) -> dict[tuple[Rule, int
     cases = [(rule, parts, seed + k) for rule in RULES for parts in PARTS for k in range(count)]
     found: dict[tuple[Rule, int], list[UnlockingRun]] = {}
     for rule, parts, number in progress(cases, "ablations", "box"):
-        run_of = unlock(*draw_box(parts, number), rule, MOST_STEPS)
+        run_of = run_unlocking(draw_lockbox(parts, number), rule, MOST_STEPS)
         found.setdefault((rule, parts), []).append(run_of)
     return found
 

@@ -10,26 +10,25 @@ from typing import Generic, TypeVar
 from kineverse.experiments.registry import Progress
 from kineverse.experiments.worker_pool import worker_pool
 
-from .trials import Trial
-
 Job = TypeVar("Job")
+Result = TypeVar("Result")
 Item = TypeVar("Item")
 
 
 def run_jobs(
-    run: Callable[[Job], Sequence[Trial]],
+    run: Callable[[Job], Sequence[Result]],
     jobs: Sequence[Job],
     progress: Progress,
     what: str,
     unit: str,
     processes: int | None = None,
-) -> list[Trial]:
-    """Return the trials of all jobs in the order of the jobs.
+) -> list[Result]:
+    """Return the results of all jobs, such as trials, in the order of the jobs.
 
     Parameters
     ----------
     run
-        Function of a module, from a job to its trials.
+        Function of a module, from a job to its results.
     jobs
         The jobs.
     progress
@@ -42,7 +41,7 @@ def run_jobs(
     count = min(processes or os.cpu_count() or 1, len(jobs))
     if count <= 1:
         return [trial for job in progress(jobs, what, unit) for trial in run(job)]
-    found: dict[int, Sequence[Trial]] = {}
+    found: dict[int, Sequence[Result]] = {}
     with worker_pool(count) as pool:
         waiting = {pool.submit(run, job): k for k, job in enumerate(jobs)}
         for done in progress(_Sized(as_completed(waiting), len(jobs)), what, unit):

@@ -1,4 +1,4 @@
-"""Figure of the ablations: boxes opened over steps."""
+"""Figure of opened boxes over steps."""
 
 from __future__ import annotations
 
@@ -7,13 +7,18 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from .locks import RULES, Rule, UnlockingRun
+from .unlocking_runs import LOCK_RULES, Rule, UnlockingRun
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure as Canvas
 
 FIGURE_SIZE = (9.0, 3.5)
-_COLORS: Mapping[Rule, str] = {"and": "tab:blue", "product": "tab:orange", "none": "0.5"}
+_COLORS: Mapping[Rule, str] = {
+    "and": "tab:blue",
+    "product": "tab:orange",
+    "none": "0.5",
+    "undemanded": "tab:green",
+}
 
 
 def draw_boxes(canvas: Canvas, boxes: Mapping[tuple[Rule, int], Sequence[UnlockingRun]]) -> None:
@@ -22,8 +27,10 @@ def draw_boxes(canvas: Canvas, boxes: Mapping[tuple[Rule, int], Sequence[Unlocki
     parts = list(dict.fromkeys(count for _, count in boxes))
     panels = np.atleast_1d(canvas.subplots(1, len(parts), sharey=True))
     for axes, count in zip(panels, parts, strict=True):
-        for rule, name in RULES.items():
-            own = boxes[rule, count]
+        for rule, name in LOCK_RULES.items():
+            own = boxes.get((rule, count))
+            if not own:
+                continue
             steps = sorted(run.steps for run in own if run.done)
             share = np.arange(len(steps) + 1) / len(own)
             axes.step(

@@ -1,0 +1,85 @@
+"""Openings of lockboxes by a controller, with each rule of trends."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from operator import and_, mul
+from time import thread_time
+from types import MappingProxyType
+from typing import Literal, TypeAlias
+
+from kineverse.control import Controller, unlock
+from kineverse.gallery.lockboxes import Lockbox, make_lockbox_model
+from kineverse.symbols import position
+
+Rule: TypeAlias = Literal["and", "product", "none", "undemanded"]
+RULES: Mapping[Rule, str] = MappingProxyType(
+    {
+        "and": "trends of & and |",
+        "product": "product rule",
+        "none": "exact gradients alone",
+    }
+)
+"""Rules of trends, with their names in tables."""
+LOCK_RULES: Mapping[Rule, str] = MappingProxyType({**RULES, "undemanded": "trends without demand"})
+"""Rules for locks: also the pursuit of all locks, whether or not something needs them."""
+
+DT, STEPS = 0.19, 200
+"""Control period [s] and largest number of steps (thesis)."""
+_REACHED = 0.01
+_BEGUN = 0.1
+
+
+@dataclass(frozen=True, slots=True)
+class UnlockingRun:
+    """Opening of a box.
+
+    Attributes
+    ----------
+    done, steps
+        Whether the goal was reached, and the number of steps.
+    order
+        Parts in the order in which they began to move by more than a tenth of their range.
+    cpu
+        CPU times of the steps [s].
+    """
+
+    done: bool
+    steps: int
+    order: tuple[str, ...]
+    cpu: tuple[float, ...]
+
+
+def run_unlocking(box: Lockbox, rule: Rule = "and", steps: int = STEPS) -> UnlockingRun:
+    """Open a box by the tasks of :func:`kineverse.control.unlock`.
+
+    Parameters
+    ----------
+    box
+        The box.
+    rule
+        Rule of trends. Demand is passed on along trends, so with the product rule it would end where two
+        conditions fail; there all locks are pursued.
+    steps
+        Largest number of steps.
+    """
+    model = make_lockbox_model(box, None, mul if rule == "product" else and_)
+    q = {name: position(name) for name in box.parts}
+    tasks = unlock(model, box.goal, demand=rule not in ("product", "undemanded"))
+    if rule == "none":
+        tasks = tasks[: len(box.goal)]
+    controller = Controller(model, tasks, dt=DT, smooth=1e-3, posture=0.0)
+    state = model.default_state()
+    order: dict[str, None] = {}
+    cpu: list[float] = []
+    for step in range(steps):
+        if all(abs(state[q[name]] - value) <= _REACHED for name, value in box.goal.items()):
+            return UnlockingRun(True, step, tuple(order), tuple(cpu))
+        begin = thread_time()
+        command = controller.step(state)
+        cpu.append(thread_time() - begin)
+        state = model.integrate(state, command.speeds, DT)
+        begun = (name for name, part in box.parts.items() if state[q[name]] > _BEGUN * min(part.upper, 1.2))
+        order.update(dict.fromkeys(begun))
+    return UnlockingRun(False, steps, tuple(order), tuple(cpu))

@@ -1,0 +1,346 @@
+"""Plans of moves that unlock what interlocks hold, or the locks that make it impossible."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Collection, Mapping
+from dataclasses import dataclass
+from time import perf_counter
+from types import MappingProxyType
+from typing import Any
+
+from kineverse._checks import finite_number
+from kineverse.errors import InvalidValueError, UnknownNameError, suggest
+from kineverse.expressions.printing import format_number
+from kineverse.model.model_view import ModelView
+from kineverse.state import StateLike, as_state
+from kineverse.symbols import Symbol
+
+from .boxes import Interval
+from .cell_graph import CellGraph, Move, make_graph
+from .find_interlocks import constant_limits, interlocks
+from .interlock import Interlock, Interlocks, Undecided
+from .move_rules import MoveRule, make_rules, relevant_rules
+from .move_search import MoveSearch, MoveSearchResult, Verdict, find_circle
+
+BUDGET = 10.0
+"""Default budget of a plan [s]."""
+_BEYOND = 0.05
+"""Largest distance by which a move goes beyond a threshold [m] or [rad]."""
+
+
+@dataclass(frozen=True)
+class UnlockingStep:
+    """Move of one coordinate, and its purpose.
+
+    Attributes
+    ----------
+    coordinate
+        The coordinate.
+    start, target
+        Its positions before and after the move [m] or [rad].
+    threshold
+        Position that has to be passed; None if the target is a goal.
+    releases
+        Interlocks that hold later moves unless this one is made.
+    """
+
+    coordinate: Symbol
+    start: float
+    target: float
+    threshold: float | None
+    releases: tuple[Interlock, ...] = ()
+
+    @property
+    def reason(self) -> str:
+        """Purpose of the move."""
+        if self.threshold is None:
+            return "it is the goal"
+        symbols = (s.position for lock in self.releases for s in lock.held.symbols)
+        held = dict.fromkeys(str(s) for s in symbols if s != self.coordinate)
+        return f"it holds {_list_words(held)}" if held else "it clears the way"
+
+    def as_data(self) -> dict[str, Any]:
+        """Return the step as data for JSON."""
+        return {
+            "coordinate": str(self.coordinate),
+            "from": self.start,
+            "to": self.target,
+            "threshold": self.threshold,
+            "releases": sorted({name for lock in self.releases for name in lock.constraints}),
+            "reason": self.reason,
+        }
+
+    def __str__(self) -> str:
+        verb = "raise" if self.target > self.start else "lower"
+        if self.threshold is None:
+            return f"{verb} {self.coordinate} to {format_number(self.target, 6)}: {self.reason}"
+        side = "above" if self.target > self.start else "below"
+        return f"{verb} {self.coordinate} {side} {format_number(self.threshold, 6)}: {self.reason}"
+
+
+@dataclass(frozen=True)
+class UnlockingPlan:
+    """Order of moves that reaches a goal, or a refutation.
+
+    Attributes
+    ----------
+    goal
+        Positions to reach, by coordinate.
+    verdict
+        ``"found"``; ``"refuted"`` if no sequence of moves of one coordinate at a time reaches the goal; or
+        ``"undecided"``, after the budget, or if locks that could not be read are in the way.
+    steps
+        The moves, empty unless found.
+    shortest
+        True if there are no fewer moves.
+    blocking
+        Interlocks that keep the goal out of reach, each because of the next one.
+    is_circle
+        True if the last of these depends on the first one.
+    unread
+        Interlocks, and undecided constraints, that count as shut because they could not be read completely.
+    still
+        Coordinates that were said not to move.
+    explored
+        Number of combinations of intervals that were looked at.
+    """
+
+    goal: Mapping[Symbol, float]
+    verdict: Verdict
+    steps: tuple[UnlockingStep, ...] = ()
+    shortest: bool = False
+    blocking: tuple[Interlock | Undecided, ...] = ()
+    is_circle: bool = False
+    unread: tuple[Interlock | Undecided, ...] = ()
+    still: tuple[Symbol, ...] = ()
+    explored: int = 0
+
+    def as_data(self) -> dict[str, Any]:
+        """Return the plan as data for JSON: lists, mappings, texts and numbers."""
+        return {
+            "goal": {str(s): value for s, value in self.goal.items()},
+            "verdict": self.verdict,
+            "steps": [step.as_data() for step in self.steps],
+            "shortest": self.shortest,
+            "blocking": [str(lock) for lock in self.blocking],
+            "circle": self.is_circle,
+            "unread": [str(lock) for lock in self.unread],
+            "still": [str(s) for s in self.still],
+            "explored": self.explored,
+        }
+
+    def __str__(self) -> str:
+        if self.verdict == "found":
+            if not self.steps:
+                return "nothing has to move"
+            lines = [f"{n}. {step}" for n, step in enumerate(self.steps, 1)]
+        else:
+            goal = _list_words(f"{s} = {format_number(value, 6)}" for s, value in self.goal.items())
+            lines = [f"{goal}: {self._explain()}"]
+            lines += [f"  {lock}" for lock in self.blocking]
+        if self.unread:
+            lines.append("treated as shut, since they could not be read:")
+            lines += [f"  {lock}" for lock in self.unread]
+        return "\n".join(lines)
+
+    def _explain(self) -> str:
+        if self.verdict == "undecided":
+            if self.blocking:
+                return "undecided, since a lock that could not be read may be open"
+            return f"undecided after {self.explored} combinations of intervals"
+        without = f" without {_list_words(map(str, self.still))}" if self.still else ""
+        if not self.blocking:
+            return f"cannot be reached{without}"
+        how = "lock each other in a circle" if self.is_circle else "keep it out of reach"
+        return f"cannot be reached{without}, since these {how}"
+
+
+def plan_unlocking(
+    model: ModelView,
+    goal: Mapping[Symbol, float] | Mapping[str, float],
+    state: StateLike | None = None,
+    *,
+    found: Interlocks | None = None,
+    still: Collection[Symbol | str] = (),
+    budget: float = BUDGET,
+) -> UnlockingPlan:
+    """Return the order in which coordinates have to move so that a goal is reached, or a refutation.
+
+    One coordinate moves at a time, along its axis, from one interval between thresholds to another. If all
+    locks want their keys on one side, the plan has no superfluous move. Otherwise, up to 50 000 combinations
+    of intervals, it has the fewest possible ones.
+
+    A refutation is certain: either a coordinate cannot be moved even if all others keep every position that
+    they ever had, or all combinations were explored. It holds for positions off the thresholds. Interlocks
+    whose conditions are not intervals of single coordinates, and undecided constraints, count as shut. They
+    are listed, and the verdict is never a refutation because of them.
+
+    Parameters
+    ----------
+    model
+        A model or a snapshot.
+    goal
+        Positions to reach, by coordinate or its name [m] or [rad].
+    state
+        Positions at the start, by default :meth:`.Model.default_state`; missing ones are those there, and
+        positions beyond limits count as at the limit.
+    found
+        Interlocks of the model if they are known, see :func:`.interlocks`.
+    still
+        Coordinates that do not move, such as those that did not move when they should have.
+    budget
+        Time for the search [s], after which the verdict is ``"undecided"``.
+
+    Raises
+    ------
+    UnknownNameError
+        For names that are no degrees of freedom.
+    InvalidValueError
+        For a goal beyond its limits, no goal, a number that is not finite, or a budget that is not positive.
+    """
+    if not (isinstance(budget, int | float) and budget > 0):
+        raise InvalidValueError(f"The budget of a plan is a positive time in seconds, not {budget!r}.")
+    if not goal:
+        raise InvalidValueError("A plan has a goal, such as {'garage/door': 1.5}.")
+    end = perf_counter() + budget
+    limits = constant_limits(dict(model.constraints.items()))
+    goals = {_freedom(model, name): value for name, value in goal.items()}
+    goals = {s: _check_goal(s, value, limits.get(s, Interval())) for s, value in goals.items()}
+    fixed = tuple(_freedom(model, name) for name in still)
+    coordinates, rules = relevant_rules(
+        make_rules(model, interlocks(model) if found is None else found), goals
+    )
+    given = dict(model.default_state())
+    if state is not None:
+        given |= dict(as_state(state, model.symbols))
+    start = {s: _clip(float(given.get(s, 0.0)), limits.get(s, Interval())) for s in coordinates}
+    graph = make_graph(coordinates, rules, limits, start, goals, fixed)
+    result = MoveSearch(graph, lambda: perf_counter() > end).run()
+    unread = tuple(dict.fromkeys(rule.lock for rule in rules if not rule.is_exact))
+    if result.verdict == "found":
+        steps = _make_steps(graph, result.moves, start, goals)
+        shown = MappingProxyType(goals)
+        return UnlockingPlan(
+            shown, "found", steps, result.shortest, unread=unread, still=fixed, explored=result.explored
+        )
+    return _make_refutation(graph, result, rules, goals, unread, fixed)
+
+
+def _make_refutation(
+    graph: CellGraph,
+    result: MoveSearchResult,
+    rules: list[MoveRule],
+    goals: dict[Symbol, float],
+    unread: tuple[Interlock | Undecided, ...],
+    fixed: tuple[Symbol, ...],
+) -> UnlockingPlan:
+    """Return the plan without steps for a search that found no moves."""
+    chain, is_circle = find_circle(graph, result.reached)
+    if not chain and result.verdict == "refuted":
+        # Each lock could be opened, but not all that are needed at once: all of them are in conflict.
+        chain = tuple(rules)
+    blocking = tuple(dict.fromkeys(rule.lock for rule in chain))
+    verdict: Verdict = "undecided" if unread else result.verdict
+    return UnlockingPlan(
+        MappingProxyType(goals),
+        verdict,
+        blocking=blocking if result.verdict == "refuted" else (),
+        is_circle=is_circle and result.verdict == "refuted",
+        unread=unread,
+        still=fixed,
+        explored=result.explored,
+    )
+
+
+def _make_steps(
+    graph: CellGraph, moves: tuple[Move, ...], start: Mapping[Symbol, float], goals: Mapping[Symbol, float]
+) -> tuple[UnlockingStep, ...]:
+    states = [graph.start]
+    for move in moves:
+        after = graph.apply(states[-1], move)
+        if after is None:
+            raise AssertionError("a blocked move")  # pragma: no cover - the search takes free moves only
+        states.append(after)
+    following = _next_moves(moves)
+    position, steps = dict(start), list[UnlockingStep]()
+    for n, (k, cell) in enumerate(moves):
+        symbol, side = graph.coordinates[k], graph.cells[k][cell]
+        way = 1 if cell > graph.cell_of(states[n], k) else -1
+        ends = symbol in goals and goals[symbol] in side
+        target = goals[symbol] if ends else _inside(graph, states[n + 1], k, cell, way)
+        last = following[n] == len(moves)
+        releases = _released(graph, moves, states, n, following[n])
+        bound = side.lower if way > 0 else side.upper
+        threshold = None if ends and last else float(bound)
+        steps.append(UnlockingStep(symbol, position[symbol], target, threshold, releases))
+        position[symbol] = target
+    return tuple(steps)
+
+
+def _next_moves(moves: tuple[Move, ...]) -> list[int]:
+    """Return for each move the number of the next one of the same coordinate, or the number of moves."""
+    following, seen = [len(moves)] * len(moves), dict[int, int]()
+    for n in reversed(range(len(moves))):
+        following[n] = seen.get(moves[n][0], len(moves))
+        seen[moves[n][0]] = n
+    return following
+
+
+def _released(
+    graph: CellGraph, moves: tuple[Move, ...], states: list[int], n: int, until: int
+) -> tuple[Interlock, ...]:
+    """Return the interlocks that would stop later moves if this one were not made."""
+    k = moves[n][0]
+    before, found = states[n] & graph.field(k), dict[Interlock, None]()
+    for later in range(n + 1, until):
+        for at, step in graph.path(states[later] & ~graph.field(k) | before, moves[later]):
+            if step is not None:
+                blocked = (r for m, r in zip(step.needs, step.rules, strict=True) if not m & at)
+                found |= dict.fromkeys(r.lock for r in blocked if isinstance(r.lock, Interlock))
+    return tuple(found)
+
+
+def _inside(graph: CellGraph, state: int, k: int, cell: int, way: int) -> float:
+    """Return a position within a cell, a little beyond the end where it is entered."""
+    side = graph.cells[k][cell]
+    lower, upper = float(side.lower), float(side.upper)
+    entered = lower if way > 0 else upper
+    closed = side.lower_closed if way > 0 else side.upper_closed
+    step = graph.step(k, cell, way)
+    if closed and step is not None and not all(map(state.__and__, step.needs)):
+        return entered
+    return entered + way * min(_BEYOND, (upper - lower) / 2)
+
+
+def _freedom(model: ModelView, name: Symbol | str) -> Symbol:
+    """Return the degree of freedom with a name."""
+    known = {str(s): s for s in model.degrees_of_freedom}
+    if str(name) not in known:
+        raise UnknownNameError(
+            f"'{name}' is no degree of freedom. {suggest(str(name), known, 'degree of freedom')}"
+        )
+    return known[str(name)]
+
+
+def _check_goal(symbol: Symbol, value: object, limit: Interval) -> float:
+    """Return a goal as a float."""
+    number = finite_number(value)
+    if number is None:
+        raise InvalidValueError(f"The goal of '{symbol}' is a finite number, not {value!r}.")
+    if number not in limit:
+        raise InvalidValueError(
+            f"The goal {symbol} = {format_number(number, 6)} is beyond its limits "
+            f"[{format_number(float(limit.lower))}, {format_number(float(limit.upper))}]."
+        )
+    return number
+
+
+def _clip(value: float, limit: Interval) -> float:
+    low = -math.inf if limit.lower == -math.inf else float(limit.lower)
+    return min(max(value, low), float(limit.upper))
+
+
+def _list_words(words: Any) -> str:
+    listed = list(words)
+    return listed[0] if len(listed) == 1 else f"{', '.join(listed[:-1])} and {listed[-1]}"

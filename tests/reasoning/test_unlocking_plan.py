@@ -1,0 +1,265 @@
+"""Plans of moves are right where exhaustive search finds one, and refuted exactly where it finds none."""
+
+import json
+from dataclasses import replace
+
+import pytest
+from lockbox_oracle import box_graph
+
+import kineverse as kv
+from kineverse.errors import InvalidValueError, UnknownNameError
+from kineverse.experiments.lockbox.exhaustive_search import can_be_opened
+from kineverse.gallery.lockboxes import (
+    THESIS,
+    draw_lockbox,
+    draw_tangled_lockbox,
+    make_lockbox_model,
+    make_rings,
+)
+from kineverse.reasoning import interlocks, plan_unlocking, plan_violations
+from kineverse.reasoning.move_search import MoveSearch
+
+A, B, C = map(kv.position, "abc")
+
+
+def goal_of(box):
+    return {f"lockbox/{name}": value for name, value in box.goal.items()}
+
+
+def three_sliders(**locks):
+    model = kv.Model()
+    with model.edit() as edit:
+        for q in (A, B, C):
+            edit.constrain(f"{q} range", 0, q, 1)
+        for name, open_if in locks.items():
+            edit.constrain(f"lock {name}", -1, kv.position(name).derivative(), open_if)
+    return model
+
+
+def test_plan_of_thesis_box_gives_its_order_with_reasons():
+    model = make_lockbox_model(THESIS)
+    plan = plan_unlocking(model, goal_of(THESIS))
+    assert plan.verdict == "found"
+    assert str(plan).splitlines() == [
+        "1. raise lockbox/f above 1.2: it holds lockbox/e",
+        "2. raise lockbox/e above 1: it holds lockbox/d and lockbox/c",
+        "3. raise lockbox/d above 0.8: it holds lockbox/b and lockbox/c",
+        "4. raise lockbox/b above 0.4: it holds lockbox/a",
+        "5. raise lockbox/c above 0.6: it holds lockbox/a",
+        "6. raise lockbox/a to 1.2: it is the goal",
+    ]
+    assert plan_violations(model, plan) == []
+
+
+@pytest.mark.parametrize("count", [1, 2, 3, 4, 5])
+def test_plan_of_rings_is_the_shortest(count):
+    model = make_lockbox_model(make_rings(count))
+    plan = plan_unlocking(model, goal_of(make_rings(count)))
+    assert plan.shortest or count == 1
+    assert len(plan.steps) == (2 ** (count + 1) - 1) // 3
+    assert plan_violations(model, plan) == []
+
+
+def test_search_of_twelve_rings_takes_2730_moves():
+    result = MoveSearch(box_graph(make_rings(12))).run()
+    assert (result.verdict, result.shortest, len(result.moves)) == ("found", True, 2730)
+
+
+@pytest.mark.parametrize("parts", [3, 5, 6, 7])
+def test_search_agrees_with_exhaustive_search(parts):
+    """Both strategies are asked, and a refutation is never wrong."""
+    refuted = 0
+    for seed in range(120):
+        box = draw_tangled_lockbox(parts, seed)
+        graph, expected = box_graph(box), can_be_opened(box)
+        search = MoveSearch(graph)
+        for result in (search.run(), search.search_best_first(), search.search_breadth_first()):
+            assert (result.verdict == "found") == expected, seed
+            state = graph.start
+            for move in result.moves:
+                state = graph.apply(state, move)
+                assert state is not None, seed
+            assert result.verdict != "found" or graph.is_goal(state), seed
+        refuted += not expected
+    assert refuted > 5
+
+
+@pytest.mark.parametrize("blocks", ["forward", "both"])
+def test_plan_from_model_agrees_with_exhaustive_search(blocks):
+    """Reading, planning and the independent checker together, on boxes with negations and circles."""
+    for seed in range(8):
+        for box in (draw_tangled_lockbox(5, 1000 + seed), draw_lockbox(6, seed, negated=0.6, blocks=blocks)):
+            model = make_lockbox_model(box)
+            plan = plan_unlocking(model, goal_of(box))
+            assert (plan.verdict == "found") == can_be_opened(box)
+            assert plan.verdict != "undecided"
+            assert plan_violations(model, plan) == []
+
+
+def test_plan_of_large_monotone_box_has_no_superfluous_move():
+    box = draw_lockbox(15, 3)
+    model = make_lockbox_model(box)
+    plan = plan_unlocking(model, goal_of(box))
+    assert plan.verdict == "found"
+    assert plan_violations(model, plan) == []
+    for n in range(len(plan.steps)):
+        fewer = replace(plan, steps=plan.steps[:n] + plan.steps[n + 1 :])
+        assert plan_violations(model, fewer), n
+
+
+def test_plan_violations_reports_wrong_order():
+    model = make_lockbox_model(THESIS)
+    plan = plan_unlocking(model, goal_of(THESIS))
+    swapped = replace(plan, steps=(plan.steps[1], plan.steps[0], *plan.steps[2:]))
+    assert plan_violations(model, swapped) == ["move 1, lockbox/e: lockbox/e/velocity"]
+    short = replace(plan, steps=plan.steps[:-1])
+    assert plan_violations(model, short) == ["lockbox/a ends at 0, and not at 1.2"]
+
+
+def test_plan_with_position_lock():
+    model = kv.load("articulations/latch", "gate")
+    door, bolt = "gate/gate/door", "gate/gate/bolt"
+    plan = plan_unlocking(model, {door: 1.9, bolt: 0.0})
+    assert [(str(step.coordinate), step.target > step.start) for step in plan.steps] == [
+        (bolt, True),
+        (door, True),
+        (bolt, False),
+    ]
+    assert plan_violations(model, plan) == []
+    back = plan_unlocking(model, {door: 0.0}, {door: 1.0})
+    assert [str(step) for step in back.steps] == ["lower gate/gate/door to 0: it is the goal"]
+    assert plan_violations(model, back, {door: 1.0}) == []
+
+
+def test_bolt_does_not_spring_out_under_the_door():
+    """A key may not move where that violates the range of another coordinate."""
+    model = kv.Model()
+    with model.edit() as edit:
+        edit.constrain("a range", 0, A, 1)
+        edit.constrain("b range", 0, B, 1)
+        edit.constrain("shut", -1, A, kv.where(B < 0.5, 0.2, 2.0))
+    plan = plan_unlocking(model, {"b": 0.0}, {"a": 0.8, "b": 1.0})
+    assert [str(step.coordinate) for step in plan.steps] == ["a", "b"]
+    assert plan.steps[0].target <= 0.2
+    assert plan_violations(model, plan, {"a": 0.8, "b": 1.0}) == []
+
+
+def test_plan_refutes_circle():
+    model = three_sliders(a=B > 0.5, b=(C > 0.3) & (C < 0.9), c=A > 0.1)
+    plan = plan_unlocking(model, {A: 1})
+    assert plan.verdict == "refuted"
+    assert plan.is_circle
+    assert [lock.constraints for lock in plan.blocking] == [("lock a",), ("lock b",), ("lock c",)]
+    assert "lock each other in a circle" in str(plan)
+
+
+def test_plan_refutes_conflict_by_exhaustion():
+    """The key has to be on both sides at once, at the same time as it may be on either side."""
+    model = three_sliders(a=(B > 0.5) & (C > 0.5), c=B < 0.4, b=C < 0.4)
+    with model.edit() as edit:
+        edit.constrain("c stays", -(B < 0.4), C.derivative(), 1)
+        edit.constrain("b stays", -(C < 0.4), B.derivative(), 1)
+    plan = plan_unlocking(model, {A: 1})
+    assert plan.verdict == "refuted"
+    assert plan.blocking
+
+
+def test_plan_without_what_does_not_move():
+    model = three_sliders(a=(B > 0.5) | (C > 0.5))
+    first = plan_unlocking(model, {A: 1}).steps[0].coordinate
+    second = plan_unlocking(model, {A: 1}, still=[first]).steps[0].coordinate
+    assert {first, second} == {B, C}
+    refuted = plan_unlocking(model, {A: 1}, still=[B, C])
+    assert refuted.verdict == "refuted"
+    assert str(refuted).startswith("a = 1: cannot be reached without b and c")
+
+
+def test_unreadable_lock_is_shut_and_named():
+    model = three_sliders(a=B * C > 0.5, b=C > 0.3)
+    plan = plan_unlocking(model, {A: 1})
+    assert plan.verdict == "undecided"
+    assert [lock.constraint for lock in plan.unread] == ["lock a"]
+    assert "could not be read" in str(plan)
+    beside = plan_unlocking(model, {B: 1})
+    assert beside.verdict == "found"
+    assert not beside.unread
+
+
+def test_range_that_depends_on_another_coordinate_is_shut_and_named():
+    model = three_sliders()
+    with model.edit() as edit:
+        edit.constrain("table", 0, C, B + 0.2)
+    plan = plan_unlocking(model, {C: 1})
+    assert plan.verdict == "undecided"
+    assert [str(lock) for lock in plan.unread] == ["c stays within [0, b + 0.2]: when b < 0.8 (table)"]
+
+
+def test_plan_after_its_budget_is_undecided():
+    box = draw_lockbox(30, 0, negated=0.5)
+    model = make_lockbox_model(box)
+    plan = plan_unlocking(model, goal_of(box), budget=1e-9)
+    assert plan.verdict == "undecided"
+    assert not plan.steps
+    assert "undecided after" in str(plan)
+
+
+def test_plan_of_a_goal_that_is_reached():
+    model = three_sliders(a=B > 0.5)
+    plan = plan_unlocking(model, {A: 0.0})
+    assert (plan.verdict, plan.steps, str(plan)) == ("found", (), "nothing has to move")
+
+
+def test_goal_in_the_interval_of_the_start_has_to_be_reached():
+    model = three_sliders(a=B > 0.5)
+    plan = plan_unlocking(model, {A: 0.7}, {A: 0.2})
+    assert [str(step.coordinate) for step in plan.steps] == ["b", "a"]
+    assert plan.steps[-1].target == 0.7
+    assert plan_violations(model, plan, {A: 0.2}) == []
+
+
+def test_known_interlocks_are_used():
+    model = three_sliders(a=B > 0.5)
+    found = interlocks(model)
+    assert plan_unlocking(model, {A: 1}, found=found) == plan_unlocking(model, {A: 1})
+
+
+def test_coordinates_without_limits_or_locks():
+    door = kv.position("door")
+    model = kv.Model()
+    with model.edit() as edit:
+        edit.constrain("lock", -1, door.derivative(), A > 3)
+    assert [str(step) for step in plan_unlocking(model, {door: 2}).steps] == [
+        "raise a above 3: it holds door",
+        "raise door to 2: it is the goal",
+    ]
+
+
+def test_plan_is_data_for_json():
+    model = make_lockbox_model(THESIS)
+    data = json.loads(json.dumps(plan_unlocking(model, goal_of(THESIS)).as_data(), allow_nan=False))
+    assert data["verdict"] == "found"
+    assert data["steps"][0] == {
+        "coordinate": "lockbox/f",
+        "from": 0.0,
+        "to": 1.25,
+        "threshold": 1.2,
+        "releases": ["lockbox/e/velocity"],
+        "reason": "it holds lockbox/e",
+    }
+
+
+@pytest.mark.parametrize(
+    ("goal", "options", "error", "text"),
+    [
+        ({}, {}, InvalidValueError, "A plan has a goal"),
+        ({"d": 1}, {}, UnknownNameError, "'d' is no degree of freedom"),
+        ({"a": 2}, {}, InvalidValueError, "beyond its limits"),
+        ({"a": float("nan")}, {}, InvalidValueError, "finite number"),
+        ({"a": 1}, {"budget": 0}, InvalidValueError, "positive time"),
+        ({"a": 1}, {"still": ["z"]}, UnknownNameError, "'z' is no degree of freedom"),
+        ({"a": 1}, {"state": {"z": 1}}, UnknownNameError, "z"),
+    ],
+)
+def test_bad_input_is_refused(goal, options, error, text):
+    with pytest.raises(error, match=text):
+        plan_unlocking(three_sliders(a=B > 0.5), goal, **options)
