@@ -21,8 +21,8 @@ _SIDE, _TURN = math.radians(80.0), math.radians(60.0)
 _BASE_EASE, _BASE_SPEED = (0.1, 0.01), 1.0
 """Weights of a base that can move beside those of joints, so that it moves where they are not enough, or
 nearly stands where there is little room; and its speed where the model has no limit [m/s]."""
-_WHOLE_ARM = 6
-"""Number of joints from which on an arm needs no motion of the base."""
+_WHOLE_ARM, _STANDING_EASE = 6, (0.1, 0.0, 0.0)
+"""Number of joints from which on an arm needs no motion of the base, and the weights of its base."""
 _QUICK, _SOON = 0.5, 4.0
 """Speed from which on a joint has the full weight [m/s], [rad/s]; time in which most arms are reached [s]."""
 _BASE_TRIES = 4
@@ -45,7 +45,7 @@ class PlacementSamples:
         Largest speeds (n,) of the moving coordinates [m/s], [rad/s].
     eases
         Weights (n,) of their motions that are used in turn: those of slow ones and of the base are small. In
-        an aisle a base had better stand where it is free: where an arm can do without it, its last one is 0.
+        an aisle a base had better stand where it is free: if the arm can do without it, most weights are 0.
     """
 
     def __init__(
@@ -63,8 +63,9 @@ class PlacementSamples:
         self.speeds = np.array([v if 0.0 < v < math.inf else _BASE_SPEED for v in speeds])
         on_base = np.array([s in self.base for s in moving], dtype=bool)
         joints = np.minimum(1.0, self.speeds / _QUICK)
-        stands = (0.0,) if on_base.any() and (~on_base).sum() >= _WHOLE_ARM else ()
-        self.eases = tuple(np.where(on_base, weight, joints) for weight in (*_BASE_EASE, *stands))
+        whole_arm = on_base.any() and (~on_base).sum() >= _WHOLE_ARM
+        weights = _STANDING_EASE if whole_arm else _BASE_EASE
+        self.eases = tuple(np.where(on_base, weight, joints) for weight in weights)
 
     def choose_grasps(
         self,
