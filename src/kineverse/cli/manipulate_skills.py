@@ -13,7 +13,7 @@ from kineverse.cli.output import join_lines, show_activity
 from kineverse.errors import InvalidValueError, UnknownNameError
 
 if TYPE_CHECKING:
-    from kineverse.grasping import Handle
+    from kineverse.grasping import Gripper, Handle
     from kineverse.manipulation.belief import Belief
     from kineverse.manipulation.outcome import Outcome
     from kineverse.worlds import World
@@ -31,20 +31,19 @@ def grasp_object(
     look: Callable[[RecordedStep], None],
 ) -> Outcome:
     """Open or close the object by its handle."""
-    if scene.gripper is None:
-        return skip_skill(scene, world, False, scene.why)
+    found = _find_gripper_and_handle(arguments, scene)
+    if isinstance(found, str):
+        return skip_skill(scene, world, False, found)
+    gripper, _ = found
 
     from kineverse.manipulation.opening.grasped_opening import open_object
     from kineverse.manipulation.session import Session
 
-    handle, why = _find_handle(arguments, scene)
-    if handle is None:
-        return skip_skill(scene, world, False, why)
     outcome: Outcome = open_object(
         Session(world, belief=belief, on_step=look),
         scene.coordinate,
         target=scene.target,
-        hand=scene.gripper.hand,
+        hand=gripper.hand,
         handle=arguments.handle,
         seconds=arguments.seconds,
         seed=arguments.seed,
@@ -60,8 +59,10 @@ def open_as_unknown(
     look: Callable[[RecordedStep], None],
 ) -> Outcome:
     """Open the object as if its joint was unknown."""
-    if scene.gripper is None:
-        return skip_skill(scene, world, False, scene.why)
+    found = _find_gripper_and_handle(arguments, scene)
+    if isinstance(found, str):
+        return skip_skill(scene, world, False, found)
+    gripper, handle = found
 
     from kineverse.manipulation import Session, open_unknown
     from kineverse.manipulation.unknown_objects import forget_joint
@@ -69,9 +70,6 @@ def open_as_unknown(
     from kineverse.worlds import Sensors
 
     model, coordinate, start = scene.model, scene.coordinate, scene.start
-    handle, why = _find_handle(arguments, scene)
-    if handle is None:
-        return skip_skill(scene, world, False, why)
     part = next((a.child for a in model.articulations.values() if coordinate in a.coordinates), None)
     if part is None:
         raise InvalidValueError(f"--unknown: '{coordinate}' is of no joint, so no part belongs to it.")
@@ -82,7 +80,7 @@ def open_as_unknown(
         model=forget_joint(model, part, start),
         part=part,
         sensors=None if arguments.noise is None else Sensors.parse(arguments.noise),
-        hand=scene.gripper.hand,
+        hand=gripper.hand,
         seconds=arguments.seconds,
         seed=arguments.seed,
         way=OPEN_WAY if far is None else far,
@@ -137,8 +135,10 @@ def push_object(
     return replace(outcome, reason=reason, measures={**outcome.measures, "placed": placed})
 
 
-def _find_handle(arguments: argparse.Namespace, scene: ManipulationScene) -> tuple[Handle | None, str]:
-    """Return the handle that is named, or the best one, and print it; or None, and why there is none.
+def _find_gripper_and_handle(
+    arguments: argparse.Namespace, scene: ManipulationScene
+) -> tuple[Gripper, Handle] | str:
+    """Return the gripper, and the handle that is named or the best one, which is printed; or why not.
 
     Raises
     ------
@@ -147,14 +147,16 @@ def _find_handle(arguments: argparse.Namespace, scene: ManipulationScene) -> tup
     """
     from kineverse.grasping import find_handle
 
+    if scene.gripper is None:
+        return scene.why
     try:
         handle = find_handle(scene.model, scene.coordinate, arguments.handle)
     except UnknownNameError as error:
         if arguments.handle is not None:
             raise
-        return None, f"{error} Without one it can be pushed: kineverse push ... --to VALUE."
+        return f"{error} Without one it can be pushed: kineverse push ... --to VALUE."
     print(handle, file=sys.stderr)
-    return handle, ""
+    return scene.gripper, handle
 
 
 def skip_skill(scene: ManipulationScene, world: World, done: bool, reason: str) -> Outcome:

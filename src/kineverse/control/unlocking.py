@@ -14,7 +14,7 @@ from typing import Literal, TypeAlias
 import casadi as ca
 
 from kineverse._checks import finite_number
-from kineverse.errors import InvalidValueError, UnknownNameError, suggest
+from kineverse.errors import InvalidValueError
 from kineverse.expressions.expression import (
     NO_NODES,
     Expression,
@@ -296,15 +296,10 @@ def _larger(a: Expression, b: Expression) -> Expression:
 def _check_goals(model: ModelView, goal: Mapping[Symbol, float] | Mapping[str, float]) -> dict[Symbol, float]:
     if not goal:
         raise InvalidValueError("Unlocking has a goal, such as {'garage/door': 1.5}.")
-    known = {str(s): s for s in model.degrees_of_freedom}
     found: dict[Symbol, float] = {}
     for name, value in goal.items():
-        number = finite_number(value)
-        if str(name) not in known:
-            raise UnknownNameError(
-                f"'{name}' is no degree of freedom. {suggest(str(name), known, 'degree of freedom')}"
-            )
+        symbol, number = model.degree_of_freedom(name), finite_number(value)
         if number is None:
             raise InvalidValueError(f"The goal of '{name}' is a finite number, not {value!r}.")
-        found[known[str(name)]] = number
+        found[symbol] = number
     return found

@@ -198,6 +198,21 @@ class ModelView(SymbolicView):
             f"There is no symbol {name!r}. {suggest(name, map(str, coordinates), 'symbol')}"
         )
 
+    def degree_of_freedom(self, name: Symbol | str) -> Symbol:
+        """Return the degree of freedom of a name.
+
+        Raises
+        ------
+        UnknownNameError
+            With similar names.
+        """
+        known = {str(s): s for s in self.degrees_of_freedom}
+        if str(name) not in known:
+            raise UnknownNameError(
+                f"'{name}' is no degree of freedom. {suggest(str(name), known, 'degree of freedom')}"
+            )
+        return known[str(name)]
+
     def default_state(self) -> State:
         """Return the default value of every symbol: its home or 0, clipped to the limits.
 

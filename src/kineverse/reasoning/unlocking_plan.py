@@ -10,7 +10,7 @@ from types import MappingProxyType
 from typing import Any
 
 from kineverse._checks import finite_number
-from kineverse.errors import InvalidValueError, UnknownNameError, suggest
+from kineverse.errors import InvalidValueError
 from kineverse.expressions.printing import format_number
 from kineverse.model.model_view import ModelView
 from kineverse.state import StateLike, as_state
@@ -205,9 +205,9 @@ def plan_unlocking(
         raise InvalidValueError("A plan has a goal, such as {'garage/door': 1.5}.")
     end = perf_counter() + budget
     limits = constant_limits(dict(model.constraints.items()))
-    goals = {_freedom(model, name): value for name, value in goal.items()}
+    goals = {model.degree_of_freedom(name): value for name, value in goal.items()}
     goals = {s: _check_goal(s, value, limits.get(s, Interval())) for s, value in goals.items()}
-    fixed = tuple(_freedom(model, name) for name in still)
+    fixed = tuple(model.degree_of_freedom(name) for name in still)
     coordinates, rules = relevant_rules(
         make_rules(model, interlocks(model) if found is None else found), goals
     )
@@ -311,16 +311,6 @@ def _inside(graph: CellGraph, state: int, k: int, cell: int, way: int) -> float:
     if closed and step is not None and not all(map(state.__and__, step.needs)):
         return entered
     return entered + way * min(_BEYOND, (upper - lower) / 2)
-
-
-def _freedom(model: ModelView, name: Symbol | str) -> Symbol:
-    """Return the degree of freedom with a name."""
-    known = {str(s): s for s in model.degrees_of_freedom}
-    if str(name) not in known:
-        raise UnknownNameError(
-            f"'{name}' is no degree of freedom. {suggest(str(name), known, 'degree of freedom')}"
-        )
-    return known[str(name)]
 
 
 def _check_goal(symbol: Symbol, value: object, limit: Interval) -> float:

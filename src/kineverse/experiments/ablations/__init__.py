@@ -95,10 +95,7 @@ def make_ablation_report(
     ]
     numbers = {
         "seed": seed,
-        "thesis": {
-            rule: {"done": one.done, "steps": one.steps, "order": list(one.order)}
-            for rule, one in thesis.items()
-        },
+        "thesis": {rule: one.as_data() for rule, one in thesis.items()},
         "boxes": [
             {"rule": rule, "parts": parts, "opened": sum(r.done for r in own), "of": len(own)}
             for (rule, parts), own in boxes.items()

@@ -84,8 +84,8 @@ class PlannerResult:
 
     Attributes
     ----------
-    verdict, moves, shortest
-        Verdict, number of moves, and whether there are no fewer.
+    verdict, moves
+        Verdict, and number of moves.
     wrong
         True if the constraints contradict the plan, or exhaustive search the verdict.
     reading, planning
@@ -95,7 +95,6 @@ class PlannerResult:
     job: PlannerJob
     verdict: str
     moves: int
-    shortest: bool
     wrong: bool
     reading: float
     planning: float
@@ -175,7 +174,7 @@ def run_planner(job: PlannerJob) -> list[PlannerResult]:
         wrong = wrong or (plan.verdict == "found") != can_be_opened(box)
     if job.kind == "rings":
         wrong = wrong or len(plan.steps) != (2 ** (job.parts + 1) - 1) // 3
-    return [PlannerResult(job, plan.verdict, len(plan.steps), plan.shortest, wrong, read - begin, end - read)]
+    return [PlannerResult(job, plan.verdict, len(plan.steps), wrong, read - begin, end - read)]
 
 
 def _draw(job: PlannerJob) -> Lockbox:
@@ -203,10 +202,7 @@ def make_lockbox_report(
             ablated.setdefault((one.job.rule, one.job.parts), []).append(one.run)
     numbers = {
         "seed": seed,
-        "thesis": {
-            rule: {"done": one.done, "steps": one.steps, "order": list(one.order)}
-            for rule, one in thesis.items()
-        },
+        "thesis": {rule: one.as_data() for rule, one in thesis.items()},
         "explorer": [
             {
                 "rule": rule,

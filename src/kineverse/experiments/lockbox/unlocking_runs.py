@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from operator import and_, mul
 from time import thread_time
 from types import MappingProxyType
-from typing import Literal, TypeAlias
+from typing import Any, Literal, TypeAlias
 
 from kineverse.control import Controller, unlock
 from kineverse.gallery.lockboxes import Lockbox, make_lockbox_model
@@ -49,6 +49,10 @@ class UnlockingRun:
     steps: int
     order: tuple[str, ...]
     cpu: tuple[float, ...]
+
+    def as_data(self) -> dict[str, Any]:
+        """Return the run as data for JSON, without its times."""
+        return {"done": self.done, "steps": self.steps, "order": list(self.order)}
 
 
 def run_unlocking(box: Lockbox, rule: Rule = "and", steps: int = STEPS) -> UnlockingRun:
