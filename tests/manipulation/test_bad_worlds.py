@@ -66,9 +66,7 @@ class StoppedBelief(TrueBelief):
     """Belief whose readings end with the fault of its world."""
 
     def update(self, world, commands=None):
-        if world.begin is None:
-            self.last = world.state
-        return self.last
+        return super().update(world, commands) if world.begin is None else self._state
 
 
 def before_drawer(model, **values):
@@ -141,8 +139,10 @@ def change(edit, what):
         edit.remove("frame robot/right_finger")
     elif what == "no handle":
         edit.remove("frame room/drawer_handle")
-    elif what == "out of reach":
+    elif what == "too high":
         edit.constrain("robot/height", 0, kv.position("robot/z"), 1)
+    elif what == "too low":
+        edit.constrain("robot/height", 2.6, kv.position("robot/z"), 3)
 
 
 @pytest.mark.parametrize(
@@ -150,7 +150,8 @@ def change(edit, what):
     [
         ("no gripper", "'robot' has no gripper"),
         ("no handle", "'room/drawer' moves no handle"),
-        ("out of reach", "arms of a robot .* goes through; failed: .* out of reach"),
+        ("too high", "Too high: .* 'robot/palm' reaches 1.03 m at most"),
+        ("too low", "arms of a robot .* goes through; failed: .* out of reach"),
     ],
 )
 def test_open_without_what_it_needs_says_what_is_missing_and_moves_nothing(what, says):
@@ -158,7 +159,7 @@ def test_open_without_what_it_needs_says_what_is_missing_and_moves_nothing(what,
     with model.edit() as edit:
         change(edit, what)
     world = KinematicWorld(model, "robot")
-    begin = before_drawer(model).updated({"robot/z": 0.5 if what == "out of reach" else 2.0})
+    begin = before_drawer(model).updated({"robot/z": {"too high": 0.5, "too low": 2.8}.get(what, 2.0)})
     world.reset(begin)
     try:
         outcome = open_object(Session(world), DRAWER, target=0.3, placements=50)
