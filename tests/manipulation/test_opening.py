@@ -9,9 +9,10 @@ import kineverse as kv
 from kineverse.errors import InvalidValueError, KineverseError, UnknownNameError
 from kineverse.grasping import find_gripper, find_handle, sample_grasps
 from kineverse.manipulation import PlacementSearch, Session, TrackedBelief, open_object
+from kineverse.manipulation.base_samples import find_planar_base
 from kineverse.manipulation.belief import EstimateError
 from kineverse.manipulation.opening.hand_paths import HandPaths
-from kineverse.manipulation.opening.placement_samples import PlacementSamples, find_planar_base
+from kineverse.manipulation.opening.placement_samples import PlacementSamples
 from kineverse.worlds import KinematicWorld, MujocoWorld, Sensors
 
 sys.path.insert(0, str(Path(__file__).parents[1] / "worlds"))

@@ -15,6 +15,7 @@ from kineverse.errors import InvalidValueError
 from kineverse.geometry import Scene
 from kineverse.grasping import Grasp, Gripper
 from kineverse.lie import Array
+from kineverse.manipulation.base_samples import BaseSamples, find_planar_base
 from kineverse.manipulation.collision_rules import find_overlapping_links, furniture_rules
 from kineverse.model.frame import is_of_robot
 from kineverse.model.model_view import ModelView
@@ -24,7 +25,7 @@ from kineverse.symbols import Symbol
 from .base_placement import NO_WAY, BasePlacement
 from .hand_height import find_highest_passage, find_highest_reach
 from .hand_paths import HandPaths
-from .placement_samples import PlacementSamples, find_planar_base
+from .placement_samples import PlacementSamples
 from .way_check import CandidateWay, WayCheck, interpolate_poses
 from .way_contacts import OWN_MARGIN, WayContacts
 
@@ -88,6 +89,7 @@ class PlacementSearch:
         add_rules((*find_overlapping_links(self.scene, self.own, state), *furniture_rules(bodies, self.own)))
         add_rules(self.scene.find_always_colliding(self._random_states(state), OWN_MARGIN))
         self.contacts = WayContacts(model, self.scene, gripper, self.own, others, margin)
+        self.bases = BaseSamples(self.scene, self.base, self.own, others, margin)
         self._reach: float | None = None
 
     def _random_states(self, state: State) -> Iterator[State]:
@@ -160,7 +162,7 @@ class PlacementSearch:
             if found is not None or number * batch >= samples or search.refused >= _MOST_REFUSED:
                 break
             self.paths.ease = self.samples.eases[number % len(self.samples.eases)]
-            search.add(batch, _MIDDLES[number % len(_MIDDLES)])
+            search.add(min(batch, samples - number * batch), _MIDDLES[number % len(_MIDDLES)])
         return found or search.nothing
 
 
@@ -215,13 +217,8 @@ class _Search:
             return
         hands = handles[middle] @ self.poses[choice]
         outside = handles[middle] @ self.approaches[choice]
-        value = float(self.values[middle])
-
-        def blocked(places: Array) -> npt.NDArray[np.bool_]:
-            at = self.state.updated({self.coordinate: value})
-            return self.owner.contacts.blocked_bases(at, self.owner.base, places)
-
-        Q, base = samples.draw(self.random, self.state, hands, outside, _STARTS, blocked)
+        at = self.state.updated({self.coordinate: float(self.values[middle])})
+        Q, base = samples.draw(self.random, at, hands, outside, _STARTS, self.owner.bases)
         Q, error = paths.solve(Q, base, hands, _START_ITERATIONS)
         good = self._count(error < 1e-3, "out of reach")
         Q, base, choice = Q[good], base[good], choice[good]

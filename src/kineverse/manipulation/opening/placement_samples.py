@@ -3,21 +3,18 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 
 import numpy as np
 import numpy.typing as npt
 
 from kineverse.grasping import Grasp
 from kineverse.lie import Array
+from kineverse.manipulation.base_samples import BaseSamples
 from kineverse.model.model_view import ModelView
 from kineverse.state import State
 from kineverse.symbols import Symbol
 
-_NEAREST, _FARTHEST = 0.3, 1.1
-"""Distance of a base from the hand [m]."""
-_SIDE, _TURN = math.radians(80.0), math.radians(60.0)
-"""Largest angles of a base beside the approach of the hand, and of its front beside the hand [rad]."""
 _BASE_EASE, _BASE_SPEED = (0.1, 0.01), 1.0
 """Weights of a base that can move beside those of joints, so that it moves where they are not enough, or
 nearly stands where there is little room; and its speed where the model has no limit [m/s]."""
@@ -25,8 +22,6 @@ _WHOLE_ARM, _STANDING_EASE = 6, (0.1, 0.0, 0.0)
 """Number of joints from which on an arm needs no motion of the base, and the weights of its base."""
 _QUICK, _SOON = 0.5, 4.0
 """Speed from which on a joint has the full weight [m/s], [rad/s]; time in which most arms are reached [s]."""
-_BASE_TRIES = 4
-"""Number of times that a base that touches something is drawn anew."""
 
 
 class PlacementSamples:
@@ -111,7 +106,7 @@ class PlacementSamples:
         hands: Array,
         approaches: Array,
         starts: int,
-        blocked: Callable[[Array], npt.NDArray[np.bool_]],
+        bases: BaseSamples,
     ) -> tuple[Array, Array]:
         """Return random arms (N, n), and bases (N, m) in front of poses of the hand (N, 4, 4).
 
@@ -120,13 +115,13 @@ class PlacementSamples:
         random
             Random numbers.
         state
-            Present state: most arms are those that are soon reached.
+            State of everything: most arms are those that are soon reached.
         hands, approaches
             Poses of the hand at the handle, and before it.
         starts
             Number of successive samples that share a base.
-        blocked
-            Function of places of the base (B, 3) that returns flags (B,) of those where it touches something.
+        bases
+            Places of the base.
         """
         count = len(hands)
         here = state.vector(self.moving)
@@ -140,28 +135,12 @@ class PlacementSamples:
         still = np.tile(state.vector(self.standing), (count, 1))
         if self.base:
             first = slice(None, None, starts)
-            out, at = (approaches - hands)[first, :2, 3], hands[first, :2, 3]
-            values = self._draw_bases(random, out, at)
-            for _ in range(_BASE_TRIES):
-                hits = blocked(values)
-                if not hits.any():
-                    break
-                values[hits] = self._draw_bases(random, out[hits], at[hits])
-            values = np.repeat(values, starts, axis=0)[:count]
+            places = bases.draw(random, state, hands[first, :2, 3], (approaches - hands)[first, :2, 3])
+            places = np.repeat(places, starts, axis=0)[:count]
             for k, s in enumerate(self.base):
                 columns, array = (self.moving, Q) if s in self.moving else (self.standing, still)
-                array[:, columns.index(s)] = values[:, k]
+                array[:, columns.index(s)] = places[:, k]
         return Q, still
-
-    def _draw_bases(self, random: np.random.Generator, out: Array, hands: Array) -> Array:
-        """Return random places (B, 3) of a base in front of hands (B, 2) that come from some directions."""
-        count = len(out)
-        angle = np.arctan2(out[:, 1], out[:, 0]) + random.uniform(-_SIDE, _SIDE, count)
-        angle = np.where(np.hypot(*out.T) > 0.02, angle, random.uniform(-math.pi, math.pi, count))
-        distance = random.uniform(_NEAREST, _FARTHEST, count)
-        turn = random.uniform(-_TURN, _TURN, count)
-        place = hands + distance[:, None] * np.stack([np.cos(angle), np.sin(angle)], axis=1)
-        return np.column_stack([place, angle + math.pi + turn])
 
     def cost(self, state: State, ways: Array, approaches: Array, ends: npt.NDArray[np.int_]) -> Array:
         """Return the costs (N,) of ways (N, K, n) until indices (N,): their times, and nearness to limits.
@@ -185,12 +164,3 @@ class PlacementSamples:
         room = np.where(np.append(used, used[:, -1:], axis=1)[:, :, None], room, 1.0)
         least = room.min(axis=(1, 2), initial=1.0)
         return np.asarray(along + there - 40.0 * np.minimum(least, 0.1))
-
-
-def find_planar_base(model: ModelView, symbols: Sequence[Symbol]) -> tuple[Symbol, ...]:
-    """Return the coordinates x, y and angle of a mobile base among some; empty without one."""
-    for joint in model.articulations.values():
-        names = tuple(s.path.rpartition("/")[2] for s in joint.coordinates)
-        if names == ("x", "y", "angle") and {*joint.coordinates} <= {*symbols}:
-            return tuple(joint.coordinates)
-    return ()

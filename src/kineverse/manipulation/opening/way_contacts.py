@@ -5,9 +5,6 @@ from __future__ import annotations
 from collections.abc import Sequence
 from functools import cached_property
 
-import numpy as np
-import numpy.typing as npt
-
 from kineverse.geometry import Rule, Scene
 from kineverse.geometry.prepared_query import PreparedQuery
 from kineverse.grasping import Gripper
@@ -55,20 +52,6 @@ class WayContacts:
         self._around: dict[str, PreparedQuery] = {}
         self._beside: dict[str, PreparedQuery] = {}
         self._found: tuple[PreparedQuery, float] | None = None
-
-    def blocked_bases(self, state: State, base: Sequence[Symbol], places: Array) -> npt.NDArray[np.bool_]:
-        """Return flags (B,) of places (B, 3) of a base at which its bodies are too near to something."""
-        found = np.zeros(len(places), dtype=bool)
-        carried = [b for b in self.own if {*self._model.symbols_of(b)} <= {*base}]
-        if carried and self._base_watch is None:
-            self._base_watch = self.scene.watch(carried, self.others, self.margin)
-        if self._base_watch is not None:
-            for k, place in enumerate(places.tolist()):
-                self.scene.update(state.updated(dict(zip(base, place, strict=True))))
-                found[k] = len(self._base_watch()) > 0
-        return found
-
-    _base_watch: PreparedQuery | None = None
 
     def first(
         self, state: State, columns: Sequence[Symbol], rows: Array, handle: str, *, opened: bool

@@ -14,7 +14,7 @@ import numpy.typing as npt
 from kineverse.control import Goal, Hold, InverseKinematics, Target
 from kineverse.control.tasks import Task
 from kineverse.errors import KineverseError
-from kineverse.expressions.expression import array
+from kineverse.manipulation.base_samples import BaseSamples, find_planar_base
 from kineverse.model.frame import is_of_robot
 from kineverse.state import State
 from kineverse.symbols import Symbol
@@ -27,8 +27,6 @@ _TILT = math.radians(50.0)
 """Largest angle between the pusher's axis and the direction of the push at a start that is exact."""
 _NEARBY = 0.12
 """Largest entry of the distance of the tip at a start that is not [m]."""
-_NEAREST, _FARTHEST = 0.35, 1.1
-_SIDE, _TURN = math.radians(70.0), math.radians(45.0)
 _MARGIN = 0.01
 _STARTS = 4
 """Number of arms from which inverse kinematics decides whether an arm that stands reaches a point."""
@@ -184,18 +182,15 @@ class _Sampler:
             for tasks, tolerance in ((exact, 2 * math.sin(_TILT / 2)), ([nearby], _NEARBY))
         ]
         self._tried = 0
-        self._base: InverseKinematics | None = None
-        root = next(b for b in pushing.scene.bodies if is_of_robot(b, pushing.robot))
-        pose = model.fk(root)
-        if pose.symbols:
-            self._planar = Target("push/start/base", np.array([0.0, 0.0, 1.0, 0.0]))
-            planar = array([pose[0, 3], pose[1, 3], pose[0, 0], pose[1, 0]])
-            self._base = InverseKinematics(model, [Goal(planar, self._planar.expression, name="base")])
+        self.base = find_planar_base(model, model.symbols_of(tool.frame))
+        own = [b for b in pushing.scene.bodies if is_of_robot(b, pushing.robot)]
+        others = [b for b in pushing.scene.bodies if b not in own]
+        self._bases = BaseSamples(pushing.scene, self.base, own, others, _MARGIN)
         self._points = pushing.surface.at(state)
         score = pushing.choice.score(self._points)
         good = np.flatnonzero(score > score.max() - _CANDIDATES)
         self.unreachable = 0
-        if self._base is None:
+        if not self.base:
             free = InverseKinematics(model, [nearby], still=still, tolerance=_NEARBY)
             near = self._select_reachable(free, good)
             good, self.unreachable = (near, 0) if len(near) else (good, len(good))
@@ -208,17 +203,9 @@ class _Sampler:
         k = int(random.choice(self._candidates, p=self._weights))
         point, normal = self._points.points[k], self._points.normals[k]
         values = dict(self._arm())
-        if self._base is not None:
-            out = normal[:2] if np.hypot(*normal[:2]) > 0.1 else random.standard_normal(2)
-            angle = math.atan2(out[1], out[0]) + random.uniform(-_SIDE, _SIDE)
-            distance = random.uniform(_NEAREST, _FARTHEST)
-            x, y = point[:2] + distance * np.array([math.cos(angle), math.sin(angle)])
-            turn = angle + math.pi + random.uniform(-_TURN, _TURN)
-            wanted = self._planar.values(np.array([x, y, math.cos(turn), math.sin(turn)]))
-            found = self._base.solve(dict(state) | wanted, starts=1)
-            if not found.solved:
-                return "base not there"
-            values |= {s: found.best[s] for s in self._base.coordinates}
+        if self.base:
+            (place,) = self._bases.draw(random, state, point[None, :2], normal[None, :2])
+            values |= dict(zip(self.base, place.tolist(), strict=True))
         at = state.updated(values)
         solver = self._solvers[self._tried % len(self._solvers)]
         self._tried += 1
@@ -255,12 +242,11 @@ class _Sampler:
         """Return random values of the coordinates between base and pusher, in every other sample."""
         if self._generator.random() < 0.5:
             return {}
-        base = () if self._base is None else self._base.coordinates
         model = self._pushing.model
         values: dict[Symbol, float] = {}
         for symbol in self._solvers[0].coordinates:
             lower, upper = model.limits(symbol)
-            if symbol not in base and math.isfinite(lower) and math.isfinite(upper):
+            if symbol not in self.base and math.isfinite(lower) and math.isfinite(upper):
                 middle = (lower + upper) / 2
                 values[symbol] = middle + 0.6 * (self._generator.uniform(lower, upper) - middle)
         return values

@@ -1,0 +1,96 @@
+"""Random places of a mobile base in front of what a hand has to reach."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+
+import numpy as np
+import numpy.typing as npt
+
+from kineverse.geometry import Scene
+from kineverse.lie import Array
+from kineverse.model.model_view import ModelView
+from kineverse.state import State
+from kineverse.symbols import Symbol
+
+_NEAREST, _FARTHEST = 0.3, 1.1
+"""Distance of a base from the point that the hand has to reach [m]."""
+_SIDE, _TURN = math.radians(80.0), math.radians(60.0)
+"""Largest angles between base and coming hand, and between the front of the base and the point [rad]."""
+_TRIES = 4
+"""Number of times that a base that touches something is drawn anew."""
+
+
+class BaseSamples:
+    """Random places of a mobile base at which it touches nothing, as far as there are some.
+
+    Parameters
+    ----------
+    scene
+        Scene with the rules of the collision filter; it is placed anew.
+    base
+        Coordinates x [m], y [m] and angle [rad] of the base.
+    own, others
+        Bodies of the robot, and those of everything else.
+    margin
+        Least distance of the base from everything else [m].
+    """
+
+    def __init__(
+        self, scene: Scene, base: Sequence[Symbol], own: Sequence[str], others: Sequence[str], margin: float
+    ) -> None:
+        self.base = tuple(base)
+        self._scene = scene
+        carried = [b for b in own if {*scene.model.symbols_of(b)} <= {*base}]
+        self._watch = scene.watch(carried, others, margin) if base and carried else None
+
+    def draw(self, random: np.random.Generator, state: State, points: Array, directions: Array) -> Array:
+        """Return places (B, 3) of the base: x [m], y [m] and angle [rad].
+
+        Parameters
+        ----------
+        random
+            Random numbers.
+        state
+            State of everything else.
+        points
+            Points (B, 2) that the hand has to reach, from above [m].
+        directions
+            Directions (B, 2) from which it comes; those without a length are from above.
+        """
+        places = self._draw(random, points, directions)
+        for _ in range(_TRIES):
+            hits = self.find_touching(state, places)
+            if not hits.any():
+                break
+            places[hits] = self._draw(random, points[hits], directions[hits])
+        return places
+
+    def find_touching(self, state: State, places: Array) -> npt.NDArray[np.bool_]:
+        """Return flags (B,) of places (B, 3) at which the base is too near to something."""
+        touching = np.zeros(len(places), dtype=bool)
+        if self._watch is not None:
+            for k, place in enumerate(places.tolist()):
+                self._scene.update(state.updated(dict(zip(self.base, place, strict=True))))
+                touching[k] = len(self._watch()) > 0
+        return touching
+
+    def _draw(self, random: np.random.Generator, points: Array, directions: Array) -> Array:
+        count = len(points)
+        angle = np.arctan2(directions[:, 1], directions[:, 0]) + random.uniform(-_SIDE, _SIDE, count)
+        from_above = np.hypot(*directions.T) <= 0.02
+        angle = np.where(from_above, random.uniform(-math.pi, math.pi, count), angle)
+        distance = random.uniform(_NEAREST, _FARTHEST, count)
+        turn = random.uniform(-_TURN, _TURN, count)
+        at = points + distance[:, None] * np.stack([np.cos(angle), np.sin(angle)], axis=1)
+        return np.column_stack([at, angle + math.pi + turn])
+
+
+def find_planar_base(model: ModelView, symbols: Sequence[Symbol]) -> tuple[Symbol, ...]:
+    """Return the coordinates x, y and angle of a mobile base among some; empty without one."""
+    for joint in model.articulations.values():
+        names = tuple(s.path.rpartition("/")[2] for s in joint.coordinates)
+        if names == ("x", "y", "angle") and {*joint.coordinates} <= {*symbols}:
+            return tuple(joint.coordinates)
+    return ()
