@@ -16,7 +16,7 @@ from kineverse.symbols import Symbol
 
 _NEAREST, _FARTHEST = 0.3, 1.1
 """Distance of a base from the point that the hand has to reach [m]."""
-_SIDE, _TURN = math.radians(80.0), math.radians(60.0)
+_SIDE, _TURN = math.radians(110.0), math.radians(60.0)
 """Largest angles between base and coming hand, and between the front of the base and the point [rad]."""
 _TRIES = 4
 """Number of times that a base that touches something is drawn anew."""
@@ -45,15 +45,17 @@ class BaseSamples:
         carried = [b for b in own if {*scene.model.symbols_of(b)} <= {*base}]
         self._watch = scene.watch(carried, others, margin) if base and carried else None
 
-    def draw(self, random: np.random.Generator, state: State, points: Array, directions: Array) -> Array:
+    def draw(
+        self, random: np.random.Generator, states: Sequence[State], points: Array, directions: Array
+    ) -> Array:
         """Return places (B, 3) of the base: x [m], y [m] and angle [rad].
 
         Parameters
         ----------
         random
             Random numbers.
-        state
-            State of everything else.
+        states
+            States of everything else, in none of which the base should touch anything.
         points
             Points (B, 2) that the hand has to reach, from above [m].
         directions
@@ -61,20 +63,21 @@ class BaseSamples:
         """
         places = self._draw(random, points, directions)
         for _ in range(_TRIES):
-            hits = self.find_touching(state, places)
+            hits = self.find_touching(states, places)
             if not hits.any():
                 break
             places[hits] = self._draw(random, points[hits], directions[hits])
         return places
 
-    def find_touching(self, state: State, places: Array) -> npt.NDArray[np.bool_]:
-        """Return flags (B,) of places (B, 3) at which the base is too near to something."""
-        touching = np.zeros(len(places), dtype=bool)
-        if self._watch is not None:
-            for k, place in enumerate(places.tolist()):
-                self._scene.update(state.updated(dict(zip(self.base, place, strict=True))))
-                touching[k] = len(self._watch()) > 0
-        return touching
+    def find_touching(self, states: Sequence[State], places: Array) -> npt.NDArray[np.bool_]:
+        """Return flags (B,) of places (B, 3) at which the base is too near to something in a state."""
+        return np.array([any(self._touches(state, place) for state in states) for place in places.tolist()])
+
+    def _touches(self, state: State, place: Sequence[float]) -> bool:
+        if self._watch is None:
+            return False
+        self._scene.update(state.updated(dict(zip(self.base, place, strict=True))))
+        return len(self._watch()) > 0
 
     def _draw(self, random: np.random.Generator, points: Array, directions: Array) -> Array:
         count = len(points)

@@ -217,8 +217,10 @@ class _Search:
             return
         hands = handles[middle] @ self.poses[choice]
         outside = handles[middle] @ self.approaches[choice]
-        at = self.state.updated({self.coordinate: float(self.values[middle])})
-        Q, base = samples.draw(self.random, at, hands, outside, _STARTS, self.owner.bases)
+        # A base that stands has to be free on all the way.
+        stops = (middle, 0, self.last) if samples.stands(paths.ease) else (middle,)
+        states = [self.state.updated({self.coordinate: float(self.values[k])}) for k in stops]
+        Q, base = samples.draw(self.random, states, hands, outside, _STARTS, self.owner.bases)
         Q, error = paths.solve(Q, base, hands, _START_ITERATIONS)
         good = self._count(error < 1e-3, "out of reach")
         Q, base, choice = Q[good], base[good], choice[good]

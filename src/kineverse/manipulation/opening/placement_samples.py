@@ -61,6 +61,11 @@ class PlacementSamples:
         whole_arm = on_base.any() and (~on_base).sum() >= _WHOLE_ARM
         weights = _STANDING_EASE if whole_arm else _BASE_EASE
         self.eases = tuple(np.where(on_base, weight, joints) for weight in weights)
+        self._on_base = on_base
+
+    def stands(self, ease: Array) -> bool:
+        """Return True if the base stands along ways with weights (n,)."""
+        return not ease[self._on_base].any()
 
     def choose_grasps(
         self,
@@ -102,7 +107,7 @@ class PlacementSamples:
     def draw(
         self,
         random: np.random.Generator,
-        state: State,
+        states: Sequence[State],
         hands: Array,
         approaches: Array,
         starts: int,
@@ -114,8 +119,9 @@ class PlacementSamples:
         ----------
         random
             Random numbers.
-        state
-            State of everything: most arms are those that are soon reached.
+        states
+            States of the object, in none of which a base should touch anything. Most arms are those that are
+            soon reached from the first one.
         hands, approaches
             Poses of the hand at the handle, and before it.
         starts
@@ -124,7 +130,7 @@ class PlacementSamples:
             Places of the base.
         """
         count = len(hands)
-        here = state.vector(self.moving)
+        here = states[0].vector(self.moving)
         lower = np.where(self._bounded, self.lower, here - math.pi)
         upper = np.where(self._bounded, self.upper, here + math.pi)
         soon = random.random((count, 1)) < 0.75
@@ -132,10 +138,10 @@ class PlacementSamples:
         low = np.where(soon, np.minimum(np.maximum(lower, here - span), upper), lower)
         high = np.where(soon, np.maximum(np.minimum(upper, here + span), lower), upper)
         Q = random.uniform(low, high)
-        still = np.tile(state.vector(self.standing), (count, 1))
+        still = np.tile(states[0].vector(self.standing), (count, 1))
         if self.base:
             first = slice(None, None, starts)
-            places = bases.draw(random, state, hands[first, :2, 3], (approaches - hands)[first, :2, 3])
+            places = bases.draw(random, states, hands[first, :2, 3], (approaches - hands)[first, :2, 3])
             places = np.repeat(places, starts, axis=0)[:count]
             for k, s in enumerate(self.base):
                 columns, array = (self.moving, Q) if s in self.moving else (self.standing, still)

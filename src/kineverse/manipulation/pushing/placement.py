@@ -204,7 +204,7 @@ class _Sampler:
         point, normal = self._points.points[k], self._points.normals[k]
         values = dict(self._arm())
         if self.base:
-            (place,) = self._bases.draw(random, state, point[None, :2], normal[None, :2])
+            (place,) = self._bases.draw(random, [state], point[None, :2], normal[None, :2])
             values |= dict(zip(self.base, place.tolist(), strict=True))
         at = state.updated(values)
         solver = self._solvers[self._tried % len(self._solvers)]
