@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from copy import copy
 from dataclasses import dataclass
 from typing import overload
 
@@ -138,6 +139,28 @@ class DistanceResults(Sequence[DistanceResult]):
     ) -> None:
         self._bodies, self._shape_numbers = world.bodies, world.shape_numbers
         self._object_indices, self.body_indices = objects, bodies
+        self._set(distances, witnesses)
+
+    def with_points(self, rows: Sequence[int], witnesses: Floats) -> DistanceResults:
+        """Return these results with further points of some pairs, nearest first.
+
+        Parameters
+        ----------
+        rows
+            Indices (N,) of the pairs.
+        witnesses
+            (N, 9) points of a and b, and the normal.
+        """
+        distances = np.einsum("ki,ki->k", witnesses[:, 6:], witnesses[:, 3:6] - witnesses[:, :3])
+        distances = np.concatenate([self.distances, distances])
+        order = np.argsort(distances, kind="stable")
+        which = np.concatenate([np.arange(len(self)), np.asarray(rows, dtype=np.intp)])[order]
+        more = copy(self)
+        more._object_indices, more.body_indices = self._object_indices[which], self.body_indices[which]
+        more._set(distances[order], np.concatenate([self.witnesses, witnesses])[order])
+        return more
+
+    def _set(self, distances: Floats, witnesses: Floats) -> None:
         self.distances, self.witnesses = distances, witnesses
         self.points_a, self.points_b, self.normals = witnesses[:, :3], witnesses[:, 3:6], witnesses[:, 6:]
 

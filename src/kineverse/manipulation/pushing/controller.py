@@ -227,9 +227,9 @@ class Pushing:
         return f"contact of {deep[0].a} and {deep[0].b}" if deep else ""
 
     @property
-    def penetration(self) -> float:
-        """Deepest penetration at the last step of pairs that may not touch [m], 0 if there is none."""
-        return self._pairs.penetration(self._slots.found)
+    def clearance(self) -> float:
+        """Least distance at the last step of pairs that may not touch [m], infinite if none is near."""
+        return self._pairs.clearance(self._slots.found)
 
     def find_deviation(self, state: State, deviation: Callable[[Symbol], float]) -> float:
         """Return the standard deviation of gaps [m] at a state whose coordinates have deviations.

@@ -162,8 +162,8 @@ class PairFinder:
                 best = PushPair(robot, thing, r, p, normal, gap, velocity, alignment)
         return best
 
-    def penetration(self, found: DistanceResults) -> float:
-        """Return the deepest penetration of all other pairs [m], 0 if there is none."""
+    def clearance(self, found: DistanceResults) -> float:
+        """Return the least distance of all other pairs [m], infinite if none is near."""
         a, b = found.body_indices.T
         distances = found.distances[self._kinds[a, b] == 0]
-        return max(0.0, -float(distances[0])) if len(distances) else 0.0
+        return float(distances[0]) if len(distances) else math.inf

@@ -28,6 +28,8 @@ _TILT = math.radians(50.0)
 _NEARBY = 0.12
 """Largest entry of the distance of the tip at a start that is not [m]."""
 _MARGIN = 0.01
+_LEAST_CLEARANCE = 1.5e-3
+"""Least distance in a roll-out of pairs that may not touch [m]: pushes in worlds differ a little."""
 _STARTS = 4
 """Number of arms from which inverse kinematics decides whether an arm that stands reaches a point."""
 _CANDIDATES = 1.0
@@ -138,18 +140,14 @@ def roll_out(pushing: Pushing, start: State, steps: int, tolerance: float = 0.01
                 return "lost the contact", k
             if pushing.choice.blocked:
                 return f"blocked at {state[pushing.coordinate]:.2f}", k
-            if pushing.penetration > _DEEPEST:
-                return "penetration", k
+            if pushing.clearance < _LEAST_CLEARANCE:
+                return "too little room", k
             state = pushing.model.integrate(state, command.speeds, pushing.controller.dt)
     except KineverseError as error:
         return f"{type(error).__name__}", 0
     finally:
         pushing.reset()
     return "out of time", steps
-
-
-_DEEPEST = 4e-4
-"""Largest penetration of a roll-out, in pairs that may not touch [m]."""
 
 
 class _Sampler:
