@@ -57,7 +57,7 @@ def open_object(
     target: float | None = None,
     hand: str | None = None,
     handle: str | None = None,
-    seconds: float = 120.0,
+    seconds: float = 180.0,
     tolerance: float = 0.02,
     placements: int = 600,
     seed: int = 0,
