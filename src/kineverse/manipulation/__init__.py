@@ -9,6 +9,7 @@ from .pushing import push
 from .session import Session
 from .tracked_belief import TrackedBelief
 from .unknown_objects import open_unknown
+from .unlocking import UnlockingExecution, execute_unlocking
 
 __all__ = [
     "ArticulatedObject",
@@ -22,6 +23,8 @@ __all__ = [
     "SkillError",
     "TrackedBelief",
     "TrueBelief",
+    "UnlockingExecution",
+    "execute_unlocking",
     "find_articulated_objects",
     "open_object",
     "open_unknown",
