@@ -9,15 +9,17 @@ from .pushing import push
 from .session import Session
 from .tracked_belief import TrackedBelief
 from .unknown_objects import open_unknown
-from .unlocking import UnlockingExecution, execute_unlocking
+from .unlocking import LockExploration, PartMover, UnlockingExecution, execute_unlocking, explore_locks
 
 __all__ = [
     "ArticulatedObject",
     "BasePlacement",
     "Belief",
+    "LockExploration",
     "OpenCloseReport",
     "OpenCloseRunner",
     "Outcome",
+    "PartMover",
     "PlacementSearch",
     "Session",
     "SkillError",
@@ -25,6 +27,7 @@ __all__ = [
     "TrueBelief",
     "UnlockingExecution",
     "execute_unlocking",
+    "explore_locks",
     "find_articulated_objects",
     "open_object",
     "open_unknown",
