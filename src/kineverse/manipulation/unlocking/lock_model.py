@@ -74,7 +74,7 @@ class LockModel:
         }
         self._priority = np.random.default_rng(seed).permutation(len(ends)).tolist()
         self._doubts = dict[tuple[KeySide, KeySide], float]()
-        self._written = dict[int, object]()
+        self._written: Mapping[int, object] = {}
 
     def read(self, state: State) -> Configuration:
         """Return the configuration of a state, with positions near a limit at the limit."""
