@@ -14,7 +14,6 @@ from kineverse.experiments.lockbox.systematic_search import (
     LockboxTrials,
     count_systematic_tries,
     permute_parts,
-    remove_locks,
 )
 from kineverse.gallery.lockboxes import (
     THESIS,
@@ -24,6 +23,7 @@ from kineverse.gallery.lockboxes import (
     draw_lockbox,
     draw_tangled_lockbox,
     make_lockbox_model,
+    remove_locks,
 )
 from kineverse.manipulation import PartMover, Session, explore_locks
 from kineverse.manipulation.unlocking.lock_hypothesis import Enclosure, KeySide, LockHypothesis

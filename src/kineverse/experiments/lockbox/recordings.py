@@ -7,11 +7,10 @@ from contextlib import contextmanager
 from pathlib import Path
 
 from kineverse.experiments.manipulation.setting import make_record_folder
-from kineverse.gallery.lockboxes import THESIS, make_lockbox_model
+from kineverse.gallery.lockboxes import THESIS, make_lockbox_model, remove_locks
 from kineverse.manipulation import PartMover, Session, execute_unlocking, explore_locks
 from kineverse.worlds import MechanismWorld, Recorder
 
-from .systematic_search import remove_locks
 from .unlocking_runs import run_unlocking
 
 _DT = 0.05

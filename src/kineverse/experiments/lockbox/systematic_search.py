@@ -99,11 +99,6 @@ def _find_ways(start: Combination, moves: dict[Combination, list[int]]) -> dict[
     return ways
 
 
-def remove_locks(box: Lockbox) -> Lockbox:
-    """Return the parts of a box without their locks."""
-    return Lockbox({name: replace(part, groups=()) for name, part in box.parts.items()}, box.goal)
-
-
 def permute_parts(box: Lockbox, seed: int) -> Lockbox:
     """Return a box whose parts have changed their names, and with them their order."""
     names = list(box.parts)

@@ -10,11 +10,11 @@ from typing import Any, Literal, TypeAlias
 import numpy as np
 
 from kineverse.experiments.report import ReportTable
-from kineverse.gallery.lockboxes import THESIS, Lockbox, draw_lockbox, make_lockbox_model
+from kineverse.gallery.lockboxes import THESIS, Lockbox, draw_lockbox, make_lockbox_model, remove_locks
 from kineverse.manipulation import explore_locks
 
 from .exhaustive_search import can_be_opened
-from .systematic_search import LockboxTrials, count_systematic_tries, permute_parts, remove_locks
+from .systematic_search import LockboxTrials, count_systematic_tries, permute_parts
 
 _PARTS = 6
 _NEGATED = 0.25
