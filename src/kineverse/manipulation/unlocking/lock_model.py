@@ -126,7 +126,8 @@ class LockModel:
                     there[s.key] = self.end(s)
             chance = lock.probability(tuple(there), box)
             if chance:
-                best = min(best, sum(tries for _, tries in chosen.values()) + 1 / chance)
+                # Not 1 / chance: a try that fails is not made again, since it teaches something.
+                best = min(best, sum(tries for _, tries in chosen.values()) + 1 / math.sqrt(chance))
             found.append(dict.fromkeys(s for s, _ in chosen.values()))
         return best, found
 
