@@ -74,10 +74,9 @@ class LockHypothesis:
 
     def observe(self, q: Configuration, moved: bool) -> None:
         """Add a try at a configuration."""
-        own = (*q[: self.number], 0.0, *q[self.number + 1 :])
-        tries = self.moved if moved else self.refused
-        if own not in tries:
-            tries.append(own)
+        q, tries = self._without_own(q), self.moved if moved else self.refused
+        if q not in tries:
+            tries.append(q)
         self.boxes = []
         for one in self.moved:
             for k, box in enumerate(self.boxes):
@@ -106,10 +105,7 @@ class LockHypothesis:
     @property
     def alternatives(self) -> Sequence[Enclosure]:
         """Boxes in which the lock is open; before the part has moved, a single one that is empty."""
-        lower, upper = (
-            (*ends[: self.number], 0.0, *ends[self.number + 1 :])
-            for ends in (self.limits.lower, self.limits.upper)
-        )
+        lower, upper = map(self._without_own, self.limits)
         return self.boxes or [Enclosure(upper, lower)]
 
     def suspects(self, q: Configuration, box: Enclosure) -> list[KeySide]:
@@ -161,7 +157,7 @@ class LockHypothesis:
 
         It is 1 or 0 only where all conjunctions that agree with the tries say so.
         """
-        q = (*q[: self.number], 0.0, *q[self.number + 1 :])
+        q = self._without_own(q)
         if box is None:
             return max(self.probability(q, box) for box in self.alternatives)
         if box.contains(q):
@@ -175,6 +171,10 @@ class LockHypothesis:
             cleared = sum(self.weight(s) * _passed(s, one, q, box) for s in suspects)
             chance *= cleared / sum(map(self.weight, suspects))
         return chance
+
+    def _without_own(self, q: Configuration) -> Configuration:
+        """Return a configuration in which the position of the locked coordinate does not count."""
+        return (*q[: self.number], 0.0, *q[self.number + 1 :])
 
 
 def _passed(s: KeySide, refused: Configuration, q: Configuration, box: Enclosure) -> float:
