@@ -163,6 +163,19 @@ def test_box_that_cannot_be_opened_is_given_up():
     assert plan_unlocking(model, {"a": 1.0}).verdict == "refuted"
 
 
+@pytest.mark.parametrize(
+    "box",
+    [
+        permute_parts(draw_lockbox(7, 7, negated=0.5), 7),
+        draw_tangled_lockbox(6, 4),
+        draw_tangled_lockbox(6, 10),
+    ],
+)
+def test_exploration_ends_where_hypotheses_leave_no_plan(box):
+    """The plans by hypotheses are refuted on the way; what is left to try decides."""
+    assert bool(explore(box, most=300)[2]) == can_be_opened(box)
+
+
 def test_erratic_part_is_left_out():
     """The part c moves every second time; a is reached through b."""
     box = Lockbox({"a": Slider(groups=((Condition("b", 0.5),),)), "b": Slider(), "c": Slider()}, {"a": 1.0})
