@@ -68,6 +68,25 @@ def test_unlock_without_what_is_stuck(capsys):
     assert "cannot be reached without lockbox/f" in capsys.readouterr().out
 
 
+def test_unlock_execute_moves_the_parts_and_records_them(capsys, tmp_path):
+    path = tmp_path / "run.mcap"
+    assert main([*THESIS, "--execute", "--record", str(path)]) == 0
+    lines = capsys.readouterr().out.splitlines()
+    assert lines[0] == "1. lockbox/f moved to 1.25 in 3.5 s: it holds lockbox/e"
+    assert lines[6:] == ["the goal is reached"]
+    run = kv.worlds.read_run_recording(path)
+    assert run.phases.entries[:2] == ("raise lockbox/f", "raise lockbox/e")
+    assert run.outcome["done"]
+    assert run.states.at(run.duration)[kv.position("lockbox/a")] == pytest.approx(1.2, abs=2e-4)
+
+
+def test_unlock_execute_with_a_jammed_part(capsys):
+    assert main([*THESIS, "--execute", "--jam", "lockbox/e", "--json"]) == 1
+    data = json.loads(capsys.readouterr().out)
+    assert data["stuck"] == ["lockbox/e"]
+    assert not data["done"]
+
+
 @pytest.mark.parametrize(
     ("words", "text"),
     [
@@ -77,6 +96,9 @@ def test_unlock_without_what_is_stuck(capsys):
         (["--goal", "lockbox/a=1", "--from", "lockbox/x=1"], "lockbox/x"),
         (["--goal", "lockbox/a=1", "--still", "lockbox/x"], "'lockbox/x' is no degree of freedom"),
         (["--goal", "lockbox/a=1", "--budget", "0"], "positive time in seconds"),
+        (["--goal", "lockbox/a=1", "--jam", "lockbox/d"], "about the world of --execute"),
+        (["--goal", "lockbox/a=1", "--execute", "--jam", "lockbox/x"], "'lockbox/x' is no degree of freedom"),
+        (["--goal", "lockbox/a=1", "--execute", "--record", "run.txt"], ".mcap"),
         ([], "--goal"),
     ],
 )

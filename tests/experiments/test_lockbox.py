@@ -2,6 +2,9 @@
 
 import json
 
+import pytest
+
+import kineverse as kv
 from kineverse.experiments import Options
 from kineverse.experiments.lockbox import (
     ExplorerJob,
@@ -13,8 +16,18 @@ from kineverse.experiments.lockbox import (
     run_planner,
 )
 from kineverse.experiments.lockbox.exhaustive_search import can_be_opened
+from kineverse.experiments.lockbox.recordings import record_thesis_box
+from kineverse.experiments.lockbox.systematic_search import count_systematic_tries
+from kineverse.experiments.lockbox.unknown_locks import list_unknown_jobs, run_unknown
 from kineverse.experiments.lockbox.unlocking_runs import LOCK_RULES, run_unlocking
-from kineverse.gallery.lockboxes import THESIS, Condition, Lockbox, Slider, make_rings
+from kineverse.gallery.lockboxes import (
+    THESIS,
+    Condition,
+    Lockbox,
+    Slider,
+    draw_tangled_lockbox,
+    make_rings,
+)
 
 
 def test_jobs_are_those_of_the_documentation():
@@ -59,7 +72,8 @@ def test_report_of_few_boxes():
     ]
     assert not any(one.wrong for one in planned)
     thesis = {rule: run_unlocking(THESIS, rule, 160) for rule in LOCK_RULES}
-    report = make_lockbox_report(thesis, explored, planned, 0)
+    unknown = [one for job in list_unknown_jobs(1, 3) for one in run_unknown(job)]
+    report = make_lockbox_report(thesis, explored, planned, unknown, 0)
     opened = {row["rule"]: (row["opened"], row["of"]) for row in report.numbers["explorer"]}
     assert opened["and"] == (1, 1)
     assert opened["none"] == (0, 1)
@@ -67,4 +81,31 @@ def test_report_of_few_boxes():
     assert not report.numbers["thesis"]["none"]["done"]
     assert [row["wrong"] for row in report.numbers["planner"]] == [[], [], [], []]
     json.dumps(report.numbers, allow_nan=False)
-    assert [len(table.rows) for table in report.tables] == [4, 4, 4]
+    assert [len(table.rows) for table in report.tables] == [4, 4, 4, 4]
+    for one in report.numbers["unknown locks"]:
+        assert one["tries"] <= one["depth"]
+
+
+def test_jobs_of_unknown_locks_are_those_of_the_documentation():
+    assert len(list_unknown_jobs(1000, 0)) == 400
+    assert {job.seed for job in list_unknown_jobs(30, 7)} == {7, 8, 9}
+
+
+def test_systematic_search_finds_exactly_the_boxes_that_can_be_opened():
+    """Both orders are complete: their numbers of tries are finite if and only if there is a solution."""
+    found = 0
+    for seed in range(40):
+        box = draw_tangled_lockbox(4, seed)
+        for order in ("depth", "breadth"):
+            assert (count_systematic_tries(box, order) is not None) == can_be_opened(box), seed
+        found += can_be_opened(box)
+    assert 5 < found < 40
+
+
+def test_thesis_box_is_recorded_in_three_ways(tmp_path):
+    record_thesis_box(tmp_path / "runs")
+    for name in ("trends", "plan", "unknown-locks"):
+        run = kv.worlds.read_run_recording(tmp_path / "runs" / f"thesis-{name}.mcap")
+        assert run.outcome["done"], name
+        assert run.states.at(run.duration)[kv.position("a")] == pytest.approx(1.2, abs=0.01)
+        assert len(run.commands.times) == len(run.times)

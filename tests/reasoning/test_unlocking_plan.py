@@ -159,9 +159,37 @@ def test_plan_refutes_conflict_by_exhaustion():
     with model.edit() as edit:
         edit.constrain("c stays", -(B < 0.4), C.derivative(), 1)
         edit.constrain("b stays", -(C < 0.4), B.derivative(), 1)
+        edit.constrain("d range", 0, kv.position("d"), 1)
+        edit.constrain("a also", -1, A.derivative(), kv.position("d") > 0.5)
     plan = plan_unlocking(model, {A: 1})
     assert plan.verdict == "refuted"
-    assert plan.blocking
+    assert not plan.is_circle
+    assert {lock.constraints for lock in plan.blocking} == {
+        ("lock a",),
+        ("lock b", "b stays"),
+        ("lock c", "c stays"),
+    }
+    for lock in plan.blocking:
+        fewer = model.copy()
+        with fewer.edit() as edit:
+            for name in lock.constraints:
+                edit.remove(f"constraint {name}")
+        assert plan_unlocking(fewer, {A: 1}).verdict == "found", lock
+
+
+def test_circle_is_named_where_another_way_is_stuck():
+    """Child lock: the lever moves while the door is open; the outer handle does not move."""
+    door, outer, lever = (kv.position(name) for name in ("door", "outer", "lever"))
+    model = kv.Model()
+    with model.edit() as edit:
+        for q in (door, outer, lever):
+            edit.constrain(f"{q} range", 0, q, 1)
+        edit.constrain("latch", -1, door.derivative(), (outer > 0.5) | (lever > 0.5))
+        edit.constrain("lever lock", -1, lever.derivative(), door > 0.5)
+    plan = plan_unlocking(model, {door: 1}, still=[outer])
+    assert plan.is_circle
+    assert [lock.constraints for lock in plan.blocking] == [("latch",), ("lever lock",)]
+    assert [str(step.coordinate) for step in plan_unlocking(model, {door: 1}).steps] == ["outer", "door"]
 
 
 def test_plan_without_what_does_not_move():

@@ -8,6 +8,7 @@ import sys
 from pathlib import Path
 
 import living
+import lockbox
 import near
 import numpy as np
 from configurations import TAKES, Take, values
@@ -24,7 +25,11 @@ from kineverse.view.rasterizer import TriangleSoup
 FOLDER = Path(__file__).resolve().parents[2] / "docs" / "pictures"
 WIDTH, GAP = 480, 4
 LARGEST = 24_000
-OTHERS = {"near": near.draw_proximity, "living": living.draw_living_kitchen}
+OTHERS = {
+    "near": near.draw_proximity,
+    "living": living.draw_living_kitchen,
+    "lockbox": lockbox.draw_thesis_box,
+}
 
 
 def main() -> int:

@@ -4,8 +4,18 @@ from __future__ import annotations
 
 import argparse
 import json
+from collections.abc import Mapping
+from contextlib import ExitStack
+from pathlib import Path
+from typing import TYPE_CHECKING
 
 from kineverse.cli.arguments import add_model_options, load_model, parse_assignments
+from kineverse.errors import InvalidValueError, KineverseError
+
+if TYPE_CHECKING:
+    from kineverse.manipulation import UnlockingExecution
+    from kineverse.model.model import Model
+    from kineverse.reasoning import UnlockingPlan
 
 HELP = """find the order in which locked parts have to move
 
@@ -13,11 +23,16 @@ The interlocks of the model are derived from its constraints. Each step is print
 are checked by evaluating the constraints along them. If the goal cannot be reached, the locks that prevent it
 are printed, and the exit status is 1; it is 3 if that stays undecided.
 
+With --execute the parts are moved as planned, in a world that has the constraints of the model: by the
+velocity controller, one at a time. If one does not move, the plan is made again without it. This needs the
+extra 'control', and --record 'recording'.
+
 examples:
   kineverse unlock lockboxes/thesis --goal lockbox/a=1.2
   kineverse unlock articulations/microwave --goal microwave/oven/door=90deg
   kineverse unlock articulations/latch --goal latch/gate/door=0.5 --goal latch/gate/bolt=0
-  kineverse unlock lockboxes/17 --goal lockbox/part_9=1 --still lockbox/part_0"""
+  kineverse unlock lockboxes/17 --goal lockbox/part_9=1 --still lockbox/part_0
+  kineverse unlock lockboxes/17 --goal lockbox/part_9=1 --execute --jam lockbox/part_2 --record run.mcap"""
 
 FOUND, REFUTED, UNDECIDED = 0, 1, 3
 STATUS = {"found": FOUND, "refuted": REFUTED, "undecided": UNDECIDED}
@@ -53,6 +68,16 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--budget", type=float, default=10.0, metavar="S", help="time for the search [s] (10)"
     )
+    parser.add_argument("--execute", action="store_true", help="move the parts as planned")
+    parser.add_argument(
+        "--jam",
+        nargs="+",
+        action="extend",
+        default=[],
+        metavar="NAME",
+        help="coordinates that do not move in the world, which the plan does not know",
+    )
+    parser.add_argument("--record", type=Path, metavar="FILE.mcap", help="file to which the run is recorded")
     add_model_options(parser)
     parser.add_argument("--json", action="store_true", help="one JSON object on standard output")
 
@@ -62,8 +87,9 @@ def run(arguments: argparse.Namespace) -> int:
     # Parsed before the model is loaded, so that a typing error is reported at once.
     goal = parse_assignments(arguments.goal, "--goal")
     start = parse_assignments(arguments.assignments, "--from")
+    if (arguments.jam or arguments.record) and not arguments.execute:
+        raise InvalidValueError("--jam and --record are about the world of --execute.")
 
-    from kineverse.errors import KineverseError
     from kineverse.reasoning import plan_unlocking, plan_violations
 
     model = load_model(arguments, arguments.model)
@@ -71,8 +97,36 @@ def run(arguments: argparse.Namespace) -> int:
     wrong = plan_violations(model, plan, start)
     if wrong:
         raise KineverseError(f"The plan violates constraints of the model: {'; '.join(wrong)}.")
-    if arguments.json:
-        print(json.dumps(plan.as_data(), allow_nan=False))
-    else:
-        print(plan)
+    if arguments.execute:
+        return _execute(arguments, model, goal, start)
+    _print(arguments, plan)
     return STATUS[plan.verdict]
+
+
+def _execute(
+    arguments: argparse.Namespace, model: Model, goal: Mapping[str, float], start: Mapping[str, float]
+) -> int:
+    """Execute the plan in a world, print what moved, and record it if wanted."""
+    from kineverse.manipulation import execute_unlocking
+    from kineverse.worlds import MechanismWorld, Recorder
+
+    world = MechanismWorld(model, arguments.jam)
+    world.reset(start)
+    with ExitStack() as stack:
+        recorder = None
+        if arguments.record is not None:
+            about = {"model": arguments.model, "world": world.name}
+            recorder = stack.enter_context(Recorder(arguments.record, model, about))
+        done = execute_unlocking(
+            world, goal, still=arguments.still, budget=arguments.budget, on_step=recorder
+        )
+        if recorder is not None:
+            recorder.write_outcome(done.as_data())
+    _print(arguments, done)
+    if done.constraint:
+        raise KineverseError(f"The motion violated '{done.constraint}', by {done.violation:.3g}.")
+    return FOUND if done else STATUS[done.plan.verdict] or REFUTED
+
+
+def _print(arguments: argparse.Namespace, answer: UnlockingPlan | UnlockingExecution) -> None:
+    print(json.dumps(answer.as_data(), allow_nan=False) if arguments.json else answer)

@@ -12,7 +12,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Iterator, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import reduce
 from operator import and_, or_
 from types import MappingProxyType
@@ -210,6 +210,11 @@ def draw_tangled_lockbox(parts: int, seed: int) -> Lockbox:
 
 def _threshold(rng: np.random.Generator) -> float:
     return round(float(rng.uniform(0.2, 0.8)), 2)
+
+
+def remove_locks(box: Lockbox) -> Lockbox:
+    """Return the parts of a box without their locks."""
+    return Lockbox({name: replace(part, groups=()) for name, part in box.parts.items()}, box.goal)
 
 
 def make_lockbox_model(box: Lockbox, prefix: str | None = "lockbox", join: Join = and_) -> Model:

@@ -9,19 +9,25 @@ from .pushing import push
 from .session import Session
 from .tracked_belief import TrackedBelief
 from .unknown_objects import open_unknown
+from .unlocking import LockExploration, PartMover, UnlockingExecution, execute_unlocking, explore_locks
 
 __all__ = [
     "ArticulatedObject",
     "BasePlacement",
     "Belief",
+    "LockExploration",
     "OpenCloseReport",
     "OpenCloseRunner",
     "Outcome",
+    "PartMover",
     "PlacementSearch",
     "Session",
     "SkillError",
     "TrackedBelief",
     "TrueBelief",
+    "UnlockingExecution",
+    "execute_unlocking",
+    "explore_locks",
     "find_articulated_objects",
     "open_object",
     "open_unknown",

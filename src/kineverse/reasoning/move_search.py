@@ -301,16 +301,18 @@ def find_circle(graph: CellGraph, reached: int) -> tuple[tuple[MoveRule, ...], b
     chain: list[MoveRule] = []
     seen: dict[int, int] = {}
     while wanted:
-        k = next(k for k in range(len(graph.coordinates)) if graph.field(k) & wanted)
-        if k in seen:
-            return tuple(chain[seen[k] :]), True
-        seen[k] = len(chain)
-        blocked = _blocking_rule(graph, k, wanted, reached)
+        concerned = [k for k in range(len(graph.coordinates)) if graph.field(k) & wanted]
+        closing = next((k for k in concerned if k in seen), None)
+        if closing is not None:
+            return tuple(chain[seen[closing] :]), True
+        # Of several ways out, one that a lock closes tells more than one whose coordinate does not move.
+        found = ((k, _blocking_rule(graph, k, graph.field(k) & wanted, reached)) for k in concerned)
+        blocked = next(((k, one) for k, one in found if one is not None), None)
         if blocked is None:
             break
-        rule, mask = blocked
+        k, (rule, wanted) = blocked
+        seen[k] = len(chain)
         chain.append(rule)
-        wanted = mask
     return tuple(chain), False
 
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Collection, Mapping
+from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import dataclass
 from time import perf_counter
 from types import MappingProxyType
@@ -95,7 +95,7 @@ class UnlockingPlan:
     shortest
         True if there are no fewer moves.
     blocking
-        Interlocks that keep the goal out of reach, each because of the next one.
+        Interlocks that keep the goal out of reach, each because of the next one, or all of them together.
     is_circle
         True if the last of these depends on the first one.
     unread
@@ -215,8 +215,12 @@ def plan_unlocking(
     if state is not None:
         given |= dict(as_state(state, model.symbols))
     start = {s: _clip(float(given.get(s, 0.0)), limits.get(s, Interval())) for s in coordinates}
-    graph = make_graph(coordinates, rules, limits, start, goals, fixed)
-    result = MoveSearch(graph, lambda: perf_counter() > end).run()
+
+    def search(some: Sequence[MoveRule]) -> tuple[CellGraph, MoveSearchResult]:
+        graph = make_graph(coordinates, some, limits, start, goals, fixed)
+        return graph, MoveSearch(graph, lambda: perf_counter() > end).run()
+
+    graph, result = search(rules)
     unread = tuple(dict.fromkeys(rule.lock for rule in rules if not rule.is_exact))
     if result.verdict == "found":
         steps = _make_steps(graph, result.moves, start, goals)
@@ -224,22 +228,34 @@ def plan_unlocking(
         return UnlockingPlan(
             shown, "found", steps, result.shortest, unread=unread, still=fixed, explored=result.explored
         )
-    return _make_refutation(graph, result, rules, goals, unread, fixed)
+    chain, is_circle = find_circle(graph, result.reached)
+    if not chain and result.verdict == "refuted":
+        # Each lock could be opened, but not all that are needed at once.
+        chain = _find_conflict(rules, search)
+    return _make_refutation(result, chain, is_circle, goals, unread, fixed)
+
+
+def _find_conflict(
+    rules: Sequence[MoveRule], search: Callable[[Sequence[MoveRule]], tuple[CellGraph, MoveSearchResult]]
+) -> tuple[MoveRule, ...]:
+    """Return rules that are in conflict, without those that are not needed for it, as far as time allows."""
+    kept = list(rules)
+    for lock in dict.fromkeys(rule.lock for rule in rules):
+        fewer = [rule for rule in kept if rule.lock != lock]
+        if search(fewer)[1].verdict == "refuted":
+            kept = fewer
+    return tuple(kept)
 
 
 def _make_refutation(
-    graph: CellGraph,
     result: MoveSearchResult,
-    rules: list[MoveRule],
+    chain: tuple[MoveRule, ...],
+    is_circle: bool,
     goals: dict[Symbol, float],
     unread: tuple[Interlock | Undecided, ...],
     fixed: tuple[Symbol, ...],
 ) -> UnlockingPlan:
     """Return the plan without steps for a search that found no moves."""
-    chain, is_circle = find_circle(graph, result.reached)
-    if not chain and result.verdict == "refuted":
-        # Each lock could be opened, but not all that are needed at once: all of them are in conflict.
-        chain = tuple(rules)
     blocking = tuple(dict.fromkeys(rule.lock for rule in chain))
     verdict: Verdict = "undecided" if unread else result.verdict
     return UnlockingPlan(

@@ -2,6 +2,7 @@
 
 from .judge import Judge
 from .kinematic_world import Event, KinematicWorld
+from .mechanism_world import MechanismWorld
 from .mujoco_world import MujocoWorld
 from .recorder import Recorder
 from .recording import RunRecording, read_run_recording
@@ -14,6 +15,7 @@ __all__ = [
     "Event",
     "Judge",
     "KinematicWorld",
+    "MechanismWorld",
     "MujocoWorld",
     "Observation",
     "Recorder",

@@ -37,6 +37,8 @@ from kineverse.model.version_cache import cached_for_version
 from kineverse.state import State, StateLike
 from kineverse.symbols import Symbol
 
+from .limit_judge import LimitJudge
+
 CONTACT_GAP = 1e-3
 """Largest gap of a contact of a push [m]."""
 
@@ -99,7 +101,12 @@ class Judge:
             raise UnknownNameError(
                 f"No body of the model is below '{robot}'. {suggest(robot, prefixes, 'prefix')}"
             )
-        self._make_limits()
+        self._robot_speeds = [v for v in model.speeds if is_of_robot(v.path, robot)]
+        self._limits = LimitJudge(model, self._robot_speeds)
+        # Speeds are given by symbol or by name.
+        self._speed_place: dict[Symbol | str, int] = {v: k for k, v in enumerate(self._robot_speeds)}
+        self._speed_place |= {str(v): k for k, v in enumerate(self._robot_speeds)}
+        self._scene_values = self._indices(self._scene.inputs)
         self._penetrations = self._scene.watch(radius=0.0)
         own = set(self._own)
         find = self._scene.find_always_colliding
@@ -146,8 +153,8 @@ class Judge:
         rms = math.sqrt(self._squares / self._seconds) if self._seconds else math.nan
         elapsed = 0.0 if self._first is None or self._stamp is None else self._stamp - self._first
         return {
-            "limit_violation": self._excess,
-            "limit": self._limit,
+            "limit_violation": self._limits.violation,
+            "limit": self._limits.limit,
             "penetration": self._depth,
             "penetrating": self._deepest,
             "grasp_error": self._slip,
@@ -167,7 +174,7 @@ class Judge:
 
     def reset(self) -> None:
         """Forget all measurements."""
-        self._excess, self._limit = 0.0, ""
+        self._limits.reset()
         self._depth, self._deepest = 0.0, ("", "")
         self._slip = self._turn = math.nan
         self._losses, self._reversals = 0, 0
@@ -217,7 +224,7 @@ class Judge:
             )
         values = state.vector(self._symbols)
         commanded = None if speeds is None else self._select_speeds(speeds)
-        self._measure_limits(values, stamp, commanded)
+        self._limits.update(values, stamp, commanded)
         if commanded is not None:
             self._measure_jitter(commanded)
         self._measure_hold(values, held)
@@ -237,31 +244,9 @@ class Judge:
         self._steps += 1
         if self._first is None:
             self._first = stamp
-        self._stamp, self._values = stamp, values
+        self._stamp = stamp
 
     # -- preparation ---------------------------------------------------------------------------------------
-
-    def _make_limits(self) -> None:
-        """Compile the constraints, and find the coordinates that are integrals of speeds."""
-        model = self.model
-        columns = model.speeds
-        self._checker = model.constraint_checker((*self._symbols, *columns))
-        known = model.constraints
-        orders = [known[n].order if n in known else 0 for n in self._checker.names]
-        self._about_speeds: npt.NDArray[np.bool_] = np.array(orders, dtype=int) > 0
-        place = {s: k for k, s in enumerate(self._symbols)}
-        own = [(k, place.get(v.position)) for k, v in enumerate(columns) if v.position not in model.rates]
-        pairs = [(k, at) for k, at in own if at is not None]
-        self._differed = np.array([k for k, _ in pairs], dtype=np.intp)
-        self._coordinate = np.array([at for _, at in pairs], dtype=np.intp)
-        self._robot_speeds = [v for v in columns if is_of_robot(v.path, self.robot)]
-        # Speeds are given by symbol or by name.
-        self._speed_place: dict[Symbol | str, int] = {v: k for k, v in enumerate(self._robot_speeds)}
-        self._speed_place |= {str(v): k for k, v in enumerate(self._robot_speeds)}
-        column = {v: k for k, v in enumerate(columns)}
-        self._robot_columns = np.array([column[v] for v in self._robot_speeds], dtype=np.intp)
-        self._vector = np.zeros(len(self._symbols) + len(columns))
-        self._scene_values = self._indices(self._scene.inputs)
 
     def _indices(self, symbols: Iterable[Symbol]) -> npt.NDArray[np.intp]:
         """Return the places of symbols among those of the model."""
@@ -311,33 +296,6 @@ class Judge:
         return found
 
     # -- measurements --------------------------------------------------------------------------------------
-
-    def _measure_limits(self, values: Array, stamp: float, commanded: Array | None) -> None:
-        vector, count = self._vector, len(self._symbols)
-        rates = vector[count:]
-        rates[:] = 0.0
-        before = np.full(len(self._about_speeds), -np.inf)
-        if self._stamp is not None:
-            if commanded is not None:
-                rates[self._robot_columns] = commanded
-            moved = values[self._coordinate] - self._values[self._coordinate]
-            rates[self._differed] = moved / (stamp - self._stamp)
-            vector[:count] = self._values
-            before = self._excesses(vector)
-        vector[:count] = values
-        excess = self._excesses(vector)
-        # A lock that closes or opens within the step may have been open while it moved.
-        excess[self._about_speeds] = np.minimum(excess, before)[self._about_speeds]
-        if not len(excess):
-            return
-        worst = int(np.argmax(excess))
-        if excess[worst] > self._excess:
-            self._excess, self._limit = float(excess[worst]), self._checker.names[worst]
-
-    def _excesses(self, vector: Array) -> Array:
-        """Return the excess of each constraint: a constraint without a value is violated beyond measure."""
-        self._checker(vector)
-        return np.where(np.isnan(self._checker.excess), np.inf, self._checker.excess)
 
     def _measure_jitter(self, commanded: Array) -> None:
         self._commanded = [*self._commanded[-2:], commanded]

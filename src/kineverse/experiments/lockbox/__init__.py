@@ -1,4 +1,4 @@
-"""``lockbox``: boxes of parts that lock each other, opened by trends and by plans.
+"""``lockbox``: boxes of parts that lock each other, opened by trends, by plans, and with unknown locks.
 
 The boxes are that of the thesis behind the 2020 paper, random ones, and the Chinese rings.
 """
@@ -28,9 +28,17 @@ from kineverse.reasoning import interlocks, plan_unlocking, plan_violations
 
 from .exhaustive_search import can_be_opened
 from .figure import FIGURE_SIZE, draw_boxes
+from .recordings import record_thesis_box
+from .unknown_locks import (
+    UnknownLockResult,
+    list_unknown_jobs,
+    list_unknown_numbers,
+    make_unknown_table,
+    run_unknown,
+)
 from .unlocking_runs import LOCK_RULES, Rule, UnlockingRun, run_unlocking
 
-OPTIONS = ("quick", "seed", "count", "processes")
+OPTIONS = ("quick", "seed", "count", "processes", "record")
 
 COUNT, QUICK_COUNT = 1000, 4
 """Number of random boxes without negations; half as many have some, a tenth is for each ablation."""
@@ -103,6 +111,8 @@ class PlannerResult:
 def run(progress: Progress, options: Options) -> Report:
     """Open boxes by trends and plan their opening; ``quick`` takes few and small boxes."""
     count = options.count or (QUICK_COUNT if options.quick else COUNT)
+    if options.record is not None:
+        record_thesis_box(options.record)
     thesis = {rule: run_unlocking(THESIS, rule) for rule in LOCK_RULES}
     explored = run_jobs(
         run_explorer,
@@ -120,7 +130,15 @@ def run(progress: Progress, options: Options) -> Report:
         "plan",
         options.processes,
     )
-    return make_lockbox_report(thesis, explored, planned, options.seed)
+    unknown = run_jobs(
+        run_unknown,
+        list_unknown_jobs(count, options.seed),
+        progress,
+        "lockbox",
+        "exploration",
+        options.processes,
+    )
+    return make_lockbox_report(thesis, explored, planned, unknown, options.seed)
 
 
 def list_explorer_jobs(count: int, seed: int, quick: bool) -> list[ExplorerJob]:
@@ -189,9 +207,10 @@ def make_lockbox_report(
     thesis: dict[Rule, UnlockingRun],
     explored: Sequence[ExplorerResult],
     planned: Sequence[PlannerResult],
+    unknown: Sequence[UnknownLockResult],
     seed: int,
 ) -> Report:
-    """Return the report on explorer and planner."""
+    """Return the report on explorer, planner and unknown locks."""
     groups: dict[tuple[Rule, bool], list[ExplorerResult]] = {}
     for one in explored:
         groups.setdefault((one.job.rule, bool(one.job.negated)), []).append(one)
@@ -223,11 +242,12 @@ def make_lockbox_report(
             }
             for kind, own in plans.items()
         ],
+        "unknown locks": list_unknown_numbers(unknown),
     }
     return Report(
         "lockbox",
-        "Lockboxes opened by trends, and plans of their opening",
-        (_thesis_table(thesis), _explorer_table(groups), _planner_table(plans)),
+        "Lockboxes opened by trends, plans of their opening, and unknown locks",
+        (_thesis_table(thesis), _explorer_table(groups), _planner_table(plans), make_unknown_table(unknown)),
         numbers,
         Figure(lambda canvas: draw_boxes(canvas, ablated), FIGURE_SIZE),
     )

@@ -21,7 +21,7 @@ def can_be_opened(box: Lockbox) -> bool:
             return True
         for n, name in enumerate(names):
             part = box.parts[name]
-            free = _is_open(state, part)
+            free = is_open(state, part)
             for way in (1, -1):
                 after = (*here[:n], here[n] + way, *here[n + 1 :])
                 inside = 0 <= after[n] < len(places[name])
@@ -38,5 +38,6 @@ def _places(box: Lockbox, name: str) -> list[float]:
     return [0.0, *((a + b) / 2 for a, b in pairwise(cuts)), box.parts[name].upper]
 
 
-def _is_open(state: Mapping[str, float], part: Slider) -> bool:
+def is_open(state: Mapping[str, float], part: Slider) -> bool:
+    """Return whether the lock of a part is open where the parts are."""
     return all(any((state[c.part] > c.threshold) == c.beyond for c in group) for group in part.groups)

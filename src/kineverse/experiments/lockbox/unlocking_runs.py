@@ -12,6 +12,7 @@ from typing import Any, Literal, TypeAlias
 from kineverse.control import Controller, unlock
 from kineverse.gallery.lockboxes import Lockbox, make_lockbox_model
 from kineverse.symbols import position
+from kineverse.worlds import Recorder
 
 Rule: TypeAlias = Literal["and", "product", "none", "undemanded"]
 RULES: Mapping[Rule, str] = MappingProxyType(
@@ -55,7 +56,9 @@ class UnlockingRun:
         return {"done": self.done, "steps": self.steps, "order": list(self.order)}
 
 
-def run_unlocking(box: Lockbox, rule: Rule = "and", steps: int = STEPS) -> UnlockingRun:
+def run_unlocking(
+    box: Lockbox, rule: Rule = "and", steps: int = STEPS, recorder: Recorder | None = None
+) -> UnlockingRun:
     """Open a box by the tasks of :func:`kineverse.control.unlock`.
 
     Parameters
@@ -67,6 +70,8 @@ def run_unlocking(box: Lockbox, rule: Rule = "and", steps: int = STEPS) -> Unloc
         conditions fail; there all locks are pursued.
     steps
         Largest number of steps.
+    recorder
+        Recorder of the states and commands.
     """
     model = make_lockbox_model(box, None, mul if rule == "product" else and_)
     q = {name: position(name) for name in box.parts}
@@ -84,6 +89,9 @@ def run_unlocking(box: Lockbox, rule: Rule = "and", steps: int = STEPS) -> Unloc
         command = controller.step(state)
         cpu.append(thread_time() - begin)
         state = model.integrate(state, command.speeds, DT)
+        if recorder is not None:
+            recorder.write_state((step + 1) * DT, state)
+            recorder.write_command((step + 1) * DT, command.speeds)
         begun = (name for name, part in box.parts.items() if state[q[name]] > _BEGUN * min(part.upper, 1.2))
         order.update(dict.fromkeys(begun))
     return UnlockingRun(False, steps, tuple(order), tuple(cpu))

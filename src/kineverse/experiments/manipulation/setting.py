@@ -61,6 +61,23 @@ class TrialSetting:
         return TrackedBelief(world.model, world.robot, Sensors.parse(self.noise))
 
 
+def make_record_folder(folder: Path) -> None:
+    """Make the folder of recordings.
+
+    Raises
+    ------
+    FormatError
+        If it cannot be made.
+    MissingDependencyError
+        If the extra ``recording`` is not installed.
+    """
+    import_mcap("mcap.writer")
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise FormatError(f"--record {folder}: {error.strerror}. Name a folder.") from None
+
+
 def make_settings(options: Options) -> tuple[TrialSetting, ...]:
     """Return the settings that options ask for, one for each world.
 
@@ -71,11 +88,7 @@ def make_settings(options: Options) -> tuple[TrialSetting, ...]:
     """
     noise = "" if options.noise is None else str(Sensors.parse(options.noise))
     if options.record is not None:
-        import_mcap("mcap.writer")
-        try:
-            options.record.mkdir(parents=True, exist_ok=True)
-        except OSError as error:
-            raise FormatError(f"--record {options.record}: {error.strerror}. Name a folder.") from None
+        make_record_folder(options.record)
     worlds = WORLDS if options.world == BOTH else (options.world,)
     return tuple(TrialSetting(world, noise, options.record) for world in worlds)
 

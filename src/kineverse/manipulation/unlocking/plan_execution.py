@@ -1,0 +1,220 @@
+"""Execution of unlocking plans by the velocity controller, planned anew without parts that do not move."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Collection, Mapping
+from dataclasses import dataclass
+from typing import Any
+
+from kineverse.expressions.printing import format_number
+from kineverse.manipulation.session import Session
+from kineverse.model.model_view import ModelView
+from kineverse.reasoning import UnlockingPlan, UnlockingStep, plan_unlocking
+from kineverse.reasoning.unlocking_plan import BUDGET
+from kineverse.state import State
+from kineverse.symbols import Symbol
+from kineverse.worlds import World
+from kineverse.worlds.limit_judge import LimitJudge
+
+from .part_mover import TOLERANCE, PartMover
+
+_SHARE = 0.1
+"""Largest distance from a target, as a share of its distance beyond the threshold."""
+_VIOLATED = 1e-6
+"""Excess of a constraint from which on it is violated, in its unit."""
+
+
+@dataclass(frozen=True, slots=True)
+class ExecutedMove:
+    """Move of a plan as it was made.
+
+    Attributes
+    ----------
+    step
+        The planned move.
+    reached
+        Position where the coordinate ended [m] or [rad].
+    seconds
+        Time that it took [s].
+    done
+        Whether it ended at the target.
+    """
+
+    step: UnlockingStep
+    reached: float
+    seconds: float
+    done: bool
+
+    def as_data(self) -> dict[str, Any]:
+        """Return the move as data for JSON."""
+        return {
+            **self.step.as_data(),
+            "reached": self.reached,
+            "seconds": round(self.seconds, 6),
+            "done": self.done,
+        }
+
+    def __str__(self) -> str:
+        name, reached = self.step.coordinate, format_number(self.reached, 4)
+        if self.done:
+            return f"{name} moved to {reached} in {self.seconds:.1f} s: {self.step.reason}"
+        return f"{name} stopped at {reached} on its way to {format_number(self.step.target, 4)}"
+
+
+@dataclass(frozen=True)
+class UnlockingExecution:
+    """Execution of a plan, true if the goal was reached.
+
+    Attributes
+    ----------
+    done
+        Whether all coordinates of the goal are where they were wanted, in the world's truth.
+    moves
+        All moves, those that did not reach their target included.
+    plan
+        The last plan, made after the last of these; it was executed if the goal was reached.
+    plans
+        Number of plans.
+    stuck
+        Coordinates that did not move when they should have, without which further plans were made.
+    violation, constraint
+        Largest excess of a constraint of the model in the states of the world, and its name; empty if no
+        constraint was violated.
+    seconds
+        Time in the world [s].
+    state
+        Believed state at the end.
+    """
+
+    done: bool
+    moves: tuple[ExecutedMove, ...]
+    plan: UnlockingPlan
+    plans: int
+    stuck: tuple[Symbol, ...]
+    violation: float
+    constraint: str
+    seconds: float
+    state: State
+
+    def __bool__(self) -> bool:
+        return self.done
+
+    @property
+    def reason(self) -> str:
+        """Reason of the end."""
+        return "the goal is reached" if self.done else str(self.plan)
+
+    def as_data(self) -> dict[str, Any]:
+        """Return the execution as data for JSON."""
+        return {
+            "done": self.done,
+            "reason": self.reason,
+            "moves": [move.as_data() for move in self.moves],
+            "plans": self.plans,
+            "stuck": [str(s) for s in self.stuck],
+            "violation": self.violation,
+            "constraint": self.constraint,
+            "seconds": self.seconds,
+            "state": {str(s): value for s, value in self.state.items()},
+        }
+
+    def __str__(self) -> str:
+        lines = [f"{n}. {move}" for n, move in enumerate(self.moves, 1)]
+        if self.constraint:
+            lines.append(f"violated on the way: {self.constraint}, by {format_number(self.violation, 3)}")
+        return "\n".join([*lines, self.reason])
+
+
+def execute_unlocking(
+    world: World,
+    goal: Mapping[Symbol, float] | Mapping[str, float],
+    *,
+    model: ModelView | None = None,
+    still: Collection[Symbol | str] = (),
+    budget: float = BUDGET,
+    dt: float = 0.05,
+    patience: float = 1.0,
+    speed: float = 0.4,
+    on_step: Callable[[Session], object] | None = None,
+) -> UnlockingExecution:
+    """Plan how a goal is reached, and move the parts of a mechanism in a world accordingly.
+
+    Each move of :func:`kineverse.reasoning.plan_unlocking` is made by the velocity controller, in whose
+    program the locks are rows. If a part ends anywhere but at its target, the plan is made again from there,
+    without that part, until the goal is reached or no plan is left.
+
+    Parameters
+    ----------
+    world
+        World whose coordinates are driven, such as :class:`kineverse.worlds.MechanismWorld`.
+    goal
+        Positions to reach, by coordinate or its name [m] or [rad].
+    model
+        Model by which it is planned and controlled; None for the model of the world.
+    still
+        Coordinates that are known not to move.
+    budget
+        Time for each plan [s].
+    dt
+        Control period [s].
+    patience
+        Time without progress after which a part counts as stuck [s].
+    speed
+        Largest speed [m/s] or [rad/s]; limits of the model count as well.
+    on_step
+        Is called with the session after each step, for recordings and output.
+
+    Raises
+    ------
+    UnknownNameError, InvalidValueError
+        As :func:`kineverse.reasoning.plan_unlocking`; also for times and speeds that are not positive.
+    """
+    known = world.model if model is None else model
+    judge = LimitJudge(known)
+    begin = world.time
+
+    def measure(session: Session) -> None:
+        truth = world.state
+        judge.update(truth.vector(judge.symbols), world.time)
+        if on_step is not None:
+            on_step(session)
+
+    session = Session(world, dt=dt, on_step=measure)
+    judge.update(world.state.vector(judge.symbols), begin)
+    mover = PartMover(known, session, patience=patience, speed=speed)
+    moves, stuck, plans = list[ExecutedMove](), list[Symbol](), 0
+    while True:
+        plan = plan_unlocking(known, goal, session.state, still=[*still, *stuck], budget=budget)
+        plans += 1
+        made = [_make_move(mover, step) for step in plan.steps[:1]]
+        for step in plan.steps[1:]:
+            if not made[-1].done:
+                break
+            made.append(_make_move(mover, step))
+        moves += made
+        if not made or made[-1].done:
+            break
+        stuck.append(made[-1].step.coordinate)
+    truth = world.state
+    return UnlockingExecution(
+        plan.verdict == "found" and all(abs(truth[s] - x) <= 2 * TOLERANCE for s, x in plan.goal.items()),
+        tuple(moves),
+        plan,
+        plans,
+        tuple(stuck),
+        judge.violation,
+        judge.limit if judge.violation > _VIOLATED else "",
+        world.time - begin,
+        session.state,
+    )
+
+
+def _make_move(mover: PartMover, step: UnlockingStep) -> ExecutedMove:
+    """Make one move of a plan."""
+    tolerance = TOLERANCE
+    if step.threshold is not None and step.threshold != step.target:
+        tolerance = min(tolerance, _SHARE * abs(step.target - step.threshold))
+    begin = mover.session.world.time
+    reached = mover.move(step.coordinate, step.target, tolerance)
+    done = abs(reached - step.target) <= tolerance
+    return ExecutedMove(step, reached, mover.session.world.time - begin, done)

@@ -1,0 +1,178 @@
+"""World of a mechanism without a robot: its coordinates are driven, and move as far as its constraints allow.
+
+A step moves all coordinates together if no constraint of the world's model becomes more violated by it. Else
+they move one after the other, each as far as the constraints allow: a locked part stands still, another one
+goes at its speed limit, and up to the limit of its position. There are no bodies, forces or contacts.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Collection
+
+import numpy as np
+
+from kineverse._checks import finite_number
+from kineverse.errors import InvalidValueError, UnknownNameError, suggest
+from kineverse.lie import Array
+from kineverse.model.model_view import ModelView
+from kineverse.state import State, StateLike, as_state
+from kineverse.symbols import Symbol
+
+from .world import Contact, Observation
+
+_ALLOWED = 1e-7
+"""Violation of a constraint that counts as none, in its unit."""
+_NO_VALUE = 1e9
+_HALVINGS = 16
+
+
+class MechanismWorld:
+    """World in which the coordinates of a mechanism are driven, such as those of a lockbox.
+
+    Parameters
+    ----------
+    model
+        Model of the mechanism, whose constraints hold here.
+    jammed
+        Coordinates that do not move, by symbol or name.
+
+    Attributes
+    ----------
+    model
+        The model.
+    robot
+        Prefix of what is driven: empty, for all coordinates.
+    jammed
+        Coordinates that do not move.
+
+    Raises
+    ------
+    UnknownNameError
+        For a name that is no degree of freedom.
+    """
+
+    name = "mechanism"
+    robot = ""
+    held = None
+    remarks: tuple[str, ...] = (
+        "there are no bodies, forces or contacts: coordinates move as far as constraints allow",
+    )
+
+    def __init__(self, model: ModelView, jammed: Collection[Symbol | str] = ()) -> None:
+        self.model, self._symbols, self._columns = model, model.symbols, model.speeds
+        self.jammed = frozenset(model.degree_of_freedom(name) for name in jammed)
+        self._integrate = model.integrator()
+        self._checker = model.constraint_checker((*self._symbols, *self._columns))
+        orders = [model.constraints[n].order if n in model.constraints else 0 for n in self._checker.names]
+        self._about_speeds = np.array(orders, dtype=int) > 0
+        self._place = {key: k for k, v in enumerate(self._columns) for key in (v, str(v))}
+        self.reset(model.default_state())
+
+    def __repr__(self) -> str:
+        return f"<MechanismWorld at {self.time:g} s>"
+
+    @property
+    def time(self) -> float:
+        """Time since the last reset [s]."""
+        return self._time
+
+    @property
+    def state(self) -> State:
+        """Values of all coordinates; its stamp is the time [s]."""
+        values = dict(zip(self._symbols, self._q.tolist(), strict=True))
+        return State(values, stamp=self._time, source=self.name)
+
+    def reset(self, state: StateLike) -> None:
+        """Start anew from a state, at time 0; coordinates without a value have their default one.
+
+        Raises
+        ------
+        UnknownNameError
+            For a symbol that the model does not have.
+        """
+        values = self.model.default_state().updated(as_state(state, self._symbols))
+        self._q, self._time = values.vector(self._symbols), 0.0
+
+    def apply(self, speeds: StateLike, duration: float, *, stamp: float | None = None) -> None:
+        """Advance by a duration with speeds of the coordinates.
+
+        Parameters
+        ----------
+        speeds
+            Speeds by symbol or name [m/s], [rad/s]; a missing one is zero.
+        duration
+            Time [s].
+        stamp
+            Time of the state from which the speeds were computed; it is not read.
+
+        Raises
+        ------
+        InvalidValueError
+            For speeds that are not finite, and a duration that is not positive.
+        UnknownNameError
+            For speeds that the model does not have.
+        """
+        length = finite_number(duration)
+        if length is None or length <= 0:
+            raise InvalidValueError(f"A duration is a positive number of seconds, not {duration!r}.")
+        v = self._vector(speeds)
+        after = self._advance(self._q, v, length)
+        if after is None:
+            after = self._q
+            for one in np.flatnonzero(v):
+                alone = np.where(np.arange(len(v)) == one, v, 0.0)
+                after = self._advance_most(after, alone, length)
+        self._q, self._time = after, self._time + length
+
+    def contacts(self) -> tuple[Contact, ...]:
+        """Return no contacts."""
+        return ()
+
+    def observe(self) -> Observation:
+        """Return the positions of all coordinates."""
+        state = self.state
+        return Observation(self._time, {s: state[s] for s in self.model.degrees_of_freedom})
+
+    def _vector(self, speeds: StateLike) -> Array:
+        """Return the speeds of all coordinates (n,); those of jammed ones are zero."""
+        v = np.zeros(len(self._columns))
+        for key, value in speeds.items():
+            place, number = self._place.get(key), finite_number(value)
+            if place is None:
+                known = map(str, self._columns)
+                raise UnknownNameError(
+                    f"The model has no free speed '{key}'. {suggest(str(key), known, 'speed')}"
+                )
+            if number is None:
+                raise InvalidValueError(f"The speed '{key}' is {value!r}; it must be finite.")
+            if self._columns[place].position not in self.jammed:
+                v[place] = number
+        return v
+
+    def _advance_most(self, q: Array, v: Array, time: float) -> Array:
+        """Return the configuration after the largest share of the speeds that the constraints allow."""
+        least, most, best = 0.0, 1.0, q
+        whole = self._advance(q, v, time)
+        if whole is not None:
+            return whole
+        for _ in range(_HALVINGS):
+            share = 0.5 * (least + most)
+            after = self._advance(q, share * v, time)
+            if after is None:
+                most = share
+            else:
+                least, best = share, after
+        return best
+
+    def _advance(self, q: Array, v: Array, time: float) -> Array | None:
+        """Return the configuration after a time with speeds; None if a constraint forbids it."""
+        after, rest = self._integrate(q, v, time), np.zeros(len(v))
+        # Limits of speeds are those at the beginning of a step, before any coordinate has moved.
+        moving, before, now = self._excesses(self._q, v), self._excesses(q, rest), self._excesses(after, rest)
+        found = np.where(self._about_speeds, moving, now - np.maximum(before, 0.0))
+        return after if bool(np.all(found <= _ALLOWED)) else None
+
+    def _excesses(self, q: Array, v: Array) -> Array:
+        """Return the excess of each constraint, a large one where it has no value."""
+        self._checker(np.concatenate([q, v]))
+        return np.nan_to_num(self._checker.excess, nan=_NO_VALUE)
