@@ -220,6 +220,7 @@ def test_locked_drawer_is_said_not_to_move():
     assert "does not move on" in outcome.reason
     assert "room/drawer/lock" in outcome.reason
     assert outcome.measures["failure"] == "other"
+    assert outcome.measures["penetration"] < 5e-4  # of the retreat, too
     assert watched.dt * sum(moving) < 2.0  # nothing moves, and the controller knows that nothing will
 
 

@@ -26,6 +26,7 @@ from kineverse.symbols import Symbol
 from kineverse.worlds import Judge
 
 from .base_placement import BasePlacement
+from .hand_retreat import find_retreat
 from .placement import PlacementSearch
 
 _CLOSING, _MOST_CLOSING = 1.5, 4.0
@@ -276,15 +277,19 @@ class HandMotion:
         state, grasp = self.session.state, placement.grasp
         assert grasp is not None
         self.move_fingers(self.gripper.opened)
-        pose = inverse(self._bar(state)) @ self._hand(state)
+        world_T_bar, world_T_hand = self._bar(state), self._hand(state)
+        pose = inverse(world_T_bar) @ world_T_hand
+        self.session.phase = "retract"
+        if abs(state[self.handle.coordinate] - placement.values[-1]) > _ARRIVED:
+            # The retreat of the placement was looked at for an object that has arrived.
+            retreat = find_retreat(self, grasp, world_T_bar, world_T_hand)
+            self.follow_line(pose, inverse(world_T_bar) @ retreat.end, retreat.arms)
+            return
         end = dict(zip(placement.coordinates, placement.retreat[-1].tolist(), strict=True))
         gone = state.updated({**end, self.handle.coordinate: float(placement.values[-1])})
         away = pose.copy()
         away[:3, 3] += (inverse(self._bar(gone)) @ self._hand(gone))[:3, 3] - grasp.pose[:3, 3]
-        self.session.phase = "retract"
-        # An object that stopped on the way was not looked at here.
-        arrived = abs(state[self.handle.coordinate] - placement.values[-1]) < _ARRIVED
-        self.follow_line(pose, away, self.rows(placement.retreat) if arrived else None)
+        self.follow_line(pose, away, self.rows(placement.retreat))
 
     def rows(self, configurations: Array) -> Array:
         """Return the arms (K, n) of configurations of a placement, with the present turns."""

@@ -14,6 +14,7 @@ from kineverse.grasping import Grasp, find_gripper, sample_grasps
 from kineverse.lie import Array, inverse
 from kineverse.manipulation.opening import BasePlacement, PlacementSearch
 from kineverse.manipulation.opening.hand_motion import HandMotion
+from kineverse.manipulation.opening.hand_retreat import find_retreat
 from kineverse.manipulation.outcome import Outcome, SkillError
 from kineverse.manipulation.session import Session
 from kineverse.manipulation.skill_arguments import check_positive
@@ -22,7 +23,6 @@ from kineverse.model.model import Model
 from kineverse.planning import Planner
 from kineverse.worlds import Judge, Sensors
 
-from .hand_retreat import find_retreat
 from .hinge_hypotheses import guess_hinges, least_share
 from .joint_learning import JointLearning, LearnedJoint
 from .joint_revision import revise_joint, watch_joint

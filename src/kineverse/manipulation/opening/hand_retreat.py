@@ -4,12 +4,15 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
+from typing import TYPE_CHECKING
 
 import numpy as np
 
 from kineverse.grasping import Grasp
 from kineverse.lie import Array
-from kineverse.manipulation.opening.hand_motion import HandMotion
+
+if TYPE_CHECKING:
+    from .hand_motion import HandMotion
 
 _ASIDE = tuple(math.radians(a) for a in (0.0, 25.0, -25.0, 50.0, -50.0))
 """Angles along the bar by which a retreat deviates from the reversed approach [rad]."""
