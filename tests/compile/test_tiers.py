@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import logging
 import threading
+import time
 from pathlib import Path
 
 import numpy as np
@@ -237,6 +238,36 @@ def test_the_queue_is_bounded(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -
     assert [f([1.0, 2.0]) for f in functions] == [2 * (50.5 + i) for i in range(6)]
     gate.touch()
     assert not functions[-1].wait(60)
+
+
+@pytest.mark.skipif(not Path("/proc/self/autogroup").exists(), reason="sessions share the processor on Linux")
+def test_session_of_a_compiler_yields_until_somebody_waits(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    """The niceness of a process counts within its session only, and a compiler has a session of its own."""
+    gate, group = tmp_path / "gate", tmp_path / "group"
+    script = (
+        f"echo $$ > {group}.new; mv {group}.new {group}; while [ ! -e {gate} ]; do sleep 0.01; done; exit 1"
+    )
+    monkeypatch.setenv("CC", broken_compiler(tmp_path, script))
+    monkeypatch.setattr(build_queue, "_worker", build_queue._Worker())
+
+    def reaches(niceness: int) -> bool:
+        for _ in range(3000):
+            if group.exists():
+                session = Path(f"/proc/{group.read_text().strip()}/autogroup").read_text()
+                if int(session.split()[-1]) == niceness:
+                    return True
+            time.sleep(0.01)
+        return False
+
+    f = kv.compile(a * b * 60.5)
+    assert reaches(19)
+    time.sleep(0.2)  # the kernel accepts a change in a tenth of a second
+    assert not f.wait(0.01)
+    assert reaches(0)
+    gate.touch()
+    assert not f.wait(60)
 
 
 def table(rows: int, columns: int) -> np.ndarray:

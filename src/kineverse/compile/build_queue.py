@@ -135,6 +135,7 @@ class _Worker:
         self._wanted: dict[str, BuildJob] = {}
         self._thread: threading.Thread | None = None
         self._compiler: subprocess.Popen[bytes] | None = None
+        self._building: BuildJob | None = None
         self._build_folder: str | None = None
         # Acquired to start the compiler and to end the process, which therefore ends a started compiler.
         self._starting = threading.Lock()
@@ -163,9 +164,13 @@ class _Worker:
 
     def prioritise(self, build: BuildJob) -> None:
         with self._lock:
-            if not build.urgent and not build.started and not build.done:
-                build.urgent = True
+            if build.urgent or build.done:
+                return
+            build.urgent = True
+            if not build.started:
                 self._queue.put((False, next(self._count), build))
+            elif build is self._building and self._compiler is not None:
+                _set_session_niceness(self._compiler.pid, 0)
 
     def _run(self) -> None:
         while not self._closing:
@@ -211,8 +216,10 @@ class _Worker:
                     # together, and do not receive the user's Ctrl-C.
                     start_new_session=True,
                 )
-            if not build.urgent:
-                _lower_priority(compiler.pid)
+            with self._lock:
+                self._building = build
+                if not build.urgent:
+                    _lower_priority(compiler.pid)
             began = time.monotonic()
             try:
                 _, messages = compiler.communicate(source, timeout=TIME_LIMIT)
@@ -220,7 +227,7 @@ class _Worker:
                 raise RuntimeError(f"the C compiler needed more than {TIME_LIMIT:.0f} s.") from None
             finally:
                 _end(compiler)
-                self._compiler = None
+                self._building = self._compiler = None
             if compiler.returncode or not os.path.exists(output):
                 text = messages.decode(errors="replace").strip()
                 raise RuntimeError(f"the C compiler failed ({compiler.returncode}): {text[:500]}")
@@ -260,6 +267,16 @@ class _Worker:
 def _lower_priority(process_group: int) -> None:
     with contextlib.suppress(OSError, AttributeError):
         os.setpriority(os.PRIO_PGRP, process_group, 19)
+    _set_session_niceness(process_group, 19)
+
+
+def _set_session_niceness(leader: int, niceness: int) -> None:
+    """Set the niceness of a session on Linux, which shares the processor among sessions first.
+
+    There, the niceness of a process counts within its session only, and a compiler has one of its own.
+    """
+    with contextlib.suppress(OSError), open(f"/proc/{leader}/autogroup", "w") as file:
+        file.write(str(niceness))
 
 
 def _end(compiler: subprocess.Popen[bytes]) -> None:

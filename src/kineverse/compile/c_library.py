@@ -175,7 +175,8 @@ class SourceLibrary:
         self._code = library_cache().load(key, self._load)
         if self._code is not None:
             return None
-        return request(key, compiler, lambda: self._source, self._flags, self._built)
+        # There are few of them, and without one its callers take up to a hundred times as long.
+        return request(key, compiler, lambda: self._source, self._flags, self._built, urgent=True)
 
     def _built(self, build: BuildJob) -> None:
         if build.path is not None and self._code is None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
@@ -162,19 +163,19 @@ class Equations:
         """
         damping = 0.0
         residual, by_x, _ = self(x, u)
-        gap = float(np.linalg.norm(residual))
+        gap = math.sqrt(residual.dot(residual))
         for _ in range(steps):
             if gap < 1e-15 or gap == np.inf:
                 break
-            matrix = by_x.T @ by_x
-            scale = max(float(np.trace(matrix)) / len(x), 1e-30)
             if damping == 0.0:
                 step = -np.linalg.lstsq(by_x, residual, rcond=_SINGULAR)[0]
             else:
+                matrix = by_x.T @ by_x
+                scale = max(float(np.trace(matrix)) / len(x), 1e-30)
                 step = -np.linalg.solve(matrix + damping * scale * np.eye(len(x)), by_x.T @ residual)
             tried = x + step
             after, derivative, _ = self(tried, u)
-            left = float(np.linalg.norm(after))
+            left = math.sqrt(after.dot(after))
             if left < gap:
                 x, residual, by_x, gap = tried, after, derivative, left
                 damping = damping / 10 if damping > 1e-6 else 0.0

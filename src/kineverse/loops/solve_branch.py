@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import itertools
+import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
@@ -312,10 +313,13 @@ def _choose_guess(name: str, samples: BranchSamples) -> tuple[BranchGuess, int, 
         if len(list_products(samples.intervals, degree)) > count:
             break
         seed = BranchGuess.fit(samples.intervals, degree, samples.inputs, samples.solutions, samples.winding)
-        steps = _steps(samples, seed, rows)
+        step_cost = 20 * n + n**3
+        # More steps than these cost more than the best guess so far.
+        most = _STEPS[-1] if best is None else (best[0] - seed.terms) / step_cost
+        steps = _steps(samples, seed, rows, most)
         if steps is None:
             continue
-        cost = seed.terms + steps * (20 * n + n**3)
+        cost = seed.terms + steps * step_cost
         if best is None or cost < best[0]:
             best = cost, seed, steps
     if best is None:
@@ -351,15 +355,15 @@ def _rows(samples: BranchSamples) -> tuple[int, ...]:
     return chosen
 
 
-def _steps(samples: BranchSamples, seed: BranchGuess, rows: tuple[int, ...]) -> int | None:
-    """Return the number of Newton steps that suffices at all samples; None without convergence."""
+def _steps(samples: BranchSamples, seed: BranchGuess, rows: tuple[int, ...], most: float) -> int | None:
+    """Return the number of Newton steps that suffices at all samples; None if it is larger than ``most``."""
     needed = 0
     chosen = list(rows)
     for q, x, wanted in zip(samples.tried, seed.evaluate(samples.tried), samples.wanted, strict=True):
         u = samples.all_inputs(q)
-        for step in range(_STEPS[-1] + 1):  # noqa: B007 - how many it took
+        for step in range(math.floor(most) + 1):  # noqa: B007 - how many it took
             residual, by_x, _ = samples.equations(x, u)
-            if np.linalg.norm(residual) < 1e-12 and np.abs(x - wanted).max(initial=0.0) < 1e-5:
+            if math.sqrt(residual.dot(residual)) < 1e-12 and np.abs(x - wanted).max(initial=0.0) < 1e-5:
                 break
             try:
                 x = x - np.linalg.solve(by_x[chosen], residual[chosen])
