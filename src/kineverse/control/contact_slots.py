@@ -26,7 +26,6 @@ from kineverse.lie import Array
 from kineverse.model.frame_dependence import FrameDependence
 from kineverse.symbols import Symbol
 
-from .contact_manifolds import ContactManifolds
 from .contact_rows import ContactRows
 from .velocity_program import RECOVERY_WEIGHT
 
@@ -58,8 +57,8 @@ class ContactSlots:
     inputs
         Symbols of :meth:`update`, in the order of its vector.
     found
-        Near pairs of the last update, nearest first, all of them. Faces that are nearly parallel are there
-        with two pairs of points, see :mod:`.contact_manifolds`.
+        Near pairs of the last update, nearest first, all of them. Parallel faces are there with several
+        points, see :meth:`.DistanceResults.extend`: a turn away from the one brings the other nearer.
     function
         Compiled twists of the groups of bodies.
     gain, radius
@@ -106,7 +105,6 @@ class ContactSlots:
         groups = {group: k for k, group in enumerate(dict.fromkeys(((), *moved)))}
         self._group = np.array([groups[group] for group in moved], dtype=np.intp)
         self._margins = np.full((len(scene.bodies), len(scene.bodies)), self.margin)
-        self._manifolds = ContactManifolds(scene)
         self._rows: ContactRows
         self._selected: dict[tuple[tuple[str, ...], tuple[str, ...]], PairFlags] = {}
         members = dict(zip(moved, scene.bodies, strict=True))
@@ -120,10 +118,6 @@ class ContactSlots:
         place = {s: k for k, s in enumerate(self.inputs)}
         self._scene_values = np.array([place[s] for s in scene.inputs], dtype=np.intp)
         self._twist_values = np.array([place[s] for s in self.function.inputs], dtype=np.intp)
-
-    def reset(self) -> None:
-        """Forget the nearest points of earlier updates."""
-        self._manifolds.reset()
 
     def update(self, values: Array) -> None:
         """Find the near pairs at the values of :attr:`inputs`.
@@ -143,7 +137,7 @@ class ContactSlots:
         margins = self._margins[found.body_indices[:, 0], found.body_indices[:, 1]]
         # Pairs with a margin of their own press on each other, and slide.
         gaps = np.where(margins == self.margin, found.distances - margins, math.inf)
-        self.found = self._manifolds.extend(found, gaps)
+        self.found = found.extend(gaps)
         self._twists.input[:] = values[self._twist_values]
         self._twists()
 

@@ -229,8 +229,6 @@ class Controller:
         """Forget the last commands and solutions: the next step starts from given speeds, or from rest."""
         self._solver.reset()
         self._relaxed.reset()
-        if self._contacts is not None:
-            self._contacts.reset()
         known = as_state(speeds or {}, self.speeds)
         self._last[:] = [known.given(s) or 0.0 for s in self.speeds]
         if len(self._before):

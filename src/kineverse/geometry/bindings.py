@@ -18,6 +18,7 @@ from . import broadphase
 from .advancement_c import ADVANCE
 from .broadphase import Indices, ObjectTable, PairSelection, build_static_tree
 from .broadphase_c import SWEEP
+from .manifold_c import MANIFOLD
 from .mesh_files import Floats
 from .narrowphase_c import NARROW, SIMPLEX
 from .penetration_c import PENETRATION
@@ -111,7 +112,7 @@ class CollisionLibrary(SourceLibrary):
     """Compiled broad and narrow phase, once it is built; shared by all scenes of the process."""
 
     def __init__(self) -> None:
-        text = SWEEP + SUPPORT + SIMPLEX + PENETRATION + NARROW + SEARCH + ADVANCE
+        text = SWEEP + SUPPORT + SIMPLEX + PENETRATION + NARROW + SEARCH + MANIFOLD + ADVANCE
         super().__init__(text, _declare_signatures)
 
     def place(self, table: ObjectTable, fresh: Floats) -> int:
@@ -151,6 +152,40 @@ class CollisionLibrary(SourceLibrary):
         where = pairs.ctypes.data, count, limit, distances.ctypes.data, witnesses.ctypes.data
         self._code.measure(_bind_table(table).address, *where)
         return distances, witnesses
+
+    def extend(
+        self, table: ObjectTable, pairs: Indices, witnesses: Floats, angle: float, apart: float
+    ) -> tuple[npt.NDArray[np.int64], Floats, Floats]:
+        """Find further facing points of near pairs, as far as C can; none without it.
+
+        Parameters
+        ----------
+        pairs, witnesses
+            Objects (K, 2) and their nearest points and normals (K, 9).
+        angle
+            Angle of the turns that bring other points nearest [rad].
+        apart
+            Least distance of two points of an object [m].
+
+        Returns
+        -------
+        which, distances, further
+            Indices (N,) of the pairs, distances along their normals (N,) [m], and both points and the normal
+            (N, 9).
+        """
+        count = len(pairs) if self._code is not None else 0
+        which, distances, further = (
+            np.empty(4 * count, np.int64),
+            np.empty(4 * count),
+            np.empty((4 * count, 9)),
+        )
+        found = 0
+        if count:
+            pairs, witnesses = np.ascontiguousarray(pairs), np.ascontiguousarray(witnesses)
+            where = pairs.ctypes.data, count, witnesses.ctypes.data, angle, apart
+            out = which.ctypes.data, distances.ctypes.data, further.ctypes.data
+            found = self._code.extend(_bind_table(table).address, *where, *out)
+        return which[:found], distances[:found], further[:found]
 
     def rank(
         self, table: ObjectTable, pairs: Indices, distances: Floats, radius: float, per_shape: bool = False
@@ -302,6 +337,10 @@ def _declare_signatures(code: Any) -> None:
     code.near.restype = ctypes.c_int64
     code.measure.argtypes = (pointer, pointer, ctypes.c_int64, ctypes.c_double, pointer, pointer)
     code.measure.restype = None
+    code.extend.argtypes = (
+        pointer, pointer, ctypes.c_int64, pointer, ctypes.c_double, ctypes.c_double, *(pointer,) * 3
+    )  # fmt: skip
+    code.extend.restype = ctypes.c_int64
     code.rank.argtypes = (pointer, pointer, ctypes.c_int64, pointer, ctypes.c_double, ctypes.c_int64, pointer)
     code.rank.restype = ctypes.c_int64
     code.gather.argtypes = (*(pointer,) * 5, ctypes.c_int64, *(pointer,) * 4)

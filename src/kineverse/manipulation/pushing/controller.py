@@ -337,8 +337,10 @@ class Pushing:
         return self.choice.choose(state, self._program.tip(state), index)
 
     def _is_stuck(self, state: State, tip: Array, point: PushPoint) -> bool:
-        """Return True without progress for a while, or if the push has left the cone of the contact point."""
+        """Return True without progress, outside of the contact point's cone, or if the robot gets pinched."""
         if self.touching:
+            if self.clearance < -self.press.slack:
+                return True
             rest = abs(state[self.coordinate] - self.target)
         else:
             if point.alignment < CONE_END:
