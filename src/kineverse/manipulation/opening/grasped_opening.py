@@ -22,11 +22,11 @@ from kineverse.manipulation.skill_arguments import (
 from kineverse.model.frame import is_of_robot
 from kineverse.model.model_view import ModelView
 from kineverse.model.version_cache import cached_for_version
-from kineverse.planning import Planner, Trajectory
 from kineverse.state import State
 from kineverse.symbols import Symbol
 from kineverse.worlds import Judge
 
+from .approach_planner import Approach, ApproachPlanner
 from .base_placement import BasePlacement
 from .hand_motion import HandMotion
 from .held_motion import move_held
@@ -67,8 +67,9 @@ def open_object(
     A base, a grasp and a way of the arm are found, see :class:`.PlacementSearch`. The robot goes to the
     handle on a planned path, closes its fingers, moves the object, lets go and retracts. Where one grasp does
     not lead to the target, the object is released on the way and grasped anew. Where no grasp leads on,
-    such as at an oven door whose handle faces the floor, it is pushed. A base that rolls on wheels is
-    put to its place by a reset of the world; its drive there is not part of the skill.
+    such as at an oven door whose handle faces the floor, it is pushed. A base on two wheels drives to its
+    place before the arm moves. One that cannot turn on the spot, or that begins in contact, is put there by a
+    reset of the world.
 
     Parameters
     ----------
@@ -145,15 +146,15 @@ class _Opener:
         self.model, self.gripper = model, gripper
         self.search = PlacementSearch(model, gripper, state)
         self.controllers: dict[Hashable, tuple[Controller, Any]] = {}
-        self._planner: Planner | None = None
+        self._approaches: ApproachPlanner | None = None
         self._grasps: dict[tuple[object, ...], tuple[Grasp, ...]] = {}
 
     @property
-    def planner(self) -> Planner:
+    def approaches(self) -> ApproachPlanner:
         """Planner of the robot's ways with the hand empty."""
-        if self._planner is None:
-            self._planner = Planner(self.model, self.search.moving, rules=self.search.scene.rules)
-        return self._planner
+        if self._approaches is None:
+            self._approaches = ApproachPlanner(self.search)
+        return self._approaches
 
     def grasps(self, handle: Handle, state: State, seed: int) -> tuple[Grasp, ...]:
         """Return the grasps of a handle where everything but the robot is as in a state."""
@@ -204,11 +205,11 @@ class _Run:
         self._rest = math.inf
         self._earlier: list[Mapping[str, Any]] = []
         self._barrier = ""
-        self._trajectory: Trajectory
+        self._approach: Approach
         self.judge = Judge(self.model, session.world.robot, self.gripper, handle=handle.frame)
         self.judge.update(session.world.state)
         self.motion = HandMotion(
-            session, self.gripper, handle, opener.search, opener.planner, self.judge, self.begin + seconds,
+            session, self.gripper, handle, opener.search, opener.approaches, self.judge, self.begin + seconds,
             opener.controllers,
         )  # fmt: skip
 
@@ -254,7 +255,7 @@ class _Run:
         """Move the object with one grasp as far as the way of a placement leads."""
         assert placement.grasp is not None
         self.grasps += 1
-        self._approach(placement)
+        self._come(placement)
         before, stall = self.left, None
         try:
             if self.motion.close(placement.grasp):
@@ -280,8 +281,8 @@ class _Run:
         fallback = PushFallback(self.motion, self.target, self.tolerance)
         value = float(self.session.state[self.handle.coordinate])
         try:
-            start = fallback.find_start(self.seed)
-            self._put_base(start)
+            fallback.find_start(self.seed)
+            self._bring_base(fallback.approach)
             fallback.perform()
         except SkillError as error:
             kind = error.kind if error.kind == "time" else failure.kind
@@ -289,19 +290,20 @@ class _Run:
         finally:
             self.pushed_from = value if fallback.begun else None
 
-    def _put_base(self, wanted: Mapping[Symbol, float]) -> None:
-        """Put a base that only stands to its place, by a reset of the world."""
-        session, standing = self.session, self.opener.search.standing
-        if not standing:
-            return
-        gone = session.world.time - self.begin
-        session.restart(session.world.state.updated({s: wanted[s] for s in standing}))
-        self.begin, self.resets = -gone, self.resets + 1
-        self.motion.until = self.seconds - gone
-        self._earlier.append(self.judge.measures)
-        self.judge.reset()
-        self.judge.update(session.world.state)
-        self.motion.look()
+    def _bring_base(self, approach: Approach) -> None:
+        """Drive a base on wheels to its place, or put it there by a reset of the world."""
+        session = self.session
+        if approach.places is not None:
+            self.motion.drive(approach)
+        elif approach.base:
+            gone = session.world.time - self.begin
+            session.restart(session.world.state.updated(approach.base))
+            self.begin, self.resets = -gone, self.resets + 1
+            self.motion.until = self.seconds - gone
+            self._earlier.append(self.judge.measures)
+            self.judge.reset()
+            self.judge.update(session.world.state)
+            self.motion.look()
 
     def _check_progress(self) -> None:
         """Raise SkillError if the handle slips time and again and the object hardly moves."""
@@ -367,18 +369,17 @@ class _Run:
 
     def _plan(self, placement: BasePlacement) -> bool:
         """Plan the way to the pose before the handle, and return whether there is one."""
-        state, planner = self.session.state, self.opener.planner
         wanted = dict(zip(placement.coordinates, placement.approach.tolist(), strict=True))
-        planner.place(state.updated({s: wanted[s] for s in self.opener.search.standing}))
-        end = np.array([wanted[s] for s in planner.symbols])
-        path = planner.plan(state.vector(planner.symbols), end, seconds=_PLANNING, seed=self.seed)
-        self._barrier = "" if path.found else f" There is no way to the handle: {path.why}"
-        if path.found:
-            self._trajectory = path.trajectory()
-        return bool(path.found)
+        self._approach = self.opener.approaches.plan(
+            self.session.state, wanted, seconds=_PLANNING, seed=self.seed
+        )
+        why = self._approach.why
+        self._barrier = f" There is no way to the handle: {why}" if why else ""
+        return not why
 
-    def _approach(self, placement: BasePlacement) -> None:
-        """Put the base to its place, and bring the hand to the handle."""
+    def _come(self, placement: BasePlacement) -> None:
+        """Bring the base to its place, and the hand to the handle."""
+        self._bring_base(self._approach)
         self.session.phase = "approach"
-        self._put_base(dict(zip(placement.coordinates, placement.approach.tolist(), strict=True)))
-        self.motion.approach(placement, self._trajectory)
+        assert self._approach.trajectory is not None
+        self.motion.approach(placement, self._approach.trajectory)

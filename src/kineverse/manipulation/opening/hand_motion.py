@@ -18,13 +18,14 @@ from kineverse.grasping import Grasp, Gripper, Handle
 from kineverse.lie import Array, inverse
 from kineverse.manipulation.hand_reference import HandReference
 from kineverse.manipulation.outcome import SkillError
-from kineverse.manipulation.session import Session
+from kineverse.manipulation.session import Session, Speeds
 from kineverse.model.frame import is_of_robot
-from kineverse.planning import Planner, Trajectory, TrajectoryFollower
+from kineverse.planning import Trajectory, TrajectoryFollower
 from kineverse.state import State
 from kineverse.symbols import Symbol
 from kineverse.worlds import Judge
 
+from .approach_planner import Approach, ApproachPlanner
 from .base_placement import BasePlacement
 from .hand_retreat import find_retreat
 from .placement import PlacementSearch
@@ -72,7 +73,7 @@ class HandMotion:
         The gripper, and the handle that it takes.
     search
         Search of placements, which has the robot's coordinates and the scene.
-    planner
+    approaches
         Planner of the robot's ways with the hand empty.
     judge
         Judge that measures all steps.
@@ -93,13 +94,13 @@ class HandMotion:
         gripper: Gripper,
         handle: Handle,
         search: PlacementSearch,
-        planner: Planner,
+        approaches: ApproachPlanner,
         judge: Judge,
         until: float,
         controllers: dict[Hashable, tuple[Controller, Any]] | None = None,
     ) -> None:
         self.session, self.gripper, self.handle = session, gripper, handle
-        self.search, self.planner, self.judge, self.until = search, planner, judge, until
+        self.search, self.approaches, self.judge, self.until = search, approaches, judge, until
         self.model = search.model
         self.turns: Array = np.zeros(len(search.moving))
         self.controllers = {} if controllers is None else controllers
@@ -158,6 +159,22 @@ class HandMotion:
         self.move_fingers(self.gripper.opened)
         self.count_turns(placement.line[0])
         self.follow_line(placement.grasp.approach, placement.grasp.pose, self.rows(placement.line))
+
+    def drive(self, approach: Approach) -> None:
+        """Drive a base on wheels to its place, with a compact arm where that is needed."""
+        drive = self.approaches.drive
+        assert drive is not None
+        assert approach.places is not None
+        self.session.phase = "drive"
+        if approach.tuck is not None:
+            self.follow(approach.tuck)
+        self.session.reference = None
+
+        def act(speeds: Speeds) -> None:
+            self.check_time()
+            self.act(speeds)
+
+        drive.follow(self.session, approach.places, act)
 
     def follow(self, trajectory: Trajectory) -> None:
         """Follow a trajectory."""
@@ -224,7 +241,7 @@ class HandMotion:
 
     def count_turns(self, row: Array) -> None:
         """Find the whole turns by which joints without limits are away from a configuration (n,)."""
-        moving, planner = self.search.moving, self.planner
+        moving, planner = self.search.moving, self.approaches.planner
         turning = np.array([planner.space.turning[planner.symbols.index(s)] for s in moving])
         away = self.session.state.vector(moving) - row[: len(moving)]
         self.turns = np.where(turning, 2 * math.pi * np.round(away / (2 * math.pi)), 0.0)

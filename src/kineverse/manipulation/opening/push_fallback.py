@@ -9,9 +9,9 @@ from kineverse.manipulation.outcome import SkillError
 from kineverse.manipulation.pushing.controller import Pushing
 from kineverse.manipulation.pushing.placement import find_push_start
 from kineverse.manipulation.pushing.push_skill import push
-from kineverse.planning import Trajectory
 from kineverse.state import State
 
+from .approach_planner import Approach
 from .hand_motion import HandMotion
 
 _SAMPLES = 240
@@ -36,6 +36,8 @@ class PushFallback:
 
     Attributes
     ----------
+    approach
+        Way to the start of the push.
     begun
         Whether the robot stood at the start of the push.
     """
@@ -43,10 +45,10 @@ class PushFallback:
     def __init__(self, motion: HandMotion, target: float, tolerance: float) -> None:
         self.motion, self.target, self.tolerance = motion, target, tolerance
         self.samples, self.begun = 0, False
-        self._trajectory: Trajectory | None = None
+        self.approach = Approach()
 
-    def find_start(self, seed: int) -> State:
-        """Return a state of the robot from which the push goes through and to which a way leads.
+    def find_start(self, seed: int) -> None:
+        """Find a state of the robot from which the push goes through and to which a way leads.
 
         Raises
         ------
@@ -78,28 +80,23 @@ class PushFallback:
         if found.state is None:
             touching = any(" and " in r or "blocked" in r or "path" in r for r in found.reasons)
             raise SkillError("collision" if touching else "reach", f"Nor does a push: {found.why}")
-        return found.state
 
     def _plan(self, start: State) -> str:
         """Plan the way to a start, and return why there is none."""
         motion, state = self.motion, self.motion.session.state
-        planner = motion.planner
-        planner.place(state.updated({s: start[s] for s in motion.search.standing}))
-        ends = start.vector(planner.symbols)
-        path = planner.plan(state.vector(planner.symbols), ends, seconds=_PLANNING)
-        if not path.found:
+        self.approach = motion.approaches.plan(state, start, seconds=_PLANNING)
+        if self.approach.trajectory is None:
             return "no path to the start"
-        self._trajectory = path.trajectory()
         left = motion.until - motion.session.world.time
-        return "far away" if self._trajectory.duration > left - _PUSHING else ""
+        return "far away" if self.approach.trajectory.duration > left - _PUSHING else ""
 
     def perform(self) -> None:
         """Go to the start that was found, push, and take the hand away, or raise SkillError."""
         motion, session = self.motion, self.motion.session
-        assert self._trajectory is not None
+        assert self.approach.trajectory is not None
         motion.judge.allow(self.pushing.object_bodies)
         session.phase = "approach"
-        motion.follow(self._trajectory)
+        motion.follow(self.approach.trajectory)
         self.begun = True
 
         def look(pushing: Pushing) -> None:

@@ -6,13 +6,12 @@ import math
 from collections.abc import Callable
 from typing import Any
 
-import numpy as np
-
 from kineverse.compile import compile  # noqa: A004
 from kineverse.errors import InfeasibleError, InvalidValueError, NotFiniteError, UnknownNameError, suggest
 from kineverse.grasping import Grasp, find_gripper, sample_grasps
 from kineverse.lie import Array, inverse
 from kineverse.manipulation.opening import BasePlacement, PlacementSearch
+from kineverse.manipulation.opening.approach_planner import ApproachPlanner
 from kineverse.manipulation.opening.hand_motion import HandMotion
 from kineverse.manipulation.opening.hand_retreat import find_retreat
 from kineverse.manipulation.outcome import Outcome, SkillError
@@ -20,7 +19,6 @@ from kineverse.manipulation.session import Session
 from kineverse.manipulation.skill_arguments import check_positive
 from kineverse.model.frame import WORLD, is_of_robot
 from kineverse.model.model import Model
-from kineverse.planning import Planner
 from kineverse.worlds import Judge, Sensors
 
 from .hinge_hypotheses import guess_hinges, least_share
@@ -243,10 +241,10 @@ class _Run:
         session = self.session
         with session.timed("place"):
             self.search = PlacementSearch(unknown.model, self.gripper, session.state)
-            self.planner = Planner(unknown.model, self.search.moving, rules=self.search.scene.rules)
+            self.approaches = ApproachPlanner(self.search)
         until = self.begin + self.seconds
         self.motion = HandMotion(
-            session, self.gripper, unknown.handle, self.search, self.planner, self.judge, until
+            session, self.gripper, unknown.handle, self.search, self.approaches, self.judge, until
         )
         self.unknown = unknown
 
@@ -296,7 +294,7 @@ class _Run:
         """Take the handle, pull, let go, and return how far the part is open."""
         grasp, motion = placement.grasp, self.motion
         assert grasp is not None
-        self._approach(placement)
+        self._come(placement)
         try:
             reason = self.pulling.perform(motion, grasp)
             self.claimed = self.pulling.opening
@@ -346,31 +344,30 @@ class _Run:
 
     def _plan(self, placement: BasePlacement) -> bool:
         """Plan the way to the pose before the handle, and return whether there is one."""
-        session, planner = self.session, self.planner
         wanted = dict(zip(placement.coordinates, placement.approach.tolist(), strict=True))
-        planner.place(session.state.updated({s: wanted[s] for s in self.search.standing}))
-        end = np.array([wanted[s] for s in planner.symbols])
-        path = planner.plan(session.state.vector(planner.symbols), end, seconds=_PLANNING, seed=self.seed)
-        self._barrier = "" if path.found else f" There is no way to the handle: {path.why}"
-        if path.found:
-            self.trajectory = path.trajectory()
-        return bool(path.found)
+        self.approach = self.approaches.plan(self.session.state, wanted, seconds=_PLANNING, seed=self.seed)
+        why = self.approach.why
+        self._barrier = f" There is no way to the handle: {why}" if why else ""
+        return not why
 
-    def _approach(self, placement: BasePlacement) -> None:
-        """Put a base that only stands to its place, and bring the hand to the handle."""
-        session, search, motion = self.session, self.search, self.motion
-        if search.standing:
-            wanted = dict(zip(placement.coordinates, placement.approach.tolist(), strict=True))
+    def _come(self, placement: BasePlacement) -> None:
+        """Bring a base on wheels to its place, and the hand to the handle."""
+        session, approach, motion = self.session, self.approach, self.motion
+        if approach.places is not None:
+            motion.drive(approach)
+            self._look()
+        elif approach.base:
             gone = self.world.time - self.begin
             self.belief.reset()
-            session.restart(self.world.state.updated({s: wanted[s] for s in search.standing}))
+            session.restart(self.world.state.updated(approach.base))
             self.pulling.rebase(gone + self.begin)
             self.begin = -gone
             motion.until = self.seconds - gone
             self.judge.reset()
             self._look()
         session.phase = "approach"
-        motion.approach(placement, self.trajectory)
+        assert approach.trajectory is not None
+        motion.approach(placement, approach.trajectory)
 
     def _report_joint(self, learned: LearnedJoint) -> str:
         """Write the learned joint into the model if it had another one or none, and say so."""

@@ -1,0 +1,175 @@
+"""Ways of a robot to where it begins a motion: the drive of a base on wheels, and the path of the rest."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+
+import numpy as np
+
+from kineverse.lie import Array
+from kineverse.manipulation.base_drive import BaseDrive, DriveSearch, Place
+from kineverse.planning import Planner, Trajectory
+from kineverse.state import State
+from kineverse.symbols import Symbol
+
+from .placement import PlacementSearch
+
+_TUCKED = 300
+"""Number of random arms among which a compact one is chosen."""
+_MOST_TUCKED, _TUCKING = 3, 2.0
+"""Number of compact arms to which a way is planned, and the time for each [s]."""
+_KEPT = 4
+"""Number of searches of drives that are kept."""
+_HERE = 1e-3
+"""Distance of a base from its place at which it stays [m], [rad]."""
+
+
+@dataclass(frozen=True, eq=False)
+class Approach:
+    """Way of a robot to a configuration.
+
+    Attributes
+    ----------
+    why
+        Why there is none; empty if there is one.
+    trajectory
+        Way of everything that moves freely, from where the base stands at last.
+    tuck
+        Way of the arm before the drive; None if it stays.
+    places
+        Places (K, 3) of the drive; None if the base does not drive by itself.
+    base
+        Values of the coordinates of a base on wheels at the end.
+    """
+
+    why: str = ""
+    trajectory: Trajectory | None = None
+    tuck: Trajectory | None = None
+    places: Array | None = None
+    base: Mapping[Symbol, float] | None = None
+
+    def __bool__(self) -> bool:
+        return not self.why
+
+
+class ApproachPlanner:
+    """Planner of ways to configurations, with the hand empty.
+
+    A base that moves freely is planned with the arm. One on wheels drives first, with the arm as it is or,
+    where that leads nowhere, with a compact one. A base on wheels that cannot turn on the spot, or that
+    touches something where it stands, has no drive.
+
+    Parameters
+    ----------
+    search
+        Search of placements, which has the robot's coordinates and the scene.
+    """
+
+    def __init__(self, search: PlacementSearch) -> None:
+        self.search = search
+        self.planner = Planner(search.model, search.moving, rules=search.scene.rules)
+        standing = {*search.standing}
+        self.drive = (
+            BaseDrive(search.model, search.base, search.scene, search.own, search.others, search.margin)
+            if standing and standing == {*search.base}
+            else None
+        )
+        self._searches: dict[State, DriveSearch] = {}
+        self._tucked: dict[State, tuple[Trajectory, State] | None] = {}
+
+    def plan(
+        self, state: State, wanted: Mapping[Symbol, float], *, seconds: float, seed: int = 0
+    ) -> Approach:
+        """Plan a way from a state to values of the robot's coordinates.
+
+        Parameters
+        ----------
+        state
+            State of everything.
+        wanted
+            Values of the coordinates that the search of placements chooses [m], [rad].
+        seconds
+            Largest time to plan the path [s].
+        seed
+            Seed of the planner.
+        """
+        planner, base = self.planner, {s: float(wanted[s]) for s in self.search.standing}
+        places, tuck, arms = None, None, state
+        if base and self.can_drive(state):
+            found = self._find_drive(state, base)
+            if found is None:
+                return Approach("no way for the base, with the arm as it is or compact")
+            places, tuck, arms = found
+        planner.place(state.updated(base))
+        end = np.array([wanted[s] for s in planner.symbols])
+        path = planner.plan(arms.vector(planner.symbols), end, seconds=seconds, seed=seed)
+        if not path.found:
+            return Approach(path.why)
+        return Approach("", path.trajectory(), tuck, places, base)
+
+    def can_drive(self, state: State) -> bool:
+        """Return whether the base rolls to other places by itself from a state."""
+        if self.drive is None or not self.drive.is_possible:
+            return False
+        return self._drives(state).begins_free
+
+    def _drives(self, state: State) -> DriveSearch:
+        assert self.drive is not None
+        if state not in self._searches:
+            if len(self._searches) >= _KEPT:
+                self._searches.pop(next(iter(self._searches)))
+            self._searches[state] = self.drive.search(state)
+        return self._searches[state]
+
+    def _find_drive(
+        self, state: State, base: Mapping[Symbol, float]
+    ) -> tuple[Array, Trajectory | None, State] | None:
+        """Return places of a drive, the way of the arm before it, and the state of the arm on the way."""
+        x, y, angle = (base[s] for s in self.search.base)
+        goal: Place = (x, y, angle)
+        if max(abs(state[s] - v) for s, v in base.items()) < _HERE:
+            return np.array([goal]), None, state
+        places = self._drives(state).find(goal)
+        if places is not None:
+            return places, None, state
+        tucked = self._tuck(state)
+        if tucked is None:
+            return None
+        places = self._drives(tucked[1]).find(goal)
+        return None if places is None else (places, *tucked)
+
+    def _tuck(self, state: State) -> tuple[Trajectory, State] | None:
+        """Return a way of the arm to a compact configuration, and the state there; None without one."""
+        if state not in self._tucked:
+            self._tucked = {state: self._plan_tuck(state)}
+        return self._tucked[state]
+
+    def _plan_tuck(self, state: State) -> tuple[Trajectory, State] | None:
+        planner = self.planner
+        planner.place(state)
+        here = state.vector(planner.symbols)
+        for row in self._find_compact(state)[:_MOST_TUCKED]:
+            path = planner.plan(here, row, seconds=_TUCKING)
+            if path.found:
+                trajectory = path.trajectory()
+                # Joints that turn without end may arrive whole turns away from the wanted values.
+                return trajectory, state.updated(trajectory.at(trajectory.duration))
+        return None
+
+    def _find_compact(self, state: State) -> Array:
+        """Return free configurations (K, n) of the arm, the one with the least radius first."""
+        search, scene, symbols = self.search, self.search.scene, self.planner.symbols
+        limits = np.array([search.model.limits(s) for s in symbols])
+        lower, upper = np.where(np.isfinite(limits), limits, np.array([-np.pi, np.pi])).T
+        rows = np.random.default_rng(0).uniform(lower, upper, (_TUCKED, len(lower)))
+        itself = scene.watch(search.own, search.own, 0.0)
+        touching = itself, scene.watch(search.own, search.others, search.margin)
+        x, y, _ = (state[s] for s in search.base)
+        found: list[tuple[float, int]] = []
+        for k, row in enumerate(rows):
+            scene.update(state.updated(dict(zip(symbols, row.tolist(), strict=True))))
+            if not any(len(watch()) for watch in touching):
+                places = np.array([scene.pose(b)[:2, 3] for b in search.own])
+                found.append((float(np.hypot(*(places - [x, y]).T).max()), k))
+        return rows[[k for _, k in sorted(found)]]
