@@ -144,6 +144,7 @@ class PartPulling:
             )
         words = f"{self._describe_opening('goes no further')} {why}"
         if opened >= LEAST_OPENING[0] or self.opening[1] >= LEAST_OPENING[1]:
+            self._measures["opened_seconds"] = self._reached - self.begin
             return f"{words} The arm could go on, so this is its stop."
         raise SkillError("other", words)
 
