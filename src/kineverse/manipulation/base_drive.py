@@ -1,8 +1,9 @@
 """Drives of a base that rolls on wheels: turns on the spot and straight lines between furniture.
 
 Such a base has fewer speeds than coordinates, so a straight way between two configurations would slip. The
-ways are searched by A* on a lattice of places with eight headings. From places near a goal a direct leg (a
-turn, a line and a turn) is tried, as in hybrid A* (Dolgov, Thrun, Montemerlo and Diebel, IJRR 29, 2010).
+ways are searched on a lattice of places with eight headings (Dijkstra), in a tree that serves several goals.
+From places near a goal a direct leg (a turn, a line and a turn) is tried, as in hybrid A* (Dolgov, Thrun,
+Montemerlo and Diebel, IJRR 29, 2010).
 """
 
 from __future__ import annotations
