@@ -23,6 +23,7 @@ import pytest
 from hypothesis import settings
 
 from hypothesis_profiles import USUAL
+from native_libraries import compile_native_libraries
 
 ROOT = Path(__file__).parents[1]
 sys.path.append(str(ROOT / "examples"))  # living_kitchen
@@ -47,6 +48,8 @@ def pytest_configure(config: pytest.Config) -> None:
     os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
     # At the very end, when the compilers in the background are gone; they were started after this.
     atexit.register(shutil.rmtree, folder, ignore_errors=True)
+    if config.getoption("numprocesses", None) and not config.getoption("collectonly"):
+        compile_native_libraries()
 
 
 @pytest.hookimpl(wrapper=True)
@@ -56,6 +59,8 @@ def pytest_collection() -> Generator[None, object, object]:
     try:
         return (yield)
     finally:
+        gc.collect()
+        gc.freeze()  # nor later, when it looks for the garbage of a test
         gc.enable()
 
 

@@ -53,9 +53,14 @@ def build(code: Callable[[kv.model.ReadRecorder], kv.model.Writes], **changes: A
 
 def reloaded(model: kv.Model) -> kv.Model:
     """Return what a process without the code makes of a model."""
+    return read_document(to_json(model))
+
+
+def read_document(text: str) -> kv.Model:
+    """Return what a process without the code makes of the document of a model."""
     result = kv.Model()
     with result.edit() as edit:
-        for tag, operation in read_operations(to_json(model)):
+        for tag, operation in read_operations(text):
             edit.apply(operation, tag)
     return result
 

@@ -15,7 +15,20 @@ _TYPES = r"""
 #include <math.h>
 #include <stdlib.h>
 #include <string.h>
-#if defined(__x86_64__) || defined(__i386__)
+#if defined(__AVX__) && !defined(__clang__) && __GNUC__ >= 10 && __GNUC__ <= 14
+/* Part of <immintrin.h>, in its order: all of it takes gcc 0.6 s, several times as long as most programs. */
+#define _IMMINTRIN_H_INCLUDED
+#include <smmintrin.h>
+#include <avxintrin.h>
+#ifdef __FMA__
+#include <fmaintrin.h>
+#endif
+#ifdef __AVX512DQ__
+#include <avx2intrin.h>
+#include <avx512fintrin.h>
+#include <avx512dqintrin.h>
+#endif
+#elif defined(__x86_64__) || defined(__i386__)
 #include <immintrin.h>
 #elif defined(__aarch64__) && defined(__ARM_NEON)
 #include <arm_neon.h>

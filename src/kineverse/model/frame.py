@@ -40,8 +40,9 @@ class Frame:
 
     parent: str
     factors: tuple[Pose | Expression, ...]
-    # Last world pose, shared by all models that share the frame.
+    # Last pose in the world, and in another frame, shared by all models that share the frame.
     placement: Placement | None = field(default=None, init=False, repr=False, compare=False)
+    relative_placement: Placement | None = field(default=None, init=False, repr=False, compare=False)
 
     def __post_init__(self) -> None:
         # The lazy factors of a traced operation are not queried here.

@@ -148,24 +148,25 @@ def branches(frame: str, relative_to: str, lookup: FrameLookup) -> tuple[list[st
     return base[common:], down[common:]
 
 
-def compose_chain(chain: Sequence[str], lookup: FrameLookup, start: Placement = ROOT) -> Placement:
-    """Return the placement of the last frame of a chain."""
-    placement = start
-    for name in chain:
-        placement = placement.then(lookup(name))
-    return placement
+def compose_chain(chain: Sequence[str], lookup: FrameLookup) -> Placement:
+    """Return the placement of the last frame of a chain, which frames cache as that in the world."""
+    return _place(chain, lookup, "relative_placement")
 
 
 def place_in_world(name: str, lookup: FrameLookup) -> Placement:
     """Return the placement of a frame in the world; frames cache the placements of all ancestors."""
+    return _place(ancestors(name, lookup)[::-1], lookup, "placement")
+
+
+def _place(chain: Sequence[str], lookup: FrameLookup, cache: str) -> Placement:
     placement = ROOT
-    for link in reversed(ancestors(name, lookup)):
-        frame = lookup(link)
-        known = frame.placement
+    for name in chain:
+        frame = lookup(name)
+        known: Placement | None = getattr(frame, cache)
         # A cached placement is valid while it refers to the same parent placement.
         if known is None or known.parent is not placement:
             known = placement.then(frame)
-            object.__setattr__(frame, "placement", known)
+            object.__setattr__(frame, cache, known)
         placement = known
     return placement
 
