@@ -15,7 +15,7 @@ _TYPES = r"""
 #include <math.h>
 #include <stdlib.h>
 #include <string.h>
-#if defined(__AVX__) && !defined(__clang__) && __GNUC__ >= 10 && __GNUC__ <= 14
+#if defined(__AVX__) && !defined(__clang__) && (__GNUC__ == 11 || __GNUC__ == 12)
 /* Part of <immintrin.h>, in its order: all of it takes gcc 0.6 s, several times as long as most programs. */
 #define _IMMINTRIN_H_INCLUDED
 #include <smmintrin.h>
