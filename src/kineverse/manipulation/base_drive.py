@@ -215,7 +215,7 @@ class DriveSearch:
 
     @property
     def begins_free(self) -> bool:
-        """Whether the robot touches nothing at the start."""
+        """Tell whether the robot touches nothing at the start."""
         self._place()
         return self._is_free(np.array([self._start]))
 
