@@ -17,6 +17,7 @@ import kineverse as kv
 from hypothesis_profiles import attempts
 from kineverse.compile import build_queue, compiler_information
 from kineverse.compile.batch_codegen import generate_batch_source
+from kineverse.compile.build_queue import working_seconds
 from kineverse.compile.call_extension import call_extension
 from kineverse.compile.program import Program
 from kineverse.expressions.implicit import ImplicitFunction
@@ -226,6 +227,18 @@ def test_wait_returns_after_its_timeout(monkeypatch: pytest.MonkeyPatch, tmp_pat
     assert not any(g.wait(60) for g in waiting)
     assert last._library._build._done.wait(60)
     assert len((tmp_path / "runs").read_text().splitlines()) == 5
+
+
+def test_working_seconds_stand_still_while_a_thread_waits(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    monkeypatch.setenv("CC", broken_compiler(tmp_path, "sleep 0.5; exit 1"))
+    monkeypatch.setattr(build_queue, "_worker", build_queue._Worker())
+    function = kv.compile(a * b * 11.25)
+    begin, worked = time.perf_counter(), working_seconds()
+    function.wait()
+    assert time.perf_counter() - begin > 0.5
+    assert 0.0 <= working_seconds() - worked < 0.25
 
 
 def test_the_queue_is_bounded(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:

@@ -19,6 +19,7 @@ import subprocess
 import threading
 import time
 from collections.abc import Callable, Sequence
+from time import perf_counter
 from typing import TypeAlias
 from weakref import WeakMethod
 
@@ -32,6 +33,21 @@ TIME_LIMIT = 120.0
 
 
 BuildCallback: TypeAlias = Callable[["BuildJob"], object]
+
+
+class _Waits(threading.local):
+    seconds = 0.0
+
+
+_waits = _Waits()
+
+
+def working_seconds() -> float:
+    """Return the time of a clock that stands still while this thread waits for the compiler [s].
+
+    Limits of a search are measured by it: what is compiled once is no part of the search.
+    """
+    return perf_counter() - _waits.seconds
 
 
 class BuildJob:
@@ -77,7 +93,11 @@ class BuildJob:
             In seconds; forever if None.
         """
         _worker.prioritise(self)
-        return self._done.wait(timeout)
+        begin = perf_counter()
+        try:
+            return self._done.wait(timeout)
+        finally:
+            _waits.seconds += perf_counter() - begin
 
     def finish(self, path: str | None = None, error: str | None = None) -> None:
         """Set the result and notify the listeners, in the worker's thread."""

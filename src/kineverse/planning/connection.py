@@ -4,10 +4,10 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from time import perf_counter
 
 import numpy as np
 
+from kineverse.compile.build_queue import working_seconds
 from kineverse.lie import Array
 
 from .bindings import TIME_IS_UP
@@ -71,15 +71,15 @@ def connect(
     patience
         Number of shortcuts in a row that may bring nothing.
     """
-    begin = perf_counter()
+    begin = working_seconds()
     search = RrtConnect(checker)
     iterations, points = 0, starts
     for attempt in range(_ATTEMPTS):
-        left = seconds - (perf_counter() - begin)
+        left = seconds - (working_seconds() - begin)
         if attempt and left <= 0.0:
             break
         for by in (_WIDER, 0.0):
-            left = seconds - (perf_counter() - begin)
+            left = seconds - (working_seconds() - begin)
             with checker.widened(by, np.vstack([starts, goals])) as wider:
                 share, most = (left / 2, min(edges, _WIDE_EDGES)) if wider else (left, edges)
                 if roadmap is None:
@@ -93,7 +93,7 @@ def connect(
             return Connected(found.points.astype(float), explain_failure(found, seconds), iterations)
         # Parts of a shortcut that just passes would not be certain by themselves.
         with checker.widened(_WIDER / 2, np.vstack([starts, goals])):
-            points = search.shorten(found.points, seconds - (perf_counter() - begin), seed, patience)
+            points = search.shorten(found.points, seconds - (working_seconds() - begin), seed, patience)
         certain = _repair(search, checker, points, begin + seconds, seed, edges)
         if certain is not None:
             return Connected(certain.astype(float), "", iterations)
@@ -115,7 +115,7 @@ def _repair(
             return points
         k, _fraction = collision
         resolution = min(_FINER * resolution, _FINEST)
-        left = end - perf_counter()
+        left = end - working_seconds()
         detour = search.solve(points[k : k + 1], points[k + 1 : k + 2], left, seed, resolution, edges)
         if not detour.found:
             return None
@@ -138,16 +138,16 @@ def connect_on_manifold(
     :meth:`.Manifold.refine`. A path that collides between samples is searched again, with another seed and
     more samples.
     """
-    begin = perf_counter()
+    begin = working_seconds()
     search = RrtConnect(checker, manifold)
     iterations, resolution, problem = 0, RESOLUTION, ""
     points = starts
     for attempt in range(_ATTEMPTS):
-        left = seconds - (perf_counter() - begin)
+        left = seconds - (working_seconds() - begin)
         if attempt and left <= 0.0:
             break
         for by in (_WIDER, 0.0):
-            left = seconds - (perf_counter() - begin)
+            left = seconds - (working_seconds() - begin)
             with checker.widened(by, np.vstack([starts, goals])) as wider:
                 share, most = (left / 2, min(edges, _WIDE_EDGES)) if wider else (left, edges)
                 found = search.solve(starts, goals, share, seed + _NEXT_SEED * attempt, resolution, most)

@@ -4,12 +4,12 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
-from time import perf_counter
 
 import numpy as np
 import numpy.typing as npt
 
 from kineverse._checks import as_entries
+from kineverse.compile.build_queue import working_seconds
 from kineverse.control.configuration_space import find_coordinates
 from kineverse.control.tasks import Hold
 from kineverse.errors import DuplicateNameError, InvalidValueError
@@ -154,7 +154,7 @@ class ModeSearch:
 
     def run(self, q: Array) -> ModePath:
         """Return a path from a configuration (n,)."""
-        self._end = perf_counter() + self._seconds
+        self._end = working_seconds() + self._seconds
         first = self._find_mode(q)
         if first is None:
             return ModePath(
@@ -196,12 +196,12 @@ class ModeSearch:
 
     def _compile(self, holds: Sequence[Hold]) -> None:
         """Compile what searches along holds need. This is done once, so its time does not count."""
-        begin = perf_counter()
+        begin = working_seconds()
         self._scene.manifold(holds)
-        self._end += perf_counter() - begin
+        self._end += working_seconds() - begin
 
     def _left(self) -> float:
-        return self._end - perf_counter()
+        return self._end - working_seconds()
 
     def _find_mode(self, q: Array) -> int | None:
         for k, mode in enumerate(self._modes):

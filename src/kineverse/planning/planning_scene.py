@@ -12,6 +12,7 @@ from typing import Any, TypeAlias
 import numpy as np
 import numpy.typing as npt
 
+from kineverse.compile.build_queue import working_seconds
 from kineverse.control.tasks import Hold
 from kineverse.errors import InvalidValueError
 from kineverse.geometry import Rule, Scene
@@ -218,7 +219,7 @@ class PlanningScene:
 
         Bodies of the pairs ``touching`` may touch, and some coordinates may stand still.
         """
-        begin = perf_counter()
+        begin, worked = perf_counter(), working_seconds()
         # A goal that is full turns away is the nearest one that is the same.
         ends = np.array([self.space.equivalents(end, q, most=1)[0] for end in ends])
         self.set_bounds(q, ends, still)
@@ -238,7 +239,7 @@ class PlanningScene:
             )  # fmt: skip
             best = search(seconds, seed)
             while optimize and best.found and best.length > straight + _SAME:
-                seed, left = seed + 1, seconds - (perf_counter() - begin)
+                seed, left = seed + 1, seconds - (working_seconds() - worked)
                 if left <= 0.0:
                     break
                 path = search(left, seed)

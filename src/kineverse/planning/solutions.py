@@ -2,10 +2,9 @@
 
 from __future__ import annotations
 
-from time import perf_counter
-
 import numpy as np
 
+from kineverse.compile.build_queue import working_seconds
 from kineverse.lie import Array
 
 from .checker import CollisionChecker
@@ -48,7 +47,7 @@ def find_solutions(
         Largest number of batches of them.
     """
     generator = np.random.default_rng(seed)
-    begin = perf_counter()
+    begin = working_seconds()
     lower, upper = checker.lower.astype(float), checker.upper.astype(float)
     found, idle = np.zeros((0, len(near))), 0
     for k in range(batches):
@@ -69,6 +68,6 @@ def find_solutions(
             found = np.vstack([found, exact[free]])
             found = found[unique_rows(found, _APART)]
         idle = 0 if len(found) > before else idle + 1
-        if len(found) >= count or (len(found) and idle >= _IDLE) or perf_counter() - begin > seconds:
+        if len(found) >= count or (len(found) and idle >= _IDLE) or working_seconds() - begin > seconds:
             break
     return found[np.argsort(np.linalg.norm(found - near, axis=1), kind="stable")][:count]

@@ -11,6 +11,7 @@ from time import perf_counter
 import numpy as np
 import numpy.typing as npt
 
+from kineverse.compile.build_queue import working_seconds
 from kineverse.control import Goal, Hold, InverseKinematics, Target
 from kineverse.control.tasks import Task
 from kineverse.errors import KineverseError
@@ -103,13 +104,13 @@ def find_push_start(
     accept
         Further test of a start, such as a trial in a world: returns the reason against it, or nothing.
     """
-    begin, reasons = perf_counter(), Counter[str]()
+    begin, worked, reasons = perf_counter(), working_seconds(), Counter[str]()
     sampler = _Sampler(pushing, state, np.random.default_rng(seed))
     if sampler.unreachable:
         reasons["out of reach"] = sampler.unreachable
         return PushStart(None, sampler.unreachable, reasons, 0, perf_counter() - begin)
     for k in range(samples):
-        if perf_counter() - begin > seconds:
+        if working_seconds() - worked > seconds:
             return PushStart(None, k, reasons, 0, perf_counter() - begin)
         start = sampler.sample()
         if isinstance(start, str):
