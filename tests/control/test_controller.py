@@ -147,6 +147,25 @@ def test_goal_on_speeds() -> None:
     assert controller.step(model.default_state()).speeds[speed] == pytest.approx(0.25, rel=1e-2)
 
 
+def test_goals_on_speeds_have_residuals_of_their_own() -> None:
+    model = planar_arm()
+    q, (a, b, c) = model.symbol("joint1"), [model.symbol(f"joint{k}").derivative() for k in (1, 2, 3)]
+    goals = [
+        Goal(a + b, 0.1, name="sum"),
+        Goal(kv.array([b - c, (1 + q) * c]), [0.05, 0.4], name="pair", weight=0.5),
+        Goal(q * a - c, name="last"),
+    ]
+    controller = Controller(model, goals, dt=DT, tier="interpreter")
+    command = controller.step({"joint1": 0.5, "joint2": 0.0, "joint3": 0.0})
+    first, second, third = (command.speeds[s] for s in (a, b, c))
+    assert command.residuals["sum"] == pytest.approx(abs(first + second - 0.1))
+    pair = math.hypot(second - third - 0.05, 1.5 * third - 0.4)
+    assert command.residuals["pair"] == pytest.approx(pair)
+    assert command.residuals["last"] == pytest.approx(abs(0.5 * first - third))
+    assert not controller.wait()
+    assert controller.tier == "interpreter"
+
+
 def test_targets_gains_and_weights_are_parameters() -> None:
     model = planar_arm()
     q = model.symbol("joint1")

@@ -17,6 +17,7 @@ from collections.abc import Callable, Iterable, Sequence
 import numpy as np
 
 from kineverse.compile import compile  # noqa: A004
+from kineverse.compile.function import WantedTier
 from kineverse.errors import InvalidValueError
 from kineverse.expressions.expression import Expression, array, as_expression
 from kineverse.geometry import Rule, Scene
@@ -51,6 +52,8 @@ class ContactSlots:
         Function that returns the twist of a body, (6, n) over the columns; by default the model's Jacobian.
     rules
         Further rules on the pairs that count, after those of the scene.
+    tier
+        Kind of evaluation of the twists, see :func:`kineverse.compile`.
 
     Attributes
     ----------
@@ -84,6 +87,7 @@ class ContactSlots:
         gain: float,
         twist: Callable[[str], Expression] | None = None,
         rules: Iterable[Rule] = (),
+        tier: WantedTier = "auto",
     ) -> None:
         if not isinstance(scene, Scene):
             raise InvalidValueError(f"scene= is a kineverse.geometry.Scene of the model, not {scene!r}.")
@@ -113,7 +117,7 @@ class ContactSlots:
         twists += [twist(members[group]) for group in groups if group]
         stacked = array([e for twist in twists for e in twist.ravel()]).reshape(len(twists), 6, len(speeds))
         self.inputs = tuple(sorted({*scene.inputs, *stacked.symbols}, key=lambda s: s.sort_key))
-        self.function = compile([stacked])
+        self.function = compile([stacked], tier=tier)
         self._twists = self.function.bind()
         place = {s: k for k, s in enumerate(self.inputs)}
         self._scene_values = np.array([place[s] for s in scene.inputs], dtype=np.intp)

@@ -12,6 +12,7 @@ import numpy as np
 import numpy.typing as npt
 
 from kineverse.compile import CompiledFunction
+from kineverse.compile.function import WantedTier
 from kineverse.errors import (
     InvalidValueError,
     ShapeError,
@@ -86,6 +87,9 @@ class Controller:
         far 2.5 m/s lead in a step if that is more. Bodies that approach faster need a larger one.
     solver
         ``"daqp"``, ``"proxsuite"`` or ``"osqp"``.
+    tier
+        Kind of evaluation, see :func:`kineverse.compile`; ``"interpreter"`` for controllers of a few hundred
+        steps, for which C would be ready too late.
 
     Attributes
     ----------
@@ -123,6 +127,7 @@ class Controller:
         margin: float = 0.005,
         radius: float | None = None,
         solver: str = "daqp",
+        tier: WantedTier = "auto",
     ) -> None:
         check_weight("smooth", smooth)
         check_weight("jerk", jerk)
@@ -145,6 +150,7 @@ class Controller:
             accelerations=stated | chosen,
             contacts=contacts if scene is not None else 0,
             dt=step,
+            tier=tier,
         )
         self.inputs = self._program.inputs
         self._contacts: ContactSlots | None = None
@@ -158,6 +164,7 @@ class Controller:
                 margin=margin,
                 radius=_contact_radius(dt) if radius is None else radius,
                 gain=_contact_gain(dt),
+                tier=tier,
             )
             self.inputs = arrange_inputs({*self.inputs, *self._contacts.inputs})
             place = {s: k for k, s in enumerate(self.inputs)}
@@ -372,11 +379,10 @@ class Controller:
         if len(self._before):
             self._before[:] = self._last
         self._last[:] = x[:n]
-        if self._program.speed_goals:
+        if len(self._program.speed_goals):
             jacobian, rate = self._evaluate.outputs[-2:]
-            missing = jacobian @ x[:n] - rate
-            for place, rows in self._program.speed_goals:
-                residuals[place] = np.linalg.norm(missing[rows])
+            squares = (jacobian @ x[:n] - rate) ** 2
+            residuals[self._program.speed_goals] = np.sqrt(np.add.reduceat(squares, self._program.speed_rows))
         values = x.tolist()
         return Command(
             dict(zip(self.speeds, values, strict=False)),

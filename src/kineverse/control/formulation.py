@@ -144,7 +144,13 @@ class Formulation:
         equalities = {name: c for name, c in relevant.items() if is_equality(c)}
         ranges = {name: c for name, c in relevant.items() if name not in equalities}
         held = {name: rates.carry(c.expression - c.lower) for name, c in equalities.items()}
-        gradients = {task: self._speed_gradient(task, error) for task, error in errors.items()}
+        about_speeds = {task: error for task, error in errors.items() if any(s.order for s in error.symbols)}
+        gradients, constants = self._split_speed_goals(about_speeds)
+        gradients |= {
+            task: rates.over_free_speeds(error.gradient(heuristic=isinstance(task, Goal) and task.heuristic))
+            for task, error in errors.items()
+            if task not in about_speeds
+        }
         closures = {
             name: rates.over_free_speeds(error.gradient(heuristic=False)) for name, error in held.items()
         }
@@ -169,7 +175,7 @@ class Formulation:
         self._check_keeps({name: c for name, c in keeps.items() if name in ranges})
         self.keeps = tuple(name for name in keeps if name not in equalities)
         self.goals = tuple(
-            self._goal_rows(task, errors[task], gradients[task])
+            self._goal_rows(task, errors[task], gradients[task], constants.get(task))
             for task in self.tasks
             if isinstance(task, Goal)
         )
@@ -214,27 +220,42 @@ class Formulation:
             recovery="allowed",
         )
 
-    def _speed_gradient(self, task: Task, error: Expression) -> dict[Symbol, Expression]:
-        """Return the gradient over free speeds; of a goal about speeds, its coefficients."""
-        rates = self.model.rates
-        if isinstance(task, Goal) and any(s.order for s in error.symbols):
-            eliminated = rates.eliminate(error)
-            speeds = [s for s in eliminated.symbols if s.order == 1]
-            slopes = eliminated.partial(speeds)
-            if any(s.order for s in slopes.symbols) or any(s.order > 1 for s in eliminated.symbols):
-                raise InvalidValueError(f"{task!r} is not linear in speeds, so no goal can be made of it.")
-            return {s: slopes[:, i] for i, s in enumerate(speeds)}
-        heuristic = task.heuristic if isinstance(task, Goal) else False
-        found: dict[Symbol, Expression] = rates.over_free_speeds(error.gradient(heuristic=heuristic))
-        return found
+    def _split_speed_goals(
+        self, errors: Mapping[Goal | Hold, Expression]
+    ) -> tuple[dict[Goal | Hold, dict[Symbol, Expression]], dict[Goal | Hold, Expression]]:
+        """Return coefficients of free speeds and constant part of goals about speeds.
 
-    def _goal_rows(self, goal: Goal, error: Expression, gradient: dict[Symbol, Expression]) -> GoalRows:
+        All goals are differentiated at once, since they often have parts in common.
+        """
+        gradients: dict[Goal | Hold, dict[Symbol, Expression]] = {}
+        constants: dict[Goal | Hold, Expression] = {}
+        if not errors:
+            return gradients, constants
+        eliminated = {task: self.model.rates.eliminate(error) for task, error in errors.items()}
+        every = as_expression(np.concatenate(list(eliminated.values())))
+        speeds = [s for s in every.symbols if s.order == 1]
+        slopes, constant = every.partial(speeds), every.substitute(dict.fromkeys(speeds, 0.0))
+        first = 0
+        for task, error in eliminated.items():
+            own, rows = set(error.symbols), slice(first, first + error.size)
+            if any(s.order for s in slopes[rows].symbols) or any(s.order > 1 for s in own):
+                raise InvalidValueError(f"{task!r} is not linear in speeds, so no goal can be made of it.")
+            gradients[task] = {s: slopes[rows, i] for i, s in enumerate(speeds) if s in own}
+            constants[task] = constant[rows]
+            first = rows.stop
+        return gradients, constants
+
+    def _goal_rows(
+        self,
+        goal: Goal,
+        error: Expression,
+        gradient: dict[Symbol, Expression],
+        constant: Expression | None,
+    ) -> GoalRows:
         jacobian = self._matrix(goal, gradient)
         given = as_expression(goal.weight).ravel()
         weight = array([given[k if given.size > 1 else 0] for k in range(goal.error.size)])
-        if any(s.order for s in error.symbols):
-            eliminated = self.model.rates.eliminate(error)
-            constant = eliminated.substitute({s: 0.0 for s in eliminated.symbols if s.order})
+        if constant is not None:
             none = as_expression(np.zeros(goal.error.size))
             return GoalRows(self._names[goal], constant, jacobian, none, -constant, weight, True)
         rate = correction = -self._limit_gain(goal.gain) * error

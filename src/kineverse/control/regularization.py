@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 
 import casadi as ca
 import numpy as np
 
+from kineverse.compile.evaluator import bind
 from kineverse.errors import InvalidValueError
 from kineverse.expressions.expression import Expression, ExpressionLike, as_expression
 from kineverse.expressions.graph import dense_column
@@ -64,16 +65,16 @@ class JointWeights:
         the Jacobians of goals and holds over random states, so that units of coordinates do not matter; times
         the share of bodies that the speed moves, or a given factor.
     curvatures
-        For each goal (n,) factors κ_i with which ``Σ κ_i v_i²`` bounds the second derivative of its errors,
-        ``Σ_j |∂²e/∂q_i∂q_j| l_i/l_j``, at random states; l is the root mean square of a column of the
-        Jacobian. Times the same shares.
+        By the name of a goal about positions (n,) factors κ_i with which ``Σ κ_i v_i²`` bounds the second
+        derivative of its errors, ``Σ_j |∂²e/∂q_i∂q_j| l_i/l_j``, at random states; l is the root mean square
+        of a column of the Jacobian. Times the same shares.
     immovable
         Names of equalities of the model whose gradient is nothing but rounding, such as the parts of a
         planar loop's closure that point out of its plane. A row of them would make others dependent.
     """
 
     shares: tuple[Expression, ...]
-    curvatures: tuple[tuple[Expression, ...], ...]
+    curvatures: Mapping[str, tuple[Expression, ...]]
     immovable: frozenset[str]
 
 
@@ -107,25 +108,30 @@ def joint_weights(
     together = np.where(together > 0, together, positive.mean() if len(positive) else 1.0)
     return JointWeights(
         tuple(float(square) * factors[s] for s, square in zip(speeds, together, strict=True)),
-        tuple(
-            tuple(float(each) * factors[s] for s, each in zip(speeds, row, strict=True))
-            for row in curvatures[: len(formulation.goals)]
-        ),
+        {
+            name: tuple(float(each) * factors[s] for s, each in zip(speeds, row, strict=True))
+            for name, row in curvatures.items()
+        },
         immovable,
     )
 
 
-def _sample_jacobians(formulation: Formulation) -> tuple[Array, Array]:
-    """Return mean squares l² of the columns of Jacobians of goals, then holds, and factors κ, (k, n) each."""
+def _sample_jacobians(formulation: Formulation) -> tuple[Array, dict[str, Array]]:
+    """Return mean squares l² of the columns of Jacobians of goals, then holds, (k, n), and factors κ.
+
+    The factors are by the name of the goal, (n,), for goals about positions.
+    """
     model, n = formulation.model, len(formulation.speeds)
     tasks: tuple[GoalRows | HoldRows, ...] = (*formulation.goals, *formulation.holds)
     if not tasks:
-        return np.ones((1, n)), np.zeros((1, n))
+        return np.ones((1, n)), {}
     stacked = as_expression(np.concatenate([row.jacobian for row in tasks]))
     first = np.cumsum([0, *(row.error.size for row in tasks[:-1])])
+    goals = {k: goal for k, goal in enumerate(formulation.goals) if not goal.about_speeds}
+    part = as_expression(np.concatenate([np.zeros((0, n)), *(goal.jacobian for goal in goals.values())]))
+    ends = np.cumsum([0, *(goal.error.size for goal in goals.values())])[:-1]
     symbols = stacked.symbols
-    # Each state counts once, so common parts are not looked for.
-    function = ca.Function("J", [ca.vertcat(*(s.sx for s in symbols))], [dense_column(stacked)])
+    every, curved = _bind_matrix(stacked, symbols), _bind_matrix(part, symbols)
     place = {s: k for k, s in enumerate(symbols)}
     known = [(j, place[s.position]) for j, s in enumerate(formulation.speeds) if s.position in place]
     generator, squares, slopes = np.random.default_rng(0), [], []
@@ -137,30 +143,54 @@ def _sample_jacobians(formulation: Formulation) -> tuple[Array, Array]:
         ranges.append((max(lower, value - math.pi), min(upper, value + math.pi)))
     for _ in range(_SAMPLES):
         q = np.array([generator.uniform(low, max(low, high)) for low, high in ranges])
-        J = np.array(function(q)).reshape(-1, n)
-        change = np.zeros((len(J), n, n))
-        for j, k in known:
+        J, here = every(q), curved(q).copy()
+        change = np.zeros((len(here), n, n))
+        for j, k in known if goals else ():
             moved = q.copy()
             moved[k] += _SHIFT
-            change[:, :, j] = (np.array(function(moved)).reshape(-1, n) - J) / _SHIFT
+            change[:, :, j] = (curved(moved) - here) / _SHIFT
         if np.isfinite(J).all() and np.isfinite(change).all():  # else outside of the domain of a closed loop
             squares.append(np.add.reduceat(J**2, first, axis=0))
-            slopes.append(np.sqrt(np.add.reduceat(change**2, first, axis=0)))
+            slopes.append(np.sqrt(np.add.reduceat(change**2, ends, axis=0)) if goals else change)
     if not squares:
-        return np.ones((len(tasks), n)), np.ones((len(tasks), n))
+        return np.ones((len(tasks), n)), {goal.name: np.ones(n) for goal in goals.values()}
     square = np.mean(squares, axis=0)
+    bounds = _bound_curvature(formulation, square[list(goals)], slopes, symbols)
+    return square, {goal.name: bound for goal, bound in zip(goals.values(), bounds, strict=True)}
+
+
+def _bind_matrix(matrix: Expression, symbols: Sequence[Symbol]) -> Callable[[Array], Array]:
+    """Return a function of values of symbols that writes an (m, n) matrix to one array, and returns it."""
+    # Each state counts once, so common parts are not looked for.
+    function = ca.Function("J", [ca.vertcat(*(s.sx for s in symbols))], [dense_column(matrix)])
+    vector, result = np.zeros(len(symbols)), np.zeros(matrix.shape)
+    run, keep = bind(function, vector, (result,), None)
+
+    def evaluate(q: Array, _: object = keep) -> Array:
+        vector[:] = q
+        run()
+        return result
+
+    return evaluate
+
+
+def _bound_curvature(
+    formulation: Formulation, square: Array, slopes: Sequence[Array], symbols: Iterable[Symbol]
+) -> Array:
+    """Return factors κ, (k, n), from mean squares of the columns of Jacobians and derivatives (k, n, n)."""
     lever = np.sqrt(np.maximum(square, np.finfo(float).tiny))
     # The median, since rotation vectors jump.
     second = np.median(slopes, axis=0)
     second = np.maximum(second, second.transpose(0, 2, 1))
     # Speeds that drive other coordinates, such as those of wheels, count as rotations.
-    driving = {s for symbol in symbols for s in model.rates.row(symbol) or ()}
+    driving = {s for symbol in symbols for s in formulation.model.rates.row(symbol) or ()}
     other = np.array([s in driving for s in formulation.speeds])
     product = lever[:, :, None] * lever[:, None, :]
     usual = product / np.maximum(lever[:, :, None], lever[:, None, :])
     second = np.where(other[:, None] & other, np.maximum(usual, second), second)
     ratio = np.where(square[:, None, :] > 0, lever[:, :, None] / lever[:, None, :], 0.0)
-    return square, np.where(square > 0, (second * ratio).sum(axis=2), 0.0)
+    bound: Array = np.where(square > 0, (second * ratio).sum(axis=2), 0.0)
+    return bound
 
 
 def check_weight(name: str, value: float) -> None:
@@ -182,7 +212,11 @@ def find_posture(
     if isinstance(posture, Mapping):
         weights = {s: w for key, w in posture.items() for s in find_speeds(model, (key,), "posture")}
     else:
-        asked = {task.expression for task in formulation.tasks if isinstance(task, Goal)}
+        asked = {
+            task.expression
+            for task in formulation.tasks
+            if isinstance(task, Goal) and isinstance(task.expression, Symbol)
+        }
         weights = {s: posture for s in formulation.speeds if s.position not in asked}
     found = {}
     for speed, weight in weights.items():

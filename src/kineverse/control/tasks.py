@@ -213,7 +213,8 @@ def _error_of(task: Goal | Hold, expression: Expression, target: ExpressionLike)
     if not wanted.symbols and not all(math.isfinite(float(v)) for v in wanted.ravel()):
         raise InvalidValueError(f"{task!r}: the target {target!r} is not finite.")
     error = expression - wanted
-    if not error.gradient():
+    # The gradient over speeds would be that of accelerations.
+    if not any(s.order for s in error.symbols) and not error.gradient():
         raise InvalidValueError(
             f"{task!r} depends on nothing that moves, so no speed can serve it. The pose of a frame that is "
             "fixed to the world is a constant."

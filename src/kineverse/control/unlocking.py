@@ -182,9 +182,8 @@ def unlock(
     for (side, is_shut, need), score in zip(states, scores, strict=True):
         trend = {q: slope * _wins(q, slope, score, claims) for q, slope in side.trend.items()}
         length = sqrt(sum((s * s for s in trend.values()), as_expression(_TINY**2)))
-        # A quantity of value 0 that changes along the unit vector of the trend.
-        along = as_expression(0.0).with_gradient({q.derivative(): s / length for q, s in trend.items()})
-        tasks.append(Goal(along, name=f"unlock {side.name}", rate=rate, weight=need * is_shut))
+        along = sum((q.derivative() * (s / length) for q, s in trend.items()), as_expression(0.0))
+        tasks.append(Goal(along, rate, name=f"unlock {side.name}", weight=need * is_shut))
     keys = dict.fromkeys(key for side in order for key in side.trend if key not in goals)
     if keys:
         still = array([key.derivative() for key in keys])

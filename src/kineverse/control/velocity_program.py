@@ -22,12 +22,12 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Mapping
 from functools import reduce
-from itertools import pairwise
 
 import casadi as ca
 import numpy as np
 
 from kineverse.compile import CompiledFunction, compile  # noqa: A004
+from kineverse.compile.function import WantedTier
 from kineverse.expressions.expression import Expression, ExpressionLike, array, as_expression, binary
 from kineverse.expressions.functions import norm
 from kineverse.lie import Array
@@ -62,9 +62,9 @@ class VelocityProgram:
         Names of holds, and of the progress.
     soft
         Flags of rows that may be violated: accelerations.
-    speed_goals
-        Goals about speeds, as pairs of their place in the residuals and the slice of their rows. The last two
-        outputs of the function are Jacobian and wanted rates of all of these, if there are any.
+    speed_goals, speed_rows
+        Places of goals about speeds in the residuals, and of their first rows in the last two outputs of the
+        function, which are Jacobian and wanted rates of all of these, if there are any.
     contact_rows
         Slice of the rows of contacts in A, which are zero here.
     """
@@ -79,6 +79,7 @@ class VelocityProgram:
         accelerations: Mapping[Symbol, ExpressionLike],
         contacts: int,
         dt: Symbol,
+        tier: WantedTier = "auto",
     ) -> None:
         self.formulation = formulation
         self.speeds = speeds = formulation.speeds
@@ -93,18 +94,20 @@ class VelocityProgram:
         last = [parameter(f"control/last/{s}", 0.0) for s in speeds]
         before = [parameter(f"control/before/{s}", 0.0) for s in speeds] if costs.jerk else []
 
-        diagonal, linear = [ZERO] * n, [ZERO] * n
+        diagonal = [ZERO] * n
         hessian: Expression = as_expression(np.zeros((n, n)))
+        wanted: Expression = as_expression(np.zeros(n))
         effort = ZERO
-        for goal, curvatures in zip(formulation.goals, joint_weights.curvatures, strict=True):
+        for goal in formulation.goals:
             weighted = goal.jacobian * goal.weight.reshape(goal.weight.size, 1)
             hessian = hessian + weighted.T @ goal.jacobian
-            pull = weighted.T @ goal.rate
-            linear = [linear[i] - pull[i] for i in range(n)]
+            wanted = wanted + weighted.T @ goal.rate
             effort = effort + (goal.weight * goal.rate) @ goal.rate
-            distance = norm(goal.weight * goal.correction)
-            for i, curvature in enumerate(curvatures):
-                diagonal[i] = diagonal[i] + curvature * dt * distance
+            if goal.name in joint_weights.curvatures:
+                distance = norm(goal.weight * goal.correction)
+                for i, curvature in enumerate(joint_weights.curvatures[goal.name]):
+                    diagonal[i] = diagonal[i] + curvature * dt * distance
+        linear = [-wanted[i] for i in range(n)]
         largest = reduce(raw_max, [hessian[i, i] for i in range(n)], as_expression(1.0))
         rows = formulation.rows
         bounds, general = rows.bounds, rows.general
@@ -197,11 +200,9 @@ class VelocityProgram:
         residuals |= {name: self._keep_residual(name) for name in formulation.keeps}
         self.residuals = tuple(residuals)
         about_speeds = [goal for goal in formulation.goals if goal.about_speeds]
-        ends = np.cumsum([0, *(goal.error.size for goal in about_speeds)]).tolist()
-        self.speed_goals = tuple(
-            (self.residuals.index(goal.name), slice(*end))
-            for goal, end in zip(about_speeds, pairwise(ends), strict=True)
-        )
+        places = [self.residuals.index(goal.name) for goal in about_speeds]
+        self.speed_goals = np.array(places, dtype=np.intp)
+        self.speed_rows = np.cumsum([0, *(goal.error.size for goal in about_speeds)])[:-1]
         self.function: CompiledFunction[tuple[Array, ...]]
         outputs = [H, f, A, array(lower), array(upper), array(list(residuals.values())), check, largest]
         if about_speeds:
@@ -211,7 +212,7 @@ class VelocityProgram:
             ]
         used = {s for output in outputs for s in output.symbols}
         self.inputs = arrange_inputs(used - {dt, *last, *before})
-        self.function = compile(outputs, (*self.inputs, dt, *last, *before))
+        self.function = compile(outputs, (*self.inputs, dt, *last, *before), tier=tier)
 
     def _keep_residual(self, name: str) -> Expression:
         """Return the violation of a keep; 0 for one on speeds, which a command satisfies."""

@@ -78,7 +78,7 @@ def run_unlocking(
     tasks = unlock(model, box.goal, demand=rule not in ("product", "undemanded"))
     if rule == "none":
         tasks = tasks[: len(box.goal)]
-    controller = Controller(model, tasks, dt=DT, smooth=1e-3, posture=0.0)
+    controller = Controller(model, tasks, dt=DT, smooth=1e-3, posture=0.0, tier="interpreter")
     state = model.default_state()
     order: dict[str, None] = {}
     cpu: list[float] = []

@@ -197,6 +197,10 @@ class _Explorer:
             if not moves:
                 break
             for move, target in moves:
+                first = self.find_deferring(move, goal)
+                if first is not None:
+                    self.attempt(first, self.known.end(first))
+                    break
                 if not self.attempt(move, target) or len(self.tries) >= most:
                     break
         self.known.write_results()
@@ -233,6 +237,26 @@ class _Explorer:
             move = KeySide(k, 1 if step.target > step.start else -1)
             moves.append((move, step.target if step.threshold is None else self.known.end(move)))
         return moves
+
+    def find_deferring(self, move: KeySide, goal: Mapping[Symbol, float]) -> KeySide | None:
+        """Return the move that is tried before that of a goal which was refused; None if there is none.
+
+        A box hides its goal behind the other parts, so those that never moved and might be free come first.
+        """
+        known, here = self.known, self.here
+        lock = known.locks[move]
+        if known.coordinates[move.key] not in goal or not lock.refused or lock.probability(here) == 1.0:
+            return None
+        seen = {one.key for one, other in known.locks.items() if other.moved}
+        chances = {
+            one: other.probability(here)
+            for one, other in known.locks.items()
+            if one.key not in seen
+            and known.coordinates[one.key] not in goal
+            and here[one.key] != known.end(one)
+        }
+        likely = max(chances, key=lambda one: (chances[one], -known.priority[one.key]), default=None)
+        return likely if likely is not None and chances[likely] > 0.0 else None
 
     def attempt(self, move: KeySide, target: float) -> bool:
         """Try to move a coordinate, and learn from it."""

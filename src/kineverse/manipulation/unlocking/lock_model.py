@@ -51,6 +51,8 @@ class LockModel:
         The coordinates, and their limits.
     locks
         Hypothesis for each coordinate, by its number, and direction.
+    priority
+        Place of each coordinate in the order of those that are equally promising.
 
     Raises
     ------
@@ -72,7 +74,7 @@ class LockModel:
         self.locks = {
             KeySide(k, way): LockHypothesis(k, self.limits, here) for k in range(len(ends)) for way in _WAYS
         }
-        self._priority = np.random.default_rng(seed).permutation(len(ends)).tolist()
+        self.priority: list[int] = np.random.default_rng(seed).permutation(len(ends)).tolist()
         self._doubts = dict[tuple[KeySide, KeySide], float]()
         self._written: Mapping[int, object] = {}
 
@@ -142,7 +144,7 @@ class LockModel:
             if math.isfinite(tries):
                 rank = tries + total / lock.weight(s) + self._doubts.get((move, s), 0.0)
                 found.append((rank, s, tries))
-        return sorted(found, key=lambda option: (option[0], self._priority[option[1].key]))
+        return sorted(found, key=lambda option: (option[0], self.priority[option[1].key]))
 
     # -- constraints of the model --------------------------------------------------------------------------
 
