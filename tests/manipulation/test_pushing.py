@@ -125,12 +125,17 @@ def test_contact_slots_keep_a_margin_for_each_pair_and_know_velocities_of_points
     slots.set_margin(PUSHER, ["drawer", "drawer/*"], -0.001)
     assert lower() == pytest.approx(-10 * (nearest.distance + 0.001))
     point, step = np.array([0.9, -1.0, 0.8]), 1e-6
-    J = slots.point_jacobian(scene.bodies.index(PUSHER), point)
+    finger, handle = (scene.bodies.index(name) for name in (PUSHER, "drawer/handle"))
+    J, still = slots.point_jacobians([finger, handle], np.array([point, point]))
     in_finger = np.linalg.inv(model.fk(PUSHER)(state)) @ [*point, 1]
     for k, speed in enumerate(speeds):
         moved = model.integrate(state, {speed: 1.0}, step)
         change = (model.fk(PUSHER)(moved) @ in_finger)[:3] - point
         np.testing.assert_allclose(J[:, k], change / step, atol=1e-5)
+        np.testing.assert_allclose(slots.point_velocity(finger, point, k), J[:, k], atol=1e-12)
+    along = np.array([str(speed) == "drawer:velocity" for speed in speeds])
+    assert np.abs(still[:, along]).max() > 0.99
+    assert not still[:, ~along].any()
     with pytest.raises(UnknownNameError, match="flnger"):
         slots.set_margin("robot/flnger", "*", 0.0)
     with pytest.raises(InvalidValueError, match="margin"):

@@ -172,20 +172,25 @@ class ContactSlots:
             )
         self._margins[self._selected[ones, others]] = margin
 
-    def point_jacobian(self, body: int, point: Array) -> Array:
-        """Return the velocity (3, n) of a point of a body over the columns, at the last update.
+    def point_jacobians(self, bodies: Sequence[int], points: Array) -> Array:
+        """Return the velocities (k, 3, n) of points of bodies over the columns, at the last update.
 
         Parameters
         ----------
-        body
-            Index of the body in the scene's ``bodies``.
-        point
-            The point in the world (3,) [m].
+        bodies
+            Index of the body of each point in the scene's ``bodies``, (k,).
+        points
+            The points in the world (k, 3) [m].
         """
-        twist = self._twists.outputs[0][self._group[body]]
-        x, y, z = point
-        across = np.array([[0.0, z, -y], [-z, 0.0, x], [y, -x, 0.0]])
-        return np.asarray(twist[:3] + across @ twist[3:])
+        twists = self._twists.outputs[0][self._group[[*bodies]]]
+        across = (points @ _ACROSS).reshape(-1, 3, 3)
+        return np.asarray(twists[:, :3] + across @ twists[:, 3:])
+
+    def point_velocity(self, body: int, point: Array, column: int) -> Array:
+        """Return the velocity (3,) of a point (3,) of a body for one column, at the last update."""
+        x, y, z, a, b, c = self._twists.outputs[0][self._group[body], :, column].tolist()
+        u, v, w = point.tolist()
+        return np.array([x + b * w - c * v, y + c * u - a * w, z + a * v - b * u])
 
     def bind(self, H: Array, f: Array, A: Array, lower: Array) -> None:
         """Choose the arrays of the program into which :meth:`write` writes.
@@ -214,6 +219,14 @@ class ContactSlots:
         used = min(len(self.found), self.count)
         if used:
             self._rows.write(self.found, used, gain=self.gain, recovery=recovery, weight=weight)
+
+
+_ACROSS = np.array(
+    [[0.0, 0.0, 0.0, 0.0, 0.0, 1.0, 0.0, -1.0, 0.0],
+     [0.0, 0.0, -1.0, 0.0, 0.0, 0.0, 1.0, 0.0, 0.0],
+     [0.0, 1.0, 0.0, -1.0, 0.0, 0.0, 0.0, 0.0, 0.0]]
+)  # fmt: skip
+"""Entries of the matrix -[p]×, whose product with ω is ω × p, by coordinate of p."""
 
 
 def check_slots(count: object) -> None:

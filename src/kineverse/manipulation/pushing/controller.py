@@ -277,11 +277,13 @@ class Pushing:
         senses = press.deviation > 0.0
         read = None if observation is None else observation.joints
         press.report(senses and observation is not None and not observation.touching.isdisjoint(self.pusher))
-        value = press.advance(state[self.coordinate], self._program.tip(state, read), self.touching)
+        tip = felt = self._program.tip(state)
+        if read is not None:
+            felt = self._program.tip(state, read)
+        value = press.advance(state[self.coordinate], felt, self.touching)
         if senses:
             state = state.updated({self.coordinate: min(max(value, self._limits[0]), self._limits[1])})
         found = self._program.load(state)
-        tip = self._program.tip(state)
         point = None if choice.chosen is None else self.surface.point_at(state, choice.chosen)
         if point is not None and not self.retreating and self._is_stuck(state, tip, point):
             self._give_up()
@@ -297,7 +299,7 @@ class Pushing:
         self._write(tip, point, contact)
         command = self._program.step()
         speeds = np.fromiter(command.speeds.values(), dtype=float)
-        press.plan(point.velocity, self._slots.point_jacobian(self._hand, tip) @ speeds)
+        press.plan(point.velocity, self._slots.point_jacobians([self._hand], tip[None])[0] @ speeds)
         return command
 
     def _update_touching(self, contact: PushPair | None) -> None:
@@ -380,18 +382,18 @@ class Pushing:
             distance, normal, thing = contact.gap, contact.normal, contact.thing
             free = self.touching and -_JAMMED * press.depth - press.slack < distance < LOST + press.slack
             slots, tangents = self._slots, contact.tangents
-            J = slots.point_jacobian(thing, contact.p)
-            relative = np.empty((3, len(self.speeds)))
-            relative[0] = normal @ (slots.point_jacobian(contact.robot, contact.r) - J)
-            relative[1:] = tangents @ (
-                slots.point_jacobian(self._hand, tip) - slots.point_jacobian(thing, tip)
+            touching, touched, hand, below = slots.point_jacobians(
+                (contact.robot, thing, self._hand, thing), np.array([contact.r, contact.p, tip, tip])
             )
+            relative = np.empty((3, len(self.speeds)))
+            relative[0] = normal @ (touching - touched)
+            relative[1:] = tangents @ (hand - below)
             program.set("relative", relative[:, program.columns].ravel())
             # A press that is late enough is not increased by the goal about the gap either.
             most = -PRESS * (1.0 - min(max(press.reserve, 0.0), 1.0))
             deeper = press.depth - PRESS
             program.set("gap", most if press.touched and self.touching else distance + deeper)
-            program.set("pushed", float(normal @ J[:, program.object_column]))
+            program.set("pushed", float(normal @ touched[:, program.object_column]))
             pose = self.scene.pose(self.scene.bodies[thing])
             program.set("slip", tangents @ self._anchor.drift(thing, pose, tip, press.weight))
         program.set("free", float(free))

@@ -155,8 +155,7 @@ class PairFinder:
             else:
                 robot, thing = int(b[row]), int(a[row])
                 r, p, normal = found.points_b[row], found.points_a[row], found.normals[row]
-            column = self._slots.point_jacobian(thing, p)[:, self._column]
-            velocity = np.asarray(self._sign * column)
+            velocity = self._sign * self._slots.point_velocity(thing, p, self._column)
             alignment = find_alignment(normal, velocity)
             if best is None or alignment > best.alignment:
                 best = PushPair(robot, thing, r, p, normal, gap, velocity, alignment)

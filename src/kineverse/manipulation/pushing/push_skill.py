@@ -257,8 +257,10 @@ class _Run:
         session, pushing = self._session, self._pushing
         session.phase = phase
         with session.timed("push"):
-            deviation = pushing.find_deviation(session.state, session.belief.deviation)
-            command = pushing.step(session.state, session.observation if deviation else None, deviation)
+            state, observation, deviation = session.state, session.observation, 0.0
+            if observation is not None:
+                deviation = pushing.find_deviation(state, session.belief.deviation)
+            command = pushing.step(state, observation if deviation else None, deviation)
         speeds = np.fromiter(command.speeds.values(), dtype=float)
         if pushing.touching and self._last is not None:
             self._changes.append(np.abs(speeds - self._last))
