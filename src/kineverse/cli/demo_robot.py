@@ -104,6 +104,7 @@ class RobotDemo:
     def __init__(self, arguments: argparse.Namespace) -> None:
         from kineverse.experiments.manipulation.robots import find_robots
         from kineverse.manipulation import find_articulated_objects
+        from kineverse.planning.bindings import request_planner
         from kineverse.worlds import Sensors
 
         self._arguments = arguments
@@ -118,6 +119,7 @@ class RobotDemo:
         self._robot = find_robots([arguments.robot or ROBOT])[0]
         if arguments.headless:
             check_picture_path(arguments.picture)
+        request_planner()
         with show_activity(f"reading the {KITCHEN} and the {self._robot.name}"):
             self.model = self._robot.load()
             self.model.include(KITCHEN)

@@ -178,7 +178,10 @@ def _add_arguments(parser: argparse.ArgumentParser, skill: str) -> None:
 
 
 def _run(arguments: argparse.Namespace, skill: str) -> int:
+    from kineverse.planning.bindings import request_planner
+
     _check(arguments)
+    request_planner()
     with show_activity(f"reading {arguments.model} and {arguments.robot}"):
         scene = make_scene(arguments, skill)
     print_notes(

@@ -12,7 +12,9 @@ import numpy as np
 from kineverse.compile.c_library import NO_COMPILER, SourceLibrary
 from kineverse.compile.toolchain import NO_UNDEFINED_FLAGS
 from kineverse.compile.vector_program import vector_header
+from kineverse.control.contact_rows import row_library
 from kineverse.errors import CompileError
+from kineverse.geometry.bindings import collision_library
 
 SOURCES = ("collision.c", "edges.c", "rrt_connect.c", "manifold.c", "roadmap.c")
 
@@ -121,6 +123,12 @@ class PlanningLibrary(SourceLibrary):
 @lru_cache(maxsize=1)
 def _library() -> PlanningLibrary:
     return PlanningLibrary()
+
+
+def request_planner() -> None:
+    """Have the planner compiled in the background, and before it what it takes less time to compile."""
+    for library in (collision_library, row_library, _library()):
+        library.prepare()
 
 
 def planning_functions() -> Any:
