@@ -104,7 +104,7 @@ def push_object(
 
     if not scene.pusher:
         return skip_skill(scene, world, False, scene.why)
-    with show_activity("compiling the controller; this is kept for the next time"):
+    with show_activity("building the controller"):
         pushing = Pushing(
             scene.model,
             scene.coordinate,
@@ -113,7 +113,6 @@ def push_object(
             target=scene.target,
             robot=scene.robot,
         )
-        pushing.wait()
     placed, where = 0, ""
     if not scene.stays:
         steps = round(arguments.seconds / 0.02)

@@ -70,7 +70,6 @@ class PushFallback:
                     dt=session.dt,
                     still=motion.gripper.joints,
                 )
-                self.pushing.wait()
                 found = find_push_start(
                     self.pushing, state, samples=_SAMPLES, seconds=math.inf, seed=seed, accept=self._plan
                 )

@@ -148,7 +148,6 @@ def push(
             leave_out=leave_out,
             logic=logic,
         )
-        pushing.wait()
     pushing.reset()
     run = _Run(session, pushing, seconds, tolerance, plan, on_step)
     try:

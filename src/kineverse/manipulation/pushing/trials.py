@@ -137,7 +137,6 @@ def try_push(
         leave_out=leave_out,
         logic=logic,
     )
-    pushing.wait()
 
     def attempt(start: State) -> tuple[Outcome, _Judge, Session]:
         world.reset(start)
