@@ -85,6 +85,22 @@ def test_grasps_differ_in_angle_place_and_half_turn() -> None:
         assert np.allclose(way, 0.1 * gripper.grasp_pose[:3, 0])
 
 
+def test_slanted_grasps_come_from_along_the_bar() -> None:
+    model = kv.load("kitchen")
+    model.include("hsr")
+    gripper, handle = find_gripper(model, "hsr"), find_handle(model, "kitchen/fridge_door")
+    judge = GraspJudge(model, "kitchen/kitchen", gripper)
+    grasps = sample_grasps(model, gripper, handle, count=24, slant=0.9)
+    slants = [grasp.slant for grasp in grasps]
+    assert -0.9 <= min(slants) < -0.3
+    assert 0.3 < max(slants) <= 0.9
+    for grasp in grasps[::6]:
+        check(judge, grasp)
+        way, along = grasp.pose[:3, :3] @ gripper.grasp_pose[:3, 0], handle.pose[:3, 2]
+        assert abs(math.asin(way @ along)) == pytest.approx(abs(grasp.slant), abs=1e-9)
+    assert all(grasp.slant == 0.0 for grasp in sample_grasps(model, gripper, handle, count=4))
+
+
 @pytest.mark.parametrize("robot", ["fetch", "hsr"])
 def test_both_fingers_touch_a_deep_bar_at_any_angle(robot: str) -> None:
     # A tilted hand meets two edges of it, which are not opposite each other in the middle.

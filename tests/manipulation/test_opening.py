@@ -128,6 +128,20 @@ def test_placement_keeps_the_grasp_along_the_way(at_the_door):
         np.testing.assert_allclose(hand(at), bar(at) @ found.grasp.pose, atol=1e-3)
 
 
+def test_a_hand_from_below_opens_a_door_that_none_from_across_reaches():
+    model = make_model("shelf_door", 1.5)
+    gripper, handle, state = find_gripper(model, "hsr"), find_handle(model, DOOR), start(model)
+    across = sample_grasps(model, gripper, handle, 32)
+    search = PlacementSearch(model, gripper, state)
+    assert search.find(state, across, 1.2, samples=200).failure == "reach"
+    world = KinematicWorld(model, "hsr")
+    world.reset(state)
+    outcome = open_object(Session(world), DOOR, target=1.2)
+    assert outcome, outcome.reason
+    assert not outcome.measures["pushed"]
+    assert outcome.measures["penetration"] < 5e-4
+
+
 def test_grasps_are_sampled_where_the_object_stands():
     model = kv.load("hsr")
     model.include("kitchens/17")

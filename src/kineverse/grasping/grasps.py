@@ -61,6 +61,8 @@ class Grasp:
         Pose handle.frame_T_hand (4, 4) before the hand approaches, outside of the handle [m].
     tilt
         Angle about the bar from its x axis to the direction from which the hand comes [rad].
+    slant
+        Angle from across the bar to that direction [rad].
     place
         Coordinate of the middle of the pads along the bar [m].
     thickness
@@ -78,10 +80,13 @@ class Grasp:
     place: float
     thickness: float
     clearance: float
+    slant: float = 0.0
 
     def __str__(self) -> str:
         tilt, place = math.degrees(self.tilt), self.place * 1e3
-        return f"grasp of {self.handle.frame} by {self.gripper.hand}: tilted {tilt:.0f}°, at {place:.0f} mm"
+        slant = f", slanted {math.degrees(self.slant):.0f}°" if self.slant else ""
+        hand = self.gripper.hand
+        return f"grasp of {self.handle.frame} by {hand}: tilted {tilt:.0f}°{slant}, at {place:.0f} mm"
 
 
 def sample_grasps(
@@ -92,6 +97,7 @@ def sample_grasps(
     seed: int = 0,
     *,
     state: State | None = None,
+    slant: float = 0.0,
     decomposed: Iterable[str] = (),
 ) -> tuple[Grasp, ...]:
     """Return grasps across a bar, without contact of the gripper with the object, the best first.
@@ -113,6 +119,9 @@ def sample_grasps(
         Seed of the samples: equal arguments give equal grasps.
     state
         Where everything stands while the hand approaches; default values without it.
+    slant
+        Largest angle by which the hand comes from along a bar, instead of from across it [rad]; an arm that
+        ends below an upright bar reaches it so.
     decomposed
         Bodies, or patterns, as for :class:`kineverse.geometry.Scene`: without them a mesh is its convex hull.
 
@@ -130,7 +139,7 @@ def sample_grasps(
     found: list[tuple[float, Grasp]] = []
     hits: Counter[tuple[str, str]] = Counter()
     rng = np.random.default_rng(seed)
-    for grasp, cost in _candidates(gripper, handle, surroundings.bar, _CANDIDATES * count, rng):
+    for grasp, cost in _candidates(gripper, handle, surroundings.bar, _CANDIDATES * count, slant, rng):
         pair = surroundings.find_contact(grasp)
         closed = None if pair else surroundings.close(grasp)
         if closed is not None:
@@ -151,7 +160,7 @@ def sample_grasps(
 
 
 def _candidates(
-    gripper: Gripper, handle: Handle, bar: Part, count: int, rng: np.random.Generator
+    gripper: Gripper, handle: Handle, bar: Part, count: int, most: float, rng: np.random.Generator
 ) -> Iterator[tuple[Grasp, float]]:
     """Yield grasps that close around the bar, and what they cost: centred and upright ones little."""
     length, width = gripper.pads.size
@@ -166,7 +175,9 @@ def _candidates(
         spin = rng.uniform(-math.pi / 2, math.pi / 2) if is_knob and k > 1 else 0.0
         part[0] *= abs(part[0])  # many are nearly upright, which fits where there is little room
         tilt, place, depth = part * (_MOST_TILT_OF_KNOB if is_knob else _MOST_TILT, along, deep)
+        slant = rng.uniform(-most, most) if most and not is_knob else 0.0
         bar_R_grasp = lie.rotation_x(np.array(spin)) @ lie.rotation_z(np.array(tilt + math.pi))
+        bar_R_grasp = bar_R_grasp @ lie.rotation_y(np.array(slant))
         if k % 2:
             bar_R_grasp = bar_R_grasp @ lie.rotation_x(np.array(math.pi))
         across = frame_R_bar @ bar_R_grasp[:, 1]
@@ -176,7 +187,7 @@ def _candidates(
         z = np.array([0.0, 0.0, 0.0 if is_knob else place])
         bar_T_grasp = lie.transform(bar_R_grasp, z - depth * bar_R_grasp[:, 0])
         pose, approach = _place_hand(gripper, handle.pose @ bar_T_grasp, thickness)
-        grasp = Grasp(gripper, handle, pose, approach, float(tilt), float(z[2]), thickness, 0.0)
+        grasp = Grasp(gripper, handle, pose, approach, float(tilt), float(z[2]), thickness, 0.0, slant)
         yield grasp, float(np.abs(part).sum())
 
 

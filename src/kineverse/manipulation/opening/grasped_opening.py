@@ -34,6 +34,8 @@ from .placement import PlacementSearch
 from .push_fallback import PushFallback
 
 _GRASPS = 96
+_SLANT = math.radians(50.0)
+"""Largest slant of grasps where those from across the handle lead nowhere [rad]."""
 _PLANNING = 2.0
 """Largest time to plan the way to the handle [s]."""
 _PROOF = 200
@@ -156,13 +158,13 @@ class _Opener:
             self._approaches = ApproachPlanner(self.search)
         return self._approaches
 
-    def grasps(self, handle: Handle, state: State, seed: int) -> tuple[Grasp, ...]:
-        """Return the grasps of a handle where everything but the robot is as in a state."""
+    def grasps(self, handle: Handle, state: State, seed: int, slant: float = 0.0) -> tuple[Grasp, ...]:
+        """Return the grasps of a handle where everything but the robot is as in a state, up to a slant."""
         robot = self.gripper.robot
         others = tuple(v for s, v in state.items() if not robot or not is_of_robot(s.path, robot))
-        key = handle.frame, handle.coordinate, seed, others
+        key = handle.frame, handle.coordinate, seed, slant, others
         if key not in self._grasps:
-            found = sample_grasps(self.model, self.gripper, handle, _GRASPS, seed, state=state)
+            found = sample_grasps(self.model, self.gripper, handle, _GRASPS, seed, state=state, slant=slant)
             self._grasps = {**dict([*self._grasps.items()][-_KEPT:]), key: found}
         return self._grasps[key]
 
@@ -348,12 +350,17 @@ class _Run:
         return found
 
     def _search(self, samples: int) -> BasePlacement:
+        """Search a placement, with hands that come from along the bar where no other one leads to it."""
+        found = self._search_with(samples, 0.0)
+        return found or self._search_with(samples, _SLANT) or found
+
+    def _search_with(self, samples: int, slant: float) -> BasePlacement:
         """Search a placement among the most sampled bases that are allowed, and count them."""
         session, search = self.session, self.opener.search
         session.phase = "place"
         with session.timed("place"):
             try:
-                grasps = self.opener.grasps(self.handle, session.state, self.seed)
+                grasps = self.opener.grasps(self.handle, session.state, self.seed, slant)
             except InvalidValueError as error:
                 raise SkillError("collision", str(error)) from error
             found = search.find(
