@@ -19,7 +19,6 @@ import subprocess
 import threading
 import time
 from collections.abc import Callable, Sequence
-from time import perf_counter
 from typing import TypeAlias
 from weakref import WeakMethod
 
@@ -47,7 +46,7 @@ def working_seconds() -> float:
 
     Limits of a search are measured by it: what is compiled once is no part of the search.
     """
-    return perf_counter() - _waits.seconds
+    return time.perf_counter() - _waits.seconds
 
 
 class BuildJob:
@@ -93,11 +92,11 @@ class BuildJob:
             In seconds; forever if None.
         """
         _worker.prioritise(self)
-        begin = perf_counter()
+        begin = time.perf_counter()
         try:
             return self._done.wait(timeout)
         finally:
-            _waits.seconds += perf_counter() - begin
+            _waits.seconds += time.perf_counter() - begin
 
     def finish(self, path: str | None = None, error: str | None = None) -> None:
         """Set the result and notify the listeners, in the worker's thread."""

@@ -23,7 +23,7 @@ from kineverse.expressions.expression import Expression, array, as_expression
 from kineverse.geometry import Rule, Scene
 from kineverse.geometry.prepared_query import PairFlags, flag_between, flag_matching
 from kineverse.geometry.results import DistanceResults
-from kineverse.lie import Array
+from kineverse.lie import Array, skew
 from kineverse.model.frame_dependence import FrameDependence
 from kineverse.symbols import Symbol
 
@@ -183,8 +183,7 @@ class ContactSlots:
             The points in the world (k, 3) [m].
         """
         twists = self._twists.outputs[0][self._group[[*bodies]]]
-        across = (points @ _ACROSS).reshape(-1, 3, 3)
-        return np.asarray(twists[:, :3] + across @ twists[:, 3:])
+        return np.asarray(twists[:, :3] - skew(points) @ twists[:, 3:])
 
     def point_velocity(self, body: int, point: Array, column: int) -> Array:
         """Return the velocity (3,) of a point (3,) of a body for one column, at the last update."""
@@ -219,14 +218,6 @@ class ContactSlots:
         used = min(len(self.found), self.count)
         if used:
             self._rows.write(self.found, used, gain=self.gain, recovery=recovery, weight=weight)
-
-
-_ACROSS = np.array(
-    [[0.0, 0.0, 0.0, 0.0, 0.0, 1.0, 0.0, -1.0, 0.0],
-     [0.0, 0.0, -1.0, 0.0, 0.0, 0.0, 1.0, 0.0, 0.0],
-     [0.0, 1.0, 0.0, -1.0, 0.0, 0.0, 0.0, 0.0, 0.0]]
-)  # fmt: skip
-"""Entries of the matrix -[p]×, whose product with ω is ω × p, by coordinate of p."""
 
 
 def check_slots(count: object) -> None:

@@ -164,7 +164,7 @@ def _candidates(
 ) -> Iterator[tuple[Grasp, float]]:
     """Yield grasps that close around the bar, and what they cost: centred and upright ones little."""
     length, width = gripper.pads.size
-    is_knob = handle.length < 1.5 * handle.thickness
+    is_knob = handle.is_knob
     along = max(handle.length / 2 - width / 2 - 5e-3, 0.0)
     overlap = min(handle.depth, max(handle.depth / 2 + 3e-3, 8e-3))  # of bar and pads, along the approach
     deep = max((length + handle.depth) / 2 - overlap, 0.0)

@@ -60,6 +60,11 @@ class Handle:
     shape: int
     is_visual: bool = False
 
+    @property
+    def is_knob(self) -> bool:
+        """True if the bar is about as long as thick, so that it has no direction to speak of."""
+        return self.length < 1.5 * self.thickness
+
     def __str__(self) -> str:
         sizes = f"{self.length * 1e3:.0f} mm long, {self.thickness * 1e3:.0f} mm thick"
         kind = ", from visual shapes" if self.is_visual else ""

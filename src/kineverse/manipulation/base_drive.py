@@ -11,6 +11,7 @@ from __future__ import annotations
 import heapq
 import math
 from collections.abc import Callable, Sequence
+from functools import cached_property
 from itertools import pairwise
 from typing import TypeAlias
 
@@ -213,9 +214,9 @@ class DriveSearch:
         turn_angle = 2.0 * math.pi / _HEADINGS
         self._headings = [start[2] + turn_angle * k for k in range(_HEADINGS)]
 
-    @property
+    @cached_property
     def begins_free(self) -> bool:
-        """Tell whether the robot touches nothing at the start."""
+        """True if the robot touches nothing at the start."""
         self._place()
         return self._is_free(np.array([self._start]))
 

@@ -126,7 +126,7 @@ def _library() -> PlanningLibrary:
 
 
 def request_planner() -> None:
-    """Have the planner compiled in the background, and before it what it takes less time to compile."""
+    """Request the planner in the background, after queries and contact rows, which are needed sooner."""
     for library in (collision_library, row_library, _library()):
         library.prepare()
 

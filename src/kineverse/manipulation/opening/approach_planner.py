@@ -13,8 +13,11 @@ from kineverse.planning import Planner, Trajectory
 from kineverse.state import State
 from kineverse.symbols import Symbol
 
+from .base_placement import BasePlacement
 from .placement import PlacementSearch
 
+_PLANNING = 2.0
+"""Largest time to plan the way to the handle [s]."""
 _TUCKED = 300
 """Number of random arms among which a compact one is chosen."""
 _MOST_TUCKED, _TUCKING = 3, 2.0
@@ -51,6 +54,11 @@ class Approach:
 
     def __bool__(self) -> bool:
         return not self.why
+
+    @property
+    def barrier(self) -> str:
+        """Sentence that there is no way, to be added to another one; empty if there is a way."""
+        return f" There is no way to the handle: {self.why}" if self.why else ""
 
 
 class ApproachPlanner:
@@ -107,6 +115,11 @@ class ApproachPlanner:
         if not path.found:
             return Approach(path.why)
         return Approach("", path.trajectory(), tuck, places, base)
+
+    def plan_to(self, state: State, placement: BasePlacement, seed: int) -> Approach:
+        """Plan a way from a state to the pose before the handle of a placement, within 2 s."""
+        wanted = dict(zip(placement.coordinates, placement.approach.tolist(), strict=True))
+        return self.plan(state, wanted, seconds=_PLANNING, seed=seed)
 
     def can_drive(self, state: State) -> bool:
         """Return whether the base rolls to other places by itself from a state."""

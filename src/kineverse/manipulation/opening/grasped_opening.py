@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import math
 from collections.abc import Hashable, Mapping
 from typing import Any
@@ -36,8 +37,6 @@ from .push_fallback import PushFallback
 _GRASPS = 96
 _SLANT = math.radians(50.0)
 """Largest slant of grasps where those from across the handle lead nowhere [rad]."""
-_PLANNING = 2.0
-"""Largest time to plan the way to the handle [s]."""
 _PROOF = 200
 """Largest number of sampled bases that are to prove that an object is too high."""
 _MOST_GRASPS = 4
@@ -206,8 +205,7 @@ class _Run:
         self.slips: list[str] = []
         self._rest = math.inf
         self._earlier: list[Mapping[str, Any]] = []
-        self._barrier = ""
-        self._approach: Approach
+        self._approach = Approach()
         self.judge = Judge(self.model, session.world.robot, self.gripper, handle=handle.frame)
         self.judge.update(session.world.state)
         self.motion = HandMotion(
@@ -346,13 +344,16 @@ class _Run:
         """Return a placement that leads as far as possible, and plan the way to the handle."""
         found = self._search(self.samples)
         if not found:
-            raise SkillError(found.failure, f"{found.why}{self._barrier}")
+            raise SkillError(found.failure, f"{found.why}{self._approach.barrier}")
         return found
 
     def _search(self, samples: int) -> BasePlacement:
         """Search a placement, with hands that come from along the bar where no other one leads to it."""
         found = self._search_with(samples, 0.0)
-        return found or self._search_with(samples, _SLANT) or found
+        if not found and not self.handle.is_knob:
+            with contextlib.suppress(SkillError):  # there may be no room for such a hand
+                found = self._search_with(samples, _SLANT) or found
+        return found
 
     def _search_with(self, samples: int, slant: float) -> BasePlacement:
         """Search a placement among the most sampled bases that are allowed, and count them."""
@@ -376,13 +377,8 @@ class _Run:
 
     def _plan(self, placement: BasePlacement) -> bool:
         """Plan the way to the pose before the handle, and return whether there is one."""
-        wanted = dict(zip(placement.coordinates, placement.approach.tolist(), strict=True))
-        self._approach = self.opener.approaches.plan(
-            self.session.state, wanted, seconds=_PLANNING, seed=self.seed
-        )
-        why = self._approach.why
-        self._barrier = f" There is no way to the handle: {why}" if why else ""
-        return not why
+        self._approach = self.opener.approaches.plan_to(self.session.state, placement, self.seed)
+        return bool(self._approach)
 
     def _come(self, placement: BasePlacement) -> None:
         """Bring the base to its place, and the hand to the handle."""

@@ -199,10 +199,6 @@ class Pushing:
         own = motion.moving_ancestors(self.tool.frame)
         return next((b for b in self.pusher if motion.moving_ancestors(b) == own), self.pusher[0])
 
-    def wait(self, timeout: float | None = None) -> bool:
-        """Wait until everything is compiled, at most for a time [s], and return whether it is."""
-        return self.controller.wait(timeout)
-
     def reset(self) -> None:
         """Forget all contacts."""
         self.controller.reset()

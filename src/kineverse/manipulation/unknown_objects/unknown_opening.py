@@ -11,7 +11,7 @@ from kineverse.errors import InfeasibleError, InvalidValueError, NotFiniteError,
 from kineverse.grasping import Grasp, find_gripper, sample_grasps
 from kineverse.lie import Array, inverse
 from kineverse.manipulation.opening import BasePlacement, PlacementSearch
-from kineverse.manipulation.opening.approach_planner import ApproachPlanner
+from kineverse.manipulation.opening.approach_planner import Approach, ApproachPlanner
 from kineverse.manipulation.opening.hand_motion import HandMotion
 from kineverse.manipulation.opening.hand_retreat import find_retreat
 from kineverse.manipulation.outcome import Outcome, SkillError
@@ -35,7 +35,7 @@ _MOST_LOOKING = 3.0
 """Largest time until a part is seen [s]."""
 _REACH = 0.25
 """Straight way of the handle that a placement should allow [m]."""
-_GRASPS, _PLANNING = 128, 2.0
+_GRASPS = 128
 _SEARCHES, _ENOUGH = 3, 0.99
 """Number of searches of a first place, and share of possible motions from which on it is taken."""
 _MOST_PLACES = 3
@@ -273,7 +273,7 @@ class _Run:
         for _, placement in sorted(found, key=lambda pair: -pair[0]):
             if self._plan(placement):
                 return placement
-        raise SkillError("collision", f"{why}{self._barrier}")
+        raise SkillError("collision", f"{why}{self.approach.barrier}")
 
     def _place_further(self) -> BasePlacement:
         """Return a placement along the learned joint."""
@@ -287,7 +287,7 @@ class _Run:
         rest = self.wanted[kind] - self.pulling.opening[kind]
         found = self._search(_FURTHER * scale * rest, self._plan, self.seed)
         if not found:
-            raise SkillError(found.failure, f"{found.why}{self._barrier}")
+            raise SkillError(found.failure, f"{found.why}{self.approach.barrier}")
         return found
 
     def _pull(self, placement: BasePlacement) -> str:
@@ -333,7 +333,7 @@ class _Run:
 
     def _search(self, way: float, accept: Callable[[BasePlacement], bool], seed: int) -> BasePlacement:
         """Search a placement from which the handle can be pulled by a way [m], or as far as possible."""
-        session, self._barrier = self.session, ""
+        session, self.approach = self.session, Approach()
         session.phase = "place"
         with session.timed("place"):
             model, handle = self.unknown.model, self.unknown.handle
@@ -344,11 +344,8 @@ class _Run:
 
     def _plan(self, placement: BasePlacement) -> bool:
         """Plan the way to the pose before the handle, and return whether there is one."""
-        wanted = dict(zip(placement.coordinates, placement.approach.tolist(), strict=True))
-        self.approach = self.approaches.plan(self.session.state, wanted, seconds=_PLANNING, seed=self.seed)
-        why = self.approach.why
-        self._barrier = f" There is no way to the handle: {why}" if why else ""
-        return not why
+        self.approach = self.approaches.plan_to(self.session.state, placement, self.seed)
+        return bool(self.approach)
 
     def _come(self, placement: BasePlacement) -> None:
         """Bring a base on wheels to its place, and the hand to the handle."""
