@@ -4,6 +4,10 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
+from typing import NamedTuple
+
+import numpy as np
+import numpy.typing as npt
 
 from kineverse.geometry.results import DistanceResult
 from kineverse.lie import Array
@@ -23,6 +27,36 @@ class StepTimes:
     total: float
 
 
+class TaskErrors(NamedTuple):
+    """Errors of tasks at a state.
+
+    Attributes
+    ----------
+    names, values
+        Names (k,) of the tasks, and norms (k,) of their errors at the state.
+    speed_goals, first_rows
+        Places of goals about speeds among these, and of their first rows in ``jacobian``.
+    jacobian, rate
+        Jacobian (m, n) and wanted rates (m,) of all goals about speeds; None without any.
+    """
+
+    names: tuple[str, ...]
+    values: Array
+    speed_goals: npt.NDArray[np.intp]
+    first_rows: npt.NDArray[np.intp]
+    jacobian: Array | None
+    rate: Array | None
+
+    def norms(self, speeds: Array) -> dict[str, float]:
+        """Return the norm of the error of each task at speeds (n,), by name."""
+        values = self.values
+        if self.jacobian is not None and self.rate is not None:
+            squares = (self.jacobian @ speeds - self.rate) ** 2
+            values = values.copy()
+            values[self.speed_goals] = np.sqrt(np.add.reduceat(squares, self.first_rows))
+        return dict(zip(self.names, values.tolist(), strict=True))
+
+
 @dataclass(frozen=True, slots=True, eq=False)
 class Command:
     """Speeds for one time step, with the state of each task.
@@ -31,9 +65,8 @@ class Command:
     ----------
     speeds
         Speed by symbol, for ``model.integrate`` and for drives [m/s], [rad/s].
-    residuals
-        Norm of the error of each task at the state, by name, in the unit of its expression; for a goal about
-        speeds the norm of what is missing, for a keep its violation.
+    vector
+        The speeds (n,) in the order of the controller's.
     progress
         Share of the wanted correction of holds that is possible, in [0, 1]: the least of all holds, 1 if
         nothing is held.
@@ -46,13 +79,22 @@ class Command:
     """
 
     speeds: Mapping[Symbol, float]
-    residuals: Mapping[str, float]
+    vector: Array = field(repr=False)
     progress: float
     times: StepTimes
     iterations: int
     multipliers: Array = field(repr=False)
     row_names: tuple[tuple[str, ...], ...] = field(repr=False)
     contacts: Sequence[DistanceResult] = field(repr=False)
+    errors: TaskErrors = field(repr=False)
+
+    @property
+    def residuals(self) -> dict[str, float]:
+        """Norm of the error of each task at the state, by name, in the unit of its expression.
+
+        That of a goal about speeds is the norm of what is missing, that of a keep its violation.
+        """
+        return self.errors.norms(self.vector)
 
     @property
     def active(self) -> tuple[str, ...]:

@@ -21,9 +21,10 @@ from kineverse.compile.function import WantedTier
 from kineverse.errors import InvalidValueError
 from kineverse.expressions.expression import Expression, array, as_expression
 from kineverse.geometry import Rule, Scene
+from kineverse.geometry.bindings import FacingPoints
 from kineverse.geometry.prepared_query import PairFlags, flag_between, flag_matching
 from kineverse.geometry.results import DistanceResults
-from kineverse.lie import Array, skew
+from kineverse.lie import Array
 from kineverse.model.frame_dependence import FrameDependence
 from kineverse.symbols import Symbol
 
@@ -61,7 +62,7 @@ class ContactSlots:
         Symbols of :meth:`update`, in the order of its vector.
     found
         Near pairs of the last update, nearest first, all of them. Parallel faces are there with several
-        points, see :meth:`.DistanceResults.extend`: a turn away from the one brings the other nearer.
+        points, see :class:`.FacingPoints`: a turn away from the one brings the other nearer.
     function
         Compiled twists of the groups of bodies.
     gain, radius
@@ -109,6 +110,8 @@ class ContactSlots:
         groups = {group: k for k, group in enumerate(dict.fromkeys(((), *moved)))}
         self._group = np.array([groups[group] for group in moved], dtype=np.intp)
         self._margins = np.full((len(scene.bodies), len(scene.bodies)), self.margin)
+        # Pairs with a margin of their own press on each other, and slide.
+        self._facing = FacingPoints(self._margins, self.margin)
         self._rows: ContactRows
         self._selected: dict[tuple[tuple[str, ...], tuple[str, ...]], PairFlags] = {}
         members = dict(zip(moved, scene.bodies, strict=True))
@@ -137,11 +140,7 @@ class ContactSlots:
                 "Build anew, or with a scene of model.snapshot()."
             )
         self.scene.update(values[self._scene_values])
-        found = self._query(self.radius)
-        margins = self._margins[found.body_indices[:, 0], found.body_indices[:, 1]]
-        # Pairs with a margin of their own press on each other, and slide.
-        gaps = np.where(margins == self.margin, found.distances - margins, math.inf)
-        self.found = found.extend(gaps)
+        self.found = self._query(self.radius, self._facing)
         self._twists.input[:] = values[self._twist_values]
         self._twists()
 
@@ -172,24 +171,17 @@ class ContactSlots:
             )
         self._margins[self._selected[ones, others]] = margin
 
-    def point_jacobians(self, bodies: Sequence[int], points: Array) -> Array:
-        """Return the velocities (k, 3, n) of points of bodies over the columns, at the last update.
+    def twist(self, body: int) -> Array:
+        """Return the twist (v, ω) of a body, (6, n) over the columns in the world, at the last update.
+
+        The velocities of a point p of the body are ``v + ω × p``.
 
         Parameters
         ----------
-        bodies
-            Index of the body of each point in the scene's ``bodies``, (k,).
-        points
-            The points in the world (k, 3) [m].
+        body
+            Index of the body in the scene's ``bodies``.
         """
-        twists = self._twists.outputs[0][self._group[[*bodies]]]
-        return np.asarray(twists[:, :3] - skew(points) @ twists[:, 3:])
-
-    def point_velocity(self, body: int, point: Array, column: int) -> Array:
-        """Return the velocity (3,) of a point (3,) of a body for one column, at the last update."""
-        x, y, z, a, b, c = self._twists.outputs[0][self._group[body], :, column].tolist()
-        u, v, w = point.tolist()
-        return np.array([x + b * w - c * v, y + c * u - a * w, z + a * v - b * u])
+        return np.asarray(self._twists.outputs[0][self._group[body]])
 
     def bind(self, H: Array, f: Array, A: Array, lower: Array) -> None:
         """Choose the arrays of the program into which :meth:`write` writes.

@@ -27,7 +27,7 @@ from kineverse.model.model_view import ModelView
 from kineverse.state import State, StateLike, as_state
 from kineverse.symbols import Symbol, parameter
 
-from .command import Command, StepTimes
+from .command import Command, StepTimes, TaskErrors
 from .contact_slots import ContactSlots, check_slots
 from .control_loop import LoopReport, run_control_loop
 from .diagnosis import Diagnosis
@@ -379,25 +379,28 @@ class Controller:
         if len(self._before):
             self._before[:] = self._last
         self._last[:] = x[:n]
-        if len(self._program.speed_goals):
-            jacobian, rate = self._evaluate.outputs[-2:]
-            squares = (jacobian @ x[:n] - rate) ** 2
-            residuals[self._program.speed_goals] = np.sqrt(np.add.reduceat(squares, self._program.speed_rows))
+        program, jacobian, rate = self._program, None, None
+        if len(program.speed_goals):
+            jacobian, rate = (output.copy() for output in self._evaluate.outputs[-2:])
+        errors = TaskErrors(
+            program.residuals, residuals.copy(), program.speed_goals, program.speed_rows, jacobian, rate
+        )
         values = x.tolist()
         return Command(
             dict(zip(self.speeds, values, strict=False)),
-            dict(zip(self._program.residuals, residuals.tolist(), strict=True)),
+            x[:n],
             min(values[n:], default=1.0),
             times,
             iterations,
             multipliers,
             self._row_names,
             () if self._contacts is None else self._contacts.found,
+            errors,
         )
 
     def _read(self, state: StateLike | npt.ArrayLike) -> None:
         """Write the values of the inputs at a state."""
-        if isinstance(state, Mapping):
+        if not isinstance(state, np.ndarray) and isinstance(state, Mapping):
             if not isinstance(state, State):
                 state = as_state(state, (*self.model.symbols, *self.model.speeds, *self.inputs))
             self._values[: len(self._coordinates)] = state.vector(self._coordinates)

@@ -60,6 +60,13 @@ class _QueryStruct(ctypes.Structure):
     )
 
 
+class _FacingStruct(ctypes.Structure):
+    _fields_ = (
+        ("margins", ctypes.c_void_p),
+        *((name, ctypes.c_double) for name in ("usual", "angle", "apart")),
+    )
+
+
 class _NeighbourStruct(ctypes.Structure):
     _fields_ = (
         ("reach", ctypes.c_double),
@@ -67,6 +74,37 @@ class _NeighbourStruct(ctypes.Structure):
         ("pairs", ctypes.c_void_p),
         *((name, ctypes.c_int64) for name in ("found", "room", "resets")),
     )
+
+
+class FacingPoints:
+    """Further facing points of near pairs of a query: what of them counts.
+
+    Parallel faces are nearest at every point, and a query finds one of them. Faces that are parallel, up to
+    an angle, have up to four further pairs of points, with the distance along the normal of the pair, see
+    :mod:`.manifold_c`. Meshes of triangles have none, nor has anything without a C compiler.
+
+    Parameters
+    ----------
+    margins
+        (B, B) distances that pairs of bodies keep [m]; the array is read at each query.
+    usual
+        Margin of the pairs that have facing points; others have none [m].
+    angle
+        Angle up to which faces count as parallel [rad]. A pair is near if a turn by it may close the gap
+        beyond the margin.
+    apart
+        Least distance of two points of a body [m].
+
+    Attributes
+    ----------
+    address
+        Address of the parameters as C reads them.
+    """
+
+    def __init__(self, margins: Floats, usual: float, angle: float = 0.02, apart: float = 0.1) -> None:
+        self._margins = margins
+        self._struct = _FacingStruct(margins.ctypes.data, usual, angle, apart)
+        self.address = ctypes.addressof(self._struct)
 
 
 class ObjectPlacement:
@@ -153,39 +191,25 @@ class CollisionLibrary(SourceLibrary):
         self._code.measure(_bind_table(table).address, *where)
         return distances, witnesses
 
-    def extend(
-        self, table: ObjectTable, pairs: Indices, witnesses: Floats, angle: float, apart: float
-    ) -> tuple[npt.NDArray[np.int64], Floats, Floats]:
-        """Find further facing points of near pairs, as far as C can; none without it.
+    def extend(self, table: ObjectTable, ranked: RankedPairs, facing: FacingPoints) -> RankedPairs:
+        """Return ranked pairs with further facing points of near ones, nearest first; without C, as given."""
+        if self._code is None or not len(ranked[2]):
+            return ranked
+        binding = _bind_table(table)
+        while True:
+            binding.take(ranked)
+            if self._extend(binding, facing):
+                return binding.copy_ranked()
 
-        Parameters
-        ----------
-        pairs, witnesses
-            Objects (K, 2) and their nearest points and normals (K, 9).
-        angle
-            Angle of the turns that bring other points nearest [rad].
-        apart
-            Least distance of two points of an object [m].
-
-        Returns
-        -------
-        which, distances, further
-            Indices (N,) of the pairs, distances along their normals (N,) [m], and both points and the normal
-            (N, 9).
-        """
-        count = len(pairs) if self._code is not None else 0
-        which, distances, further = (
-            np.empty(4 * count, np.int64),
-            np.empty(4 * count),
-            np.empty((4 * count, 9)),
-        )
-        found = 0
-        if count:
-            pairs, witnesses = np.ascontiguousarray(pairs), np.ascontiguousarray(witnesses)
-            where = pairs.ctypes.data, count, witnesses.ctypes.data, angle, apart
-            out = which.ctypes.data, distances.ctypes.data, further.ctypes.data
-            found = self._code.extend(_bind_table(table).address, *where, *out)
-        return which[:found], distances[:found], further[:found]
+    def _extend(self, binding: _TableBinding, facing: FacingPoints) -> bool:
+        """Add facing points to the results of a query; False, with larger buffers, if they were too short."""
+        found = self._code.extend(binding.address, binding.query_address, facing.address)
+        if found < 0:
+            raise MemoryError("There is no memory for the facing points of near bodies.")
+        if found <= binding.query.room:
+            return True
+        binding.reserve(2 * found)
+        return False
 
     def rank(
         self, table: ObjectTable, pairs: Indices, distances: Floats, radius: float, per_shape: bool = False
@@ -225,10 +249,12 @@ class CollisionLibrary(SourceLibrary):
         radius: float,
         selection: PairSelection | None = None,
         per_shape: bool = False,
+        facing: FacingPoints | None = None,
     ) -> tuple[MeasuredPairs | None, RankedPairs | None]:
         """Apply :meth:`near`, :meth:`measure` and, if none is left to coal, :meth:`rank` and :meth:`gather`.
 
-        The search covers the selected pairs of bodies, or all checked pairs if None.
+        The search covers the selected pairs of bodies, or all checked pairs if None. With ``facing``, ranked
+        pairs are extended, see :meth:`extend`.
 
         Returns
         -------
@@ -255,14 +281,12 @@ class CollisionLibrary(SourceLibrary):
                 known.reserve(-2 * found)
             elif found > query.room:
                 binding.reserve(2 * found)
-            else:
+            elif query.kept <= 0 or facing is None or self._extend(binding, facing):
                 break
-        kept = query.kept
-        if kept < 0:
+        if query.kept < 0:
             pairs, lows = binding.pairs[:found], binding.lows[:found]
             return (pairs, lows, binding.distances[:found], binding.witnesses[:found]), None
-        objects, bodies, near, points = binding.nearest
-        return None, (objects[:kept].copy(), bodies[:kept].copy(), near[:kept].copy(), points[:kept].copy())
+        return None, binding.copy_ranked()
 
 
 class _TableBinding:
@@ -304,6 +328,22 @@ class _TableBinding:
             setattr(self.query, name, array.ctypes.data)
         self.query.room = count
 
+    def take(self, ranked: RankedPairs) -> None:
+        """Copy ranked pairs into the buffers of results."""
+        kept = len(ranked[2])
+        if kept > self.query.room:
+            self.reserve(2 * kept)
+        buffers: tuple[npt.NDArray[Any], ...] = self.nearest
+        for own, given in zip(buffers, ranked, strict=True):
+            own[:kept] = given
+        self.query.kept = kept
+
+    def copy_ranked(self) -> RankedPairs:
+        """Return the results of the last query."""
+        kept = self.query.kept
+        objects, bodies, near, points = self.nearest
+        return objects[:kept].copy(), bodies[:kept].copy(), near[:kept].copy(), points[:kept].copy()
+
 
 class _NeighbourBinding:
     """List of neighbours among selected pairs, as C reads and writes it."""
@@ -337,10 +377,7 @@ def _declare_signatures(code: Any) -> None:
     code.near.restype = ctypes.c_int64
     code.measure.argtypes = (pointer, pointer, ctypes.c_int64, ctypes.c_double, pointer, pointer)
     code.measure.restype = None
-    code.extend.argtypes = (
-        pointer, pointer, ctypes.c_int64, pointer, ctypes.c_double, ctypes.c_double, *(pointer,) * 3
-    )  # fmt: skip
-    code.extend.restype = ctypes.c_int64
+    code.extend.argtypes, code.extend.restype = (pointer, pointer, pointer), ctypes.c_int64
     code.rank.argtypes = (pointer, pointer, ctypes.c_int64, pointer, ctypes.c_double, ctypes.c_int64, pointer)
     code.rank.restype = ctypes.c_int64
     code.gather.argtypes = (*(pointer,) * 5, ctypes.c_int64, *(pointer,) * 4)

@@ -9,7 +9,7 @@ import numpy.typing as npt
 
 from kineverse.errors import InvalidValueError
 
-from .bindings import collision_library
+from .bindings import FacingPoints, collision_library
 from .broadphase import Indices, PairSelection
 from .collision_world import CollisionWorld
 from .mesh_files import Floats
@@ -41,24 +41,29 @@ def find_pairs_within(
     radius: float,
     selection: PairSelection | None = None,
     per_shape: bool = False,
+    facing: FacingPoints | None = None,
 ) -> DistanceResults:
     """Return the pairs of bodies within a radius [m], nearest first.
 
     All checked pairs are searched, or only the selected ones. If ``per_shape``, the results are all pairs of
-    collision objects, else the nearest of each pair of bodies. Selected objects have solids already.
+    collision objects, else the nearest of each pair of bodies. Selected objects have solids already. With
+    ``facing``, near pairs have further facing points.
     """
     check_radius(radius)
     world.prepare(None if selection is None else ())
     table = world.table
     reach = radius + ACCURACY
-    measured, nearest = collision_library.search(table, reach, radius, selection, per_shape)
+    measured, nearest = collision_library.search(table, reach, radius, selection, per_shape, facing)
     if measured is None:
         assert nearest is not None
         return DistanceResults(world, *nearest)
     pairs, lows, distances, witnesses = measured
     world.measure_remaining(pairs, lows, radius, distances, witnesses, per_shape)
     order = collision_library.rank(table, pairs, distances, radius, per_shape)
-    return _make_results(world, pairs, distances, witnesses, order)
+    ranked = collision_library.gather(table, pairs, distances, witnesses, order)
+    return DistanceResults(
+        world, *(ranked if facing is None else collision_library.extend(table, ranked, facing))
+    )
 
 
 def find_first_contact(world: CollisionWorld, margin: float) -> DistanceResult | None:

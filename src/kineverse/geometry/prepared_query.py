@@ -15,7 +15,7 @@ from kineverse.model.kinematics import ancestors
 from kineverse.model.model_view import ModelView
 from kineverse.symbols import Symbol
 
-from .bindings import collision_library
+from .bindings import FacingPoints, collision_library
 from .broadphase import Flags, Indices, PairSelection
 from .collision_world import CollisionWorld
 from .distance_queries import check_radius, find_pairs_within
@@ -57,10 +57,13 @@ class PreparedQuery:
         self._selection: PairSelection | None = None
         self._motion: SampledMotion | None = None
 
-    def __call__(self, radius: float | None = None) -> DistanceResults:
-        """Return the selected pairs within the radius [m], or within another one, nearest first."""
+    def __call__(self, radius: float | None = None, facing: FacingPoints | None = None) -> DistanceResults:
+        """Return the selected pairs within the radius [m], or within another one, nearest first.
+
+        With ``facing``, pairs with parallel faces are there with further facing points.
+        """
         within = self.radius if radius is None else radius
-        return find_pairs_within(self._world, within, self._select(), self.per_shape)
+        return find_pairs_within(self._world, within, self._select(), self.per_shape, facing)
 
     def first_within(
         self, coordinates: Sequence[Symbol | str], Q: npt.ArrayLike, radius: float | None = None

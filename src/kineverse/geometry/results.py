@@ -3,21 +3,14 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from copy import copy
 from dataclasses import dataclass
 from typing import overload
 
 import numpy as np
 
-from .bindings import collision_library
 from .broadphase import Indices
 from .collision_world import CollisionWorld
 from .mesh_files import Floats
-
-_PARALLEL = 0.02
-"""Angle up to which faces count as parallel [rad]; a base turns less in a step."""
-_OTHER = 0.1
-"""Distance from which on facing points count as other ones [m]."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -132,10 +125,8 @@ class DistanceResults(Sequence[DistanceResult]):
     ----------
     distances
         (K,) signed distances [m].
-    points_a, points_b, normals
-        (K, 3) each, as in :class:`DistanceResult`.
     witnesses
-        (K, 9) all three side by side.
+        (K, 9) points of both bodies and normals side by side.
     body_indices
         (K, 2) indices of both bodies in the scene's ``bodies`` at the time of the query.
     """
@@ -145,42 +136,22 @@ class DistanceResults(Sequence[DistanceResult]):
     ) -> None:
         self._bodies, self._shape_numbers, self._table = world.bodies, world.shape_numbers, world.table
         self._object_indices, self.body_indices = objects, bodies
-        self._set(distances, witnesses)
-
-    def extend(self, gaps: Floats) -> DistanceResults:
-        """Return these results with further facing points of near pairs, nearest first.
-
-        Faces that are parallel, up to 0.02 rad, have up to four further pairs of points, with the distance
-        along the normal of the pair, see :mod:`.manifold_c`. Meshes of triangles have none, nor has anything
-        without a C compiler.
-
-        Parameters
-        ----------
-        gaps
-            (K,) distances beyond those that the pairs keep [m]; infinite for pairs to leave out. A pair is
-            near if a turn by 0.02 rad may close its gap. Nothing has moved since the query.
-        """
-        objects, radius = self._object_indices, self._table.radius
-        turned = _PARALLEL * 2.0 * np.minimum(radius[objects[:, 0]], radius[objects[:, 1]])
-        near = np.flatnonzero(gaps < turned)
-        if not len(near):
-            return self
-        which, distances, further = collision_library.extend(
-            self._table, objects[near], self.witnesses[near], _PARALLEL, _OTHER
-        )
-        if not len(which):
-            return self
-        distances = np.concatenate([self.distances, distances])
-        order = np.argsort(distances, kind="stable")
-        rows = np.concatenate([np.arange(len(self)), near[which]])[order]
-        more = copy(self)
-        more._object_indices, more.body_indices = objects[rows], self.body_indices[rows]
-        more._set(distances[order], np.concatenate([self.witnesses, further])[order])
-        return more
-
-    def _set(self, distances: Floats, witnesses: Floats) -> None:
         self.distances, self.witnesses = distances, witnesses
-        self.points_a, self.points_b, self.normals = witnesses[:, :3], witnesses[:, 3:6], witnesses[:, 6:]
+
+    @property
+    def points_a(self) -> Floats:
+        """Nearest points of the first bodies (K, 3) [m]."""
+        return self.witnesses[:, :3]
+
+    @property
+    def points_b(self) -> Floats:
+        """Nearest points of the second bodies (K, 3) [m]."""
+        return self.witnesses[:, 3:6]
+
+    @property
+    def normals(self) -> Floats:
+        """Unit vectors (K, 3) from the first bodies to the second ones."""
+        return self.witnesses[:, 6:]
 
     @property
     def shape_indices(self) -> Indices:

@@ -44,9 +44,7 @@ def plan_push_approach(
     free = [s for s in moving if s in model.degrees_of_freedom and s not in model.rates]
     planner = Planner(model, free, rules=pushing.scene.rules, leave_out=pushing.leave_out)
     planner.place(state)
-    world_T_hand = model.fk(tool.frame)
-    tip = world_T_hand[:3, :3] @ tool.tip + world_T_hand[:3, 3]
-    axis = world_T_hand[:3, :3] @ tool.axis
+    tip, axis = tool.locate_tip(model), tool.point_axis(model)
     at = pushing.surface.at(state)
     path: Path | None = None
     chosen, goal = -1, None

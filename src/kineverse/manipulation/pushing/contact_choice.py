@@ -10,6 +10,7 @@ from kineverse.lie import Array
 from kineverse.state import State
 
 from .contact_points import PushContacts, PushPoint, PushSurface
+from .vectors import Vector
 
 CONE, CONE_END = math.cos(math.radians(25.0)), math.cos(math.radians(40.0))
 """Cosines of the friction cone in which a contact point is chosen, and of the one in which it is kept."""
@@ -66,10 +67,12 @@ class ContactChoice:
             + 0.7 * self._surface.room
         )
 
-    def rank(self, state: State, tip: Array, limit: float) -> list[int]:
+    def rank(self, state: State, tip: Vector, limit: float) -> list[int]:
         """Return contact points at a state, the best first, each some distance from better ones [m]."""
         points = self._surface.at(state)
-        score = self.score(points) - _DISTANCE_COST * np.sqrt(((points.points - tip) ** 2).sum(axis=1))
+        score = self.score(points) - _DISTANCE_COST * np.sqrt(
+            ((points.points - np.array(tip)) ** 2).sum(axis=1)
+        )
         for k, times in self._given_up.items():
             near = ((points.points - points.points[k]) ** 2).sum(axis=1) < _SURROUNDINGS**2
             score = score - np.where(near, _GIVEN_UP_COST * times, 0.0)
@@ -81,7 +84,7 @@ class ContactChoice:
             score = np.where(near, -math.inf, score)
         return ranked
 
-    def choose(self, state: State, tip: Array, index: int | None = None) -> PushPoint:
+    def choose(self, state: State, tip: Vector, index: int | None = None) -> PushPoint:
         """Choose a contact point, by default the best, and return it."""
         self.chosen = self.rank(state, tip, math.inf)[0] if index is None else index
         self.contacts += 1

@@ -16,7 +16,7 @@ import numpy.typing as npt
 
 from kineverse.compile import compile  # noqa: A004
 from kineverse.errors import InvalidValueError
-from kineverse.expressions.expression import array
+from kineverse.expressions.expression import Expression, array
 from kineverse.geometry import Scene
 from kineverse.geometry.objects import Exclusion
 from kineverse.geometry.shapes import Solid
@@ -25,6 +25,8 @@ from kineverse.lie import Array
 from kineverse.model.model_view import ModelView
 from kineverse.state import State
 from kineverse.symbols import Symbol
+
+from .vectors import Vector, dot, length, move_point, place, rotate, scale
 
 _SPACING = 0.05
 """Distance of sampled points [m]."""
@@ -66,9 +68,9 @@ class PushContacts:
 class PushPoint:
     """One contact point at one state; see :class:`PushContacts`."""
 
-    point: Array
-    normal: Array
-    velocity: Array
+    point: Vector
+    normal: Vector
+    velocity: Vector
     alignment: float
 
 
@@ -91,6 +93,8 @@ class PushSurface:
         State of everything else.
     values
         Values of the coordinate on its way, the present one first.
+    tip
+        Foremost point (3,) of the pusher, which is computed along with the surface.
 
     Attributes
     ----------
@@ -115,6 +119,7 @@ class PushSurface:
         ignored: Iterable[Exclusion],
         state: State,
         values: Sequence[float] | Array,
+        tip: Expression,
     ) -> None:
         self.bodies = tuple(bodies)
         self._coordinate = coordinate
@@ -122,7 +127,7 @@ class PushSurface:
         poses = [model.fk(body)[:3, :] for body in bodies]
         twists = [model.jacobian(body, form="world", symbols=[speed]).ravel() for body in bodies]
         stacked = [array([e for pose in poses for e in pose.ravel()]), array([e for t in twists for e in t])]
-        self._function = compile(stacked)
+        self._function = compile([*stacked, tip])
         self._evaluate = self._function.bind()
         self._inputs = self._function.inputs
         self.sign = 1.0 if values[-1] >= values[0] else -1.0
@@ -147,12 +152,13 @@ class PushSurface:
         """Return poses (B, 3, 4) and twists (B, 6) of the bodies at a state, per unit of the coordinate."""
         self._evaluate.input[:] = state.vector(self._inputs)
         self._evaluate()
-        poses, twists = self._evaluate.outputs
-        return poses.reshape(-1, 3, 4), self.sign * twists.reshape(-1, 6)
+        poses, twists, _ = self._evaluate.outputs
+        return poses.reshape(-1, 3, 4), twists.reshape(-1, 6)
 
     def at(self, state: State) -> PushContacts:
         """Return all points at a state."""
         poses, twists = self._place(state)
+        twists = self.sign * twists
         own = poses[self.owner]
         points = np.einsum("kij,kj->ki", own[:, :, :3], self._points) + own[:, :, 3]
         normals = np.einsum("kij,kj->ki", own[:, :, :3], self._normals)
@@ -167,13 +173,28 @@ class PushSurface:
 
     def point_at(self, state: State, index: int) -> PushPoint:
         """Return one point at a state."""
-        poses, twists = self._place(state)
+        return self._point(index, *self._place(state))
+
+    def locate(self, state: State, index: int | None) -> tuple[Vector, PushPoint | None]:
+        """Return the tip of the pusher and one point, if any, at a state."""
+        placed = self._place(state)
+        x, y, z = self._evaluate.outputs[2].tolist()
+        return (x, y, z), None if index is None else self._point(index, *placed)
+
+    def _point(self, index: int, poses: Array, twists: Array) -> PushPoint:
         body = self.owner[index]
-        R, twist = poses[body, :, :3], twists[body]
-        point = R @ self._points[index] + poses[body, :, 3]
-        normal = R @ self._normals[index]
-        velocity = twist[:3] + cross_product(twist[3:], point)
+        pose = poses[body].tolist()
+        point, normal = (
+            place(pose, self._one(self._points, index)),
+            rotate(pose, self._one(self._normals, index)),
+        )
+        velocity = scale(self.sign, move_point(twists[body].tolist(), point))
         return PushPoint(point, normal, velocity, find_alignment(normal, velocity))
+
+    @staticmethod
+    def _one(vectors: Array, index: int) -> Vector:
+        x, y, z = vectors[index].tolist()
+        return x, y, z
 
     def _sample(self, scene: Scene, state: State) -> list[tuple[int, Array, Array]]:
         """Return body, point and normal in the body of the points that rays reach at a state."""
@@ -181,6 +202,7 @@ class PushSurface:
         world = scene.collision_world
         world.prepare()
         poses, twists = self._place(state)
+        twists = self.sign * twists
         found = []
         for k, body in enumerate(self.bodies):
             R, t = poses[k, :, :3], poses[k, :, 3]
@@ -257,6 +279,15 @@ class PushTool:
     axis: Array
     bodies: tuple[str, ...]
 
+    def locate_tip(self, model: ModelView) -> Expression:
+        """Return the point in the world (3,), as an expression [m]."""
+        world_T_hand = model.fk(self.frame)
+        return world_T_hand[:3, :3] @ self.tip + world_T_hand[:3, 3]
+
+    def point_axis(self, model: ModelView) -> Expression:
+        """Return the axis in the world (3,), as an expression."""
+        return model.fk(self.frame)[:3, :3] @ self.axis
+
 
 def find_push_tool(
     model: ModelView, bodies: Sequence[str], state: State, leave_out: Iterable[Exclusion] = ()
@@ -323,14 +354,7 @@ def _ancestors(model: ModelView, frame: str) -> list[str]:
     return found
 
 
-def cross_product(a: Array, b: Array) -> Array:
-    """Return the cross product (3,) of two vectors (3,), faster than numpy's."""
-    x, y, z = a.tolist()
-    u, v, w = b.tolist()
-    return np.array([y * w - z * v, z * u - x * w, x * v - y * u])
-
-
-def find_alignment(normal: Array, velocity: Array) -> float:
+def find_alignment(normal: Vector, velocity: Vector) -> float:
     """Return the cosine between -n and a velocity; -1 for a point that does not move."""
-    speed = math.sqrt(float(velocity @ velocity))
-    return -float(normal @ velocity) / speed if speed > 1e-9 else -1.0
+    speed = length(velocity)
+    return -dot(normal, velocity) / speed if speed > 1e-9 else -1.0

@@ -27,7 +27,6 @@ from kineverse.control import Command
 from kineverse.errors import InvalidValueError, KineverseError
 from kineverse.geometry import Rule, Scene
 from kineverse.geometry.objects import Exclusion
-from kineverse.lie import Array
 from kineverse.manipulation.collision_rules import find_overlapping_links, furniture_rules, match_bodies
 from kineverse.model.frame import is_of_robot
 from kineverse.model.frame_dependence import FrameDependence
@@ -40,7 +39,8 @@ from .contact_choice import CONE, CONE_END, ContactChoice
 from .contact_points import PushPoint, PushSurface, find_push_tool
 from .nearest_pair import PairFinder, PushPair, PushView, make_view
 from .press import PushPress, TipAnchor
-from .program import LOST, NEAR, PRESS, TOUCHING, PushProgram
+from .program import LOST, NEAR, PRESS, TOUCHING, PushNumbers, PushProgram
+from .vectors import ZERO, Vector, add, cross, dot, length, move_point, scale, subtract
 
 _APART = 4e-3
 """Gap between pusher and object away from the contact [m]."""
@@ -109,6 +109,8 @@ class Pushing:
         The present contact point, and those that were given up.
     press
         Touch, lag and speed of the press.
+    clearance
+        Least distance at the last step of pairs that may not touch [m], infinite if none is near.
     view
         Points and vectors of the last step.
 
@@ -164,6 +166,7 @@ class Pushing:
             (*own, *self.leave_out),
             at,
             (at[coordinate], (at[coordinate] + target) / 2, target),
+            self.tool.locate_tip(model),
         )
         furniture = furniture_rules(plain.bodies, own)
         self.overlapping = find_overlapping_links(plain, own, at)
@@ -184,6 +187,7 @@ class Pushing:
             self._program.object_column,
             self.surface.sign,
         )
+        self._far = [0.0] * (3 * len(self._program.columns))
         self._hand = self.scene.bodies.index(self._hand_body())
         self._all = self.scene.watch(f"{self.robot}/*", "*", radius=0.0, moving=self.speeds)
         self.choice = ContactChoice(self.surface)
@@ -209,7 +213,8 @@ class Pushing:
         self._anchor = TipAnchor()
         self._aside = math.inf
         self._margin = math.nan
-        self._seen: tuple[PushPair | None, PushPoint, Array] | None = None
+        self.clearance = math.inf
+        self._seen: tuple[PushPair | None, PushPoint, Vector] | None = None
 
     def done(self, state: State, tolerance: float = 0.02) -> bool:
         """Return True if the coordinate is within a tolerance of the target."""
@@ -222,11 +227,6 @@ class Pushing:
         deep = [pair for pair in found if pair.distance < -_DEEPEST]
         return f"contact of {deep[0].a} and {deep[0].b}" if deep else ""
 
-    @property
-    def clearance(self) -> float:
-        """Least distance at the last step of pairs that may not touch [m], infinite if none is near."""
-        return self._pairs.clearance(self._slots.found)
-
     def find_deviation(self, state: State, deviation: Callable[[Symbol], float]) -> float:
         """Return the standard deviation of gaps [m] at a state whose coordinates have deviations.
 
@@ -238,12 +238,12 @@ class Pushing:
             Standard deviation by coordinate [m], [rad], such as that of a :class:`.Belief`.
         """
         symbols, jacobian = self._program.tip_jacobian(state)
-        normal, velocity = np.zeros(3), np.zeros(3)
+        normal = velocity = ZERO
         if self.choice.chosen is not None:
             point = self.surface.point_at(state, self.choice.chosen)
             normal, velocity = point.normal, point.velocity
-        rates = dict(zip(symbols, (normal @ jacobian).tolist(), strict=True))
-        rates[self.coordinate] = float(normal @ velocity)
+        rates = dict(zip(symbols, (np.array(normal) @ jacobian).tolist(), strict=True))
+        rates[self.coordinate] = dot(normal, velocity)
         # The deviation of what was never seen is infinite, and counts only where it changes the gap.
         return math.hypot(*(rate * deviation(s) for s, rate in rates.items() if rate))
 
@@ -273,29 +273,26 @@ class Pushing:
         senses = press.deviation > 0.0
         read = None if observation is None else observation.joints
         press.report(senses and observation is not None and not observation.touching.isdisjoint(self.pusher))
-        tip = felt = self._program.tip(state)
-        if read is not None:
-            felt = self._program.tip(state, read)
+        tip, point = self.surface.locate(state, choice.chosen)
+        felt = tip if read is None else self._program.tip(state, read)
         value = press.advance(state[self.coordinate], felt, self.touching)
         if senses:
             state = state.updated({self.coordinate: min(max(value, self._limits[0]), self._limits[1])})
-        found = self._program.load(state)
-        point = None if choice.chosen is None else self.surface.point_at(state, choice.chosen)
+            tip, point = self.surface.locate(state, choice.chosen)
+        contact, self.clearance = self._pairs.nearest(self._program.load(state))
         if point is not None and not self.retreating and self._is_stuck(state, tip, point):
             self._give_up()
             point = None
         if point is None:
             point = choice.choose(state, tip)
-        offset = tip - point.point
-        offset = offset - point.normal * float(point.normal @ offset)
-        self._aside = math.sqrt(float(offset @ offset))
-        contact = self._pairs.nearest(found)
+        offset = subtract(tip, point.point)
+        self._aside = length(add(offset, point.normal, -dot(point.normal, offset)))
         if not self.retreating:
             self._update_touching(contact)
-        self._write(tip, point, contact)
-        command = self._program.step()
-        speeds = np.fromiter(command.speeds.values(), dtype=float)
-        press.plan(point.velocity, self._slots.point_jacobians([self._hand], tip[None])[0] @ speeds)
+        command = self._program.step(self._numbers(tip, point, contact))
+        moved: list[float] = (self._slots.twist(self._hand) @ command.vector).tolist()
+        press.plan(point.velocity, move_point(moved, tip))
+        self._seen = contact, point, tip
         return command
 
     def _update_touching(self, contact: PushPair | None) -> None:
@@ -314,8 +311,7 @@ class Pushing:
                 self.choice.restart()
                 self._anchor = TipAnchor()
         if contact is not None:
-            rate = -float(contact.normal @ contact.velocity) * self.surface.sign
-            press.correct(contact.gap, rate)
+            press.correct(contact.gap, -dot(contact.normal, contact.velocity) * self.surface.sign)
 
     def _release(self) -> None:
         self.touching = False
@@ -334,7 +330,7 @@ class Pushing:
         """Choose a contact point, by default the best, and return it."""
         return self.choice.choose(state, self._program.tip(state), index)
 
-    def _is_stuck(self, state: State, tip: Array, point: PushPoint) -> bool:
+    def _is_stuck(self, state: State, tip: Vector, point: PushPoint) -> bool:
         """Return True without progress, outside of the contact point's cone, or if the robot gets pinched."""
         if self.touching:
             if self.clearance < -self.press.slack:
@@ -343,57 +339,68 @@ class Pushing:
         else:
             if point.alignment < CONE_END:
                 return True
-            offset = point.point - tip
-            rest = math.sqrt(float(offset @ offset))
+            rest = length(subtract(point.point, tip))
         return self.choice.is_stuck(rest)
 
-    def _write(self, tip: Array, point: PushPoint, contact: PushPair | None) -> None:
-        """Set the parameters of the program."""
-        c, m, velocity = point.point, point.normal, point.velocity
-        press, program = self.press, self._program
-        near, height = self._aside < NEAR and not self.retreating, float((tip - c) @ m)
+    def _numbers(self, tip: Vector, point: PushPoint, contact: PushPair | None) -> PushNumbers:
+        """Return the numbers of the program."""
+        c, m, press = point.point, point.normal, self.press
+        near, height = self._aside < NEAR and not self.retreating, dot(subtract(tip, c), m)
         standoff = _STANDOFF
         if not near:
             standoff = min(_FUNNEL, _STANDOFF + press.slack + 1.5 * max(self._aside - NEAR, 0.0))
         if self.retreating:
             self.touching, standoff = False, _RETREAT
-        program.set("target", c + standoff * m)
-        program.set("normal", m)
-        program.set("facing", -m)
-        leverage = max(math.sqrt(float(velocity @ velocity)), 1e-3)
-        program.set("pace", press.pace() / leverage)
         self._keep_apart(contact, self.touching or (near and height < _LOW + press.slack))
-        # The pusher goes on until it touches: where the object is believed to be, there may be none.
-        program.set("near", TOUCHING if press.deviation == 0.0 else -1.0)
-        program.set("reach", 0.0 if self.touching else 1.0)
-        program.set("touch", 0.0 if self.touching or self.retreating else 1.0)
-        program.set("hold", _HOLD_WEIGHT if self.touching else 0.0)
-        program.set("engaged", float(self.touching))
-        free = False
-        if contact is None:
-            for name in ("relative", "slip", "pushed"):
-                program.set(name, 0.0)
-            program.set("gap", _FAR)
-        else:
-            distance, normal, thing = contact.gap, contact.normal, contact.thing
-            free = self.touching and -_JAMMED * press.depth - press.slack < distance < LOST + press.slack
-            slots, tangents = self._slots, contact.tangents
-            touching, touched, hand, below = slots.point_jacobians(
-                (contact.robot, thing, self._hand, thing), np.array([contact.r, contact.p, tip, tip])
-            )
-            relative = np.empty((3, len(self.speeds)))
-            relative[0] = normal @ (touching - touched)
-            relative[1:] = tangents @ (hand - below)
-            program.set("relative", relative[:, program.columns].ravel())
-            # A press that is late enough is not increased by the goal about the gap either.
-            most = -PRESS * (1.0 - min(max(press.reserve, 0.0), 1.0))
-            deeper = press.depth - PRESS
-            program.set("gap", most if press.touched and self.touching else distance + deeper)
-            program.set("pushed", float(normal @ touched[:, program.object_column]))
-            pose = self.scene.pose(self.scene.bodies[thing])
-            program.set("slip", tangents @ self._anchor.drift(thing, pose, tip, press.weight))
-        program.set("free", float(free))
-        self._seen = (contact, point, tip)
+        numbers = PushNumbers(
+            gap=_FAR,
+            relative=self._far,
+            slip=(0.0, 0.0),
+            pushed=0.0,
+            target=add(c, m, standoff),
+            facing=scale(-1.0, m),
+            normal=m,
+            reach=0.0 if self.touching else 1.0,
+            touch=0.0 if self.touching or self.retreating else 1.0,
+            hold=_HOLD_WEIGHT if self.touching else 0.0,
+            engaged=float(self.touching),
+            # The pusher goes on until it touches: where the object is believed to be, there may be none.
+            near=TOUCHING if press.deviation == 0.0 else -1.0,
+            pace=press.pace() / max(length(point.velocity), 1e-3),
+            free=0.0,
+        )
+        if contact is not None:
+            self._add_contact(numbers, contact, tip)
+        return numbers
+
+    def _add_contact(self, numbers: PushNumbers, contact: PushPair, tip: Vector) -> None:
+        """Set the numbers of a near pair of pusher and object."""
+        press, slots, thing, n = self.press, self._slots, contact.thing, contact.normal
+        allowed = -_JAMMED * press.depth - press.slack < contact.gap < LOST + press.slack
+        numbers.free = float(self.touching and allowed)
+        tangents = contact.tangents
+        # Wrenches on the twists of the touching body, of the object, and of the hand.
+        nothing = (0.0,) * 6
+        wrenches = [
+            (*n, *cross(contact.r, n), *scale(-1.0, n), *cross(n, contact.p), *nothing),
+            *((*nothing, *scale(-1.0, t), *cross(t, tip), *t, *cross(tip, t)) for t in tangents),
+        ]
+        twists = np.concatenate([slots.twist(body) for body in (contact.robot, thing, self._hand)])
+        relative = np.array(wrenches) @ twists
+        numbers.relative = relative[:, self._program.columns].ravel().tolist()
+        # A press that is late enough is not increased by the goal about the gap either.
+        most = -PRESS * (1.0 - min(max(press.reserve, 0.0), 1.0))
+        deeper = press.depth - PRESS
+        numbers.gap = most if press.touched and self.touching else contact.gap + deeper
+        numbers.pushed = dot(n, contact.velocity) * self.surface.sign
+        drift = self._anchor.drift(thing, self._fixed_to(thing), tip, press.weight)
+        numbers.slip = [dot(t, drift) for t in tangents]
+
+    def _fixed_to(self, thing: int) -> list[list[float]]:
+        """Return the pose (3, 4) of a shape of a body."""
+        world = self.scene.collision_world
+        pose: list[list[float]] = world.table.poses[world.members[thing][0]].tolist()
+        return pose
 
     @property
     def view(self) -> PushView | None:

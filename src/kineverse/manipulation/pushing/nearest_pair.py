@@ -12,8 +12,9 @@ from kineverse.control.contact_slots import ContactSlots
 from kineverse.geometry.results import DistanceResults
 from kineverse.lie import Array
 
-from .contact_points import PushPoint, cross_product, find_alignment
+from .contact_points import PushPoint, find_alignment
 from .program import PRESS, TOUCHING
+from .vectors import Vector, cross, length, move_point, scale
 
 _MOST_PAIRS = 6
 
@@ -63,46 +64,50 @@ class PushPair:
     robot, thing
         Indices of the bodies in the scene.
     r, p
-        Nearest points on the robot and on the object (3,) [m].
+        Nearest points on the robot and on the object [m].
     normal
         Unit vector from p to r.
     gap
         Distance [m].
     velocity
-        Velocity (3,) of p per unit of the object's motion to the target.
+        Velocity of p per unit of the object's motion to the target.
     alignment
         Cosine between the velocity and -normal.
     """
 
     robot: int
     thing: int
-    r: Array
-    p: Array
-    normal: Array
+    r: Vector
+    p: Vector
+    normal: Vector
     gap: float
-    velocity: Array
+    velocity: Vector
     alignment: float
 
     @property
-    def tangents(self) -> Array:
-        """Two unit vectors (2, 3) that are orthogonal to the normal and to each other."""
-        across = cross_product(self.normal, np.eye(3)[int(np.argmin(np.abs(self.normal)))])
-        across /= math.sqrt(float(across @ across))
-        return np.array([across, cross_product(self.normal, across)])
+    def tangents(self) -> tuple[Vector, Vector]:
+        """Two unit vectors that are orthogonal to the normal and to each other."""
+        sizes = [abs(v) for v in self.normal]
+        side = [0.0, 0.0, 0.0]
+        side[sizes.index(min(sizes))] = 1.0
+        across = cross(self.normal, (side[0], side[1], side[2]))
+        across = scale(1.0 / length(across), across)
+        return across, cross(self.normal, across)
 
 
-def make_view(pair: PushPair | None, point: PushPoint, tip: Array) -> PushView:
+def make_view(pair: PushPair | None, point: PushPoint, tip: Vector) -> PushView:
     """Return the points and vectors of a push with a near pair, or with a tip that is still far."""
     p, n, r, velocity, distance = point.point, point.normal, tip, point.velocity, math.inf
     if pair is not None:
         p, n, r, velocity, distance = pair.p, pair.normal, pair.r, pair.velocity, pair.gap
-    push = velocity / max(math.sqrt(float(velocity @ velocity)), 1e-9)
-    tangent = cross_product(cross_product(push, n), n)
-    return PushView(p, r, n, push, tangent, point.point, distance)
+    push = scale(1.0 / max(length(velocity), 1e-9), velocity)
+    tangent = cross(cross(push, n), n)
+    p_, r_, n_, push_, tangent_, target = np.array([p, r, n, push, tangent, point.point])
+    return PushView(p_, r_, n_, push_, tangent_, target, distance)
 
 
 class PairFinder:
-    """Search of the near pair of pusher and object that pushes best.
+    """Search of the near pair of pusher and object that pushes best, and of the nearest other pair.
 
     Parameters
     ----------
@@ -131,38 +136,45 @@ class PairFinder:
         pushed = np.array([b in object_bodies for b in bodies])
         forward = np.outer(pushers, pushed)
         # 1 for pairs of pusher and object, -1 for the other order, 0 for all others.
-        self._kinds = forward.astype(np.int8) - forward.T.astype(np.int8)
+        kinds = forward.astype(np.int8) - forward.T.astype(np.int8)
+        self._kinds: list[list[int]] = kinds.tolist()
         self._slots, self._column, self._sign = slots, column, sign
 
-    def nearest(self, found: DistanceResults) -> PushPair | None:
-        """Return the pair that pushes best among those that are about the nearest; None if none is near."""
-        if not len(found):
-            return None
-        a, b = found.body_indices.T
-        kinds = self._kinds[a, b]
-        rows = np.flatnonzero(kinds)
-        if not len(rows):
-            return None
-        least = found.distances[rows[0]]
-        best = None
-        for row in rows[:_MOST_PAIRS].tolist():
-            gap = float(found.distances[row])
-            if gap > max(least + TOUCHING, PRESS):
-                break
-            if kinds[row] > 0:
-                robot, thing = int(a[row]), int(b[row])
-                r, p, normal = found.points_a[row], found.points_b[row], -found.normals[row]
-            else:
-                robot, thing = int(b[row]), int(a[row])
-                r, p, normal = found.points_b[row], found.points_a[row], found.normals[row]
-            velocity = self._sign * self._slots.point_velocity(thing, p, self._column)
-            alignment = find_alignment(normal, velocity)
-            if best is None or alignment > best.alignment:
-                best = PushPair(robot, thing, r, p, normal, gap, velocity, alignment)
-        return best
+    def nearest(self, found: DistanceResults) -> tuple[PushPair | None, float]:
+        """Return the pair that pushes best, and the clearance.
 
-    def clearance(self, found: DistanceResults) -> float:
-        """Return the least distance of all other pairs [m], infinite if none is near."""
-        a, b = found.body_indices.T
-        distances = found.distances[self._kinds[a, b] == 0]
-        return float(distances[0]) if len(distances) else math.inf
+        Returns
+        -------
+        pair
+            That with the best alignment among those that are about the nearest; None if none is near.
+        clearance
+            Least distance of all other pairs [m], infinite if none is near.
+        """
+        best, clearance = None, math.inf
+        most, count = math.inf, 0
+        gaps = found.distances.tolist()
+        for row, (a, b) in enumerate(found.body_indices.tolist()):
+            kind, gap = self._kinds[a][b], gaps[row]
+            if not kind:
+                clearance = min(clearance, gap)
+            elif gap <= most and count < _MOST_PAIRS:
+                if not count:
+                    most = max(gap + TOUCHING, PRESS)
+                count += 1
+                pair = self._make_pair(found, row, gap, kind < 0)
+                if best is None or pair.alignment > best.alignment:
+                    best = pair
+            if clearance < math.inf and gap > most:
+                break
+        return best, clearance
+
+    def _make_pair(self, found: DistanceResults, row: int, gap: float, swapped: bool) -> PushPair:
+        """Return a pair of results as one of robot and object."""
+        robot, thing = found.body_indices[row].tolist()
+        one, other, normal = (found.witnesses[row, k : k + 3].tolist() for k in (0, 3, 6))
+        r, p, n = tuple(one), tuple(other), scale(-1.0, normal)
+        if swapped:
+            robot, thing, r, p, n = thing, robot, p, r, tuple(normal)
+        twist = self._slots.twist(thing)[:, self._column].tolist()
+        velocity = scale(self._sign, move_point(twist, p))
+        return PushPair(robot, thing, r, p, n, gap, velocity, find_alignment(n, velocity))

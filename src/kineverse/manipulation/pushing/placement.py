@@ -163,9 +163,7 @@ class _Sampler:
     def __init__(self, pushing: Pushing, state: State, generator: np.random.Generator) -> None:
         self._pushing, self._state, self._generator = pushing, state, generator
         model, tool = pushing.model, pushing.tool
-        world_T_hand = model.fk(tool.frame)
-        tip = world_T_hand[:3, :3] @ tool.tip + world_T_hand[:3, 3]
-        axis = world_T_hand[:3, :3] @ tool.axis
+        tip, axis = tool.locate_tip(model), tool.point_axis(model)
         self._point = Target("push/start/point", np.zeros(3))
         self._facing = Target("push/start/facing", np.array([1.0, 0.0, 0.0]))
         still = [s for s in model.degrees_of_freedom if not is_of_robot(s.path, pushing.robot)]

@@ -15,12 +15,10 @@ pusher penetrates the object is corrected likewise.
 from __future__ import annotations
 
 import math
-
-import numpy as np
-
-from kineverse.lie import Array
+from collections.abc import Sequence
 
 from .program import PRESS
+from .vectors import ZERO, Vector, add, dot, length, place, rotate_back, scale, subtract
 
 RAMP = 0.02
 """Speed of the contact point beyond the measured one that is tried [m/s]."""
@@ -77,9 +75,8 @@ class PushPress:
         self.speed = self.lag = self.correction = 0.0
         self._way = self._crept = self._stuck = 0.0
         self._touch, self._estimate, self._value = math.inf, math.nan, math.nan
-        self._tip: Array | None = None
-        self._planned: Array = np.zeros(3)
-        self._velocity: Array = np.zeros(3)
+        self._tip: Vector | None = None
+        self._planned, self._velocity = ZERO, ZERO
 
     @property
     def slack(self) -> float:
@@ -100,7 +97,7 @@ class PushPress:
         """Take the report of touch sensors for a step."""
         self._touch = 0.0 if touched else self._touch + self._dt
 
-    def advance(self, estimate: float, tip: Array, touching: bool) -> float:
+    def advance(self, estimate: float, tip: Vector, touching: bool) -> float:
         """Return the value of the coordinate at a step.
 
         Parameters
@@ -108,14 +105,14 @@ class PushPress:
         estimate
             Estimate of the value [m], [rad].
         tip
-            Foremost point of the pusher (3,) by the readings of the encoders [m].
+            Foremost point of the pusher by the readings of the encoders [m].
         touching
             Whether the object is being pushed.
         """
-        moved = np.zeros(3) if self._tip is None else tip - self._tip
-        leverage = math.sqrt(float(self._velocity @ self._velocity))
-        along = self._velocity / max(leverage, 1e-9)
-        self._way = way = float(along @ moved)
+        moved = ZERO if self._tip is None else subtract(tip, self._tip)
+        leverage = length(self._velocity)
+        along = scale(1.0 / max(leverage, 1e-9), self._velocity)
+        self._way = way = dot(along, moved)
         shift = self._sign * (estimate - self._estimate) if math.isfinite(self._estimate) else 0.0
         if touching and self.touched:
             self.speed = max(way / self._dt, 0.0)
@@ -123,7 +120,7 @@ class PushPress:
             self.speed = max(self.speed + self.weight * (shift * leverage / self._dt - self.speed), 0.0)
         if touching:
             kept = self.lag * math.exp(-self._dt / _FORGET - max(way, 0.0) / _FORGET_WAY)
-            self.lag = max(kept + float(along @ self._planned) - way, 0.0)
+            self.lag = max(kept + dot(along, self._planned) - way, 0.0)
         else:
             self.lag = 0.0
         self._stuck = self._stuck + self._dt if touching and self.speed < STILL else 0.0
@@ -154,9 +151,9 @@ class PushPress:
         """True if the pusher has crept from the one end of the allowed errors to the other."""
         return self._crept >= 2.0 * self.slack
 
-    def plan(self, velocity: Array, tip_velocity: Array) -> None:
-        """Take the velocity of the contact point per unit of the push, and of the tip by a command (3,)."""
-        self._velocity, self._planned = velocity, self._dt * tip_velocity
+    def plan(self, velocity: Vector, tip_velocity: Vector) -> None:
+        """Take the velocity of the contact point per unit of the push, and of the tip by a command."""
+        self._velocity, self._planned = velocity, scale(self._dt, tip_velocity)
 
     @property
     def depth(self) -> float:
@@ -198,25 +195,25 @@ class TipAnchor:
 
     def __init__(self) -> None:
         self._thing: int | None = None
-        self._anchor: Array = np.zeros(3)
-        self._drift: Array = np.zeros(3)
+        self._anchor, self._drift = ZERO, ZERO
 
-    def drift(self, thing: int, pose: Array, tip: Array, weight: float) -> Array:
-        """Return how far the tip has moved on a body since the first touch (3,) [m], filtered.
+    def drift(self, thing: int, pose: Sequence[Sequence[float]], tip: Vector, weight: float) -> Vector:
+        """Return how far the tip has moved on a body since the first touch [m], filtered.
 
         Parameters
         ----------
         thing
             Index of the body.
         pose
-            Its pose (4, 4).
+            Three rows of the pose of something fixed to it.
         tip
-            The tip (3,) in the world [m].
+            The tip in the world [m].
         weight
             Weight of the latest drift, from 0 to 1.
         """
-        R, t = pose[:3, :3], pose[:3, 3]
         if self._thing != thing:
-            self._thing, self._anchor, self._drift = thing, R.T @ (tip - t), np.zeros(3)
-        self._drift = self._drift + weight * (tip - R @ self._anchor - t - self._drift)
+            offset = subtract(tip, place(pose, ZERO))
+            self._thing, self._anchor, self._drift = thing, rotate_back(pose, offset), ZERO
+        now = subtract(tip, place(pose, self._anchor))
+        self._drift = add(self._drift, subtract(now, self._drift), weight)
         return self._drift

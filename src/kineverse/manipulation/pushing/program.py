@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Mapping
-from itertools import pairwise
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass
 
 import numpy as np
 
@@ -23,6 +23,7 @@ from kineverse.state import State
 from kineverse.symbols import Symbol, parameter
 
 from .contact_points import PushTool
+from .vectors import Vector
 
 TOUCHING = 1e-3
 """Largest gap of a contact [m]."""
@@ -45,6 +46,51 @@ _ANY = 1e3
 """Speed that restricts nothing."""
 
 
+@dataclass(slots=True)
+class PushNumbers:
+    """Numbers of the present contact, which a program is set to in each step.
+
+    Attributes
+    ----------
+    gap
+        Distance of pusher and object [m].
+    relative
+        Derivatives (3 n) of the gap, and of the motion of the tip on the object along two tangents, over the
+        speeds of the program.
+    slip
+        How far the tip has moved along both tangents since it touched [m].
+    pushed
+        Derivative of the gap over the object's speed.
+    target, normal, facing
+        Where the tip is to go [m], the normal of the object there, and the wanted axis of the pusher.
+    reach, touch, hold
+        Weights of the ways to that point and to a contact, and of the goals that keep a contact.
+    engaged
+        1 while the pusher touches, else 0.
+    near
+        Gap from which on the pusher touches [m].
+    pace
+        Largest speed of the coordinate [m/s], [rad/s].
+    free
+        1 if the object may move, else 0.
+    """
+
+    gap: float
+    relative: Sequence[float]
+    slip: Sequence[float]
+    pushed: float
+    target: Vector
+    facing: Vector
+    normal: Vector
+    reach: float
+    touch: float
+    hold: float
+    engaged: float
+    near: float
+    pace: float
+    free: float
+
+
 class PushProgram:
     """Controller of a push, whose tasks depend on the numbers of the present contact.
 
@@ -64,7 +110,7 @@ class PushProgram:
     controller
         The controller.
     columns
-        Its speeds in the order of the parameters ``relative``, by their index.
+        Its speeds in the order of :attr:`PushNumbers.relative`, by their index.
     object_column
         Index of the object's speed among the speeds of the controller.
     """
@@ -83,9 +129,7 @@ class PushProgram:
     ) -> None:
         still = tuple(still)
         speed = coordinate.derivative()
-        world_T_hand = model.fk(tool.frame)
-        tip = world_T_hand[:3, :3] @ tool.tip + world_T_hand[:3, 3]
-        axis = world_T_hand[:3, :3] @ tool.axis
+        tip, axis = tool.locate_tip(model), tool.point_axis(model)
         resting = find_speeds(model, still, "still")
         moving = set(model.rates.over_free_speeds(tip.gradient())) - resting - {speed}
         speeds = [*sorted(moving, key=lambda s: s.sort_key), speed]
@@ -160,9 +204,7 @@ class PushProgram:
         self._coordinates = tuple(s for s in self.controller.inputs if s.value is None)
         # Parameters are kept in one vector, and without trends some of them serve nothing.
         every = [symbol for symbols in parameters.values() for symbol in symbols]
-        ends = np.cumsum([0, *map(len, parameters.values())]).tolist()
-        self._slices = {name: slice(*end) for name, end in zip(parameters, pairwise(ends), strict=True)}
-        self._numbers = np.zeros(len(every))
+        self._names = tuple(parameters)
         self._used = np.array([k for k, s in enumerate(every) if s in place], dtype=np.intp)
         self._places = np.array([place[every[k]] for k in self._used], dtype=np.intp)
         self._tip_symbols = tuple(s for s in tip.symbols if not s.order)
@@ -174,24 +216,28 @@ class PushProgram:
         self._values[: len(self._coordinates)] = state.vector(self._coordinates)
         return self.controller.query_contacts(self._values)
 
-    def set(self, name: str, values: float | Array) -> None:
-        """Set parameters by name: a number, or one for each."""
-        self._numbers[self._slices[name]] = values
-
-    def step(self) -> Command:
+    def step(self, numbers: PushNumbers) -> Command:
         """Return the command for one time step, at the state that was loaded."""
-        self._values[self._places] = self._numbers[self._used]
+        flat: list[float] = []
+        for name in self._names:
+            value = getattr(numbers, name)
+            if isinstance(value, float):
+                flat.append(value)
+            else:
+                flat.extend(value)
+        self._values[self._places] = np.array(flat)[self._used]
         return self.controller.step(self._values)
 
-    def tip(self, state: State, read: Mapping[Symbol, float] | None = None) -> Array:
-        """Return the foremost point of the pusher (3,) at a state, or at readings of encoders [m]."""
+    def tip(self, state: State, read: Mapping[Symbol, float] | None = None) -> Vector:
+        """Return the foremost point of the pusher at a state, or at readings of encoders [m]."""
         inputs = self._tip_function.inputs
         if read is None:
             self._tip.input[:] = state.vector(inputs)
         else:
             self._tip.input[:] = [read[s] if s in read else state[s] for s in inputs]
         self._tip()
-        return np.array(self._tip.outputs[0])
+        x, y, z = self._tip.outputs[0].tolist()
+        return x, y, z
 
     def tip_jacobian(self, state: State) -> tuple[tuple[Symbol, ...], Array]:
         """Return the coordinates of the tip, and its derivatives (3, n) over them."""

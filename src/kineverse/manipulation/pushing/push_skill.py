@@ -260,7 +260,7 @@ class _Run:
             if observation is not None:
                 deviation = pushing.find_deviation(state, session.belief.deviation)
             command = pushing.step(state, observation if deviation else None, deviation)
-        speeds = np.fromiter(command.speeds.values(), dtype=float)
+        speeds = command.vector
         if pushing.touching and self._last is not None:
             self._changes.append(np.abs(speeds - self._last))
         self._last = speeds if pushing.touching else None
