@@ -272,6 +272,21 @@ def test_start_is_placed_and_rolled_out_and_trends_make_it_touch() -> None:
     assert "not today" in never.why
 
 
+def test_points_beyond_one_that_was_out_of_reach_are_given_up_too() -> None:
+    model, start = room(), opened(door=0.6)
+    pushing = Pushing(model, "door", PUSHER, start, target=0.0)
+    choice, points = pushing.choice, pushing.surface.at(start).points
+    first = choice.rank(start, (0.0, 0.0, 0.0), np.inf)[0]
+    choice.choose(start, (0.0, 0.0, 0.0), first)
+    for way in ((0.0, 0.0, 0.3), (0.0, 0.0, -0.3)):
+        choice.reset()
+        choice.chosen = first
+        choice.give_up(False, way)
+        after = choice.choose(start, (0.0, 0.0, 0.0))
+        assert (np.array(after.point) - points[first]) @ way <= 1e-9
+        assert choice.blocked == 1
+
+
 def test_approach_is_planned_to_a_contact_point() -> None:
     model, start = room(), opened(drawer=0.4)
     pushing = Pushing(model, "drawer", PUSHER, start, target=0.0)

@@ -281,7 +281,8 @@ class Pushing:
             tip, point = self.surface.locate(state, choice.chosen)
         contact, self.clearance = self._pairs.nearest(self._program.load(state))
         if point is not None and not self.retreating and self._is_stuck(state, tip, point):
-            self._give_up()
+            reaches = self.touching or point.alignment < CONE_END
+            self._give_up(ZERO if reaches else subtract(point.point, tip))
             point = None
         if point is None:
             point = choice.choose(state, tip)
@@ -303,7 +304,7 @@ class Pushing:
                 self.losses += 1
                 self._release()
             elif contact.alignment < CONE_END:
-                self._give_up()
+                self._give_up(ZERO)
         elif self._aside < 2 * NEAR and contact is not None and contact.alignment > CONE:
             certain = press.deviation == 0.0 or press.certain
             if contact.gap < (TOUCHING if certain else TOUCHING + press.slack) and (certain or press.touched):
@@ -317,9 +318,9 @@ class Pushing:
         self.touching = False
         self.choice.restart()
 
-    def _give_up(self) -> None:
-        """Leave the present contact point for another one."""
-        self.choice.give_up(self.touching)
+    def _give_up(self, rest: Vector) -> None:
+        """Leave the present contact point, to which a vector from the tip is left, for another one."""
+        self.choice.give_up(self.touching, rest)
         self._release()
 
     def rank(self, state: State, limit: float = 0.1) -> list[int]:
