@@ -13,10 +13,11 @@ from kineverse.control.contact_slots import ContactSlots
 from kineverse.errors import InvalidValueError, UnknownNameError
 from kineverse.geometry import Scene
 from kineverse.manipulation.outcome import Outcome
+from kineverse.manipulation.pushing import placement
 from kineverse.manipulation.pushing.approach import plan_push_approach
 from kineverse.manipulation.pushing.contact_points import PushSurface, find_push_tool
 from kineverse.manipulation.pushing.controller import Pushing
-from kineverse.manipulation.pushing.placement import find_push_start, roll_out
+from kineverse.manipulation.pushing.placement import RollOut, find_push_start, roll_out
 from kineverse.manipulation.pushing.press import PushPress
 from kineverse.manipulation.pushing.push_skill import push
 from kineverse.manipulation.pushing.trials import try_push
@@ -285,6 +286,16 @@ def test_points_beyond_one_that_was_out_of_reach_are_given_up_too() -> None:
         after = choice.choose(start, (0.0, 0.0, 0.0))
         assert (np.array(after.point) - points[first]) @ way <= 1e-9
         assert choice.blocked == 1
+
+
+def test_search_of_a_start_ends_where_no_push_moves_the_object(monkeypatch: pytest.MonkeyPatch) -> None:
+    state, ends = opened(door=0.6), iter([0.6] * 1000)
+    pushing = Pushing(room(), "door", PUSHER, state, target=0.0)
+    monkeypatch.setattr(placement._Sampler, "sample", lambda self: state)
+    monkeypatch.setattr(placement, "roll_out", lambda *args: RollOut("blocked", 9, next(ends)))
+    assert find_push_start(pushing, state).samples < 100
+    ends = iter([0.6, 0.5, *[0.6] * 1000])
+    assert find_push_start(pushing, state).samples == 400
 
 
 def test_approach_is_planned_to_a_contact_point() -> None:

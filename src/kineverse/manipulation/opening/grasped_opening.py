@@ -39,7 +39,7 @@ _SLANT = math.radians(50.0)
 """Largest slant of grasps where those from across the handle lead nowhere [rad]."""
 _PROOF = 200
 """Largest number of sampled bases that are to prove that an object is too high."""
-_MOST_GRASPS = 4
+_MOST_GRASPS, _MOST_PUSHES = 4, 3
 _KEPT = 15
 """Number of sets of grasps that are kept."""
 _MOST_SLIPS, _LEAST_PROGRESS = 2, 0.1
@@ -238,17 +238,20 @@ class _Run:
         self._check_start()
         self._check_height()
         failure: SkillError | None = None
+        kind = "other"
         while failure is None and self.grasps < _MOST_GRASPS and self.left > self.tolerance / 2:
             try:
                 placement = self._place()
             except SkillError as error:
                 failure = error
             else:
+                # Grasps that lead on prove nothing about the reach of the arm.
+                kind = placement.failure if placement.failure != "reach" else "other"
                 self._move(placement)
         if self.left > self.tolerance:
             what = self.handle.coordinate
             self._push(
-                failure or SkillError("reach", f"After {self.grasps} grasps '{what}' is not at the target.")
+                failure or SkillError(kind, f"After {self.grasps} grasps '{what}' is not at the target.")
             )
 
     def _move(self, placement: BasePlacement) -> None:
@@ -278,17 +281,20 @@ class _Run:
 
     def _push(self, failure: SkillError) -> None:
         """Push the object on where no grasp leads, or raise SkillError with both reasons."""
-        fallback = PushFallback(self.motion, self.target, self.tolerance)
         value = float(self.session.state[self.handle.coordinate])
-        try:
-            fallback.find_start(self.seed)
-            self._bring_base(fallback.approach)
-            fallback.perform()
-        except SkillError as error:
-            kind = error.kind if error.kind == "time" else failure.kind
-            raise SkillError(kind, f"{failure} {error}") from error
-        finally:
-            self.pushed_from = value if fallback.begun else None
+        for attempt in range(1, _MOST_PUSHES + 1):
+            fallback = PushFallback(self.motion, self.target, self.tolerance)
+            try:
+                fallback.find_start(self.seed + attempt - 1)
+                self._bring_base(fallback.approach)
+                fallback.perform()
+                return
+            except SkillError as error:
+                if error.kind == "time" or not fallback.begun or attempt == _MOST_PUSHES:
+                    kind = error.kind if error.kind == "time" else failure.kind
+                    raise SkillError(kind, f"{failure} {error}") from error
+            finally:
+                self.pushed_from = value if fallback.begun else self.pushed_from
 
     def _bring_base(self, approach: Approach) -> None:
         """Drive a base on wheels to its place, or put it there by a reset of the world."""

@@ -14,7 +14,7 @@ from kineverse.state import State
 from .approach_planner import Approach
 from .hand_motion import HandMotion
 
-_SAMPLES = 240
+_SAMPLES = 480
 """Largest number of sampled starts. A limit of time would let results depend on other processes."""
 _PLANNING = 1.0
 """Largest time to plan the way to a start [s]."""
@@ -77,7 +77,9 @@ class PushFallback:
                 raise SkillError("reach", f"It cannot be pushed: {error}") from error
         self.samples += found.samples
         if found.state is None:
-            touching = any(" and " in r or "blocked" in r or "path" in r for r in found.reasons)
+            touching = any(
+                " and " in r or "blocked" in r or "path" in r or "base" in r for r in found.reasons
+            )
             raise SkillError("collision" if touching else "reach", f"Nor does a push: {found.why}")
 
     def _plan(self, start: State) -> str:

@@ -7,6 +7,7 @@ from collections import Counter
 from collections.abc import Callable
 from dataclasses import dataclass
 from time import perf_counter
+from typing import NamedTuple
 
 import numpy as np
 import numpy.typing as npt
@@ -15,6 +16,7 @@ from kineverse.compile.build_queue import working_seconds
 from kineverse.control import Goal, Hold, InverseKinematics, Target
 from kineverse.control.tasks import Task
 from kineverse.errors import KineverseError
+from kineverse.lie import Array
 from kineverse.manipulation.base_samples import BaseSamples, find_planar_base
 from kineverse.model.frame import is_of_robot
 from kineverse.state import State
@@ -35,6 +37,14 @@ _STARTS = 4
 """Number of arms from which inverse kinematics decides whether an arm that stands reaches a point."""
 _CANDIDATES = 1.0
 """Largest difference of the score of contact points to the best one."""
+_SOLVER_STARTS = 2, 1
+"""Numbers of starts of inverse kinematics: to the point, and out of collisions from there."""
+_DRAWS = 8
+"""Number of times that a place is drawn at which the base touches nothing."""
+_MOST_UNMOVED = 60
+"""Number of pushes without any motion of the object after which one more is not expected to move it."""
+_MOVED = 0.01
+"""Motion of an object that counts as one [m], [rad]."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -76,7 +86,7 @@ def find_push_start(
     pushing: Pushing,
     state: State,
     *,
-    samples: int = 200,
+    samples: int = 400,
     seconds: float = 30.0,
     steps: int = 900,
     seed: int = 0,
@@ -84,10 +94,12 @@ def find_push_start(
 ) -> PushStart:
     """Return a start state of the robot from which a push goes through in a roll-out of its own prediction.
 
-    A sample is a contact point and a pose of the base in front of it. Inverse kinematics brings the pusher to
-    the point, collisions included, and the push is rolled out from there. The first one without lost contacts
-    and penetration is taken. Robots without a mobile base are sampled over their arms alone, at those points
-    that are within reach.
+    A sample is a contact point and a free place of the base in front of it. Inverse kinematics brings the
+    pusher to the point, at first without collisions, in every other pair of samples with the base where it
+    stands. If the base touches nothing then, the arm is led out of collisions, and the push is rolled out.
+    The first one without lost contacts and penetration is taken. The search ends early after 60 roll-outs
+    none of which moves the object. Robots without a mobile base are sampled over their arms alone, at those
+    points that are within reach.
 
     Parameters
     ----------
@@ -109,6 +121,7 @@ def find_push_start(
     if sampler.unreachable:
         reasons["out of reach"] = sampler.unreachable
         return PushStart(None, sampler.unreachable, reasons, 0, perf_counter() - begin)
+    here, unmoved, moved = state[pushing.coordinate], 0, False
     for k in range(samples):
         if working_seconds() - worked > seconds:
             return PushStart(None, k, reasons, 0, perf_counter() - begin)
@@ -116,39 +129,61 @@ def find_push_start(
         if isinstance(start, str):
             reasons[start] += 1
             continue
-        problem, taken = roll_out(pushing, start, steps)
+        end = roll_out(pushing, start, steps)
+        moved, unmoved = moved or abs(end.value - here) > _MOVED, unmoved + 1
+        problem = end.problem
         if not problem and accept is not None:
             problem = accept(start)
         if not problem:
-            return PushStart(start, k + 1, reasons, taken, perf_counter() - begin)
+            return PushStart(start, k + 1, reasons, end.steps, perf_counter() - begin)
         reasons[problem] += 1
+        if not moved and unmoved >= _MOST_UNMOVED:
+            return PushStart(None, k + 1, reasons, 0, perf_counter() - begin)
     return PushStart(None, samples, reasons, 0, perf_counter() - begin)
 
 
-def roll_out(pushing: Pushing, start: State, steps: int, tolerance: float = 0.015) -> tuple[str, int]:
-    """Return why a push fails in its own prediction, empty if it goes through, and the number of steps."""
-    state = start
+class RollOut(NamedTuple):
+    """Result of :func:`roll_out`.
+
+    Attributes
+    ----------
+    problem
+        Why the push fails; empty if it goes through.
+    steps
+        Number of steps.
+    value
+        Value of the object's coordinate at the end [m], [rad].
+    """
+
+    problem: str
+    steps: int
+    value: float
+
+
+def roll_out(pushing: Pushing, start: State, steps: int, tolerance: float = 0.015) -> RollOut:
+    """Return how a push ends in its own prediction."""
+    state, taken = start, 0
     pushing.reset()
     try:
-        contact = pushing.first_contact(state)
-        if contact:
-            return contact, 0
-        for k in range(steps):
-            if pushing.done(state, tolerance):
-                return "", k
+        problem = pushing.first_contact(state)
+        while not problem and not pushing.done(state, tolerance):
             command = pushing.step(state)
             if pushing.losses:
-                return "lost the contact", k
-            if pushing.choice.blocked:
-                return f"blocked at {state[pushing.coordinate]:.2f}", k
-            if pushing.clearance < _LEAST_CLEARANCE:
-                return "too little room", k
-            state = pushing.model.integrate(state, command.speeds, pushing.controller.dt)
+                problem = "lost the contact"
+            elif pushing.choice.blocked:
+                problem = f"blocked at {state[pushing.coordinate]:.2f}"
+            elif pushing.clearance < _LEAST_CLEARANCE:
+                problem = "too little room"
+            elif taken + 1 == steps:
+                problem = "out of time"
+            else:
+                state = pushing.model.integrate(state, command.speeds, pushing.controller.dt)
+                taken += 1
     except KineverseError as error:
-        return f"{type(error).__name__}", 0
+        problem = type(error).__name__
     finally:
         pushing.reset()
-    return "out of time", steps
+    return RollOut(problem, taken, float(state[pushing.coordinate]))
 
 
 class _Sampler:
@@ -171,15 +206,28 @@ class _Sampler:
         if axis.gradient():
             exact.append(Goal(axis, self._facing.expression, name="facing", weight=0.1))
         nearby = Goal(tip, self._point.expression, name="tip")
+        self.base = find_planar_base(model, model.symbols_of(tool.frame))
         # A pusher that cannot face the contact may still reach it with another part than its tip.
-        self._solvers = [
+        goals: tuple[tuple[list[Task], float], ...] = (
+            (exact, 2 * math.sin(_TILT / 2)), ([nearby], _NEARBY)
+        )  # fmt: skip
+        clear = [
             InverseKinematics(
                 model, tasks, still=still, scene=pushing.scene, margin=_MARGIN, tolerance=tolerance
             )
-            for tasks, tolerance in ((exact, 2 * math.sin(_TILT / 2)), ([nearby], _NEARBY))
+            for tasks, tolerance in goals
         ]
+        self._coordinates = clear[0].coordinates
+        self._ways: list[tuple[InverseKinematics, ...]] = [(last,) for last in clear]
+        if self.base:
+            # Steps out of collisions take most of the time, and seldom lead a base out of one.
+            arm = all({s.position for s in e.gradient()} - {*self.base} for e in (tip, axis))
+            self._ways = [
+                (InverseKinematics(model, tasks, still=[*still, *standing], tolerance=tolerance), last)
+                for standing in ((self.base, ()) if arm else ((),))
+                for (tasks, tolerance), last in zip(goals, clear, strict=True)
+            ]
         self._tried = 0
-        self.base = find_planar_base(model, model.symbols_of(tool.frame))
         own = [b for b in pushing.scene.bodies if is_of_robot(b, pushing.robot)]
         others = [b for b in pushing.scene.bodies if b not in own]
         self._bases = BaseSamples(pushing.scene, self.base, own, others, _MARGIN)
@@ -198,21 +246,33 @@ class _Sampler:
         """Return a start state, or why there is none."""
         random, state = self._generator, self._state
         k = int(random.choice(self._candidates, p=self._weights))
-        point, normal = self._points.points[k], self._points.normals[k]
-        values = dict(self._arm())
+        at = state.updated(self._arm())
         if self.base:
-            (place,) = self._bases.draw(random, [state], point[None, :2], normal[None, :2])
-            values |= dict(zip(self.base, place.tolist(), strict=True))
-        at = state.updated(values)
-        solver = self._solvers[self._tried % len(self._solvers)]
+            place = self._draw_place(k)
+            if place is None:
+                return "no free place of the base"
+            at = at.updated(dict(zip(self.base, place.tolist(), strict=True)))
+        way = self._ways[self._tried % len(self._ways)]
         self._tried += 1
-        reached = solver.solve(
-            dict(at) | self._targets(k, solver), starts=2, seed=int(random.integers(2**31))
-        )
-        if not reached.solved:
-            (obstacle,) = [name for name, _ in reached.obstacles.most_common(1)] or ["out of reach"]
-            return obstacle
-        return at.updated({s: reached.best[s] for s in self._solvers[0].coordinates})
+        seed = int(random.integers(2**31))
+        for starts, solver in zip(_SOLVER_STARTS, way, strict=False):
+            reached = solver.solve(dict(at) | self._targets(k, solver), starts=starts, seed=seed)
+            if not reached.solved:
+                (obstacle,) = [name for name, _ in reached.obstacles.most_common(1)] or ["out of reach"]
+                return obstacle
+            at = at.updated({s: reached.best[s] for s in solver.coordinates})
+            if self.base and self._bases.find_touching([state], at.vector(self.base)[None])[0]:
+                return "the base touches something"
+        return at
+
+    def _draw_place(self, k: int) -> Array | None:
+        """Return a free place (3,) of the base in front of a contact point; None if none is found."""
+        point, normal = self._points.points[k, :2], self._points.normals[k, :2]
+        for _ in range(_DRAWS):
+            places = self._bases.draw(self._generator, [self._state], point[None], normal[None])
+            if not self._bases.find_touching([self._state], places)[0]:
+                return np.asarray(places[0])
+        return None
 
     def _select_reachable(
         self, solver: InverseKinematics, chosen: npt.NDArray[np.intp]
@@ -241,7 +301,7 @@ class _Sampler:
             return {}
         model = self._pushing.model
         values: dict[Symbol, float] = {}
-        for symbol in self._solvers[0].coordinates:
+        for symbol in self._coordinates:
             lower, upper = model.limits(symbol)
             if symbol not in self.base and math.isfinite(lower) and math.isfinite(upper):
                 middle = (lower + upper) / 2
