@@ -14,7 +14,7 @@ from kineverse.state import State
 from .approach_planner import Approach
 from .hand_motion import HandMotion
 
-_SAMPLES = 480
+_SAMPLES = 960
 """Largest number of sampled starts. A limit of time would let results depend on other processes."""
 _LEAST_SHARE = 0.2
 """Least share of the motion that a push is for."""
