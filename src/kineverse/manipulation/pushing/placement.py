@@ -43,6 +43,7 @@ _DRAWS = 8
 """Number of times that a place is drawn at which the base touches nothing."""
 _MOST_UNMOVED = 60
 """Number of pushes without any motion of the object after which one more is not expected to move it."""
+_NO_ROOM = "too little room"
 _MOVED = 0.01
 """Motion of an object that counts as one [m], [rad]."""
 
@@ -61,6 +62,8 @@ class PushStart:
         Number of samples by the reason of their failure.
     steps
         Number of steps of the push in the roll-out.
+    whole
+        Whether the push reaches the target.
     seconds
         Duration of the search [s].
     """
@@ -70,6 +73,7 @@ class PushStart:
     reasons: Counter[str]
     steps: int
     seconds: float
+    whole: bool = True
 
     def __bool__(self) -> bool:
         return self.state is not None
@@ -90,6 +94,7 @@ def find_push_start(
     seconds: float = 30.0,
     steps: int = 900,
     seed: int = 0,
+    least: float = 1.0,
     accept: Callable[[State], str] | None = None,
 ) -> PushStart:
     """Return a start state of the robot from which a push goes through in a roll-out of its own prediction.
@@ -113,6 +118,8 @@ def find_push_start(
         Largest number of steps of a roll-out.
     seed
         Seed of the samples.
+    least
+        Share of the motion from which on a start counts whose push goes the farthest, if none goes through.
     accept
         Further test of a start, such as a trial in a world: returns the reason against it, or nothing.
     """
@@ -122,9 +129,12 @@ def find_push_start(
         reasons["out of reach"] = sampler.unreachable
         return PushStart(None, sampler.unreachable, reasons, 0, perf_counter() - begin)
     here, unmoved, moved = state[pushing.coordinate], 0, False
-    for k in range(samples):
-        if working_seconds() - worked > seconds:
-            return PushStart(None, k, reasons, 0, perf_counter() - begin)
+    parts: list[tuple[float, int, State, int]] = []
+    count = 0
+    while count < samples and working_seconds() - worked <= seconds:
+        if unmoved >= _MOST_UNMOVED and not moved:
+            break
+        count += 1
         start = sampler.sample()
         if isinstance(start, str):
             reasons[start] += 1
@@ -132,14 +142,18 @@ def find_push_start(
         end = roll_out(pushing, start, steps)
         moved, unmoved = moved or abs(end.value - here) > _MOVED, unmoved + 1
         problem = end.problem
+        way = abs(end.value - here)
+        if problem and problem != _NO_ROOM and way >= least * abs(pushing.target - here):
+            parts.append((-way, count, start, end.steps))
         if not problem and accept is not None:
             problem = accept(start)
         if not problem:
-            return PushStart(start, k + 1, reasons, end.steps, perf_counter() - begin)
+            return PushStart(start, count, reasons, end.steps, perf_counter() - begin)
         reasons[problem] += 1
-        if not moved and unmoved >= _MOST_UNMOVED:
-            return PushStart(None, k + 1, reasons, 0, perf_counter() - begin)
-    return PushStart(None, samples, reasons, 0, perf_counter() - begin)
+    for _, _, start, taken in sorted(parts, key=lambda part: part[:2]):
+        if accept is None or not accept(start):
+            return PushStart(start, count, reasons, taken, perf_counter() - begin, False)
+    return PushStart(None, count, reasons, 0, perf_counter() - begin)
 
 
 class RollOut(NamedTuple):
@@ -173,7 +187,7 @@ def roll_out(pushing: Pushing, start: State, steps: int, tolerance: float = 0.01
             elif pushing.choice.blocked:
                 problem = f"blocked at {state[pushing.coordinate]:.2f}"
             elif pushing.clearance < _LEAST_CLEARANCE:
-                problem = "too little room"
+                problem = _NO_ROOM
             elif taken + 1 == steps:
                 problem = "out of time"
             else:
