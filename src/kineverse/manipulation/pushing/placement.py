@@ -261,13 +261,14 @@ class _Sampler:
         random, state = self._generator, self._state
         k = int(random.choice(self._candidates, p=self._weights))
         at = state.updated(self._arm())
-        if self.base:
-            place = self._draw_place(k)
-            if place is None:
-                return "no free place of the base"
-            at = at.updated(dict(zip(self.base, place.tolist(), strict=True)))
         way = self._ways[self._tried % len(self._ways)]
         self._tried += 1
+        if self.base:
+            place, free = self._draw_place(k)
+            # A base that moves may leave what it touches: below a flap most places are in cupboards.
+            if not free and self.base[0] not in way[0].coordinates:
+                return "no free place of the base"
+            at = at.updated(dict(zip(self.base, place.tolist(), strict=True)))
         seed = int(random.integers(2**31))
         for starts, solver in zip(_SOLVER_STARTS, way, strict=False):
             reached = solver.solve(dict(at) | self._targets(k, solver), starts=starts, seed=seed)
@@ -279,14 +280,15 @@ class _Sampler:
                 return "the base touches something"
         return at
 
-    def _draw_place(self, k: int) -> Array | None:
-        """Return a free place (3,) of the base in front of a contact point; None if none is found."""
+    def _draw_place(self, k: int) -> tuple[Array, bool]:
+        """Return a place (3,) of the base in front of a contact point, and whether it is free there."""
         point, normal = self._points.points[k, :2], self._points.normals[k, :2]
         for _ in range(_DRAWS):
             places = self._bases.draw(self._generator, [self._state], point[None], normal[None])
-            if not self._bases.find_touching([self._state], places)[0]:
-                return np.asarray(places[0])
-        return None
+            free = not self._bases.find_touching([self._state], places)[0]
+            if free:
+                break
+        return places[0], free
 
     def _select_reachable(
         self, solver: InverseKinematics, chosen: npt.NDArray[np.intp]
