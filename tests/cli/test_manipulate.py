@@ -132,6 +132,23 @@ def test_what_is_there_from_the_start_is_done(run, files):
     assert (status, out) == (0, "drawer: shut at 0.01 m, after 0 s in the kinematic world\n")
 
 
+@pytest.mark.parametrize(
+    ("upper", "skill", "more", "done", "says"),
+    [
+        ("0", "open", (), False, "cannot move"),
+        ("0", "open", ("--to", "0.1"), False, "cannot move"),
+        ("0", "close", (), True, "there from the start"),
+        ("0.01", "open", (), False, "moves no handle"),
+    ],
+)
+def test_what_hardly_moves_is_not_open_from_the_start(run, files, upper, skill, more, done, says):
+    (files / "box.urdf").write_text(DRAWER.replace('upper="0.2"', f'upper="{upper}"'))
+    status, out, _ = run(skill, "box.urdf", *HSR[:2], "--what", "drawer", "--json", *more)
+    answer = json.loads(out)
+    assert (status, answer["done"]) == (1 - done, done)
+    assert says in answer["reason"]
+
+
 def test_open_begins_shut_and_close_begins_open(run, asked, tmp_path):
     status, out, err = run("open", "shelf_drawers", *HSR, "--json", "--seconds", 5)
     answer = json.loads(out)

@@ -172,6 +172,28 @@ def test_open_without_what_it_needs_says_what_is_missing_and_moves_nothing(what,
     assert dict(world.state) == dict(begin)
 
 
+@pytest.mark.parametrize(
+    ("upper", "says"),
+    [
+        (0, "'room/drawer' cannot move: its lower and its upper limit are 0."),
+        (kv.position("robot/finger") - 0.05, "'room/drawer' is locked at 0 while 'robot/finger' is 0.05."),
+    ],
+)
+def test_open_of_what_its_limits_hold_is_not_done_and_says_what_holds_it(upper, says):
+    model = pusher()
+    with model.edit() as edit:
+        edit.constrain("room/lock", 0, kv.position(DRAWER), upper)
+    world = KinematicWorld(model, "robot")
+    world.reset(before_drawer(model))
+    session = Session(world)
+    for target in (None, 0.3):
+        outcome = open_object(session, DRAWER, target=target)
+        assert (bool(outcome), outcome.steps) == (False, 0)
+        assert outcome.reason.startswith(says)
+    assert open_object(session, DRAWER, target=0.0)
+    assert push(session, DRAWER, bodies="robot/palm")
+
+
 def test_beliefs_know_the_deviation_of_their_own_coordinates_only():
     model = pusher()
     world = KinematicWorld(model, "robot")

@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, Any, Literal, NamedTuple
 
 from kineverse.cli.arguments import add_model_options, print_notes
 from kineverse.cli.manipulate_output import PhaseLines, report_outcome
-from kineverse.cli.manipulate_setup import TOLERANCE, ManipulationScene, make_scene
+from kineverse.cli.manipulate_setup import ManipulationScene, make_scene
 from kineverse.cli.manipulate_skills import grasp_object, open_as_unknown, push_object, skip_skill
 from kineverse.cli.output import show_activity
 from kineverse.cli.view import (
@@ -281,7 +281,10 @@ def _act(
             for watch in watchers:
                 watch(step)
 
-        if abs(scene.start[scene.coordinate] - scene.target) < TOLERANCE:
+        there = abs(scene.start[scene.coordinate] - scene.target) <= scene.tolerance
+        if scene.fixed and (not there or (skill == "open" and arguments.to is None)):
+            outcome = skip_skill(scene, world, False, scene.fixed)
+        elif there:
             outcome = skip_skill(scene, world, True, f"'{scene.coordinate}' is there from the start")
         else:
             act = push_object if skill == "push" else open_as_unknown if arguments.unknown else grasp_object

@@ -64,7 +64,7 @@ def report_outcome(
             "robot": scene.robot,
             "what": str(scene.coordinate),
             "start": scene.start[scene.coordinate],
-            "target": scene.target,
+            "target": None if arguments.unknown and arguments.to is None else scene.target,
             "hand": None if scene.gripper is None else scene.gripper.hand,
             "measures": outcome.measures,
             "remarks": world.remarks,

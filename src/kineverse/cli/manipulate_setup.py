@@ -23,7 +23,7 @@ if TYPE_CHECKING:
 OPENING = 0.4
 """Distance from shut at which closing and pushing begin [m], [rad]."""
 TOLERANCE = 0.02
-"""Distance from the target within which an object is there [m], [rad]."""
+"""Distance from the target within which an object is there, unless its whole range is short [m], [rad]."""
 _NEXT_STEP = (
     "Name a hand with two opposed fingers by --hand FRAME, or move the object with any body of the robot: "
     "kineverse push ... --hand BODY --to VALUE.",
@@ -62,6 +62,10 @@ class ManipulationScene:
         Bodies that may push.
     stays
         Whether the start of the robot was given, so that it is not placed elsewhere.
+    fixed
+        Why the object cannot move at the start; empty if it can.
+    tolerance
+        Distance from the target within which the object is there [m], [rad].
     """
 
     model: kv.Model
@@ -74,6 +78,8 @@ class ManipulationScene:
     why: str
     pusher: tuple[str, ...]
     stays: bool
+    fixed: str
+    tolerance: float
 
 
 def make_scene(arguments: argparse.Namespace, skill: str) -> ManipulationScene:
@@ -87,6 +93,7 @@ def make_scene(arguments: argparse.Namespace, skill: str) -> ManipulationScene:
     """
     from kineverse.experiments.manipulation.robots import SHIPPED, remove_unusable_shapes
     from kineverse.manipulation.articulated_objects import find_shut_value
+    from kineverse.manipulation.skill_arguments import explain_fixed, limit_tolerance
     from kineverse.view.sliders import infer_units
 
     begin, end = (None if v is None else parse_value(v) for v in (arguments.start, arguments.to))
@@ -120,7 +127,10 @@ def make_scene(arguments: argparse.Namespace, skill: str) -> ManipulationScene:
         end = shut if skill != "open" else max(lower, upper, key=lambda limit: abs(limit - shut))
     if not math.isfinite(end):
         raise InvalidValueError(f"'{coordinate}' has no limit at which it is open; say how far: --to VALUE.")
+    fixed = explain_fixed(model, coordinate, default.updated({coordinate: begin}))
     for option, value in (("--from", begin), ("--to", end)):
+        if fixed and option == "--to":
+            continue  # that it is fixed is the result
         if not lower - 1e-9 <= value <= upper + 1e-9:
             raise InvalidValueError(
                 f"{option} {value:.4g}: '{coordinate}' is between {lower:.4g} and {upper:.4g}."
@@ -132,7 +142,18 @@ def make_scene(arguments: argparse.Namespace, skill: str) -> ManipulationScene:
         state = _stand_free(model, named, state, free)
     gripper, why, pusher = _find_pusher(model, named, arguments.hand, skill)
     return ManipulationScene(
-        model, named, coordinate, unit, state, end, gripper, why, pusher, place is not None
+        model,
+        named,
+        coordinate,
+        unit,
+        state,
+        end,
+        gripper,
+        why,
+        pusher,
+        place is not None,
+        fixed,
+        limit_tolerance(model, coordinate, TOLERANCE),
     )
 
 
@@ -141,7 +162,7 @@ def is_shut(scene: ManipulationScene) -> bool:
     from kineverse.manipulation.articulated_objects import find_shut_value
 
     shut = find_shut_value(scene.model, scene.coordinate)
-    return abs(scene.target - shut) < TOLERANCE
+    return abs(scene.target - shut) <= scene.tolerance
 
 
 def _open_from(shut: float, lower: float, upper: float) -> float:

@@ -13,6 +13,9 @@ from kineverse.state import State
 from kineverse.symbols import Symbol
 from kineverse.worlds import World
 
+_FIXED = 1e-9
+"""Range of a coordinate up to which it counts as fixed [m], [rad]."""
+
 
 def find_object_coordinate(world: World, what: Symbol | str) -> Symbol:
     """Return the coordinate of an object by symbol or name.
@@ -48,11 +51,30 @@ def check_target(given: Any) -> float | None:
     return number
 
 
+def explain_fixed(model: ModelView, coordinate: Symbol, state: State) -> str:
+    """Return why a coordinate cannot move from where it is in a state; empty if its limits let it.
+
+    A lock is a limit that depends on other coordinates, so these are named.
+    """
+    lower, upper = (float(v) for v in model.limits(coordinate, state))
+    if upper - lower > _FIXED:
+        return ""
+    limits = [c for c in model.constraints_for(coordinate, exact=True).values() if c.expression == coordinate]
+    keys = sorted({str(s) for c in limits for s in c.symbols if s != coordinate})
+    at = ", ".join(f"'{key}' is {state[key]:.3g}" for key in keys if key in state)
+    if at:
+        return (
+            f"'{coordinate}' is locked at {upper:.3g} while {at}. "
+            "'kineverse unlock' says what has to move before it."
+        )
+    return f"'{coordinate}' cannot move: its lower and its upper limit are {upper:.3g}."
+
+
 def limit_tolerance(model: ModelView, coordinate: Symbol, given: Any) -> float:
     """Return a tolerance of a target [m], [rad], at most a tenth of the coordinate's range."""
     tolerance = as_tolerance(given, "tolerance=")
     lower, upper = (float(v) for v in model.limits(coordinate))
-    return min(tolerance, 0.1 * (upper - lower)) if math.isfinite(upper - lower) else tolerance
+    return min(tolerance, max(0.0, 0.1 * (upper - lower))) if math.isfinite(upper - lower) else tolerance
 
 
 def choose_target(model: ModelView, coordinate: Symbol, state: State, target: float | None) -> float:

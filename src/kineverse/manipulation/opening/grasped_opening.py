@@ -18,6 +18,7 @@ from kineverse.manipulation.skill_arguments import (
     check_positive,
     check_target,
     choose_target,
+    explain_fixed,
     find_object_coordinate,
     limit_tolerance,
 )
@@ -109,6 +110,9 @@ def open_object(
     world, model = session.world, session.world.model
     coordinate = find_object_coordinate(world, what)
     seconds = check_positive("seconds", seconds)
+    fixed, here = explain_fixed(model, coordinate, session.state), float(world.state[coordinate])
+    if fixed and (target is None or check_target(target) != here):
+        return Outcome(False, here, fixed, world.name, 0.0, 0, {"failure": "other"})
     goal = choose_target(model, coordinate, session.state, check_target(target))
     tolerance = limit_tolerance(model, coordinate, tolerance)
     found = find_handle(model, coordinate, handle)

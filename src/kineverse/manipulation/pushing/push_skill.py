@@ -128,9 +128,9 @@ def push(
         session.stop()
     if pushing is None:
         target = find_shut_value(model, coordinate) if target is None else target
-        if abs(session.state[coordinate] - target) < tolerance / 2:
+        if abs(session.state[coordinate] - target) <= tolerance / 2:
             value, reason = world.state[coordinate], f"'{coordinate}' is there from the start"
-            done = abs(value - target) < tolerance
+            done = abs(value - target) <= tolerance
             return Outcome(done, value, reason, world.name, world.time - begin, session.steps - first)
         if bodies is None:
             bodies = find_gripper(model, world.robot).bodies
