@@ -11,6 +11,7 @@ from kineverse.grasping import find_gripper, find_handle, sample_grasps
 from kineverse.manipulation import PlacementSearch, Session, TrackedBelief, open_object
 from kineverse.manipulation.base_samples import find_planar_base
 from kineverse.manipulation.belief import EstimateError
+from kineverse.manipulation.opening.arm_rows import find_least_time
 from kineverse.manipulation.opening.hand_paths import HandPaths
 from kineverse.manipulation.opening.placement_samples import PlacementSamples
 from kineverse.worlds import KinematicWorld, MujocoWorld, Sensors
@@ -133,7 +134,9 @@ def test_a_hand_from_below_opens_a_door_that_none_from_across_reaches():
     gripper, handle, state = find_gripper(model, "hsr"), find_handle(model, DOOR), start(model)
     across = sample_grasps(model, gripper, handle, 32)
     search = PlacementSearch(model, gripper, state)
-    assert search.find(state, across, 1.2, samples=200).failure == "reach"
+    found = search.find(state, across, 1.2)
+    assert found.failure == "reach"
+    assert found.samples < 600  # no arm reached the handle at all
     world = KinematicWorld(model, "hsr")
     world.reset(state)
     outcome = open_object(Session(world), DOOR, target=1.2)
@@ -252,6 +255,22 @@ def test_drawer_above_the_hand_is_said_to_be_too_high():
     hand = float(model.fk("hsr/hand_palm_link")(start(model).updated(up))[2, 3])
     reach = float(re.search(r"reaches (\S+) m", outcome.reason)[1])
     assert hand + 0.09 < reach < hand + 0.16
+
+
+def test_arms_on_a_base_that_stays_are_the_present_one_or_random(model):
+    search = PlacementSearch(model, find_gripper(model, "hsr"), start(model))
+    Q, standing = search.samples.stay(np.random.default_rng(0), start(model), 40)
+    here = start(model).vector(search.moving)
+    on_base = [s in search.base for s in search.moving]
+    np.testing.assert_array_equal(Q[:, on_base], np.tile(here[on_base], (40, 1)))
+    assert standing.shape == (40, len(search.standing))
+    assert 10 < (here == Q).all(axis=1).sum() < 30
+
+
+def test_a_way_takes_as_long_as_its_slowest_part():
+    rows = np.array([[0.0, 0.0], [0.1, 0.0], [0.2, 0.06]])
+    assert find_least_time(rows, np.array([1.0, 0.02])) == pytest.approx(2 * 0.06 / 0.02)
+    assert find_least_time(rows[:1], np.array([1.0, 0.02])) == 0.0
 
 
 def test_base_of_a_whole_arm_stands_in_a_part_of_the_samples():

@@ -13,10 +13,11 @@ from kineverse.control.contact_slots import ContactSlots
 from kineverse.errors import InvalidValueError, UnknownNameError
 from kineverse.geometry import Scene
 from kineverse.manipulation.outcome import Outcome
+from kineverse.manipulation.pushing import placement
 from kineverse.manipulation.pushing.approach import plan_push_approach
 from kineverse.manipulation.pushing.contact_points import PushSurface, find_push_tool
 from kineverse.manipulation.pushing.controller import Pushing
-from kineverse.manipulation.pushing.placement import find_push_start, roll_out
+from kineverse.manipulation.pushing.placement import RollOut, find_push_start, roll_out
 from kineverse.manipulation.pushing.press import PushPress
 from kineverse.manipulation.pushing.push_skill import push
 from kineverse.manipulation.pushing.trials import try_push
@@ -270,6 +271,31 @@ def test_start_is_placed_and_rolled_out_and_trends_make_it_touch() -> None:
     never = find_push_start(pushing, away, samples=2, accept=lambda state: "not today")
     assert not never
     assert "not today" in never.why
+
+
+def test_points_beyond_one_that_was_out_of_reach_are_given_up_too() -> None:
+    model, start = room(), opened(door=0.6)
+    pushing = Pushing(model, "door", PUSHER, start, target=0.0)
+    choice, points = pushing.choice, pushing.surface.at(start).points
+    first = choice.rank(start, (0.0, 0.0, 0.0), np.inf)[0]
+    choice.choose(start, (0.0, 0.0, 0.0), first)
+    for way in ((0.0, 0.0, 0.3), (0.0, 0.0, -0.3)):
+        choice.reset()
+        choice.chosen = first
+        choice.give_up(False, way)
+        after = choice.choose(start, (0.0, 0.0, 0.0))
+        assert (np.array(after.point) - points[first]) @ way <= 1e-9
+        assert choice.blocked == 1
+
+
+def test_search_of_a_start_ends_where_no_push_moves_the_object(monkeypatch: pytest.MonkeyPatch) -> None:
+    state, ends = opened(door=0.6), iter([0.6] * 1000)
+    pushing = Pushing(room(), "door", PUSHER, state, target=0.0)
+    monkeypatch.setattr(placement._Sampler, "sample", lambda self: state)
+    monkeypatch.setattr(placement, "roll_out", lambda *args: RollOut("blocked", 9, next(ends)))
+    assert find_push_start(pushing, state).samples < 100
+    ends = iter([0.6, 0.5, *[0.6] * 1000])
+    assert find_push_start(pushing, state).samples == 400
 
 
 def test_approach_is_planned_to_a_contact_point() -> None:

@@ -75,3 +75,16 @@ def limit_tolerance(model: ModelView, coordinate: Symbol, given: Any) -> float:
     tolerance = as_tolerance(given, "tolerance=")
     lower, upper = (float(v) for v in model.limits(coordinate))
     return min(tolerance, max(0.0, 0.1 * (upper - lower))) if math.isfinite(upper - lower) else tolerance
+
+
+def choose_target(model: ModelView, coordinate: Symbol, state: State, target: float | None) -> float:
+    """Return a wanted value within limits, by default the limit that is the farthest away."""
+    lower, upper = (float(v) for v in model.limits(coordinate, state))
+    here = state[coordinate]
+    if target is None:
+        target = upper if abs(upper - here) >= abs(lower - here) else lower
+        if not math.isfinite(target):
+            raise InvalidValueError(f"'{coordinate}' has no limit to move to; name a target.")
+    if not lower - 1e-9 <= target <= upper + 1e-9:
+        raise InvalidValueError(f"'{coordinate}' moves from {lower:g} to {upper:g}, not to {target!r}.")
+    return float(target)

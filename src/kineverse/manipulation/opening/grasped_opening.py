@@ -17,6 +17,7 @@ from kineverse.manipulation.session import Session
 from kineverse.manipulation.skill_arguments import (
     check_positive,
     check_target,
+    choose_target,
     explain_fixed,
     find_object_coordinate,
     limit_tolerance,
@@ -40,7 +41,9 @@ _SLANT = math.radians(50.0)
 """Largest slant of grasps where those from across the handle lead nowhere [rad]."""
 _PROOF = 200
 """Largest number of sampled bases that are to prove that an object is too high."""
-_MOST_GRASPS = 4
+_MOST_GRASPS, _MOST_PUSHES = 4, 3
+_LATE = 1.0
+"""Time before the end at which it counts as up [s]."""
 _KEPT = 15
 """Number of sets of grasps that are kept."""
 _MOST_SLIPS, _LEAST_PROGRESS = 2, 0.1
@@ -110,7 +113,7 @@ def open_object(
     fixed, here = explain_fixed(model, coordinate, session.state), float(world.state[coordinate])
     if fixed and (target is None or check_target(target) != here):
         return Outcome(False, here, fixed, world.name, 0.0, 0, {"failure": "other"})
-    goal = _choose_target(model, coordinate, session.state, check_target(target))
+    goal = choose_target(model, coordinate, session.state, check_target(target))
     tolerance = limit_tolerance(model, coordinate, tolerance)
     found = find_handle(model, coordinate, handle)
     gripper = find_gripper(model, world.robot, hand)
@@ -172,18 +175,6 @@ class _Opener:
         return self._grasps[key]
 
 
-def _choose_target(model: ModelView, coordinate: Symbol, state: State, target: float | None) -> float:
-    lower, upper = (float(v) for v in model.limits(coordinate, state))
-    here = state[coordinate]
-    if target is None:
-        target = upper if abs(upper - here) >= abs(lower - here) else lower
-        if not math.isfinite(target):
-            raise InvalidValueError(f"'{coordinate}' has no limit to move to; name a target.")
-    if not lower - 1e-9 <= target <= upper + 1e-9:
-        raise InvalidValueError(f"'{coordinate}' moves from {lower:g} to {upper:g}, not to {target!r}.")
-    return float(target)
-
-
 class _Run:
     """One opening: its phases, and what was measured on the way."""
 
@@ -237,23 +228,36 @@ class _Run:
         return f"; it was pushed from {self.pushed_from:.3f} on, where no grasp led further"
 
     def perform(self) -> None:
-        """Move the object to the target with one grasp after the other, or raise SkillError."""
+        """Move the object to the target by grasps, and by pushes where none leads on, or raise SkillError."""
         self.motion.look()
         self._check_start()
         self._check_height()
+        failure = self._move_grasped()
+        for attempt in range(_MOST_PUSHES):
+            before = self.left
+            if before <= self.tolerance:
+                return
+            self._push(failure, attempt)
+            if self.tolerance < self.left < (1.0 - _LEAST_PROGRESS) * before:
+                failure = self._move_grasped()
+        if self.left > self.tolerance:
+            raise failure
+
+    def _move_grasped(self) -> SkillError:
+        """Move the object with one grasp after the other, and return why none leads on."""
         failure: SkillError | None = None
+        kind = "other"
         while failure is None and self.grasps < _MOST_GRASPS and self.left > self.tolerance / 2:
             try:
                 placement = self._place()
             except SkillError as error:
                 failure = error
             else:
+                # Grasps that lead on prove nothing about the reach of the arm.
+                kind = placement.failure if placement.failure != "reach" else "other"
                 self._move(placement)
-        if self.left > self.tolerance:
-            what = self.handle.coordinate
-            self._push(
-                failure or SkillError("reach", f"After {self.grasps} grasps '{what}' is not at the target.")
-            )
+        what = self.handle.coordinate
+        return failure or SkillError(kind, f"After {self.grasps} grasps '{what}' is not at the target.")
 
     def _move(self, placement: BasePlacement) -> None:
         """Move the object with one grasp as far as the way of a placement leads."""
@@ -280,19 +284,21 @@ class _Run:
         """Distance of the object from the target [m], [rad]."""
         return abs(float(self.session.state[self.handle.coordinate]) - self.target)
 
-    def _push(self, failure: SkillError) -> None:
-        """Push the object on where no grasp leads, or raise SkillError with both reasons."""
+    def _push(self, failure: SkillError, attempt: int) -> None:
+        """Push the object on where no grasp leads, or raise SkillError after the last attempt."""
         fallback = PushFallback(self.motion, self.target, self.tolerance)
         value = float(self.session.state[self.handle.coordinate])
         try:
-            fallback.find_start(self.seed)
+            fallback.find_start(self.seed + attempt)
             self._bring_base(fallback.approach)
             fallback.perform()
         except SkillError as error:
-            kind = error.kind if error.kind == "time" else failure.kind
-            raise SkillError(kind, f"{failure} {error}") from error
+            late = error.kind == "time" and self.session.world.time > self.motion.until - _LATE
+            if late or not fallback.begun or attempt + 1 == _MOST_PUSHES:
+                raise SkillError("time" if late else failure.kind, f"{failure} {error}") from error
         finally:
-            self.pushed_from = value if fallback.begun else None
+            if self.pushed_from is None and fallback.begun:
+                self.pushed_from = value
 
     def _bring_base(self, approach: Approach) -> None:
         """Drive a base on wheels to its place, or put it there by a reset of the world."""

@@ -26,6 +26,7 @@ from kineverse.symbols import Symbol
 from kineverse.worlds import Judge
 
 from .approach_planner import Approach, ApproachPlanner
+from .arm_rows import find_least_time, row_at
 from .base_placement import BasePlacement
 from .hand_retreat import find_retreat
 from .placement import PlacementSearch
@@ -213,7 +214,10 @@ class HandMotion:
         bar = compile(self._bar, tier="interpreter")  # some hundred calls
         controller, (wanted, rate, posture, follow) = self.find_controller(("line", rows is None), make)
         way = end[:3, 3] - start[:3, 3]
-        steps = max(2, math.ceil(float(np.linalg.norm(way)) / (_LINE_SPEED * session.dt)))
+        seconds = float(np.linalg.norm(way)) / _LINE_SPEED
+        if rows is not None:
+            seconds = max(seconds, find_least_time(rows, self.search.samples.speeds))
+        steps = max(2, math.ceil(seconds / session.dt))
         speed = np.concatenate([end[:3, :3].T @ way / (steps * session.dt), np.zeros(3)])
         uncertain = [session.deviation(x) for x in (self._bar @ end)[:3, 3]]
         settled = max(_SETTLED, _SIGMAS * float(np.linalg.norm(uncertain)))
@@ -401,12 +405,3 @@ class HandMotion:
         """Raise SkillError if the time is up."""
         if self.session.world.time > self.until:
             raise SkillError("time", f"The time is up in '{self.session.phase}'.")
-
-
-def row_at(rows: Array, share: float) -> Array:
-    """Return the configuration (n,) at a share of the way along some (K, n)."""
-    place = share * (len(rows) - 1)
-    k = min(max(int(place), 0), max(len(rows) - 2, 0))
-    rest = min(max(place - k, 0.0), 1.0)
-    found = (1.0 - rest) * rows[k] + rest * rows[min(k + 1, len(rows) - 1)]
-    return np.asarray(found)

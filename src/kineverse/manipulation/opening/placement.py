@@ -39,7 +39,10 @@ _STARTS = 4
 _MIDDLES = (0.5, 0.5, 0.25, 0.5, 0.0)
 """Shares of the object's way from which the arms of successive batches set out to both ends."""
 _WHOLE = 300
-"""Number of bases after which a way to a part of the motion is taken."""
+"""Number of bases after which a way to a part of the motion is taken, and after which the search ends if no
+arm has reached the handle anywhere: at the middle of its way, or at a quarter of it."""
+_AROUND, _HERE = 0.6, 100
+"""Distance of the hand from the handle up to which the base may stay [m], and the number of arms there."""
 _LEAST_SHARE = 0.2
 """Least share of the motion that one grasp is for."""
 _MOST_CHECKS, _MOST_REFUSED = 150, 3
@@ -134,9 +137,11 @@ class PlacementSearch:
     ) -> BasePlacement:
         """Return a placement from which the object can be moved from its value to a target, or towards it.
 
-        Bases are sampled in front of the handle, arms at random. All of them follow the way of the handle at
-        once, and the straight ways to it and from it; those that arrive are checked for contacts, the
-        quickest first. Where none of many bases arrives, the one with the longest way is returned.
+        Bases are sampled in front of the handle, arms at random. Where none of the first batch leads to the
+        target and the hand is near, so that it has just let go, the base may stay as well. All of them
+        follow the way of the handle at once, and the straight ways to it and from it; those that arrive are
+        checked for contacts, the quickest first. Where none of many bases arrives, the one with the longest
+        way is returned. The search ends early if no arm reaches the handle on its way.
 
         Parameters
         ----------
@@ -159,10 +164,13 @@ class PlacementSearch:
         for number in count():
             whole = number * batch < min(_WHOLE, samples)
             found = search.take(whole)
-            if found is not None or number * batch >= samples or search.refused >= _MOST_REFUSED:
+            ended = number * batch >= samples or (not whole and not search.reached)
+            if found is not None or ended or search.refused >= _MOST_REFUSED:
                 break
             self.paths.ease = self.samples.eases[number % len(self.samples.eases)]
             search.add(min(batch, samples - number * batch), _MIDDLES[number % len(_MIDDLES)])
+            if number == 1:
+                search.add_here()
         return found or search.nothing
 
 
@@ -179,7 +187,7 @@ class _Search:
         random: np.random.Generator,
     ) -> None:
         self.owner, self.state, self.grasps, self.random = owner, state, grasps, random
-        self.begin, self.tried = perf_counter(), 0
+        self.begin, self.tried, self.reached = perf_counter(), 0, False
         self.accept, self.refused = accept, 0
         self.coordinate = grasps[0].handle.coordinate
         start = float(state[self.coordinate])
@@ -206,6 +214,16 @@ class _Search:
 
     # -- sampling ------------------------------------------------------------------------------------------
 
+    def add_here(self) -> None:
+        """Sample arms and grasps where the base stands, if the hand is near the handle."""
+        hand = np.asarray(self.owner.model.fk(self.grasps[0].gripper.hand)(self.state))
+        if np.linalg.norm(hand[:3, 3] - self.handles[0, :3, 3]) > _AROUND:
+            return
+        samples = self.owner.samples
+        choice = samples.choose_grasps(self.random, self.grasps, self.free, _HERE, True)
+        if len(choice):
+            self._keep(*samples.stay(self.random, self.state, _HERE), choice, 0)
+
     def add(self, batch: int, middle_share: float) -> None:
         """Sample bases, arms and grasps, and keep those that reach along the way."""
         paths, handles = self.owner.paths, self.handles
@@ -221,8 +239,14 @@ class _Search:
         stops = (middle, 0, self.last) if samples.stands(paths.ease) else (middle,)
         states = [self.state.updated({self.coordinate: float(self.values[k])}) for k in stops]
         Q, base = samples.draw(self.random, states, hands, outside, _STARTS, self.owner.bases)
-        Q, error = paths.solve(Q, base, hands, _START_ITERATIONS)
+        self._keep(Q, base, choice, middle)
+
+    def _keep(self, Q: Array, base: Array, choice: npt.NDArray[np.intp], middle: int) -> None:
+        """Keep those arms (N, n) that reach along the way, from a value with the index ``middle`` on."""
+        paths, handles = self.owner.paths, self.handles
+        Q, error = paths.solve(Q, base, handles[middle] @ self.poses[choice], _START_ITERATIONS)
         good = self._count(error < 1e-3, "out of reach")
+        self.reached |= bool(good.any())
         Q, base, choice = Q[good], base[good], choice[good]
         before, reached = paths.follow(Q, base, handles[None, middle::-1] @ self.poses[choice, None])
         good = self._count(reached == middle + 1, "the arm ends on the way")

@@ -130,14 +130,7 @@ class PlacementSamples:
             Places of the base.
         """
         count = len(hands)
-        here = states[0].vector(self.moving)
-        lower = np.where(self._bounded, self.lower, here - math.pi)
-        upper = np.where(self._bounded, self.upper, here + math.pi)
-        soon = random.random((count, 1)) < 0.75
-        span = _SOON * self.speeds
-        low = np.where(soon, np.minimum(np.maximum(lower, here - span), upper), lower)
-        high = np.where(soon, np.maximum(np.minimum(upper, here + span), lower), upper)
-        Q = random.uniform(low, high)
+        Q = self._draw_arms(random, states[0], count)
         still = np.tile(states[0].vector(self.standing), (count, 1))
         if self.base:
             first = slice(None, None, starts)
@@ -147,6 +140,22 @@ class PlacementSamples:
                 columns, array = (self.moving, Q) if s in self.moving else (self.standing, still)
                 array[:, columns.index(s)] = places[:, k]
         return Q, still
+
+    def stay(self, random: np.random.Generator, state: State, count: int) -> tuple[Array, Array]:
+        """Return arms (N, n) on a base that stays, (N, m): half of them as in a state, the others random."""
+        kept = self._on_base | (random.random((count, 1)) < 0.5)
+        Q = np.where(kept, state.vector(self.moving), self._draw_arms(random, state, count))
+        return Q, np.tile(state.vector(self.standing), (count, 1))
+
+    def _draw_arms(self, random: np.random.Generator, state: State, count: int) -> Array:
+        here = state.vector(self.moving)
+        lower = np.where(self._bounded, self.lower, here - math.pi)
+        upper = np.where(self._bounded, self.upper, here + math.pi)
+        soon = random.random((count, 1)) < 0.75
+        span = _SOON * self.speeds
+        low = np.where(soon, np.minimum(np.maximum(lower, here - span), upper), lower)
+        high = np.where(soon, np.maximum(np.minimum(upper, here + span), lower), upper)
+        return random.uniform(low, high)
 
     def cost(self, state: State, ways: Array, approaches: Array, ends: npt.NDArray[np.int_]) -> Array:
         """Return the costs (N,) of ways (N, K, n) until indices (N,): their times, and nearness to limits.

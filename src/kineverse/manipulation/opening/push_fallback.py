@@ -14,8 +14,12 @@ from kineverse.state import State
 from .approach_planner import Approach
 from .hand_motion import HandMotion
 
-_SAMPLES = 240
+_SAMPLES = 960
 """Largest number of sampled starts. A limit of time would let results depend on other processes."""
+_LEAST_SHARE = 0.2
+"""Least share of the motion that a push is for."""
+_LONGER, _SETTLING = 1.5, 2.0
+"""Share of its time in the roll-out for which a push to a part of the motion lasts, and what is added [s]."""
 _PLANNING = 1.0
 """Largest time to plan the way to a start [s]."""
 _PUSHING = 10.0
@@ -45,10 +49,11 @@ class PushFallback:
     def __init__(self, motion: HandMotion, target: float, tolerance: float) -> None:
         self.motion, self.target, self.tolerance = motion, target, tolerance
         self.samples, self.begun = 0, False
+        self._seconds = math.inf
         self.approach = Approach()
 
     def find_start(self, seed: int) -> None:
-        """Find a state of the robot from which the push goes through and to which a way leads.
+        """Find a state of the robot from which the push goes through, or far, and to which a way leads.
 
         Raises
         ------
@@ -71,14 +76,24 @@ class PushFallback:
                     still=motion.gripper.joints,
                 )
                 found = find_push_start(
-                    self.pushing, state, samples=_SAMPLES, seconds=math.inf, seed=seed, accept=self._plan
+                    self.pushing,
+                    state,
+                    samples=_SAMPLES,
+                    seconds=math.inf,
+                    seed=seed,
+                    least=_LEAST_SHARE,
+                    accept=self._plan,
                 )
             except InvalidValueError as error:
                 raise SkillError("reach", f"It cannot be pushed: {error}") from error
         self.samples += found.samples
         if found.state is None:
-            touching = any(" and " in r or "blocked" in r or "path" in r for r in found.reasons)
+            touching = any(
+                " and " in r or "blocked" in r or "path" in r or "base" in r for r in found.reasons
+            )
             raise SkillError("collision" if touching else "reach", f"Nor does a push: {found.why}")
+        if not found.whole:
+            self._seconds = _LONGER * found.steps * session.dt + _SETTLING
 
     def _plan(self, start: State) -> str:
         """Plan the way to a start, and return why there is none."""
@@ -90,13 +105,20 @@ class PushFallback:
         return "far away" if self.approach.trajectory.duration > left - _PUSHING else ""
 
     def perform(self) -> None:
-        """Go to the start that was found, push, and take the hand away, or raise SkillError."""
+        """Go to the start that was found, push, and take the hand away.
+
+        Raises
+        ------
+        SkillError
+            If the object is neither at the target nor nearer by the share that a push is for.
+        """
         motion, session = self.motion, self.motion.session
         assert self.approach.trajectory is not None
         motion.judge.allow(self.pushing.object_bodies)
         session.phase = "approach"
         motion.follow(self.approach.trajectory)
         self.begun = True
+        before = abs(session.state[motion.handle.coordinate] - self.target)
 
         def look(pushing: Pushing) -> None:
             motion.judge.update(session.world.state, session.commands, pushing=session.phase == "push")
@@ -106,11 +128,12 @@ class PushFallback:
             motion.handle.coordinate,
             target=self.target,
             tolerance=self.tolerance,
-            seconds=motion.until - session.world.time,
+            seconds=min(self._seconds, motion.until - session.world.time),
             pushing=self.pushing,
             plan=False,
             retreat=True,
             on_step=look,
         )
-        if not outcome:
+        left = abs(session.state[motion.handle.coordinate] - self.target)
+        if not outcome and left > (1.0 - _LEAST_SHARE / 2) * before:
             raise SkillError("time" if "time" in outcome.reason else "collision", outcome.reason)

@@ -10,7 +10,7 @@ from kineverse.lie import Array
 from kineverse.state import State
 
 from .contact_points import PushContacts, PushPoint, PushSurface
-from .vectors import Vector
+from .vectors import Vector, length
 
 CONE, CONE_END = math.cos(math.radians(25.0)), math.cos(math.radians(40.0))
 """Cosines of the friction cone in which a contact point is chosen, and of the one in which it is kept."""
@@ -18,6 +18,8 @@ _DISTANCE_COST, _GIVEN_UP_COST = 0.5, 0.6
 """Cost of a contact point by its distance from the tip [1/m], and by the times that it was given up."""
 _SURROUNDINGS = 0.1
 """Distance within which other points count as given up, too [m]."""
+_OUT_OF_REACH = 0.02
+"""Distance of the tip from a point that is given up from which on points beyond are out of reach, too [m]."""
 _BLOCKED_STEPS = 60
 _BLOCKED_WAY = 0.004
 
@@ -51,6 +53,7 @@ class ContactChoice:
         self.chosen: int | None = None
         self.contacts = self.blocked = self.jammed = 0
         self._given_up: dict[int, int] = {}
+        self._out_of_reach: list[tuple[int, Array]] = []
         self.restart()
 
     def restart(self) -> None:
@@ -76,6 +79,9 @@ class ContactChoice:
         for k, times in self._given_up.items():
             near = ((points.points - points.points[k]) ** 2).sum(axis=1) < _SURROUNDINGS**2
             score = score - np.where(near, _GIVEN_UP_COST * times, 0.0)
+        for k, rest in self._out_of_reach:
+            beyond = (points.points - points.points[k]) @ rest > 0.0
+            score = score - np.where(beyond, _GIVEN_UP_COST, 0.0)
         ranked: list[int] = []
         while score.max() > -math.inf:
             best = int(np.argmax(score))
@@ -91,10 +97,20 @@ class ContactChoice:
         self.restart()
         return self._surface.point_at(state, self.chosen)
 
-    def give_up(self, touching: bool) -> None:
-        """Leave the present contact point for another one."""
+    def give_up(self, touching: bool, rest: Vector) -> None:
+        """Leave the present contact point for another one.
+
+        Parameters
+        ----------
+        touching
+            Whether the object was being pushed.
+        rest
+            Vector from the tip to the point [m]. What is farther in this direction counts as given up, too.
+        """
         self.jammed += touching
         if self.chosen is not None:
+            if length(rest) > _OUT_OF_REACH:
+                self._out_of_reach.append((self.chosen, np.array(rest)))
             self._given_up[self.chosen] = self._given_up.get(self.chosen, 0) + 1
             self.blocked += 1
         self.chosen = None

@@ -26,7 +26,7 @@ from kineverse.model.model_view import ModelView
 from kineverse.state import State
 from kineverse.symbols import Symbol
 
-from .vectors import Vector, dot, length, move_point, place, rotate, scale
+from .vectors import Vector, inner_product, length, move_point, rotate, scale, transform_point
 
 _SPACING = 0.05
 """Distance of sampled points [m]."""
@@ -185,7 +185,7 @@ class PushSurface:
         body = self.owner[index]
         pose = poses[body].tolist()
         point, normal = (
-            place(pose, self._one(self._points, index)),
+            transform_point(pose, self._one(self._points, index)),
             rotate(pose, self._one(self._normals, index)),
         )
         velocity = scale(self.sign, move_point(twists[body].tolist(), point))
@@ -357,4 +357,4 @@ def _ancestors(model: ModelView, frame: str) -> list[str]:
 def find_alignment(normal: Vector, velocity: Vector) -> float:
     """Return the cosine between -n and a velocity; -1 for a point that does not move."""
     speed = length(velocity)
-    return -dot(normal, velocity) / speed if speed > 1e-9 else -1.0
+    return -inner_product(normal, velocity) / speed if speed > 1e-9 else -1.0

@@ -40,7 +40,7 @@ from .contact_points import PushPoint, PushSurface, find_push_tool
 from .nearest_pair import PairFinder, PushPair, PushView, make_view
 from .press import PushPress, TipAnchor
 from .program import LOST, NEAR, PRESS, TOUCHING, PushNumbers, PushProgram
-from .vectors import ZERO, Vector, add, cross, dot, length, move_point, scale, subtract
+from .vectors import ZERO, Vector, add, apply_force, inner_product, length, move_point, scale, subtract
 
 _APART = 4e-3
 """Gap between pusher and object away from the contact [m]."""
@@ -243,7 +243,7 @@ class Pushing:
             point = self.surface.point_at(state, self.choice.chosen)
             normal, velocity = point.normal, point.velocity
         rates = dict(zip(symbols, (np.array(normal) @ jacobian).tolist(), strict=True))
-        rates[self.coordinate] = dot(normal, velocity)
+        rates[self.coordinate] = inner_product(normal, velocity)
         # The deviation of what was never seen is infinite, and counts only where it changes the gap.
         return math.hypot(*(rate * deviation(s) for s, rate in rates.items() if rate))
 
@@ -281,12 +281,13 @@ class Pushing:
             tip, point = self.surface.locate(state, choice.chosen)
         contact, self.clearance = self._pairs.nearest(self._program.load(state))
         if point is not None and not self.retreating and self._is_stuck(state, tip, point):
-            self._give_up()
+            reaches = self.touching or point.alignment < CONE_END
+            self._give_up(ZERO if reaches else subtract(point.point, tip))
             point = None
         if point is None:
             point = choice.choose(state, tip)
         offset = subtract(tip, point.point)
-        self._aside = length(add(offset, point.normal, -dot(point.normal, offset)))
+        self._aside = length(add(offset, point.normal, -inner_product(point.normal, offset)))
         if not self.retreating:
             self._update_touching(contact)
         command = self._program.step(self._numbers(tip, point, contact))
@@ -303,7 +304,7 @@ class Pushing:
                 self.losses += 1
                 self._release()
             elif contact.alignment < CONE_END:
-                self._give_up()
+                self._give_up(ZERO)
         elif self._aside < 2 * NEAR and contact is not None and contact.alignment > CONE:
             certain = press.deviation == 0.0 or press.certain
             if contact.gap < (TOUCHING if certain else TOUCHING + press.slack) and (certain or press.touched):
@@ -311,15 +312,15 @@ class Pushing:
                 self.choice.restart()
                 self._anchor = TipAnchor()
         if contact is not None:
-            press.correct(contact.gap, -dot(contact.normal, contact.velocity) * self.surface.sign)
+            press.correct(contact.gap, -inner_product(contact.normal, contact.velocity) * self.surface.sign)
 
     def _release(self) -> None:
         self.touching = False
         self.choice.restart()
 
-    def _give_up(self) -> None:
-        """Leave the present contact point for another one."""
-        self.choice.give_up(self.touching)
+    def _give_up(self, rest: Vector) -> None:
+        """Leave the present contact point, to which a vector from the tip is left, for another one."""
+        self.choice.give_up(self.touching, rest)
         self._release()
 
     def rank(self, state: State, limit: float = 0.1) -> list[int]:
@@ -345,7 +346,7 @@ class Pushing:
     def _numbers(self, tip: Vector, point: PushPoint, contact: PushPair | None) -> PushNumbers:
         """Return the numbers of the program."""
         c, m, press = point.point, point.normal, self.press
-        near, height = self._aside < NEAR and not self.retreating, dot(subtract(tip, c), m)
+        near, height = self._aside < NEAR and not self.retreating, inner_product(subtract(tip, c), m)
         standoff = _STANDOFF
         if not near:
             standoff = min(_FUNNEL, _STANDOFF + press.slack + 1.5 * max(self._aside - NEAR, 0.0))
@@ -380,11 +381,9 @@ class Pushing:
         numbers.free = float(self.touching and allowed)
         tangents = contact.tangents
         # Wrenches on the twists of the touching body, of the object, and of the hand.
-        nothing = (0.0,) * 6
-        wrenches = [
-            (*n, *cross(contact.r, n), *scale(-1.0, n), *cross(n, contact.p), *nothing),
-            *((*nothing, *scale(-1.0, t), *cross(t, tip), *t, *cross(tip, t)) for t in tangents),
-        ]
+        nothing, back = (0.0,) * 6, scale(-1.0, n)
+        wrenches = [(*apply_force(n, contact.r), *apply_force(back, contact.p), *nothing)]
+        wrenches += [(*nothing, *apply_force(scale(-1.0, t), tip), *apply_force(t, tip)) for t in tangents]
         twists = np.concatenate([slots.twist(body) for body in (contact.robot, thing, self._hand)])
         relative = np.array(wrenches) @ twists
         numbers.relative = relative[:, self._program.columns].ravel().tolist()
@@ -392,9 +391,9 @@ class Pushing:
         most = -PRESS * (1.0 - min(max(press.reserve, 0.0), 1.0))
         deeper = press.depth - PRESS
         numbers.gap = most if press.touched and self.touching else contact.gap + deeper
-        numbers.pushed = dot(n, contact.velocity) * self.surface.sign
+        numbers.pushed = inner_product(n, contact.velocity) * self.surface.sign
         drift = self._anchor.drift(thing, self._fixed_to(thing), tip, press.weight)
-        numbers.slip = [dot(t, drift) for t in tangents]
+        numbers.slip = [inner_product(t, drift) for t in tangents]
 
     def _fixed_to(self, thing: int) -> list[list[float]]:
         """Return the pose (3, 4) of a shape of a body."""

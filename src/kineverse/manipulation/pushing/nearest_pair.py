@@ -14,7 +14,7 @@ from kineverse.lie import Array
 
 from .contact_points import PushPoint, find_alignment
 from .program import PRESS, TOUCHING
-from .vectors import Vector, cross, length, move_point, scale
+from .vectors import Vector, cross_product, length, move_point, scale
 
 _MOST_PAIRS = 6
 
@@ -90,9 +90,9 @@ class PushPair:
         sizes = [abs(v) for v in self.normal]
         side = [0.0, 0.0, 0.0]
         side[sizes.index(min(sizes))] = 1.0
-        across = cross(self.normal, (side[0], side[1], side[2]))
+        across = cross_product(self.normal, (side[0], side[1], side[2]))
         across = scale(1.0 / length(across), across)
-        return across, cross(self.normal, across)
+        return across, cross_product(self.normal, across)
 
 
 def make_view(pair: PushPair | None, point: PushPoint, tip: Vector) -> PushView:
@@ -101,7 +101,7 @@ def make_view(pair: PushPair | None, point: PushPoint, tip: Vector) -> PushView:
     if pair is not None:
         p, n, r, velocity, distance = pair.p, pair.normal, pair.r, pair.velocity, pair.gap
     push = scale(1.0 / max(length(velocity), 1e-9), velocity)
-    tangent = cross(cross(push, n), n)
+    tangent = cross_product(cross_product(push, n), n)
     p_, r_, n_, push_, tangent_, target = np.array([p, r, n, push, tangent, point.point])
     return PushView(p_, r_, n_, push_, tangent_, target, distance)
 

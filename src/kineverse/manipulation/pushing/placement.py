@@ -7,6 +7,7 @@ from collections import Counter
 from collections.abc import Callable
 from dataclasses import dataclass
 from time import perf_counter
+from typing import NamedTuple
 
 import numpy as np
 import numpy.typing as npt
@@ -15,6 +16,7 @@ from kineverse.compile.build_queue import working_seconds
 from kineverse.control import Goal, Hold, InverseKinematics, Target
 from kineverse.control.tasks import Task
 from kineverse.errors import KineverseError
+from kineverse.lie import Array
 from kineverse.manipulation.base_samples import BaseSamples, find_planar_base
 from kineverse.model.frame import is_of_robot
 from kineverse.state import State
@@ -35,6 +37,15 @@ _STARTS = 4
 """Number of arms from which inverse kinematics decides whether an arm that stands reaches a point."""
 _CANDIDATES = 1.0
 """Largest difference of the score of contact points to the best one."""
+_SOLVER_STARTS = 2, 1
+"""Numbers of starts of inverse kinematics: to the point, and out of collisions from there."""
+_DRAWS = 8
+"""Number of times that a place is drawn at which the base touches nothing."""
+_MOST_UNMOVED = 60
+"""Number of pushes without any motion of the object after which one more is not expected to move it."""
+_NO_ROOM = "too little room"
+_MOVED = 0.01
+"""Motion of an object that counts as one [m], [rad]."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -51,6 +62,8 @@ class PushStart:
         Number of samples by the reason of their failure.
     steps
         Number of steps of the push in the roll-out.
+    whole
+        Whether the push reaches the target.
     seconds
         Duration of the search [s].
     """
@@ -60,6 +73,7 @@ class PushStart:
     reasons: Counter[str]
     steps: int
     seconds: float
+    whole: bool = True
 
     def __bool__(self) -> bool:
         return self.state is not None
@@ -76,18 +90,21 @@ def find_push_start(
     pushing: Pushing,
     state: State,
     *,
-    samples: int = 200,
+    samples: int = 400,
     seconds: float = 30.0,
     steps: int = 900,
     seed: int = 0,
+    least: float = 1.0,
     accept: Callable[[State], str] | None = None,
 ) -> PushStart:
     """Return a start state of the robot from which a push goes through in a roll-out of its own prediction.
 
-    A sample is a contact point and a pose of the base in front of it. Inverse kinematics brings the pusher to
-    the point, collisions included, and the push is rolled out from there. The first one without lost contacts
-    and penetration is taken. Robots without a mobile base are sampled over their arms alone, at those points
-    that are within reach.
+    A sample is a contact point and a free place of the base in front of it. Inverse kinematics brings the
+    pusher to the point, at first without collisions, in every other pair of samples with the base where it
+    stands. If the base touches nothing then, the arm is led out of collisions, and the push is rolled out.
+    The first one without lost contacts and penetration is taken. The search ends early after 60 roll-outs
+    none of which moves the object. Robots without a mobile base are sampled over their arms alone, at those
+    points that are within reach.
 
     Parameters
     ----------
@@ -101,6 +118,8 @@ def find_push_start(
         Largest number of steps of a roll-out.
     seed
         Seed of the samples.
+    least
+        Share of the motion from which on a start counts whose push goes the farthest, if none goes through.
     accept
         Further test of a start, such as a trial in a world: returns the reason against it, or nothing.
     """
@@ -109,46 +128,76 @@ def find_push_start(
     if sampler.unreachable:
         reasons["out of reach"] = sampler.unreachable
         return PushStart(None, sampler.unreachable, reasons, 0, perf_counter() - begin)
-    for k in range(samples):
-        if working_seconds() - worked > seconds:
-            return PushStart(None, k, reasons, 0, perf_counter() - begin)
+    here, unmoved, moved = state[pushing.coordinate], 0, False
+    parts: list[tuple[float, int, State, int]] = []
+    count = 0
+    while count < samples and working_seconds() - worked <= seconds:
+        if unmoved >= _MOST_UNMOVED and not moved:
+            break
+        count += 1
         start = sampler.sample()
         if isinstance(start, str):
             reasons[start] += 1
             continue
-        problem, taken = roll_out(pushing, start, steps)
+        end = roll_out(pushing, start, steps)
+        moved, unmoved = moved or abs(end.value - here) > _MOVED, unmoved + 1
+        problem = end.problem
+        way = abs(end.value - here)
+        if problem and problem != _NO_ROOM and way >= least * abs(pushing.target - here):
+            parts.append((-way, count, start, end.steps))
         if not problem and accept is not None:
             problem = accept(start)
         if not problem:
-            return PushStart(start, k + 1, reasons, taken, perf_counter() - begin)
+            return PushStart(start, count, reasons, end.steps, perf_counter() - begin)
         reasons[problem] += 1
-    return PushStart(None, samples, reasons, 0, perf_counter() - begin)
+    for _, _, start, taken in sorted(parts, key=lambda part: part[:2]):
+        if accept is None or not accept(start):
+            return PushStart(start, count, reasons, taken, perf_counter() - begin, False)
+    return PushStart(None, count, reasons, 0, perf_counter() - begin)
 
 
-def roll_out(pushing: Pushing, start: State, steps: int, tolerance: float = 0.015) -> tuple[str, int]:
-    """Return why a push fails in its own prediction, empty if it goes through, and the number of steps."""
-    state = start
+class RollOut(NamedTuple):
+    """Result of :func:`roll_out`.
+
+    Attributes
+    ----------
+    problem
+        Why the push fails; empty if it goes through.
+    steps
+        Number of steps.
+    value
+        Value of the object's coordinate at the end [m], [rad].
+    """
+
+    problem: str
+    steps: int
+    value: float
+
+
+def roll_out(pushing: Pushing, start: State, steps: int, tolerance: float = 0.015) -> RollOut:
+    """Return how a push ends in its own prediction."""
+    state, taken = start, 0
     pushing.reset()
     try:
-        contact = pushing.first_contact(state)
-        if contact:
-            return contact, 0
-        for k in range(steps):
-            if pushing.done(state, tolerance):
-                return "", k
+        problem = pushing.first_contact(state)
+        while not problem and not pushing.done(state, tolerance):
             command = pushing.step(state)
             if pushing.losses:
-                return "lost the contact", k
-            if pushing.choice.blocked:
-                return f"blocked at {state[pushing.coordinate]:.2f}", k
-            if pushing.clearance < _LEAST_CLEARANCE:
-                return "too little room", k
-            state = pushing.model.integrate(state, command.speeds, pushing.controller.dt)
+                problem = "lost the contact"
+            elif pushing.choice.blocked:
+                problem = f"blocked at {state[pushing.coordinate]:.2f}"
+            elif pushing.clearance < _LEAST_CLEARANCE:
+                problem = _NO_ROOM
+            elif taken + 1 == steps:
+                problem = "out of time"
+            else:
+                state = pushing.model.integrate(state, command.speeds, pushing.controller.dt)
+                taken += 1
     except KineverseError as error:
-        return f"{type(error).__name__}", 0
+        problem = type(error).__name__
     finally:
         pushing.reset()
-    return "out of time", steps
+    return RollOut(problem, taken, float(state[pushing.coordinate]))
 
 
 class _Sampler:
@@ -171,15 +220,28 @@ class _Sampler:
         if axis.gradient():
             exact.append(Goal(axis, self._facing.expression, name="facing", weight=0.1))
         nearby = Goal(tip, self._point.expression, name="tip")
+        self.base = find_planar_base(model, model.symbols_of(tool.frame))
         # A pusher that cannot face the contact may still reach it with another part than its tip.
-        self._solvers = [
+        goals: tuple[tuple[list[Task], float], ...] = (
+            (exact, 2 * math.sin(_TILT / 2)), ([nearby], _NEARBY)
+        )  # fmt: skip
+        clear = [
             InverseKinematics(
                 model, tasks, still=still, scene=pushing.scene, margin=_MARGIN, tolerance=tolerance
             )
-            for tasks, tolerance in ((exact, 2 * math.sin(_TILT / 2)), ([nearby], _NEARBY))
+            for tasks, tolerance in goals
         ]
+        self._coordinates = clear[0].coordinates
+        self._ways: list[tuple[InverseKinematics, ...]] = [(last,) for last in clear]
+        if self.base:
+            # Steps out of collisions take most of the time, and seldom lead a base out of one.
+            arm = all({s.position for s in e.gradient()} - {*self.base} for e in (tip, axis))
+            self._ways = [
+                (InverseKinematics(model, tasks, still=[*still, *standing], tolerance=tolerance), last)
+                for standing in ((self.base, ()) if arm else ((),))
+                for (tasks, tolerance), last in zip(goals, clear, strict=True)
+            ]
         self._tried = 0
-        self.base = find_planar_base(model, model.symbols_of(tool.frame))
         own = [b for b in pushing.scene.bodies if is_of_robot(b, pushing.robot)]
         others = [b for b in pushing.scene.bodies if b not in own]
         self._bases = BaseSamples(pushing.scene, self.base, own, others, _MARGIN)
@@ -198,21 +260,35 @@ class _Sampler:
         """Return a start state, or why there is none."""
         random, state = self._generator, self._state
         k = int(random.choice(self._candidates, p=self._weights))
-        point, normal = self._points.points[k], self._points.normals[k]
-        values = dict(self._arm())
-        if self.base:
-            (place,) = self._bases.draw(random, [state], point[None, :2], normal[None, :2])
-            values |= dict(zip(self.base, place.tolist(), strict=True))
-        at = state.updated(values)
-        solver = self._solvers[self._tried % len(self._solvers)]
+        at = state.updated(self._arm())
+        way = self._ways[self._tried % len(self._ways)]
         self._tried += 1
-        reached = solver.solve(
-            dict(at) | self._targets(k, solver), starts=2, seed=int(random.integers(2**31))
-        )
-        if not reached.solved:
-            (obstacle,) = [name for name, _ in reached.obstacles.most_common(1)] or ["out of reach"]
-            return obstacle
-        return at.updated({s: reached.best[s] for s in self._solvers[0].coordinates})
+        if self.base:
+            place, free = self._draw_place(k)
+            # A base that moves may leave what it touches: below a flap most places are in cupboards.
+            if not free and self.base[0] not in way[0].coordinates:
+                return "no free place of the base"
+            at = at.updated(dict(zip(self.base, place.tolist(), strict=True)))
+        seed = int(random.integers(2**31))
+        for starts, solver in zip(_SOLVER_STARTS, way, strict=False):
+            reached = solver.solve(dict(at) | self._targets(k, solver), starts=starts, seed=seed)
+            if not reached.solved:
+                (obstacle,) = [name for name, _ in reached.obstacles.most_common(1)] or ["out of reach"]
+                return obstacle
+            at = at.updated({s: reached.best[s] for s in solver.coordinates})
+            if self.base and self._bases.find_touching([state], at.vector(self.base)[None])[0]:
+                return "the base touches something"
+        return at
+
+    def _draw_place(self, k: int) -> tuple[Array, bool]:
+        """Return a place (3,) of the base in front of a contact point, and whether it is free there."""
+        point, normal = self._points.points[k, :2], self._points.normals[k, :2]
+        for _ in range(_DRAWS):
+            places = self._bases.draw(self._generator, [self._state], point[None], normal[None])
+            free = not self._bases.find_touching([self._state], places)[0]
+            if free:
+                break
+        return places[0], free
 
     def _select_reachable(
         self, solver: InverseKinematics, chosen: npt.NDArray[np.intp]
@@ -241,7 +317,7 @@ class _Sampler:
             return {}
         model = self._pushing.model
         values: dict[Symbol, float] = {}
-        for symbol in self._solvers[0].coordinates:
+        for symbol in self._coordinates:
             lower, upper = model.limits(symbol)
             if symbol not in self.base and math.isfinite(lower) and math.isfinite(upper):
                 middle = (lower + upper) / 2

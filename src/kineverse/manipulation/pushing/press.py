@@ -18,7 +18,7 @@ import math
 from collections.abc import Sequence
 
 from .program import PRESS
-from .vectors import ZERO, Vector, add, dot, length, place, rotate_back, scale, subtract
+from .vectors import ZERO, Vector, add, inner_product, length, rotate_back, scale, subtract, transform_point
 
 RAMP = 0.02
 """Speed of the contact point beyond the measured one that is tried [m/s]."""
@@ -112,7 +112,7 @@ class PushPress:
         moved = ZERO if self._tip is None else subtract(tip, self._tip)
         leverage = length(self._velocity)
         along = scale(1.0 / max(leverage, 1e-9), self._velocity)
-        self._way = way = dot(along, moved)
+        self._way = way = inner_product(along, moved)
         shift = self._sign * (estimate - self._estimate) if math.isfinite(self._estimate) else 0.0
         if touching and self.touched:
             self.speed = max(way / self._dt, 0.0)
@@ -120,7 +120,7 @@ class PushPress:
             self.speed = max(self.speed + self.weight * (shift * leverage / self._dt - self.speed), 0.0)
         if touching:
             kept = self.lag * math.exp(-self._dt / _FORGET - max(way, 0.0) / _FORGET_WAY)
-            self.lag = max(kept + dot(along, self._planned) - way, 0.0)
+            self.lag = max(kept + inner_product(along, self._planned) - way, 0.0)
         else:
             self.lag = 0.0
         self._stuck = self._stuck + self._dt if touching and self.speed < STILL else 0.0
@@ -212,8 +212,8 @@ class TipAnchor:
             Weight of the latest drift, from 0 to 1.
         """
         if self._thing != thing:
-            offset = subtract(tip, place(pose, ZERO))
+            offset = subtract(tip, transform_point(pose, ZERO))
             self._thing, self._anchor, self._drift = thing, rotate_back(pose, offset), ZERO
-        now = subtract(tip, place(pose, self._anchor))
+        now = subtract(tip, transform_point(pose, self._anchor))
         self._drift = add(self._drift, subtract(now, self._drift), weight)
         return self._drift

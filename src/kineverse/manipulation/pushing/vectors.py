@@ -28,12 +28,12 @@ def scale(factor: float, a: Vector) -> Vector:
     return factor * a[0], factor * a[1], factor * a[2]
 
 
-def dot(a: Vector, b: Vector) -> float:
+def inner_product(a: Vector, b: Vector) -> float:
     """Return the inner product of two vectors."""
     return a[0] * b[0] + a[1] * b[1] + a[2] * b[2]
 
 
-def cross(a: Vector, b: Vector) -> Vector:
+def cross_product(a: Vector, b: Vector) -> Vector:
     """Return the cross product of two vectors."""
     return a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0]
 
@@ -65,7 +65,7 @@ def rotate_back(R: Sequence[Sequence[float]], a: Vector) -> Vector:
     )
 
 
-def place(pose: Sequence[Sequence[float]], a: Vector) -> Vector:
+def transform_point(pose: Sequence[Sequence[float]], a: Vector) -> Vector:
     """Return a point in the frame in which a pose, three rows of four numbers, is given."""
     return add(rotate(pose, a), (pose[0][3], pose[1][3], pose[2][3]))
 
@@ -75,3 +75,11 @@ def move_point(twist: Sequence[float], point: Vector) -> Vector:
     u, v, w, a, b, c = twist
     x, y, z = point
     return u + b * z - c * y, v + c * x - a * z, w + a * y - b * x
+
+
+def apply_force(force: Vector, point: Vector) -> tuple[float, ...]:
+    """Return the wrench (f, p × f) about the origin of a force at a point.
+
+    Its product with a twist (v, ω) is the speed of the point of the body along the force.
+    """
+    return *force, *cross_product(point, force)
