@@ -44,6 +44,8 @@ _PROOF = 200
 _MOST_GRASPS, _MOST_PUSHES = 4, 3
 _LATE = 1.0
 """Time before the end at which it counts as up [s]."""
+_OVERLAP = 1e-3
+"""Penetration from which on the reason says it [m]."""
 _KEPT = 15
 """Number of sets of grasps that are kept."""
 _MOST_SLIPS, _LEAST_PROGRESS = 2, 0.1
@@ -137,8 +139,13 @@ def open_object(
             if done
             else (f"'{coordinate}' ended at {value:.3f}, not at {goal:.3f}.")
         )
+    judged = run.measures
+    overlap = judged["penetration"]
+    if overlap > _OVERLAP:
+        one, other = judged["penetrating"]
+        reason += f" On the way '{one}' and '{other}' overlapped by {1e3 * overlap:.0f} mm."
     reason = " ".join([*run.slips, reason])
-    measures: dict[str, Any] = {**run.measures, "placements": run.placements, "grasps": run.grasps}
+    measures: dict[str, Any] = {**judged, "placements": run.placements, "grasps": run.grasps}
     measures |= {"pushed": run.pushed_from is not None, "resets": run.resets, "slips": len(run.slips)}
     if not done:
         measures["failure"] = kind or "other"
