@@ -11,8 +11,7 @@ from kineverse.grasping import find_gripper, find_handle, sample_grasps
 from kineverse.manipulation import PlacementSearch, Session, TrackedBelief, open_object
 from kineverse.manipulation.base_samples import find_planar_base
 from kineverse.manipulation.belief import EstimateError
-from kineverse.manipulation.opening.arm_rows import find_least_time
-from kineverse.manipulation.opening.hand_paths import HandPaths
+from kineverse.manipulation.opening.hand_paths import HandPaths, find_least_time
 from kineverse.manipulation.opening.placement_samples import PlacementSamples
 from kineverse.worlds import KinematicWorld, MujocoWorld, Sensors
 

@@ -134,7 +134,7 @@ class DistanceResults(Sequence[DistanceResult]):
     def __init__(
         self, world: CollisionWorld, objects: Indices, bodies: Indices, distances: Floats, witnesses: Floats
     ) -> None:
-        self._bodies, self._shape_numbers, self._table = world.bodies, world.shape_numbers, world.table
+        self._bodies, self._shape_numbers = world.bodies, world.shape_numbers
         self._object_indices, self.body_indices = objects, bodies
         self.distances, self.witnesses = distances, witnesses
 

@@ -26,8 +26,8 @@ from kineverse.symbols import Symbol
 from kineverse.worlds import Judge
 
 from .approach_planner import Approach, ApproachPlanner
-from .arm_rows import find_least_time, row_at
 from .base_placement import BasePlacement
+from .hand_paths import find_least_time, row_at
 from .hand_retreat import find_retreat
 from .placement import PlacementSearch
 

@@ -1,4 +1,4 @@
-"""Batched inverse kinematics of a hand along sequences of poses."""
+"""Batched inverse kinematics of a hand along sequences of poses, and the configurations that it gives."""
 
 from __future__ import annotations
 
@@ -141,3 +141,26 @@ class HandPaths:
             paths[going, k] = found
             reached[going] = k + 1
         return paths, reached
+
+
+def find_least_time(rows: Array, speeds: Array) -> float:
+    """Return the least time [s] in which a robot passes configurations (L, n) evenly.
+
+    Parameters
+    ----------
+    rows
+        Configurations (L, n).
+    speeds
+        Largest speeds (n,) of the coordinates [m/s], [rad/s].
+    """
+    slowest = (np.abs(np.diff(rows, axis=0)) / speeds).max(initial=0.0)
+    return float(slowest) * (len(rows) - 1)
+
+
+def row_at(rows: Array, share: float) -> Array:
+    """Return the configuration (n,) at a share of the way along some (K, n)."""
+    place = share * (len(rows) - 1)
+    k = min(max(int(place), 0), max(len(rows) - 2, 0))
+    rest = min(max(place - k, 0.0), 1.0)
+    found = (1.0 - rest) * rows[k] + rest * rows[min(k + 1, len(rows) - 1)]
+    return np.asarray(found)

@@ -10,9 +10,9 @@ from kineverse.geometry import Scene
 from kineverse.lie import inverse
 from kineverse.manipulation.outcome import SkillError, SlipError
 
-from .arm_rows import row_at
 from .base_placement import BasePlacement
 from .hand_motion import FOLLOWING, HandMotion
+from .hand_paths import row_at
 
 _SPEED, _RAMP = 0.3, 0.5
 """Speed of an object along its planned way [m/s], [rad/s], and the time from rest to it [s]."""

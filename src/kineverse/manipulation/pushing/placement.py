@@ -99,12 +99,12 @@ def find_push_start(
 ) -> PushStart:
     """Return a start state of the robot from which a push goes through in a roll-out of its own prediction.
 
-    A sample is a contact point and a free place of the base in front of it. Inverse kinematics brings the
-    pusher to the point, at first without collisions, in every other pair of samples with the base where it
-    stands. If the base touches nothing then, the arm is led out of collisions, and the push is rolled out.
-    The first one without lost contacts and penetration is taken. The search ends early after 60 roll-outs
-    none of which moves the object. Robots without a mobile base are sampled over their arms alone, at those
-    points that are within reach.
+    A sample is a contact point and a place of the base in front of it, a free one if one is found. Inverse
+    kinematics brings the pusher to the point, at first without collisions, in every other pair of samples
+    with the base where it stands, which has to be free. If the base touches nothing then, the arm is led out
+    of collisions, and the push is rolled out. The first one without lost contacts and penetration is taken.
+    The search ends early after 60 roll-outs none of which moves the object. Robots without a mobile base are
+    sampled over their arms alone, at those points that are within reach.
 
     Parameters
     ----------

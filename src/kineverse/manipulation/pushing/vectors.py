@@ -56,13 +56,7 @@ def rotate(R: Sequence[Sequence[float]], a: Vector) -> Vector:
 
 def rotate_back(R: Sequence[Sequence[float]], a: Vector) -> Vector:
     """Return Rᵀ a for the first three columns of a matrix with three rows."""
-    x, y, z = a
-    r, s, t = R[0], R[1], R[2]
-    return (
-        r[0] * x + s[0] * y + t[0] * z,
-        r[1] * x + s[1] * y + t[1] * z,
-        r[2] * x + s[2] * y + t[2] * z,
-    )
+    return rotate([*zip(*R, strict=True)], a)
 
 
 def transform_point(pose: Sequence[Sequence[float]], a: Vector) -> Vector:

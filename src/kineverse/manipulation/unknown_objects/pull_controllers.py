@@ -12,8 +12,8 @@ from kineverse.errors import InvalidValueError
 from kineverse.estimation import Fit
 from kineverse.geometry import Scene
 from kineverse.lie import Array, adjoint, exp_se3, inverse
-from kineverse.manipulation.opening.arm_rows import row_at
 from kineverse.manipulation.opening.hand_motion import HandMotion
+from kineverse.manipulation.opening.hand_paths import row_at
 from kineverse.model.frame import WORLD
 from kineverse.model.model import Model
 from kineverse.model.model_view import ModelView
