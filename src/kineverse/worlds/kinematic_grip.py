@@ -12,15 +12,19 @@ hold began.
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
+import numpy.typing as npt
 
 from kineverse.compile import compile  # noqa: A004
 from kineverse.errors import InvalidValueError
+from kineverse.expressions.expression import array
 from kineverse.grasping.gripper import Gripper
-from kineverse.lie import Array, inverse, log_so3
+from kineverse.lie import Array, inverse
+from kineverse.model.model_view import ModelView
+from kineverse.spatial import log_so3, skew
 from kineverse.symbols import Symbol
 
 from .object_gaps import Gaps
@@ -43,11 +47,74 @@ _ROUNDS = 6
 
 @dataclass(frozen=True, slots=True, eq=False)
 class _Hold:
-    """Held body: its pose in the hand, and the middle between the fingers in the body."""
+    """Held body, and the error of the hold with its derivatives at values of the model's symbols."""
 
     body: str
-    pose: Array
-    middle: Array
+    error: Callable[[Array], tuple[Array, Array]]
+
+
+class _HoldError:
+    """Error of the hold of a body, compiled as a function of its place in the hand.
+
+    Parameters
+    ----------
+    model
+        The model.
+    hand, body
+        Frames of the hand and of the body.
+    speeds
+        Speeds of objects.
+    """
+
+    def __init__(self, model: ModelView, hand: str, body: str, speeds: Sequence[Symbol]) -> None:
+        places = [Symbol(f"world/{hand}_T_{body}/{k}", 0, "parameter", 0.0) for k in range(12)]
+        middles = [Symbol(f"world/middle/{k}", 0, "parameter", 0.0) for k in range(3)]
+        hand_T_body = array([*places, 0.0, 0.0, 0.0, 1.0]).reshape(4, 4)
+        body_p = array([*middles, 1.0])
+        world_T_body, wanted = model.fk(body), model.fk(hand) @ hand_T_body
+        twists, middle = model.jacobian(body, form="world", symbols=speeds), (world_T_body @ body_p)[:3]
+        moved = middle - (wanted @ body_p)[:3]
+        turned = ROTATION_ARM * log_so3(world_T_body[:3, :3] @ wanted[:3, :3].T)
+        linear = twists[:3] - skew(middle) @ twists[3:]
+        # A few calls a step: compiling C takes longer than all of them.
+        self._function = compile(
+            [
+                array([*moved, *turned]),
+                array([*linear.ravel(), *(ROTATION_ARM * twists[3:]).ravel()]).reshape(6, len(speeds)),
+            ],
+            tier="interpreter",
+        )
+        given = {s: k for k, s in enumerate((*places, *middles))}
+        place = {s: k for k, s in enumerate(model.symbols)}
+        inputs = list(enumerate(self._function.inputs))
+        self._from_state = _index_pairs((k, place[s]) for k, s in inputs if s not in given)
+        self._from_hold = _index_pairs((k, given[s]) for k, s in inputs if s in given)
+
+    def at(self, hand_T_body: Array, middle: Array) -> Callable[[Array], tuple[Array, Array]]:
+        """Return the error (6,) and its derivatives (6, n) as a function of the model's symbols.
+
+        Parameters
+        ----------
+        hand_T_body
+            Wanted pose of the body in the hand (4, 4).
+        middle
+            Middle between the fingers in the body (3,) [m].
+        """
+        evaluator, (to, source), (of_hold, given) = self._function.bind(), self._from_state, self._from_hold
+        evaluator.input[of_hold] = np.concatenate([hand_T_body[:3].ravel(), middle])[given]
+
+        def evaluate(q: Array) -> tuple[Array, Array]:
+            evaluator.input[to] = q[source]
+            evaluator()
+            error, derivatives = evaluator.outputs
+            return error.copy(), derivatives.copy()
+
+        return evaluate
+
+
+def _index_pairs(pairs: Iterable[tuple[int, int]]) -> npt.NDArray[np.intp]:
+    """Return pairs of indices as two rows."""
+    return np.array(list(pairs), dtype=np.intp).reshape(-1, 2).T
 
 
 class KinematicGrip:
@@ -100,6 +167,7 @@ class KinematicGrip:
         self._fingers = [
             np.array([number[b] for b in names if b in number], dtype=np.intp) for names in gripper.fingers
         ]
+        self._errors: dict[str, _HoldError] = {}
         self.speeds: Array = np.zeros(len(self._at))
         self._hold: _Hold | None = None
         self._may_hold = True
@@ -203,23 +271,19 @@ class KinematicGrip:
         body = motion.scene.bodies[nearest[1]]
         hand, world_T_body = self._hand(), motion.scene.pose(body)
         middle = inverse(world_T_body) @ hand @ self.gripper.grasp_pose[:, 3]
-        self._hold = _Hold(body, inverse(hand) @ world_T_body, middle)
+        if body not in self._errors:
+            model, speeds = motion.scene.model, motion.columns[: motion.count]
+            self._errors[body] = _HoldError(model, self.gripper.hand, body, speeds)
+        error = self._errors[body].at(inverse(hand) @ world_T_body, middle[:3])
+        self._hold = _Hold(body, error)
         same = [b for k, b in enumerate(motion.scene.bodies) if motion.group[k] == best]
         motion.ignore(self.gripper.bodies, same)
         self._report(f"'{body}' is held")
 
     def _error(self) -> tuple[Array, Array]:
         """Return the error of the hold in axes of the world (6,) [m], and its Jacobian (6, n)."""
-        hold, scene = self._hold, self._motion.scene
-        assert hold is not None
-        hand, body = self._hand(), scene.pose(hold.body)
-        wanted = hand @ hold.pose
-        middle = (body @ hold.middle)[:3]
-        turn = log_so3(body[:3, :3] @ wanted[:3, :3].T)
-        twist = self._motion.twist(hold.body)
-        linear = twist[:3] + np.cross(twist[3:].T, middle).T
-        error = np.concatenate([middle - (wanted @ hold.middle)[:3], ROTATION_ARM * turn])
-        return error, np.concatenate([linear, ROTATION_ARM * twist[3:]])
+        assert self._hold is not None
+        return self._hold.error(self._motion.q)
 
     def _check(self) -> None:
         """Lose the held body if it is too far from its place in the hand."""

@@ -27,6 +27,7 @@ from kineverse.lie import Array
 from kineverse.model.frame import is_of_robot
 from kineverse.model.model_view import ModelView
 from kineverse.state import State, StateLike
+from kineverse.symbols import Symbol
 
 from .kinematic_grip import TOUCH, KinematicGrip
 from .object_motion import ObjectMotion
@@ -165,9 +166,12 @@ class KinematicWorld:
                 self._motion, gripper, float(grasp_tolerance), (float(slip[0]), float(slip[1])), self._report
             )
         )
-        self._speeds = {str(v): v for v in model.speeds}
         own = [v for v in model.speeds if self._is_robot(v.path)]
-        self._column = {v: k for k, v in enumerate(own)}
+        self._speed_count = len(own)
+        # Speeds are given by symbol or by name; those of objects are known and not read.
+        self._column: dict[Symbol | str, int | None] = dict.fromkeys(model.speeds)
+        self._column |= {v: k for k, v in enumerate(own)}
+        self._column |= {str(v): k for v, k in self._column.items()}
         self._finger = np.array([self._column[s.derivative()] for s in fingers], dtype=np.intp)
         self._integrate = model.integrator(own)
         self._state: State | None = None
@@ -241,7 +245,7 @@ class KinematicWorld:
         self._events: list[Event] = []
         if self._grip is not None:
             self._grip.reset()
-        self._last: Array = np.zeros(len(self._column))
+        self._last: Array = np.zeros(self._speed_count)
         self._commands: deque[_Command] = deque()
         self._active = _Command(self._last, 0.0, 0.0)
         self._state = self._contacts = None
@@ -308,14 +312,14 @@ class KinematicWorld:
             raise InvalidValueError(f"Speeds are a mapping from symbols or names to numbers, not {speeds!r}.")
         vector = self._stopped(self._last)
         for key, value in speeds.items():
-            speed = self._speeds.get(str(key))
-            if speed is None:
+            if key not in self._column:
                 if isinstance(speeds, State):
                     continue  # a state may have further values
+                names = [name for name in self._column if isinstance(name, str)]
                 raise UnknownNameError(
-                    f"The model has no free speed '{key}'. {suggest(str(key), self._speeds, 'speed')}"
+                    f"The model has no free speed '{key}'. {suggest(str(key), names, 'speed')}"
                 )
-            column = self._column.get(speed)
+            column = self._column[key]
             if column is not None:
                 number = finite_number(value)
                 if number is None:
@@ -345,15 +349,14 @@ class KinematicWorld:
         way = float(moved.max(initial=0.0)) + reach
         grips = grip is not None and (grip.held is not None or reach > 0.0)
         # What is not near now has not been touched on the way.
-        near = motion.near_bodies(way)
-        longest = float(moved[near].max(initial=0.0)) + reach if len(near) else 0.0
-        count = min(math.ceil(longest / _SUBSTEP), _MOST_SUBSTEPS)
+        longest = motion.longest_way(moved, way)
+        count = 0 if longest is None else min(math.ceil((longest + reach) / _SUBSTEP), _MOST_SUBSTEPS)
         if count > 1:
             motion.place(start)
             for _ in range(count):
                 motion.place(self._integrate(motion.q, arm, time / count))
                 self._settle(time / count, way / count, grips)
-        elif len(near) or grips:
+        elif longest is not None or grips:
             self._settle(time, way, grips)
 
     def _settle(self, time: float, moved: float, grips: bool) -> None:

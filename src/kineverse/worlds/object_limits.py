@@ -47,8 +47,6 @@ class ObjectLimits:
 
     Attributes
     ----------
-    linked
-        (n, n) flags of speeds that share a row, directly or by others.
     skipped
         Constraints that are no rows, as pairs (name, reason).
     """
@@ -81,8 +79,30 @@ class ObjectLimits:
         self._positions, self._rates = (
             _CompiledRows(parts, len(speeds), place) for parts in (rows[:2], rows[2:])
         )
-        self.linked = _link_columns(len(speeds), (self._positions.pattern, self._rates.pattern))
+        self._linked = _link_columns(len(speeds), (self._positions.pattern, self._rates.pattern))
+        self._found: dict[bytes, tuple[npt.NDArray[np.intp], ...]] = {}
         self.reset()
+
+    def find_linked(self, moved: npt.NDArray[np.bool_]) -> tuple[npt.NDArray[np.intp], ...]:
+        """Return the indices of speeds that share rows with some, directly or by others, and of these rows.
+
+        Parameters
+        ----------
+        moved
+            (n,) flags of speeds.
+
+        Returns
+        -------
+        tuple of numpy.ndarray
+            Indices of speeds, of rows of positions, and of rows of rates.
+        """
+        key = moved.tobytes()
+        if key not in self._found:
+            linked = moved | self._linked[moved].any(axis=0)
+            patterns = (self._positions.pattern, self._rates.pattern)
+            rows = [np.flatnonzero(pattern[:, linked].any(axis=1)) for pattern in patterns]
+            self._found[key] = np.flatnonzero(linked), *rows
+        return self._found[key]
 
     def reset(self) -> None:
         """Forget what the last motion exceeded."""

@@ -171,16 +171,26 @@ class ObjectMotion:
         self.scene.update(self.q[self._inputs])
 
     def travel(self) -> Array:
-        """Return the ways that bodies of the robot have gone so far, at most (B,) [m]; 0 for other bodies."""
-        found = np.zeros(len(self.scene.bodies))
-        table = self.scene.collision_world.table
-        np.maximum.at(found, self._robot_owners, table.travel[self._robot_objects])
-        return found
+        """Return the ways that shapes of the robot have gone so far, at most (K,) [m]."""
+        travel: Array = self.scene.collision_world.table.travel[self._robot_objects]
+        return travel
 
-    def near_bodies(self, radius: float) -> npt.NDArray[np.intp]:
-        """Return the indices of bodies in pairs within a radius [m] that are not ignored."""
+    def longest_way(self, moved: Array, radius: float) -> float | None:
+        """Return the longest way of a body in a pair within a radius [m]; None without such a pair.
+
+        Parameters
+        ----------
+        moved
+            Ways of the shapes of the robot (K,) [m].
+        radius
+            Largest distance of pairs that are not ignored [m].
+        """
         pairs, index = self.find_near(radius)
-        return np.unique(pairs.body_indices[index]).astype(np.intp)
+        if not len(index):
+            return None
+        of_bodies = np.zeros(len(self.scene.bodies))
+        np.maximum.at(of_bodies, self._robot_owners, moved)
+        return float(of_bodies[pairs.body_indices[index]].max())
 
     def ignore(self, ones: Iterable[str] = (), others: Iterable[str] = ()) -> None:
         """Ignore pairs of one body each, in place of those that were ignored before."""
@@ -261,12 +271,6 @@ class ObjectMotion:
             for k in deep.tolist():
                 self._penetrated.setdefault(keys[k], gaps.pairs.normals[k].copy())
 
-    def twist(self, body: str) -> Array:
-        """Return the spatial twist of a body by the speeds of objects, (6, n)."""
-        self._evaluate_twists()
-        found: Array = self._twists.outputs[0][self.group[self.scene.bodies.index(body)], :, : self.count]
-        return found
-
     def _evaluate_twists(self) -> None:
         self._twists.input[:] = self.q[self._twist_inputs]
         self._twists()
@@ -336,13 +340,14 @@ class ObjectMotion:
         """Return the speeds of one linearisation at speeds v."""
         n = self.count
         G, d = gaps.rows[:, :n], gaps.distances
-        active = (G != 0.0).any(axis=0) | (v != 0.0)
+        moved = v != 0.0
+        if len(d):
+            moved |= (G != 0.0).any(axis=0)
         if pulled is not None:
-            active |= (pulled[1] != 0.0).any(axis=0)
-        active = self._limits.linked[active].any(axis=0)
-        use = np.flatnonzero(active)
-        if not len(use):
+            moved |= (pulled[1] != 0.0).any(axis=0)
+        if not moved.any():
             return v
+        use, *concerned = self._limits.find_linked(moved)
         H, f = np.diag(self.weights[use]), np.zeros(len(use))
         if pulled is not None:
             error, J = pulled[0] / h, pulled[1][:, use]
@@ -350,27 +355,30 @@ class ObjectMotion:
             H[mine, mine] *= _HELD
             H += J.T @ J
             f += J.T @ (error - J @ v[use])
-        matrix, lower, upper = (np.concatenate(both) for both in zip(limits[:3], rates[:3], strict=True))
-        concerned, touching = ((M[:, use] != 0.0).any(axis=1) for M in (matrix, G))
-        G, d = G[touching], d[touching]
-        rows = np.concatenate([matrix[concerned][:, use], G[:, use]])
-        wanted = (aims[touching] - d) / h + G @ v
-        # What is jammed moves nothing, and lets nothing move into it.
-        np.minimum(wanted, 0.0, out=wanted, where=gaps.jammed[touching])
-        least = np.concatenate([lower[concerned], wanted])
-        most = np.concatenate([upper[concerned], np.full(len(d), _UNBOUNDED)])
-        sense = np.repeat(np.array([0, _SOFT], dtype=np.intc), [len(rows) - len(d), len(d)])
-        np.clip(least, -_UNBOUNDED, _UNBOUNDED, out=least)
-        np.clip(most, -_UNBOUNDED, _UNBOUNDED, out=most)
+        sets, parts = zip((limits, rates), concerned, strict=True), []
+        for (A, low, high, _), index in sets:
+            # At some places nothing moves what a row limits.
+            index = index[A[index[:, None], use].any(axis=1)]
+            parts.append((A[index[:, None], use], low[index], high[index]))
+        hard = sum(len(low) for _, low, _ in parts)
+        if len(d):
+            touching = (G[:, use] != 0.0).any(axis=1)
+            wanted = (aims - d) / h + G @ v
+            # What is jammed moves nothing, and lets nothing move into it.
+            np.minimum(wanted, 0.0, out=wanted, where=gaps.jammed)
+            G, wanted = G[touching][:, use], wanted[touching]
+            parts.append((G, wanted, np.full(len(G), _UNBOUNDED)))
+        rows, least, most = (np.concatenate(each) for each in zip(*parts, strict=True))
+        sense = np.full(len(rows), _SOFT, dtype=np.intc)
+        sense[:hard] = 0
+        np.maximum(least, -_UNBOUNDED, out=least)
+        np.minimum(most, _UNBOUNDED, out=most)
         x, _, flag, _ = self._daqp.solve(
-            H, f, np.ascontiguousarray(rows), most, least, sense,
-            rho_soft=_SLACK, primal_tol=1e-10, sing_tol=1e-14,
-        )  # fmt: skip
+            H, f, rows, most, least, sense, rho_soft=_SLACK, primal_tol=1e-10, sing_tol=1e-14
+        )
         found = np.zeros(n)
         if flag >= 1 and np.isfinite(x).all():
-            hard = rows[: len(rows) - len(d)]
-            single = np.count_nonzero(hard, axis=1) == 1
-            _clip_to_bounds(x, hard[single], least[: len(hard)][single], most[: len(hard)][single])
+            _clip_to_bounds(x, rows[:hard], least[:hard], most[:hard])
             found[use] = x
         return found
 
@@ -380,11 +388,13 @@ _SOFT, _UNBOUNDED = 8, 1e9
 
 def _clip_to_bounds(x: Array, rows: Array, lower: Array, upper: Array) -> None:
     """Clip values to the bounds of rows with one entry each, in place: solvers satisfy them nearly."""
-    for row, low, high in zip(rows, lower, upper, strict=True):
-        k = int(np.argmax(np.abs(row)))
-        ends = (low / row[k], high / row[k])
-        if min(ends) <= max(ends):
-            x[k] = min(max(x[k], min(ends)), max(ends))
+    for row, low, high in zip(rows.tolist(), lower.tolist(), upper.tolist(), strict=True):
+        entries = [k for k, weight in enumerate(row) if weight]
+        if len(entries) == 1:
+            (k,) = entries
+            ends = (low / row[k], high / row[k])
+            if min(ends) <= max(ends):
+                x[k] = min(max(x[k], min(ends)), max(ends))
 
 
 def _import_daqp() -> Any:
