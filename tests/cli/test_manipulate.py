@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import re
 import sys
 from types import SimpleNamespace
 
@@ -149,6 +150,13 @@ def test_what_hardly_moves_is_not_open_from_the_start(run, files, upper, skill, 
     assert says in answer["reason"]
 
 
+def test_what_has_no_shape_is_not_to_be_pushed(run, files):
+    (files / "box.urdf").write_text(re.sub("<collision>.*</collision>", "", DRAWER))
+    status, out, _ = run("open", "box.urdf", *HSR[:2], "--what", "drawer")
+    assert status == 1
+    assert "push" not in out
+
+
 def test_open_begins_shut_and_close_begins_open(run, asked, tmp_path):
     status, out, err = run("open", "shelf_drawers", *HSR, "--json", "--seconds", 5)
     answer = json.loads(out)
@@ -177,6 +185,17 @@ def test_open_begins_shut_and_close_begins_open(run, asked, tmp_path):
     assert [state[f"hsr/base/{c}"] for c in ("x", "y", "angle")] == pytest.approx([-1, 0.5, 1.5708], abs=1e-4)
 
 
+def test_other_coordinates_are_set_at_the_start(run, asked):
+    lower = HSR[3].replace("upper", "lower")
+    status, _, err = run(
+        "open", "shelf_drawers", *HSR, "--set", f"{lower}=10cm", "--set", "hsr/arm_lift_joint=5"
+    )
+    state = asked[0].session.world.state
+    assert status == 0
+    assert (state[HSR[3]], state[lower], state["hsr/arm_lift_joint"]) == (0.0, 0.1, 5.0)
+    assert "hsr/arm_lift_joint = 5 m is beyond its limits" in err
+
+
 @pytest.mark.parametrize(
     ("words", "message"),
     [
@@ -188,6 +207,11 @@ def test_open_begins_shut_and_close_begins_open(run, asked, tmp_path):
         (["shelf_drawers", "--robot", "hsr@0,0,0", *HSR[2:]], "begins in contact: shelf_drawers/"),
         (["shelf_drawers", *HSR, "--from", "2m"], "--from 2: 'shelf_drawers/upper_drawer' is between 0 and"),
         (["shelf_drawers", *HSR, "--to", "far"], "'far' is not a value"),
+        (["shelf_drawers", *HSR, "--set", f"{HSR[3]}=1cm"], "--from VALUE says where it is"),
+        (
+            ["shelf_drawers", *HSR, "--set", "shelf_drawers/uper_drawer=1cm"],
+            "Did you mean 'shelf_drawers/upper",
+        ),
         (["shelf_drawers", *HSR, "--to", "30deg"], "'shelf_drawers/upper_drawer' is in m"),
         (["shelf_drawers", *HSR, "--robot", "pr2"], "--robot is given twice"),
         (["shelf_drawers", *HSR, "--picture", "no_such_folder/end.png"], "no_such_folder: No such file"),

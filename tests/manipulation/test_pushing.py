@@ -321,6 +321,18 @@ def test_locked_object_is_told_and_not_penetrated() -> None:
     assert min(deepest) > -2.2e-3
 
 
+def test_push_of_what_its_limits_hold_is_not_tried() -> None:
+    model = room().copy()
+    with model.edit() as edit:
+        edit.constrain("bolt", 0.6, kv.position("door"), 0.6)
+    world = KinematicWorld(model, "robot")
+    world.reset(opened(door=0.6))
+    outcome = push(Session(world), "door", bodies=PUSHER, target=0.0)
+    assert not outcome
+    assert (outcome.steps, outcome.value) == (0, 0.6)
+    assert "cannot move" in outcome.reason
+
+
 def test_push_says_what_is_wrong() -> None:
     model, start = room(), opened(door=0.6)
 

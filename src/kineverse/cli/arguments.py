@@ -37,15 +37,15 @@ UNITS = {
 LENGTHS = (None, "m", "cm", "mm")
 
 
-def add_set_option(parser: argparse.ArgumentParser) -> None:
-    """Add ``--set`` to a command."""
+def add_set_option(parser: argparse.ArgumentParser, what: str = "a position") -> None:
+    """Add ``--set`` to a command, with what it sets."""
     parser.add_argument(
         "--set",
         metavar="NAME=VALUE",
         action="append",
         default=[],
         dest="assignments",
-        help="a position in rad or m: 0.3, pi/2, 30deg, 12cm; may be given several times",
+        help=f"{what} in rad or m: 0.3, pi/2, 30deg, 12cm; may be given several times",
     )
 
 

@@ -12,7 +12,7 @@ from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal, NamedTuple
 
-from kineverse.cli.arguments import add_model_options, print_notes
+from kineverse.cli.arguments import add_model_options, add_set_option, print_notes
 from kineverse.cli.manipulate_output import PhaseLines, report_outcome
 from kineverse.cli.manipulate_setup import ManipulationScene, make_scene
 from kineverse.cli.manipulate_skills import grasp_object, open_as_unknown, push_object, skip_skill
@@ -87,7 +87,8 @@ is farthest from shut, or to --to.
 The object is open by .4 (rad, m) or to its limit at first, unless --from says otherwise. It is shut at the
 limit nearest to its default value.
 {_COMMON}  kineverse close kitchen --robot fetch --what kitchen/fridge_door
-  kineverse close kitchen --robot hsr --what kitchen/oven_door --from 60deg --record run.mcap""",
+  kineverse close kitchen --robot hsr --what kitchen/oven_door --from 60deg --record run.mcap
+  kineverse close kitchen --robot hsr --what kitchen/fridge_door --set kitchen/oven_door=90deg""",
     ),
     "push": ManipulationCommand(
         "push",
@@ -136,6 +137,7 @@ def _add_arguments(parser: argparse.ArgumentParser, skill: str) -> None:
     )
     parser.add_argument("--from", metavar="VALUE", dest="start", help="value at the start (0.3, 30deg, 12cm)")
     parser.add_argument("--to", metavar="VALUE", help="wanted value")
+    add_set_option(parser, "another coordinate at the start")
     parser.add_argument(
         "--hand", metavar="FRAME", help="hand of the robot, or one of its fingers; the likeliest gripper"
     )

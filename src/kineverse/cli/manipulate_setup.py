@@ -12,7 +12,7 @@ from itertools import product
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from kineverse.cli.arguments import load_model, parse_value, print_notes
+from kineverse.cli.arguments import find_limit_notes, load_model, parse_assignments, parse_value, print_notes
 from kineverse.cli.plan_arguments import parse_robot, place_base
 from kineverse.errors import InvalidValueError, UnknownNameError, suggest
 
@@ -116,6 +116,8 @@ def make_scene(arguments: argparse.Namespace, skill: str) -> ManipulationScene:
     coordinate = _find_coordinate(model, arguments.what, named)
     default = model.default_state()
     values = {str(s): default[s] for s in model.symbols if s in default}
+    placed = _parse_others(arguments.assignments, model, coordinate, values)
+    default = default.updated(placed)
     unit = infer_units(model, values, [str(coordinate)]).get(str(coordinate)) or ""
     for option, text in (("--from", arguments.start), ("--to", arguments.to)):
         _check_unit(option, text, coordinate, unit)
@@ -136,7 +138,7 @@ def make_scene(arguments: argparse.Namespace, skill: str) -> ManipulationScene:
                 f"{option} {value:.4g}: '{coordinate}' is between {lower:.4g} and {upper:.4g}."
             )
     state = SHIPPED[source].start_state(model) if source in SHIPPED else default
-    state = state.updated(standing).updated({coordinate: begin})
+    state = state.updated(standing).updated(placed).updated({coordinate: begin})
     if skill != "push":  # pushes search a place for the whole push
         free = {} if place is not None else _base_coordinates(model, joints)
         state = _stand_free(model, named, state, free)
@@ -155,6 +157,25 @@ def make_scene(arguments: argparse.Namespace, skill: str) -> ManipulationScene:
         fixed,
         limit_tolerance(model, coordinate, TOLERANCE),
     )
+
+
+def _parse_others(
+    texts: list[str], model: kv.Model, coordinate: kv.Symbol, defaults: dict[str, float]
+) -> dict[str, float]:
+    """Return the values of ``--set``, of anything but the coordinate that is to change.
+
+    Raises
+    ------
+    KineverseError
+        For what cannot be read, unknown names, the coordinate itself, and values out of limits.
+    """
+    given = parse_assignments(texts)
+    for name in given:
+        model.symbol(name)
+        if name == str(coordinate):
+            raise InvalidValueError(f"--set {name}: --from VALUE says where it is at the start.")
+    print_notes(find_limit_notes(model, defaults | given, texts))
+    return given
 
 
 def is_shut(scene: ManipulationScene) -> bool:

@@ -144,6 +144,7 @@ def _find_gripper_and_handle(
     UnknownNameError
         For a named handle that the object does not have.
     """
+    from kineverse.geometry import Scene
     from kineverse.grasping import find_handle
 
     if scene.gripper is None:
@@ -153,6 +154,8 @@ def _find_gripper_and_handle(
     except UnknownNameError as error:
         if arguments.handle is not None:
             raise
+        if not Scene(scene.model).bodies_moved_by([scene.coordinate]):
+            return str(error)  # nothing to push at either
         return f"{error} Without one it can be pushed: kineverse push ... --to VALUE."
     print(handle, file=sys.stderr)
     return scene.gripper, handle

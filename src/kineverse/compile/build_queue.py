@@ -86,6 +86,8 @@ class BuildJob:
     def wait(self, timeout: float | None = None) -> bool:
         """Wait until the job is done, ahead of jobs that are not urgent, and return True if it is.
 
+        Without a time-out, a job that has not begun is done by the thread that waits.
+
         Parameters
         ----------
         timeout
@@ -94,6 +96,8 @@ class BuildJob:
         _worker.prioritise(self)
         begin = time.perf_counter()
         try:
+            if timeout is None:
+                _worker.serve(self)
             return self._done.wait(timeout)
         finally:
             _waits.seconds += time.perf_counter() - begin
@@ -153,10 +157,9 @@ class _Worker:
         self._count = itertools.count()
         self._wanted: dict[str, BuildJob] = {}
         self._thread: threading.Thread | None = None
-        self._compiler: subprocess.Popen[bytes] | None = None
-        self._building: BuildJob | None = None
-        self._build_folder: str | None = None
-        # Acquired to start the compiler and to end the process, which therefore ends a started compiler.
+        self._compilers: dict[BuildJob, subprocess.Popen[bytes]] = {}
+        self._build_folders: set[str] = set()
+        # Acquired to start a compiler and to end the process, which therefore ends all started compilers.
         self._starting = threading.Lock()
         self._closing = False
         self._warned = False
@@ -188,17 +191,18 @@ class _Worker:
             build.urgent = True
             if not build.started:
                 self._queue.put((False, next(self._count), build))
-            elif build is self._building and self._compiler is not None:
-                _set_session_niceness(self._compiler.pid, 0)
+            elif build in self._compilers:
+                _set_session_niceness(self._compilers[build].pid, 0)
 
     def _run(self) -> None:
         while not self._closing:
-            self._serve(self._queue.get()[-1])
+            self.serve(self._queue.get()[-1])
 
-    def _serve(self, build: BuildJob) -> None:
+    def serve(self, build: BuildJob) -> None:
+        """Do a job, unless it has begun."""
         with self._lock:
             # A job that became urgent is in the queue twice.
-            if build.started:
+            if build.started or build.done:
                 return
             build.started = True
             build.forgotten = not build.urgent and all(listener() is None for listener in build.listeners)
@@ -212,20 +216,25 @@ class _Worker:
         except Exception as problem:
             error = str(problem)
             self._log_failure(error)
-        with self._lock:
-            if self._wanted.get(build.key) is build:
-                del self._wanted[build.key]
-        build.finish(path, error)
+        except BaseException:
+            build.forgotten = True  # Ctrl-C in a thread that waits; whoever needs it next requests it again
+            raise
+        finally:
+            with self._lock:
+                if self._wanted.get(build.key) is build:
+                    del self._wanted[build.key]
+            build.finish(path, error)
 
     def _compile(self, build: BuildJob) -> str:
-        source = build.source().encode()
+        source, build_folder = build.source().encode(), ""
         try:
             with self._starting:
                 if self._closing:
                     raise RuntimeError("the process ends.")
-                self._build_folder = build_folder = build.cache.create_build_folder()
+                build_folder = build.cache.create_build_folder()
+                self._build_folders.add(build_folder)
                 output = os.path.join(build_folder, "library.so")
-                compiler = self._compiler = subprocess.Popen(
+                compiler = subprocess.Popen(
                     build.compiler.arguments(build.flags, output),
                     stdin=subprocess.PIPE,
                     stdout=subprocess.DEVNULL,
@@ -235,10 +244,10 @@ class _Worker:
                     # together, and do not receive the user's Ctrl-C.
                     start_new_session=True,
                 )
-            with self._lock:
-                self._building = build
-                if not build.urgent:
-                    _lower_priority(compiler.pid)
+                with self._lock:
+                    self._compilers[build] = compiler
+                    if not build.urgent:
+                        _lower_priority(compiler.pid)
             began = time.monotonic()
             try:
                 _, messages = compiler.communicate(source, timeout=TIME_LIMIT)
@@ -246,16 +255,17 @@ class _Worker:
                 raise RuntimeError(f"the C compiler needed more than {TIME_LIMIT:.0f} s.") from None
             finally:
                 _end(compiler)
-                self._building = self._compiler = None
+                with self._lock:
+                    del self._compilers[build]
             if compiler.returncode or not os.path.exists(output):
                 text = messages.decode(errors="replace").strip()
                 raise RuntimeError(f"the C compiler failed ({compiler.returncode}): {text[:500]}")
             logger.debug("Compiled %s in %.2f s.", build.key[:12], time.monotonic() - began)
             return build.cache.store(build.key, output)
         finally:
-            if self._build_folder is not None:
-                shutil.rmtree(self._build_folder, ignore_errors=True)
-            self._build_folder = None
+            if build_folder:
+                shutil.rmtree(build_folder, ignore_errors=True)
+                self._build_folders.discard(build_folder)
 
     def _log_failure(self, error: str) -> None:
         """Log a failure, as a warning only once: a compiler that fails for one function fails for all."""
@@ -265,14 +275,13 @@ class _Worker:
             self._warned = True
 
     def close(self) -> None:
-        """End the compiler and remove its folder, when the process ends."""
+        """End all compilers and remove their folders, when the process ends."""
         with self._starting:
             self._closing = True
-            compiler, build_folder = self._compiler, self._build_folder
-            if compiler is not None:
+            for compiler in [*self._compilers.values()]:
                 _end(compiler)
-            if build_folder is not None:
-                shutil.rmtree(build_folder, ignore_errors=True)
+            for folder in [*self._build_folders]:
+                shutil.rmtree(folder, ignore_errors=True)
 
     def abandon(self) -> None:
         """Drop the jobs of the parent process, in a child process without the worker's thread."""

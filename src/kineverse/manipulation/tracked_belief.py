@@ -214,6 +214,7 @@ class TrackedBelief:
 
     def _begin(self, stamp: float) -> None:
         """Begin anew at a time, with objects where they were believed."""
+        self.tracker.wait()  # each update before would take a hundred times as long
         if not math.isinf(self._now):
             self._estimate = self.tracker.reset(dict(self.tracker.estimate.state), at=stamp)
         self._history.clear()

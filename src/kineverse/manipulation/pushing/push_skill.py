@@ -19,6 +19,7 @@ from kineverse.manipulation.session import Session
 from kineverse.manipulation.skill_arguments import (
     check_positive,
     check_target,
+    explain_fixed,
     find_object_coordinate,
     limit_tolerance,
 )
@@ -132,6 +133,9 @@ def push(
             value, reason = world.state[coordinate], f"'{coordinate}' is there from the start"
             done = abs(value - target) <= tolerance
             return Outcome(done, value, reason, world.name, world.time - begin, session.steps - first)
+        if fixed := explain_fixed(model, coordinate, session.state):
+            value, seconds = world.state[coordinate], world.time - begin
+            return Outcome(False, value, fixed, world.name, seconds, session.steps - first)
         if bodies is None:
             bodies = find_gripper(model, world.robot).bodies
         pushing = Pushing(
