@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from concurrent.futures import Future, ThreadPoolExecutor
 from pathlib import Path
 from typing import NamedTuple
 
@@ -38,7 +39,7 @@ class _Still(NamedTuple):
 
 
 class SkillStills:
-    """Stills of a robot that opens and closes objects.
+    """Stills of a robot that opens and closes objects, which are drawn while it goes on with the next one.
 
     Parameters
     ----------
@@ -51,7 +52,8 @@ class SkillStills:
     def __init__(self, model: ModelView, robot: str) -> None:
         self._model, self._robot = model, robot
         self._drawing = RunDrawing(model)
-        self._rows: list[tuple[Symbol, list[_Still]]] = []
+        self._rows: list[Future[list[npt.NDArray[np.uint8]]]] = []
+        self._drawer = ThreadPoolExecutor(1, "kineverse-stills")
         self._grasped: list[_Still] = []
         self._last: _Still | None = None
 
@@ -72,12 +74,13 @@ class SkillStills:
         if self._last is not None:
             last = self._last
             stills = [*self._grasped, last]
-            self._rows.append((coordinate, [*stills, *[last] * (3 - len(stills))]))
+            row = [*stills, *[last] * (3 - len(stills))]
+            self._rows.append(self._drawer.submit(self._draw_row, coordinate, row))
         self._grasped, self._last = [], None
 
     def draw(self) -> npt.NDArray[np.uint8]:
         """Return the picture as (height, width, 3) bytes."""
-        return join_pictures([self._draw_row(coordinate, row) for coordinate, row in self._rows])
+        return join_pictures([row.result() for row in self._rows])
 
     def save(self, path: str | Path) -> None:
         """Write the picture to a PNG file."""
