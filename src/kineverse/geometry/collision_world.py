@@ -11,6 +11,7 @@ import numpy as np
 import numpy.typing as npt
 
 from kineverse._checks import as_entries
+from kineverse.compile.function import CompiledFunction
 from kineverse.compile.function import compile as compile_expressions
 from kineverse.errors import (
     InvalidValueError,
@@ -21,6 +22,7 @@ from kineverse.errors import (
 )
 from kineverse.lie import inverse
 from kineverse.model.model_view import ModelView
+from kineverse.model.version_cache import cached_for_version
 from kineverse.state import State, StateLike
 from kineverse.symbols import Symbol
 
@@ -169,14 +171,14 @@ class CollisionWorld:
         self._restore_poses()
 
     def _compile(self, moving: list[CollisionObject]) -> None:
-        """Compile the poses of moving objects, those of a body together: (M, 3, 4)."""
-        poses = []
-        for _, group in groupby(moving, lambda item: item.body):
-            items = [*group]
-            origins = np.hstack([item.shape.origin.matrix for item in items])
-            rows = items[0].body_pose[:3] @ origins
-            poses.append(rows.reshape(3, len(items), 4).transpose(1, 0, 2))
-        self._function = function = compile_expressions(np.concatenate(poses)) if poses else None
+        """Compile the poses of moving objects (M, 3, 4), once for all worlds of a model."""
+        function = None
+        if moving:
+            key = "poses of objects", tuple((item.body, item.shape.origin) for item in moving)
+            of, function = cached_for_version(self.model, key, lambda: (moving, _compile_poses(moving)))
+            if any(a.body_pose is not b.body_pose for a, b in zip(of, moving, strict=True)):
+                function = _compile_poses(moving)  # the model is being edited
+        self._function = function
         self.inputs = function.inputs if function else ()
         self._evaluator = function.bind() if function else None
 
@@ -419,6 +421,17 @@ class _NearestByBodies:
     def has_nearer(self, k: int, low: float) -> bool:
         """Return True if another pair of the same bodies is nearer than a lower bound, by the accuracy."""
         return low > self._least.get(self._keys[k], math.inf) + ACCURACY
+
+
+def _compile_poses(moving: list[CollisionObject]) -> CompiledFunction[Floats]:
+    """Compile the poses of moving objects, those of a body together: (M, 3, 4)."""
+    poses = []
+    for _, group in groupby(moving, lambda item: item.body):
+        items = [*group]
+        origins = np.hstack([item.shape.origin.matrix for item in items])
+        rows = items[0].body_pose[:3] @ origins
+        poses.append(rows.reshape(3, len(items), 4).transpose(1, 0, 2))
+    return compile_expressions(np.concatenate(poses))
 
 
 def _static_pose(item: CollisionObject, poses: dict[str, Floats]) -> Floats:
