@@ -293,9 +293,9 @@ def test_search_of_a_start_ends_where_no_push_moves_the_object(monkeypatch: pyte
     pushing = Pushing(room(), "door", PUSHER, state, target=0.0)
     monkeypatch.setattr(placement._Sampler, "sample", lambda self: state)
     monkeypatch.setattr(placement, "roll_out", lambda *args: RollOut("blocked", 9, next(ends)))
-    assert find_push_start(pushing, state).samples < 100
-    ends = iter([0.6, 0.5, *[0.6] * 1000])
-    assert find_push_start(pushing, state).samples == 400
+    assert find_push_start(pushing, state).samples == 60
+    ends = iter([0.6, 0.5, 0.3, *[0.31] * 1000])
+    assert find_push_start(pushing, state).samples == 123
 
 
 def test_approach_is_planned_to_a_contact_point() -> None:

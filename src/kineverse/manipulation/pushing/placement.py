@@ -41,8 +41,8 @@ _SOLVER_STARTS = 2, 1
 """Numbers of starts of inverse kinematics: to the point, and out of collisions from there."""
 _DRAWS = 8
 """Number of times that a place is drawn at which the base touches nothing."""
-_MOST_UNMOVED = 60
-"""Number of pushes without any motion of the object after which one more is not expected to move it."""
+_MOST_UNMOVED, _MOST_NO_FURTHER = 60, 120
+"""Numbers of pushes without motion of the object, and without more of it, after which none is expected."""
 _NO_ROOM = "too little room"
 _MOVED = 0.01
 """Motion of an object that counts as one [m], [rad]."""
@@ -103,8 +103,9 @@ def find_push_start(
     kinematics brings the pusher to the point, at first without collisions, in every other pair of samples
     with the base where it stands, which has to be free. If the base touches nothing then, the arm is led out
     of collisions, and the push is rolled out. The first one without lost contacts and penetration is taken.
-    The search ends early after 60 roll-outs none of which moves the object. Robots without a mobile base are
-    sampled over their arms alone, at those points that are within reach.
+    The search ends early after 60 roll-outs none of which moves the object, or 120 that move it no further
+    than the best one before. Robots without a mobile base are sampled over their arms alone, at those points
+    that are within reach.
 
     Parameters
     ----------
@@ -128,11 +129,11 @@ def find_push_start(
     if sampler.unreachable:
         reasons["out of reach"] = sampler.unreachable
         return PushStart(None, sampler.unreachable, reasons, 0, perf_counter() - begin)
-    here, unmoved, moved = state[pushing.coordinate], 0, False
+    here, furthest, since = state[pushing.coordinate], 0.0, 0
     parts: list[tuple[float, int, State, int]] = []
     count = 0
     while count < samples and working_seconds() - worked <= seconds:
-        if unmoved >= _MOST_UNMOVED and not moved:
+        if since >= (_MOST_NO_FURTHER if furthest else _MOST_UNMOVED):
             break
         count += 1
         start = sampler.sample()
@@ -140,9 +141,8 @@ def find_push_start(
             reasons[start] += 1
             continue
         end = roll_out(pushing, start, steps)
-        moved, unmoved = moved or abs(end.value - here) > _MOVED, unmoved + 1
-        problem = end.problem
-        way = abs(end.value - here)
+        problem, way = end.problem, abs(end.value - here)
+        furthest, since = (way, 0) if way > furthest + _MOVED else (furthest, since + 1)
         if problem and problem != _NO_ROOM and way >= least * abs(pushing.target - here):
             parts.append((-way, count, start, end.steps))
         if not problem and accept is not None:
