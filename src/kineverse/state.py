@@ -56,9 +56,9 @@ class State(Mapping[Symbol, float]):
         of the symbols have.
     """
 
-    __slots__ = ("_by_name", "_values", "source", "stamp")
+    __slots__ = ("_names", "_values", "source", "stamp")
 
-    _by_name: dict[str, Symbol | None]
+    _names: dict[str, Symbol | None] | None
     _values: dict[Symbol, float]
     source: str
     stamp: float | None
@@ -68,16 +68,17 @@ class State(Mapping[Symbol, float]):
     ) -> None:
         known: dict[Symbol, float] = {}
         for key, value in _items({} if values is None else values):
-            symbol = _symbol(key)
+            symbol = key if type(key) is Symbol else _symbol(key)
             if symbol in known:
                 raise duplicate_value_error(symbol)
-            known[symbol] = _number(symbol, value)
-        self._set(known, _symbols_by_name(known), stamp, source)
+            # Worlds and beliefs make a state a step, of doubles.
+            known[symbol] = value if type(value) is float and value == value else _number(symbol, value)
+        self._set(known, None, stamp, source)
 
     def _set(
         self,
         values: dict[Symbol, float],
-        by_name: dict[str, Symbol | None],
+        names: dict[str, Symbol | None] | None,
         stamp: float | None,
         source: str,
     ) -> None:
@@ -85,9 +86,16 @@ class State(Mapping[Symbol, float]):
             raise InvalidValueError(f"The stamp of a state is a time in seconds, not {stamp!r}.")
         write = object.__setattr__
         write(self, "_values", values)
-        write(self, "_by_name", by_name)
+        write(self, "_names", names)
         write(self, "stamp", stamp)
         write(self, "source", source)
+
+    @property
+    def _by_name(self) -> dict[str, Symbol | None]:
+        """Symbol of each name, None where several have it; found when it is asked for first."""
+        if self._names is None:
+            object.__setattr__(self, "_names", _symbols_by_name(self._values))
+        return self._names  # type: ignore[return-value]
 
     def __setattr__(self, name: str, value: Any) -> None:
         raise ExpressionError("States are immutable; use updated({symbol: number}, stamp=...).")
@@ -224,11 +232,10 @@ class State(Mapping[Symbol, float]):
     def _with(self, values: Mapping[Symbol, float], stamp: float | None, source: str | None) -> State:
         # All values have been checked already.
         every = {**self._values, **values}
-        by_name = self._by_name if len(every) == len(self._values) else _symbols_by_name(every)
         found = State.__new__(State)
         found._set(
             every,
-            by_name,
+            self._names if len(every) == len(self._values) else None,
             self.stamp if stamp is None else stamp,
             self.source if source is None else source,
         )
