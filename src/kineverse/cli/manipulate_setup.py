@@ -6,7 +6,7 @@ import argparse
 import math
 import re
 import sys
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from itertools import product
 from pathlib import Path
@@ -116,8 +116,8 @@ def make_scene(arguments: argparse.Namespace, skill: str) -> ManipulationScene:
     coordinate = _find_coordinate(model, arguments.what, named)
     default = model.default_state()
     values = {str(s): default[s] for s in model.symbols if s in default}
-    placed = _parse_others(arguments.assignments, model, coordinate, values)
-    default = default.updated(placed)
+    others = _parse_other_positions(arguments.assignments, model, coordinate, standing)
+    default = default.updated(others)
     unit = infer_units(model, values, [str(coordinate)]).get(str(coordinate)) or ""
     for option, text in (("--from", arguments.start), ("--to", arguments.to)):
         _check_unit(option, text, coordinate, unit)
@@ -138,7 +138,10 @@ def make_scene(arguments: argparse.Namespace, skill: str) -> ManipulationScene:
                 f"{option} {value:.4g}: '{coordinate}' is between {lower:.4g} and {upper:.4g}."
             )
     state = SHIPPED[source].start_state(model) if source in SHIPPED else default
-    state = state.updated(standing).updated(placed).updated({coordinate: begin})
+    state = state.updated(standing).updated(others).updated({coordinate: begin})
+    if others:
+        start = {str(s): state[s] for s in model.symbols if s in state}
+        print_notes(find_limit_notes(model, start, arguments.assignments))
     if skill != "push":  # pushes search a place for the whole push
         free = {} if place is not None else _base_coordinates(model, joints)
         state = _stand_free(model, named, state, free)
@@ -159,22 +162,22 @@ def make_scene(arguments: argparse.Namespace, skill: str) -> ManipulationScene:
     )
 
 
-def _parse_others(
-    texts: list[str], model: kv.Model, coordinate: kv.Symbol, defaults: dict[str, float]
-) -> dict[str, float]:
+def _parse_other_positions(
+    texts: list[str], model: kv.Model, coordinate: kv.Symbol, standing: Mapping[kv.Symbol, float]
+) -> dict[kv.Symbol, float]:
     """Return the values of ``--set``, of anything but the coordinate that is to change.
 
     Raises
     ------
     KineverseError
-        For what cannot be read, unknown names, the coordinate itself, and values out of limits.
+        For what cannot be read, unknown names, the coordinate itself, and a place that is given already.
     """
-    given = parse_assignments(texts)
-    for name in given:
-        model.symbol(name)
-        if name == str(coordinate):
-            raise InvalidValueError(f"--set {name}: --from VALUE says where it is at the start.")
-    print_notes(find_limit_notes(model, defaults | given, texts))
+    given = {model.symbol(name): value for name, value in parse_assignments(texts).items()}
+    if coordinate in given:
+        raise InvalidValueError(f"--set {coordinate}: --from VALUE says where it is at the start.")
+    for symbol in given:
+        if symbol in standing:
+            raise InvalidValueError(f"--set {symbol}: --robot ROBOT@X,Y,ANGLE says where the robot stands.")
     return given
 
 

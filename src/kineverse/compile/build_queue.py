@@ -1,7 +1,9 @@
-"""Background queue of C builds: one compiler at a time, at low priority.
+"""Background queue of C builds: one compiler at a time, at low priority, but for jobs that are waited for.
 
 A :class:`BuildJob` is a requested library. Jobs whose listeners are all deleted are dropped, and urgent jobs
-are compiled first. The worker thread is a daemon: it ends with the process, together with the compiler.
+are compiled first. A job that is waited for has a thread and a compiler of its own, unless it has begun: the
+processor of the thread that waits is free. All these threads are daemons: they end with the process, together
+with their compilers.
 Sources are piped to the compiler; all other files are in one folder that is always removed.
 """
 
@@ -86,8 +88,6 @@ class BuildJob:
     def wait(self, timeout: float | None = None) -> bool:
         """Wait until the job is done, ahead of jobs that are not urgent, and return True if it is.
 
-        Without a time-out, a job that has not begun is done by the thread that waits.
-
         Parameters
         ----------
         timeout
@@ -96,14 +96,14 @@ class BuildJob:
         _worker.prioritise(self)
         begin = time.perf_counter()
         try:
-            if timeout is None:
-                _worker.serve(self)
+            if not self.started:
+                _start_thread(_worker.serve, self)
             return self._done.wait(timeout)
         finally:
             _waits.seconds += time.perf_counter() - begin
 
     def finish(self, path: str | None = None, error: str | None = None) -> None:
-        """Set the result and notify the listeners, in the worker's thread."""
+        """Set the result and notify the listeners, in the thread that has done the job."""
         self.path, self.error = path, error
         # Listeners first, so that functions have changed when :meth:`wait` returns.
         for listener in self.listeners:
@@ -133,11 +133,11 @@ def request(
     compiler
         The compiler.
     source
-        Function that returns the C source; called in the worker's thread.
+        Function that returns the C source; called in another thread.
     flags
         Flags of the compiler.
     listener
-        Method to be called in the worker's thread when the job is done. It is referenced weakly: a job whose
+        Method to be called in another thread when the job is done. It is referenced weakly: a job whose
         listeners are all deleted is dropped.
     urgent
         True to compile it before jobs that are not urgent.
@@ -177,8 +177,7 @@ class _Worker:
                 known.urgent = urgent
                 self._queue.put((not urgent, next(self._count), known))
                 if self._thread is None:
-                    self._thread = threading.Thread(target=self._run, name="kineverse-compile", daemon=True)
-                    self._thread.start()
+                    self._thread = _start_thread(self._run)
             known.listeners.append(WeakMethod(listener))
         if urgent:
             self.prioritise(known)
@@ -199,9 +198,9 @@ class _Worker:
             self.serve(self._queue.get()[-1])
 
     def serve(self, build: BuildJob) -> None:
-        """Do a job, unless it has begun."""
+        """Do a job in this thread, unless it has begun."""
         with self._lock:
-            # A job that became urgent is in the queue twice.
+            # A job that became urgent is in the queue twice, and one that is waited for has a thread.
             if build.started or build.done:
                 return
             build.started = True
@@ -216,14 +215,10 @@ class _Worker:
         except Exception as problem:
             error = str(problem)
             self._log_failure(error)
-        except BaseException:
-            build.forgotten = True  # Ctrl-C in a thread that waits; whoever needs it next requests it again
-            raise
-        finally:
-            with self._lock:
-                if self._wanted.get(build.key) is build:
-                    del self._wanted[build.key]
-            build.finish(path, error)
+        with self._lock:
+            if self._wanted.get(build.key) is build:
+                del self._wanted[build.key]
+        build.finish(path, error)
 
     def _compile(self, build: BuildJob) -> str:
         source, build_folder = build.source().encode(), ""
@@ -290,6 +285,12 @@ class _Worker:
             build._done = threading.Event()
             build.forgotten = True
             build._done.set()
+
+
+def _start_thread(target: Callable[..., object], *arguments: object) -> threading.Thread:
+    thread = threading.Thread(target=target, args=arguments, name="kineverse-compile", daemon=True)
+    thread.start()
+    return thread
 
 
 def _lower_priority(process_group: int) -> None:

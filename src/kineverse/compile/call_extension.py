@@ -324,6 +324,7 @@ class CallExtension:
         self.module: Any = None
         self._state: Literal["unknown", "awaited", "settled"] = "unknown"
         self._listeners: list[WeakMethod[Callable[[], object]]] = []
+        self._build: BuildJob | None = None
         self._lock = threading.Lock()
 
     def prepare(self, listener: Callable[[], object], urgent: bool = False) -> None:
@@ -357,7 +358,13 @@ class CallExtension:
         if not os.path.exists(os.path.join(headers, "Python.h")):
             return False
         flags = ("-O2", f"-I{headers}", f"-I{np.get_include()}")
-        return request(key, compiler, lambda: EXTENSION_SOURCE, flags, self._built, urgent) is not None
+        self._build = request(key, compiler, lambda: EXTENSION_SOURCE, flags, self._built, urgent)
+        return self._build is not None
+
+    def wait(self, timeout: float | None = None) -> None:
+        """Wait until the extension is loaded or has failed, at most some time [s]; None for no limit."""
+        if self._state == "awaited" and self._build is not None:
+            self._build.wait(timeout)
 
     def _built(self, build: BuildJob) -> None:
         if build.path is not None:

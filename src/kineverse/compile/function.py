@@ -185,7 +185,7 @@ class CompiledFunction(Generic[Results]):
             if tier == "c" and self._library.error:
                 raise CompileError(f"The function cannot be compiled: {self._library.error}.")
         if self._library is not None:
-            # First, so that it is ready when the function's own library is.
+            # First, so that it is ready when the function's own library is, also for those who wait.
             call_extension.prepare(self._ready, urgent=wait)
         if self._library is not None and self._library.find():
             self._ready()
@@ -280,6 +280,7 @@ class CompiledFunction(Generic[Results]):
         """
         if self._library is None:
             return False
+        call_extension.wait(timeout)  # first, so that evaluators which are bound from now on are its own
         there = self._library.wait(timeout)
         if self._wanted == "c" and self._library.error:
             raise CompileError(f"The function cannot be compiled: {self._library.error}.")

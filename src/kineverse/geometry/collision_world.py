@@ -174,10 +174,10 @@ class CollisionWorld:
         """Compile the poses of moving objects (M, 3, 4), once for all worlds of a model."""
         function = None
         if moving:
-            key = "poses of objects", tuple((item.body, item.shape.origin) for item in moving)
-            of, function = cached_for_version(self.model, key, lambda: (moving, _compile_poses(moving)))
-            if any(a.body_pose is not b.body_pose for a, b in zip(of, moving, strict=True)):
-                function = _compile_poses(moving)  # the model is being edited
+            poses = [item.body_pose for item in moving]  # kept, so that no other one has the same number
+            places = ((item.body, item.shape.origin, id(item.body_pose)) for item in moving)
+            key = "poses of objects", tuple(places)
+            _, function = cached_for_version(self.model, key, lambda: (poses, _compile_poses(moving)))
         self._function = function
         self.inputs = function.inputs if function else ()
         self._evaluator = function.bind() if function else None

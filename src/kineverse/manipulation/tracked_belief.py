@@ -191,6 +191,8 @@ class TrackedBelief:
     def update(self, world: World, commands: State | None = None) -> State:
         """Return the believed state of all coordinates at the present time.
 
+        The first call, and the first one after a reset, wait for compiled code of the tracker.
+
         Parameters
         ----------
         world

@@ -39,7 +39,9 @@ class _Still(NamedTuple):
 
 
 class SkillStills:
-    """Stills of a robot that opens and closes objects, which are drawn while it goes on with the next one.
+    """Stills of a robot that opens and closes objects.
+
+    A thread draws them while the robot goes on with the next object; its errors are raised by :meth:`draw`.
 
     Parameters
     ----------

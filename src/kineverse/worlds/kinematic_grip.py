@@ -67,8 +67,8 @@ class _HoldError:
     """
 
     def __init__(self, model: ModelView, hand: str, body: str, speeds: Sequence[Symbol]) -> None:
-        places = [Symbol(f"world/{hand}_T_{body}/{k}", 0, "parameter", 0.0) for k in range(12)]
-        middles = [Symbol(f"world/middle/{k}", 0, "parameter", 0.0) for k in range(3)]
+        places = [Symbol(f"world/hold/pose/{k}", 0, "parameter", 0.0) for k in range(12)]
+        middles = [Symbol(f"world/hold/middle/{k}", 0, "parameter", 0.0) for k in range(3)]
         hand_T_body = array([*places, 0.0, 0.0, 0.0, 1.0]).reshape(4, 4)
         body_p = array([*middles, 1.0])
         world_T_body, wanted = model.fk(body), model.fk(hand) @ hand_T_body
@@ -90,7 +90,7 @@ class _HoldError:
         self._from_state = _index_pairs((k, place[s]) for k, s in inputs if s not in given)
         self._from_hold = _index_pairs((k, given[s]) for k, s in inputs if s in given)
 
-    def at(self, hand_T_body: Array, middle: Array) -> Callable[[Array], tuple[Array, Array]]:
+    def bind(self, hand_T_body: Array, middle: Array) -> Callable[[Array], tuple[Array, Array]]:
         """Return the error (6,) and its derivatives (6, n) as a function of the model's symbols.
 
         Parameters
@@ -149,7 +149,7 @@ class KinematicGrip:
     ) -> None:
         model = motion.scene.model
         for s in gripper.joints:
-            if s in model.rates or s not in motion.symbols:
+            if s in model.rates or s.derivative() not in motion.columns or s not in motion.symbols:
                 raise InvalidValueError(
                     f"'{s}' of the gripper at '{gripper.hand}' is no free coordinate of the model, so no "
                     "speed of its own moves it. Give a Gripper with the coordinates that open and close the "
@@ -274,7 +274,7 @@ class KinematicGrip:
         if body not in self._errors:
             model, speeds = motion.scene.model, motion.columns[: motion.count]
             self._errors[body] = _HoldError(model, self.gripper.hand, body, speeds)
-        error = self._errors[body].at(inverse(hand) @ world_T_body, middle[:3])
+        error = self._errors[body].bind(inverse(hand) @ world_T_body, middle[:3])
         self._hold = _Hold(body, error)
         same = [b for k, b in enumerate(motion.scene.bodies) if motion.group[k] == best]
         motion.ignore(self.gripper.bodies, same)

@@ -355,8 +355,8 @@ class ObjectMotion:
             H[mine, mine] *= _HELD
             H += J.T @ J
             f += J.T @ (error - J @ v[use])
-        sets, parts = zip((limits, rates), concerned, strict=True), []
-        for (A, low, high, _), index in sets:
+        parts = []
+        for (A, low, high, _), index in zip((limits, rates), concerned, strict=True):
             # At some places nothing moves what a row limits.
             index = index[A[index[:, None], use].any(axis=1)]
             parts.append((A[index[:, None], use], low[index], high[index]))

@@ -42,7 +42,7 @@ _SOLVER_STARTS = 2, 1
 _DRAWS = 8
 """Number of times that a place is drawn at which the base touches nothing."""
 _MOST_UNMOVED, _MOST_NO_FURTHER = 60, 120
-"""Numbers of pushes without motion of the object, and without more of it, after which none is expected."""
+"""Numbers of roll-outs without motion of the object, and without more of it, after which none is expected."""
 _NO_ROOM = "too little room"
 _MOVED = 0.01
 """Motion of an object that counts as one [m], [rad]."""
@@ -142,7 +142,9 @@ def find_push_start(
             continue
         end = roll_out(pushing, start, steps)
         problem, way = end.problem, abs(end.value - here)
-        furthest, since = (way, 0) if way > furthest + _MOVED else (furthest, since + 1)
+        # Pushes that go through and are not accepted tell nothing about those to come.
+        since = 0 if not problem or way > furthest + _MOVED else since + 1
+        furthest = max(furthest, way) if way > _MOVED else furthest
         if problem and problem != _NO_ROOM and way >= least * abs(pushing.target - here):
             parts.append((-way, count, start, end.steps))
         if not problem and accept is not None:

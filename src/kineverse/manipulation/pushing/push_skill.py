@@ -72,7 +72,8 @@ def push(
 
     The controller finds contact points and changes them where it is blocked. After some of them a path is
     planned to another one. Where the session's belief is an estimate, the robot first looks until it knows
-    the coordinate, and then feels for the object. The result is judged by the world's truth.
+    the coordinate, and then feels for the object. What its limits hold is not pushed. The result is judged by
+    the world's truth.
 
     Parameters
     ----------
