@@ -163,7 +163,7 @@ def test_fingers_without_readable_shapes_are_where_their_frames_are() -> None:
     ("path", "hand", "joints", "width"),
     [
         ("pr2/pr2_description/robots/pr2.urdf", "r_gripper_palm_link", ["r_gripper_l_finger_joint"], 0.0923),
-        ("hsrb/hsrb_description/robots/hsrb4s.urdf", "hand_palm_link", ["hand_motor_joint"], 0.14),
+        ("hsrb/hsrb_description/robots/hsrb4s.urdf", "hand_palm_link", ["hand_motor_joint"], 0.136),
         (
             "fetch/fetch_description/robots/fetch.urdf",
             "gripper_link",
@@ -190,3 +190,11 @@ def test_published_grippers(path: str, hand: str, joints: list[str], width: floa
     assert gripper.hand == f"r/{hand}"
     assert [str(s) for s in gripper.joints] == [f"r/{name}" for name in joints]
     assert gripper.width == pytest.approx(width, abs=1e-3)
+
+
+def test_a_gripper_opens_within_the_limits_of_joints_that_mimic() -> None:
+    model = kv.load(str(shared("hsrb", "hsrb_description", "robots", "hsrb4s.urdf")), prefix="r")
+    gripper, start = find_grippers(model, "r")[0], model.default_state()
+    assert max(gripper.opened.values()) < model.limits("r/hand_motor_joint")[1] - 0.05
+    for values in (gripper.opened, gripper.closed):
+        assert not model.violations(start.updated(values))

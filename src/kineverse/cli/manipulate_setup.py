@@ -12,7 +12,7 @@ from itertools import product
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from kineverse.cli.arguments import find_limit_notes, load_model, parse_assignments, parse_value, print_notes
+from kineverse.cli.arguments import load_model, parse_assignments, parse_value, print_notes
 from kineverse.cli.plan_arguments import parse_robot, place_base
 from kineverse.errors import InvalidValueError, UnknownNameError, suggest
 
@@ -130,18 +130,11 @@ def make_scene(arguments: argparse.Namespace, skill: str) -> ManipulationScene:
     if not math.isfinite(end):
         raise InvalidValueError(f"'{coordinate}' has no limit at which it is open; say how far: --to VALUE.")
     fixed = explain_fixed(model, coordinate, default.updated({coordinate: begin}))
-    for option, value in (("--from", begin), ("--to", end)):
-        if fixed and option == "--to":
-            continue  # that it is fixed is the result
-        if not lower - 1e-9 <= value <= upper + 1e-9:
-            raise InvalidValueError(
-                f"{option} {value:.4g}: '{coordinate}' is between {lower:.4g} and {upper:.4g}."
-            )
+    _check_limits(model, "--from", coordinate, begin)
+    if not fixed:  # that it is fixed is the result
+        _check_limits(model, "--to", coordinate, end)
     state = SHIPPED[source].start_state(model) if source in SHIPPED else default
     state = state.updated(standing).updated(others).updated({coordinate: begin})
-    if others:
-        start = {str(s): state[s] for s in model.symbols if s in state}
-        print_notes(find_limit_notes(model, start, arguments.assignments))
     if skill != "push":  # pushes search a place for the whole push
         free = {} if place is not None else _base_coordinates(model, joints)
         state = _stand_free(model, named, state, free)
@@ -170,15 +163,26 @@ def _parse_other_positions(
     Raises
     ------
     KineverseError
-        For what cannot be read, unknown names, the coordinate itself, and a place that is given already.
+        For what cannot be read, unknown names, values out of limits, the coordinate itself, and a place that
+        is given already.
     """
     given = {model.symbol(name): value for name, value in parse_assignments(texts).items()}
     if coordinate in given:
         raise InvalidValueError(f"--set {coordinate}: --from VALUE says where it is at the start.")
-    for symbol in given:
+    for symbol, value in given.items():
         if symbol in standing:
             raise InvalidValueError(f"--set {symbol}: --robot ROBOT@X,Y,ANGLE says where the robot stands.")
+        _check_limits(model, "--set", symbol, value)
     return given
+
+
+def _check_limits(model: kv.Model, option: str, coordinate: kv.Symbol, value: float) -> None:
+    """Raise InvalidValueError for the value of an option that is out of limits."""
+    lower, upper = model.limits(coordinate)
+    if not lower - 1e-9 <= value <= upper + 1e-9:
+        raise InvalidValueError(
+            f"{option} {value:.4g}: '{coordinate}' is between {lower:.4g} and {upper:.4g}."
+        )
 
 
 def is_shut(scene: ManipulationScene) -> bool:

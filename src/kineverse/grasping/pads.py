@@ -224,6 +224,22 @@ def _find_edges(motion: _Motion, axes: Array, height: float) -> Array | None:
     return edges
 
 
+def _find_range(model: ModelView, joint: Symbol) -> tuple[float, float]:
+    """Return the limits of a joint within those of joints that mimic it; its own if these leave nothing."""
+    own = low, high = model.limits(joint)
+    if not np.isfinite(own).all() or low == high:
+        return own
+    for c in model.constraints_for(joint).values():
+        if c.order or c.expression.symbols != (joint,) or c.lower.symbols or c.upper.symbols:
+            continue
+        first, middle, last = (float(c.expression({joint: q})) for q in (own[0], sum(own) / 2, own[1]))
+        slope = (last - first) / (own[1] - own[0])
+        if slope and abs(first + last - 2.0 * middle) < 1e-9 * abs(last - first):  # it is linear
+            ends = sorted(own[0] + (float(bound) - first) / slope for bound in (c.lower, c.upper))
+            low, high = max(low, ends[0]), min(high, ends[1])
+    return (low, high) if low < high else own
+
+
 class _Motion:
     """Closing motion of two branches, as a line through the values of their joints."""
 
@@ -235,7 +251,7 @@ class _Motion:
         # The roots of fingers are near to each other whether these are open or closed.
         self.tips = [_tips(model, frames) for frames in (self.a, self.b)]
         self.joints = joints
-        self.limits = {s: model.limits(s) for s in joints}
+        self.limits = {s: _find_range(model, s) for s in joints}
         defaults = model.default_state()
         self._still = {s: defaults[s] for s in alone.joints if s not in joints}
         self.opened: dict[Symbol, float] = {}

@@ -54,20 +54,24 @@ def check_target(given: Any) -> float | None:
 def explain_fixed(model: ModelView, coordinate: Symbol, state: State) -> str:
     """Return why a coordinate cannot move from where it is in a state; empty if its limits let it.
 
-    A lock is a limit that depends on other coordinates, so these are named.
+    A lock is a limit of the coordinate or of its speed that depends on other coordinates, so these are named.
     """
-    lower, upper = (float(v) for v in model.limits(coordinate, state))
-    if upper - lower > _FIXED:
-        return ""
-    limits = [c for c in model.constraints_for(coordinate, exact=True).values() if c.expression == coordinate]
-    keys = sorted({str(s) for c in limits for s in c.symbols if s != coordinate})
-    at = ", ".join(f"'{key}' is {state[key]:.3g}" for key in keys if key in state)
-    if at:
-        return (
-            f"'{coordinate}' is locked at {upper:.3g} while {at}. "
-            "'kineverse unlock' says what has to move before it."
-        )
-    return f"'{coordinate}' cannot move: its lower and its upper limit are {upper:.3g}."
+    for symbol in (coordinate, coordinate.derivative()):
+        lower, upper = (float(v) for v in model.limits(symbol, state))
+        if upper - lower > _FIXED:
+            continue
+        limits = [c for c in model.constraints_for(symbol, exact=True).values() if c.expression == symbol]
+        keys = sorted({str(s) for c in limits for s in c.symbols if s not in (symbol, coordinate)})
+        at = ", ".join(f"'{key}' is {state[key]:.3g}" for key in keys if key in state)
+        if at:
+            return (
+                f"'{coordinate}' is locked at {state[coordinate]:.3g} while {at}. "
+                "'kineverse unlock' says what has to move before it."
+            )
+        if symbol.order:
+            return f"'{coordinate}' cannot move: the limits of its speed are {lower:.3g} and {upper:.3g}."
+        return f"'{coordinate}' cannot move: its lower and its upper limit are {upper:.3g}."
+    return ""
 
 
 def limit_tolerance(model: ModelView, coordinate: Symbol, given: Any) -> float:

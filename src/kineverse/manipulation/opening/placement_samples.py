@@ -173,8 +173,9 @@ class PlacementSamples:
         steps = (np.abs(np.diff(ways, axis=1)) / self.speeds).max(axis=2, initial=0.0)
         used = np.arange(steps.shape[1]) < ends[:, None]
         along = (steps * used).sum(axis=1)
-        lower, upper = self.lower[self._bounded], self.upper[self._bounded]
-        bounded = ways[:, :, self._bounded]
+        # Joints that their limits hold are as near to them everywhere.
+        has_range = self._bounded & (self.lower < self.upper)
+        lower, upper, bounded = self.lower[has_range], self.upper[has_range], ways[:, :, has_range]
         room = np.minimum(bounded - lower, upper - bounded) / (upper - lower)
         room = np.where(np.append(used, used[:, -1:], axis=1)[:, :, None], room, 1.0)
         least = room.min(axis=(1, 2), initial=1.0)
