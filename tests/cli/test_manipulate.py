@@ -118,6 +118,13 @@ def test_without_a_gripper_it_is_not_done_and_says_why(run, files):
         assert ("kineverse push" in answer["reason"]) == (skill == "open")
 
 
+def test_a_robot_out_of_reach_without_a_base_is_to_get_one(run, files):
+    words = ["box.urdf", "--robot", "arm.urdf", "--what", "drawer", "--hand", "arm/finger"]
+    status, out, _ = run("push", *words)
+    assert status == 1
+    assert "--base omni" in out
+
+
 def test_without_a_handle_it_is_not_done_and_says_how_else(run, files):
     for more in ((), ("--unknown",)):
         status, out, _ = run("open", "box.urdf", *HSR[:2], "--what", "drawer", "--json", *more)

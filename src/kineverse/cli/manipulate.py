@@ -259,6 +259,7 @@ def _act(
     from kineverse.manipulation.belief import EstimateError
     from kineverse.manipulation.tracked_belief import TrackedBelief
     from kineverse.worlds import Recorder, Sensors
+    from kineverse.worlds.sensor_sampler import find_robot_base
 
     belief: Belief | None = None
     error = EstimateError(scene.coordinate)
@@ -291,6 +292,10 @@ def _act(
         else:
             act = push_object if skill == "push" else open_as_unknown if arguments.unknown else grasp_object
             outcome = act(arguments, scene, world, belief, look)
+            out_of_reach = outcome.measures.get("failure") == "reach" or "out of reach" in outcome.reason
+            if not outcome and out_of_reach and not find_robot_base(scene.model, scene.robot).coordinates:
+                advice = "The robot stands still without a mobile base: --base omni gives it one."
+                outcome = replace(outcome, reason=f"{outcome.reason} {advice}")
             outcome = replace(outcome, measures={**outcome.measures, **error.measures})
         if recorder is not None:
             recorder.write_outcome(outcome)

@@ -195,7 +195,9 @@ def _alike(name: str, files: list[str]) -> list[str]:
         collection = registry.find_collection(group)
         if collection is not None and not collection.accept:
             shown |= {f"{group}/{member}": f"{group}/{member}" for member in collection.names()}
-    alike = difflib.get_close_matches(wanted, {_end(p).casefold() for p in shown}, n=_LISTED, cutoff=0.7)
+    last = {_end(p).casefold() for p in shown}
+    alike = sorted(end for end in last if sorted(end) == sorted(wanted))  # 'hrs', too short to be alike
+    alike += difflib.get_close_matches(wanted, last, n=_LISTED, cutoff=0.7)
     close = [n for end in alike for p, n in shown.items() if _end(p).casefold() == end]
     within = [n for p, n in shown.items() if wanted in p.casefold()]
     found = list(dict.fromkeys(close + sorted(within, key=lambda n: (len(n), n))))[:_LISTED]
