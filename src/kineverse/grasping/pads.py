@@ -224,7 +224,7 @@ def _find_edges(motion: _Motion, axes: Array, height: float) -> Array | None:
     return edges
 
 
-def _find_range(model: ModelView, joint: Symbol) -> tuple[float, float]:
+def find_finger_range(model: ModelView, joint: Symbol) -> tuple[float, float]:
     """Return the limits of a joint within those of joints that mimic it; its own if these leave nothing."""
     own = low, high = model.limits(joint)
     if not np.isfinite(own).all() or low == high:
@@ -251,7 +251,7 @@ class _Motion:
         # The roots of fingers are near to each other whether these are open or closed.
         self.tips = [_tips(model, frames) for frames in (self.a, self.b)]
         self.joints = joints
-        self.limits = {s: _find_range(model, s) for s in joints}
+        self.limits = {s: find_finger_range(model, s) for s in joints}
         defaults = model.default_state()
         self._still = {s: defaults[s] for s in alone.joints if s not in joints}
         self.opened: dict[Symbol, float] = {}

@@ -22,6 +22,7 @@ from kineverse.compile import compile  # noqa: A004
 from kineverse.errors import InvalidValueError
 from kineverse.expressions.expression import array
 from kineverse.grasping.gripper import Gripper
+from kineverse.grasping.pads import find_finger_range
 from kineverse.lie import Array, inverse
 from kineverse.model.model_view import ModelView
 from kineverse.spatial import log_so3, skew
@@ -159,7 +160,7 @@ class KinematicGrip:
         self._report = report
         self._at = np.array([motion.symbols.index(s) for s in gripper.joints], dtype=np.intp)
         self._closing = np.array([np.sign(gripper.closed[s] - gripper.opened[s]) for s in gripper.joints])
-        self._range = np.array([model.limits(s) for s in gripper.joints]).reshape(-1, 2)
+        self._range = np.array([find_finger_range(model, s) for s in gripper.joints]).reshape(-1, 2)
         self._hand_pose = compile(model.fk(gripper.hand), tier="interpreter")  # a few calls a step
         place = {s: k for k, s in enumerate(motion.symbols)}
         self._hand_inputs = np.array([place[s] for s in self._hand_pose.inputs], dtype=np.intp)
