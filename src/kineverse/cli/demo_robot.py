@@ -151,8 +151,9 @@ class RobotDemo:
         with show_activity("preparing the world"):
             make_world = MujocoWorld if self._arguments.world == "mujoco" else KinematicWorld
             prefix, sensors = self._robot.prefix, self._sensors
-            world = make_world(self.model, prefix, self.gripper, sensors=sensors, seed=self._seed)
+            # First, so that its code is compiled while the world is made.
             belief = None if sensors is None else TrackedBelief(self.model, prefix, sensors)
+            world = make_world(self.model, prefix, self.gripper, sensors=sensors, seed=self._seed)
             start = self._robot.start_state(self.model)
             runner = OpenCloseRunner(
                 world,
