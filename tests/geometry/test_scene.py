@@ -246,6 +246,21 @@ def test_edit_rebuilds_only_the_objects_it_changes(counted):
     assert after(remove) == {"pieces": 0, "solids": 0, "compiled": 0}
 
 
+def test_scenes_of_a_model_share_compiled_poses_until_it_is_edited(counted):
+    model = arm_among_boxes()
+    scenes = [Scene(model) for _ in range(3)]
+    assert counted["compiled"] == 1
+    with model.edit() as edit:
+        edit.attach("box0", "hand", kv.translation(0, 0, 0.3))
+    scenes += [Scene(model) for _ in range(2)]
+    state = random_state(model, np.random.default_rng(4))
+    for scene in scenes:
+        scene.update(state)
+        np.testing.assert_allclose(scene.pose("box0"), model.fk("box0")(state), atol=1e-12)
+        np.testing.assert_allclose(scene.pose("hand"), model.fk("hand")(state), atol=1e-12)
+    assert counted["compiled"] <= 4
+
+
 def test_attached_body_moves_with_its_new_parent():
     model = arm_among_boxes(boxes=1)
     state = random_state(model, np.random.default_rng(5))
