@@ -106,6 +106,12 @@ def test_session_ends_when_its_world_stops_answering(world, fault, says):
     world.blocked.set()
 
 
+def test_steps_beyond_the_time_out_of_a_world_are_refused(world):
+    with pytest.raises(InvalidValueError, match="timeout=0.2"):
+        Session(world, dt=0.2)
+    assert Session(world, dt=world.timeout).dt == world.timeout
+
+
 def test_open_ends_when_the_object_moves_away(world):
     start(world, "moves away")
     session = Session(world)

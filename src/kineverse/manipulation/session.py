@@ -77,7 +77,8 @@ class Session:
     Raises
     ------
     InvalidValueError
-        For a time of a step, or a time-out, that is not positive.
+        For a time of a step, or a time-out, that is not positive, and for steps that are longer than the
+        world's own time-out, after which it stops the robot.
     """
 
     def __init__(
@@ -94,6 +95,12 @@ class Session:
         if timeout is not None and not timeout > 0.0:
             raise InvalidValueError(
                 f"timeout= is a positive time in s, or None to wait for ever, not {timeout!r}."
+            )
+        lasts = getattr(world, "timeout", math.inf)
+        if dt > lasts + 1e-9:
+            raise InvalidValueError(
+                f"dt={dt:g} s is longer than the time-out of the world, {lasts:g} s: the robot would stand "
+                f"still for the rest of each step. Make the world with timeout={dt:g} or more."
             )
         self.world, self.dt = world, dt
         self._timeout, self.answers = timeout, True

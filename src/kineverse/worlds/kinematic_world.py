@@ -91,6 +91,8 @@ class KinematicWorld:
 
     Attributes
     ----------
+    timeout
+        The parameter of this name.
     refused
         Number of commands since the last reset that were stale when they came.
 
@@ -129,7 +131,7 @@ class KinematicWorld:
                 raise InvalidValueError(f"'{field}' of a world is a number from 0 on, not {value!r}.")
         self.model, self.robot, self._version = model, robot, model.version
         self._is_robot = partial(is_of_robot, robot=robot)
-        self._timeout, self._delay = float(timeout), float(delay)
+        self.timeout, self._delay = float(timeout), float(delay)
         if not any(self._is_robot(s.path) for s in model.degrees_of_freedom):
             prefixes = sorted({s.path.partition("/")[0] for s in model.degrees_of_freedom})
             raise UnknownNameError(
@@ -285,8 +287,8 @@ class KinematicWorld:
         vector, now = self._vector(speeds), self._time
         until = now + length
         if taken is not None:
-            if now - self._timeout <= taken + _ROUNDING <= now + 2 * _ROUNDING:
-                until = min(until, taken + self._timeout)
+            if now - self.timeout <= taken + _ROUNDING <= now + 2 * _ROUNDING:
+                until = min(until, taken + self.timeout)
             else:
                 self.refused += 1
                 self._report(f"speeds with the stamp {taken:g} s are refused")

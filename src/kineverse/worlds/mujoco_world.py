@@ -123,7 +123,7 @@ class MujocoWorld:
         if grasp not in _GRASPS:
             raise InvalidValueError(f"'grasp' of a world is 'friction' or 'tie', not {grasp!r}.")
         self.model, self.robot = model, robot
-        self._step, self._timeout, self._delay = float(step), float(timeout), float(delay)
+        self._step, self.timeout, self._delay = float(step), float(timeout), float(delay)
         self._remarks: dict[str, None] = {}
         coordinates = [s for s in model.degrees_of_freedom if self._is_robot(s.path)]
         if not coordinates:
@@ -272,12 +272,12 @@ class MujocoWorld:
         keep = self._is_finger & ~given
         vector[keep] = self._speeds[keep]
         now = self._end
-        if taken is not None and not now - self._timeout <= taken + _ROUNDING <= now + 2 * _ROUNDING:
+        if taken is not None and not now - self.timeout <= taken + _ROUNDING <= now + 2 * _ROUNDING:
             self._refused += 1
             logger.info("speeds of %g s are refused at %g s", taken, now)
             vector = np.where(self._is_finger, self._speeds, 0.0)
         self._speeds = vector
-        until = now + length if taken is None else min(now + length, taken + self._timeout)
+        until = now + length if taken is None else min(now + length, taken + self.timeout)
         self._commands.append(_Command(vector, now + self._delay, until + self._delay))
         self._end = now + length
         if self._drive is not None:

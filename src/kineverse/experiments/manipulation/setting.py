@@ -24,6 +24,8 @@ from .trials import Moment
 SettingOptions = ("world", "noise", "record")
 """Options of experiments that are read here."""
 
+_USUAL_STEP = 0.02
+"""Longest step for which the worlds have their own time-outs [s]."""
 _FILM_STEPS = 5
 """Number of steps from one moment of a film to the next."""
 
@@ -46,11 +48,15 @@ class TrialSetting:
     noise: str = ""
     record: Path | None = None
 
-    def make_world(self, model: Model, robot: str, state: StateLike, seed: int = 0) -> World:
-        """Return the world at a state, in which nothing is held."""
+    def make_world(
+        self, model: Model, robot: str, state: StateLike, seed: int = 0, dt: float = 0.02
+    ) -> World:
+        """Return the world at a state, in which nothing is held, for steps of a length [s]."""
         kind = MujocoWorld if self.world == "mujoco" else KinematicWorld
         sensors = Sensors.parse(self.noise) if self.noise else None
-        world: World = kind(model, robot, sensors=sensors, seed=seed)
+        # Commands come at least every second step, also where an estimate is a picture old.
+        more: dict[str, Any] = {"timeout": 2.0 * dt} if dt > _USUAL_STEP else {}
+        world: World = kind(model, robot, sensors=sensors, seed=seed, **more)
         world.reset(state)
         return world
 

@@ -89,6 +89,6 @@ def run_push(job: PushJob) -> list[Trial]:
         film=job.thing in FILMED and job.paper == "2022",
         measures=(("thing", job.thing),),
     )
-    world = job.setting.make_world(setup.model, job.robot.prefix, setup.start)
+    world = job.setting.make_world(setup.model, job.robot.prefix, setup.start, dt=dt)
     skill = f"push ({job.paper})"
     return [run_push_trial(case, setup.model, world, setup.start, skill, dt=dt, steps=steps, logic=job.logic)]
