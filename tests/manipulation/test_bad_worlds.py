@@ -107,7 +107,7 @@ def test_session_ends_when_its_world_stops_answering(world, fault, says):
 
 
 def test_steps_beyond_the_time_out_of_a_world_are_refused(world):
-    with pytest.raises(InvalidValueError, match="timeout=0.2"):
+    with pytest.raises(InvalidValueError, match=r"timeout=0\.2"):
         Session(world, dt=0.2)
     assert Session(world, dt=world.timeout).dt == world.timeout
 
