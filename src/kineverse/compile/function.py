@@ -7,6 +7,7 @@ import logging
 import threading
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
+from time import perf_counter
 from typing import TYPE_CHECKING, Any, Generic, Literal, TypeAlias, overload
 from weakref import WeakSet
 
@@ -280,8 +281,10 @@ class CompiledFunction(Generic[Results]):
         """
         if self._library is None:
             return False
+        begin = perf_counter()
         call_extension.wait(timeout)  # first, so that evaluators which are bound from now on are its own
-        there = self._library.wait(timeout)
+        left = None if timeout is None else max(timeout - (perf_counter() - begin), 0.0)
+        there = self._library.wait(left)
         if self._wanted == "c" and self._library.error:
             raise CompileError(f"The function cannot be compiled: {self._library.error}.")
         return there

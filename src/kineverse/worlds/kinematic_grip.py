@@ -12,11 +12,10 @@ hold began.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
-import numpy.typing as npt
 
 from kineverse.compile import compile  # noqa: A004
 from kineverse.errors import InvalidValueError
@@ -79,17 +78,11 @@ class _HoldError:
         linear = twists[:3] - skew(middle) @ twists[3:]
         # A few calls a step: compiling C takes longer than all of them.
         self._function = compile(
-            [
-                array([*moved, *turned]),
-                array([*linear.ravel(), *(ROTATION_ARM * twists[3:]).ravel()]).reshape(6, len(speeds)),
-            ],
+            [np.concatenate([moved, turned]), np.concatenate([linear, ROTATION_ARM * twists[3:]])],
+            (*model.symbols, *places, *middles),
             tier="interpreter",
         )
-        given = {s: k for k, s in enumerate((*places, *middles))}
-        place = {s: k for k, s in enumerate(model.symbols)}
-        inputs = list(enumerate(self._function.inputs))
-        self._from_state = _index_pairs((k, place[s]) for k, s in inputs if s not in given)
-        self._from_hold = _index_pairs((k, given[s]) for k, s in inputs if s in given)
+        self._count = len(model.symbols)
 
     def bind(self, hand_T_body: Array, middle: Array) -> Callable[[Array], tuple[Array, Array]]:
         """Return the error (6,) and its derivatives (6, n) as a function of the model's symbols.
@@ -101,21 +94,16 @@ class _HoldError:
         middle
             Middle between the fingers in the body (3,) [m].
         """
-        evaluator, (to, source), (of_hold, given) = self._function.bind(), self._from_state, self._from_hold
-        evaluator.input[of_hold] = np.concatenate([hand_T_body[:3].ravel(), middle])[given]
+        evaluator, count = self._function.bind(), self._count
+        evaluator.input[count:] = [*hand_T_body[:3].ravel(), *middle]
 
         def evaluate(q: Array) -> tuple[Array, Array]:
-            evaluator.input[to] = q[source]
+            evaluator.input[:count] = q
             evaluator()
             error, derivatives = evaluator.outputs
             return error.copy(), derivatives.copy()
 
         return evaluate
-
-
-def _index_pairs(pairs: Iterable[tuple[int, int]]) -> npt.NDArray[np.intp]:
-    """Return pairs of indices as two rows."""
-    return np.array(list(pairs), dtype=np.intp).reshape(-1, 2).T
 
 
 class KinematicGrip:

@@ -49,7 +49,7 @@ class TrialSetting:
     record: Path | None = None
 
     def make_world(
-        self, model: Model, robot: str, state: StateLike, seed: int = 0, dt: float = 0.02
+        self, model: Model, robot: str, state: StateLike, seed: int = 0, dt: float = _USUAL_STEP
     ) -> World:
         """Return the world at a state, in which nothing is held, for steps of a length [s]."""
         kind = MujocoWorld if self.world == "mujoco" else KinematicWorld
