@@ -138,7 +138,7 @@ def test_run_kitchen_opens_then_closes_and_reports_every_failure(monkeypatch):
 
     class World(SimpleNamespace):
         def __init__(self, model, robot, *, sensors, seed):
-            super().__init__(model=model, robot=robot, name="kinematic", time=0.0)
+            super().__init__(model=model, robot=robot, name="kinematic", time=0.0, timeout=0.1)
 
         def reset(self, state):
             self.state = state

@@ -296,6 +296,26 @@ def test_search_of_a_start_ends_where_no_push_moves_the_object(monkeypatch: pyte
     assert find_push_start(pushing, state).samples == 60
     ends = iter([0.6, 0.5, 0.3, *[0.31] * 1000])
     assert find_push_start(pushing, state).samples == 123
+    monkeypatch.setattr(placement._Sampler, "sample", lambda self: placement._UNREACHED)
+    assert find_push_start(pushing, state, samples=3).failure == "reach"
+
+
+def test_start_of_the_push_that_goes_furthest_is_taken_where_none_goes_through(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    state, ends = opened(door=0.6), (0.5, 0.3, 0.45)
+    starts = [state.updated({"robot/base/x": -k / 10}) for k in range(3)]
+    pushing = Pushing(room(), "door", PUSHER, state, target=0.0)
+    drawn, rolled = iter(starts), iter([RollOut("blocked", 9, end) for end in ends])
+    monkeypatch.setattr(placement._Sampler, "sample", lambda self: next(drawn))
+    monkeypatch.setattr(placement, "roll_out", lambda *args: next(rolled))
+    found = find_push_start(pushing, state, samples=3, least=0.4)
+    assert found.state is starts[1]
+    assert not found.whole
+    drawn, rolled = iter(starts), iter([RollOut("blocked", 9, end) for end in ends])
+    none = find_push_start(pushing, state, samples=3, least=0.9)
+    assert none.state is None
+    assert none.failure == "collision"
 
 
 def test_approach_is_planned_to_a_contact_point() -> None:
@@ -317,6 +337,7 @@ def test_locked_object_is_told_and_not_penetrated() -> None:
     )  # fmt: skip
     assert not outcome
     assert "does not move" in outcome.reason
+    assert outcome.measures["failure"] == "other"
     assert outcome.value == pytest.approx(0.6)
     assert min(deepest) > -2.2e-3
 

@@ -36,7 +36,7 @@ def model():
 class HiddenWorld:
     """World that moves as it is told, and whose truth nobody may read through its interface."""
 
-    name, robot, remarks, held = "hidden", "rover", (), None
+    name, robot, remarks, held, timeout = "hidden", "rover", (), None, 1.0
 
     def __init__(self, model, sensors, seed=0, **values):
         self.model, self.sensors = model, sensors

@@ -268,6 +268,17 @@ def test_locks_hold_what_is_pulled_until_they_open():
     assert world.state["room/drawer"] == pytest.approx(0.1, abs=1e-6)
 
 
+def test_fingers_keep_within_the_limits_of_joints_that_mimic_them():
+    model = pusher()
+    with model.edit() as edit:
+        edit.constrain("robot/thumb/range", 0.01, 0.5 * kv.position("robot/finger"), 0.02)
+    world = KinematicWorld(model, "robot", gripper(model))
+    start(world, finger=0.03)
+    for speed, end in ((0.1, 0.04), (-0.1, 0.02)):
+        move(world, 0.5, finger=speed)
+        assert world.state["robot/finger"] == pytest.approx(end, abs=1e-9)
+
+
 def test_commands_are_delayed_and_stale_ones_are_refused(model, hand):
     world = KinematicWorld(model, "robot", hand, delay=0.03, timeout=0.1)
     for _ in range(5):

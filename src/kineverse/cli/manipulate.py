@@ -292,7 +292,7 @@ def _act(
         else:
             act = push_object if skill == "push" else open_as_unknown if arguments.unknown else grasp_object
             outcome = act(arguments, scene, world, belief, look)
-            out_of_reach = outcome.measures.get("failure") == "reach" or "out of reach" in outcome.reason
+            out_of_reach = outcome.measures.get("failure") == "reach"
             if not outcome and out_of_reach and not find_robot_base(scene.model, scene.robot).coordinates:
                 advice = "The robot stands still without a mobile base: --base omni gives it one."
                 outcome = replace(outcome, reason=f"{outcome.reason} {advice}")

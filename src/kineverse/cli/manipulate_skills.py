@@ -113,7 +113,7 @@ def push_object(
             target=scene.target,
             robot=scene.robot,
         )
-    placed, where = 0, ""
+    placed, where, failure = 0, "", ""
     if not scene.stays:
         steps = round(arguments.seconds / 0.02)
         problem = pushing.first_contact(scene.start) or roll_out(pushing, scene.start, steps)[0]
@@ -127,11 +127,15 @@ def push_object(
             if found.state is not None:
                 world.reset(found.state)
                 where = ""
+            else:
+                failure = found.failure
 
     session = Session(world, belief=belief, on_step=look)
     outcome = push(session, scene.coordinate, seconds=arguments.seconds, pushing=pushing)
-    reason = outcome.reason if outcome or not where else f"{outcome.reason} {where}"
-    return replace(outcome, reason=reason, measures={**outcome.measures, "placed": placed})
+    if not outcome and where:
+        measures = {**outcome.measures, "failure": failure}
+        outcome = replace(outcome, reason=f"{outcome.reason} {where}", measures=measures)
+    return replace(outcome, measures={**outcome.measures, "placed": placed})
 
 
 def _find_gripper_and_handle(

@@ -18,8 +18,6 @@ _NEAREST, _FARTHEST = 0.3, 1.1
 """Distance of a base from the point that the hand has to reach [m]."""
 _SIDE, _TURN = math.radians(110.0), math.radians(60.0)
 """Largest angles between base and coming hand, and between the front of the base and the point [rad]."""
-_TRIES = 4
-"""Number of times that a base that touches something is drawn anew."""
 
 
 class BaseSamples:
@@ -46,7 +44,12 @@ class BaseSamples:
         self._watch = scene.watch(carried, others, margin) if base and carried else None
 
     def draw(
-        self, random: np.random.Generator, states: Sequence[State], points: Array, directions: Array
+        self,
+        random: np.random.Generator,
+        states: Sequence[State],
+        points: Array,
+        directions: Array,
+        tries: int = 5,
     ) -> Array:
         """Return places (B, 3) of the base: x [m], y [m] and angle [rad].
 
@@ -60,9 +63,11 @@ class BaseSamples:
             Points (B, 2) that the hand has to reach, from above [m].
         directions
             Directions (B, 2) from which it comes; those without a length are from above.
+        tries
+            Largest number of draws for each point. The last one may touch something.
         """
         places = self._draw(random, points, directions)
-        for _ in range(_TRIES):
+        for _ in range(tries - 1):
             hits = self.find_touching(states, places)
             if not hits.any():
                 break

@@ -96,11 +96,10 @@ class Session:
             raise InvalidValueError(
                 f"timeout= is a positive time in s, or None to wait for ever, not {timeout!r}."
             )
-        lasts = getattr(world, "timeout", math.inf)
-        if dt > lasts + 1e-9:
+        if dt > world.timeout + 1e-9:
             raise InvalidValueError(
-                f"dt={dt:g} s is longer than the time-out of the world, {lasts:g} s: the robot would stand "
-                f"still for the rest of each step. Make the world with timeout={dt:g} or more."
+                f"dt={dt:g} s is longer than the time-out of the world, {world.timeout:g} s: the robot would "
+                f"stand still for the rest of each step. Make the world with timeout={dt:g} or more."
             )
         self.world, self.dt = world, dt
         self._timeout, self.answers = timeout, True

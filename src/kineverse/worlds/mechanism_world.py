@@ -7,6 +7,7 @@ goes at its speed limit, and up to the limit of its position. There are no bodie
 
 from __future__ import annotations
 
+import math
 from collections.abc import Collection
 
 import numpy as np
@@ -54,6 +55,7 @@ class MechanismWorld:
     name = "mechanism"
     robot = ""
     held = None
+    timeout = math.inf
     remarks: tuple[str, ...] = (
         "there are no bodies, forces or contacts: coordinates move as far as constraints allow",
     )

@@ -73,12 +73,15 @@ class World(Protocol):
         Prefix of the robot: coordinates and bodies below it are the robot's.
     remarks
         What was added to the model or left out of it.
+    timeout
+        Time after which a command no longer acts [s].
     """
 
     name: str
     model: ModelView
     robot: str
     remarks: tuple[str, ...]
+    timeout: float
 
     @property
     def time(self) -> float:

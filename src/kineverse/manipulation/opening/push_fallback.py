@@ -88,10 +88,7 @@ class PushFallback:
                 raise SkillError("reach", f"It cannot be pushed: {error}") from error
         self.samples += found.samples
         if found.state is None:
-            touching = any(
-                " and " in r or "blocked" in r or "path" in r or "base" in r for r in found.reasons
-            )
-            raise SkillError("collision" if touching else "reach", f"Nor does a push: {found.why}")
+            raise SkillError(found.failure, f"Nor does a push: {found.why}")
         if not found.whole:
             self._seconds = _LONGER * found.steps * session.dt + _SETTLING
 
@@ -136,4 +133,4 @@ class PushFallback:
         )
         left = abs(session.state[motion.handle.coordinate] - self.target)
         if not outcome and left > (1.0 - _LEAST_SHARE / 2) * before:
-            raise SkillError("time" if "time" in outcome.reason else "collision", outcome.reason)
+            raise SkillError(outcome.measures["failure"], outcome.reason)

@@ -39,11 +39,11 @@ _CANDIDATES = 1.0
 """Largest difference of the score of contact points to the best one."""
 _SOLVER_STARTS = 2, 1
 """Numbers of starts of inverse kinematics: to the point, and out of collisions from there."""
-_DRAWS = 8
+_DRAWS = 40
 """Number of times that a place is drawn at which the base touches nothing."""
 _MOST_UNMOVED, _MOST_NO_FURTHER = 60, 120
 """Numbers of roll-outs without motion of the object, and without more of it, after which none is expected."""
-_NO_ROOM = "too little room"
+_NO_ROOM, _UNREACHED = "too little room", "out of reach"
 _MOVED = 0.01
 """Motion of an object that counts as one [m], [rad]."""
 
@@ -77,6 +77,11 @@ class PushStart:
 
     def __bool__(self) -> bool:
         return self.state is not None
+
+    @property
+    def failure(self) -> str:
+        """Class of the failure: ``"reach"`` if no sample reaches the object, otherwise ``"collision"``."""
+        return "reach" if {*self.reasons} == {_UNREACHED} else "collision"
 
     @property
     def why(self) -> str:
@@ -127,7 +132,7 @@ def find_push_start(
     begin, worked, reasons = perf_counter(), working_seconds(), Counter[str]()
     sampler = _Sampler(pushing, state, np.random.default_rng(seed))
     if sampler.unreachable:
-        reasons["out of reach"] = sampler.unreachable
+        reasons[_UNREACHED] = sampler.unreachable
         return PushStart(None, sampler.unreachable, reasons, 0, perf_counter() - begin)
     here, furthest, since = state[pushing.coordinate], 0.0, 0
     parts: list[tuple[float, int, State, int]] = []
@@ -275,7 +280,7 @@ class _Sampler:
         for starts, solver in zip(_SOLVER_STARTS, way, strict=False):
             reached = solver.solve(dict(at) | self._targets(k, solver), starts=starts, seed=seed)
             if not reached.solved:
-                (obstacle,) = [name for name, _ in reached.obstacles.most_common(1)] or ["out of reach"]
+                (obstacle,) = [name for name, _ in reached.obstacles.most_common(1)] or [_UNREACHED]
                 return obstacle
             at = at.updated({s: reached.best[s] for s in solver.coordinates})
             if self.base and self._bases.find_touching([state], at.vector(self.base)[None])[0]:
@@ -285,12 +290,9 @@ class _Sampler:
     def _draw_place(self, k: int) -> tuple[Array, bool]:
         """Return a place (3,) of the base in front of a contact point, and whether it is free there."""
         point, normal = self._points.points[k, :2], self._points.normals[k, :2]
-        for _ in range(_DRAWS):
-            places = self._bases.draw(self._generator, [self._state], point[None], normal[None])
-            free = not self._bases.find_touching([self._state], places)[0]
-            if free:
-                break
-        return places[0], free
+        states = [self._state]
+        places = self._bases.draw(self._generator, states, point[None], normal[None], tries=_DRAWS)
+        return places[0], not self._bases.find_touching(states, places)[0]
 
     def _select_reachable(
         self, solver: InverseKinematics, chosen: npt.NDArray[np.intp]

@@ -14,7 +14,7 @@ from kineverse.geometry.objects import Exclusion
 from kineverse.grasping import find_gripper
 from kineverse.lie import Array
 from kineverse.manipulation.articulated_objects import find_shut_value
-from kineverse.manipulation.outcome import Outcome
+from kineverse.manipulation.outcome import Outcome, SkillError
 from kineverse.manipulation.session import Session
 from kineverse.manipulation.skill_arguments import (
     check_positive,
@@ -106,7 +106,8 @@ def push(
     -------
     Outcome
         With ``measures``: ``losses``, ``blocked``, ``contacts``, ``jammed``, ``planned``, ``jitter`` (largest
-        mean change of a speed from step to step while touching, [m/s], [rad/s]).
+        mean change of a speed from step to step while touching, [m/s], [rad/s]), and ``failure``:
+        ``"collision"``, ``"time"`` or ``"other"``, if it was not done.
 
     Raises
     ------
@@ -156,17 +157,18 @@ def push(
     pushing.reset()
     run = _Run(session, pushing, seconds, tolerance, plan, on_step)
     try:
-        reason = run.push()
+        failure = run.push()
         if retreat:
             run.retreat()
     except KineverseError as error:
-        reason = f"{type(error).__name__}: {error}"
+        failure = SkillError("other", f"{type(error).__name__}: {error}")
     session.stop()
-    value = world.state[coordinate]
+    value, measures = world.state[coordinate], run.measures()
     done = abs(value - pushing.target) < tolerance
-    if done:
-        reason = f"'{coordinate}' is at {value:.3g}"
-    return Outcome(done, value, reason, world.name, run.time, run.steps, run.measures())
+    if not done:
+        measures["failure"] = failure.kind
+    reason = f"'{coordinate}' is at {value:.3g}" if done else str(failure)
+    return Outcome(done, value, reason, world.name, run.time, run.steps, measures)
 
 
 class _End:
@@ -229,33 +231,34 @@ class _Run:
     def time(self) -> float:
         return self._session.world.time - self._begin
 
-    def push(self) -> str:
-        """Push until the object is at its target, and return what prevented it."""
+    def push(self) -> SkillError:
+        """Push until the object is at its target, and return what prevented it if it is not there."""
         session, pushing = self._session, self._pushing
         contact = pushing.first_contact(session.state)
         if contact:
-            return f"The push begins with a {contact}."
+            return SkillError("collision", f"The push begins with a {contact}.")
         blocked = 0
         end = _End(pushing, self._tolerance)
         while self.time < self._seconds:
             if end.reached(session.state):
-                return "The estimate is at the target, and the world is not."
+                return SkillError("other", "The estimate is at the target, and the world is not.")
             if pushing.choice.jammed >= _MOST_JAMMED:
-                return (
+                return SkillError(
+                    "other",
                     f"The object does not move: pushed at {pushing.choice.jammed} points, it stays at "
-                    f"{session.state[pushing.coordinate]:.3g}. It may be locked, jammed or blocked."
+                    f"{session.state[pushing.coordinate]:.3g}. It may be locked, jammed or blocked.",
                 )
             if pushing.choice.blocked - blocked >= _MOST_BLOCKED and self._plan:
                 blocked = pushing.choice.blocked
                 problem = self._approach()
                 if problem:
-                    return problem
+                    return SkillError("collision", problem)
             if end.near:
                 session.stop()  # an object that has run on by itself is not followed
                 continue
             self._step("push")
         where = "touching" if pushing.touching else "on the way to a contact"
-        return f"Out of time at {session.state[pushing.coordinate]:.3g}, {where}."
+        return SkillError("time", f"Out of time at {session.state[pushing.coordinate]:.3g}, {where}.")
 
     def _step(self, phase: str) -> None:
         session, pushing = self._session, self._pushing
