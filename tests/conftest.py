@@ -3,7 +3,8 @@
 A test that drives a browser carries the marker ``browser`` and asks for the fixture ``chromium``, the path of
 the system's Chromium. Without one it is skipped, or with ``KINEVERSE_REQUIRE_BROWSER=1`` it fails. A test that
 needs compiled code carries the marker ``compiler``; without a C compiler it is skipped as well. What reads data
-that is not ours is skipped where there is none. The summary has a line for each cause.
+that is not ours is skipped where there is none. The summary has a line for each cause. What takes long beside
+what it tells carries the marker ``long``: it runs with ``--long``, or if it is named.
 """
 
 from __future__ import annotations
@@ -35,6 +36,11 @@ settings.register_profile("thorough", settings.get_profile("kineverse"), max_exa
 settings.load_profile("kineverse")
 
 
+def pytest_addoption(parser: pytest.Parser) -> None:
+    """Add the option for long tests."""
+    parser.addoption("--long", action="store_true", help="also run the tests that take long")
+
+
 def pytest_configure(config: pytest.Config) -> None:
     """Set the environment, once: the workers of xdist inherit it."""
     if hasattr(config, "workerinput"):
@@ -62,6 +68,16 @@ def pytest_collection() -> Generator[None, object, object]:
         gc.collect()
         gc.freeze()  # nor later, when it looks for the garbage of a test
         gc.enable()
+
+
+def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item]) -> None:
+    """Leave out what takes long, unless it is asked for."""
+    if config.getoption("--long") or any("::" in argument for argument in config.args):
+        return
+    left_out = [item for item in items if item.get_closest_marker("long")]
+    if left_out:
+        items[:] = [item for item in items if not item.get_closest_marker("long")]
+        config.hook.pytest_deselected(items=left_out)
 
 
 def pytest_collection_finish(session: pytest.Session) -> None:
