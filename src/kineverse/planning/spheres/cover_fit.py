@@ -33,7 +33,7 @@ _WARM, _COLD = 0.2, 0.015
 
 _MOMENTUM, _SIDES = 0.6, 12
 _SAMPLES, _SAMPLES_EACH, _HARD = 300, 8, 0.6
-_TRIALS = 4
+_TRIALS, _SPLITS = 4, 4
 _REMOVALS, _FEW_SPHERES = 3, 12
 _PROOF, _ALLOWANCE, _ATTEMPTS = 0.01, 1.04, 4
 """Growth of radii for the sake of the proof, as a fraction of the protrusion."""
@@ -120,9 +120,13 @@ def _fit_to_points(problem: _Problem, aim: float, most: int) -> FittedSpheres:
     starts = CoverStarts(problem.region, aim)
     problem.expect(min(len(starts.greedy(1.2 * aim)), most))
     best = _search_start(problem, starts, aim, most, best)
-    if best.protrusion > aim and len(best.radii) < most:
-        added = descend(problem, _split_worst(problem, best, most), aim)
-        best = added if added.is_better(best, aim) else best
+    split = best
+    for _ in range(_SPLITS):
+        if best.protrusion <= aim or len(split.radii) >= most:
+            break
+        # More spheres may protrude further at first, such as three of a cone that two cover well.
+        split = descend(problem, _split_worst(problem, split, most), aim)
+        best = split if split.is_better(best, aim) else best
     polished = descend(problem, best.centres, aim)
     return _remove(problem, polished if polished.is_better(best, aim) else best, aim)
 
