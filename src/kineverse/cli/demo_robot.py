@@ -33,6 +33,8 @@ if TYPE_CHECKING:
 KITCHEN, ROBOT, WORLD = "kitchen", "hsr", "kinematic"
 NOISE = "3mm+3mm/m,0.5deg,30Hz"
 """Noise of the observed poses, unless another one is asked for."""
+_BRIEF = ("*/oven_door", "*/fridge_door", "*/sink_left_upper_drawer")
+"""The objects without a page: a flap, a door and a drawer."""
 _FASTEST = 100.0
 _INTERRUPTED = 130
 """Exit status after Ctrl-C, as of all commands."""
@@ -245,12 +247,11 @@ def _choose_objects(
     found: tuple[ArticulatedObject, ...], patterns: list[str] | None, headless: bool
 ) -> tuple[ArticulatedObject, ...]:
     """Return the objects to open: those that are asked for, or all but knobs; without a page one a kind."""
-    from kineverse.manipulation.articulated_objects import select_objects, select_one_of_each_kind
+    from kineverse.manipulation.articulated_objects import select_objects
 
-    if patterns is not None:
-        return select_objects(found, patterns)
-    large = tuple(one for one in found if one.kind != "knob")
-    return select_one_of_each_kind(large) if headless else large
+    if patterns is None and not headless:
+        return tuple(one for one in found if one.kind != "knob")
+    return select_objects(found, _BRIEF if patterns is None else patterns)
 
 
 def _wait_for_browser(page: Viewer) -> None:

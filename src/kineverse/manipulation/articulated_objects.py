@@ -115,14 +115,6 @@ def select_objects(
     return tuple(found.values())
 
 
-def select_one_of_each_kind(objects: Iterable[ArticulatedObject]) -> tuple[ArticulatedObject, ...]:
-    """Return the first object of each kind."""
-    first: dict[MotionKind, ArticulatedObject] = {}
-    for one in objects:
-        first.setdefault(one.kind, one)
-    return tuple(first.values())
-
-
 def _find_kind(
     model: ModelView, coordinate: Symbol, bodies: Sequence[str], limits: Sequence[float]
 ) -> MotionKind:
