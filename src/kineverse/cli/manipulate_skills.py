@@ -5,6 +5,7 @@ from __future__ import annotations
 import argparse
 import sys
 from collections.abc import Callable
+from contextlib import ExitStack
 from dataclasses import replace
 from typing import TYPE_CHECKING
 
@@ -39,15 +40,22 @@ def grasp_object(
     from kineverse.manipulation.opening.grasped_opening import open_object
     from kineverse.manipulation.session import Session
 
-    outcome: Outcome = open_object(
-        Session(world, belief=belief, on_step=look),
-        scene.coordinate,
-        target=scene.target,
-        hand=gripper.hand,
-        handle=arguments.handle,
-        seconds=arguments.seconds,
-        seed=arguments.seed,
-    )
+    with ExitStack() as search:
+        search.enter_context(show_activity("searching a place for the robot and a way for its hand"))
+
+        def watch(step: RecordedStep) -> None:
+            search.close()  # the first step has been made
+            look(step)
+
+        outcome: Outcome = open_object(
+            Session(world, belief=belief, on_step=watch),
+            scene.coordinate,
+            target=scene.target,
+            hand=gripper.hand,
+            handle=arguments.handle,
+            seconds=arguments.seconds,
+            seed=arguments.seed,
+        )
     return outcome
 
 
