@@ -222,6 +222,8 @@ def test_other_coordinates_are_set_at_the_start(run, asked):
         (["shelf_drawers", *HSR, "--robot", "pr2"], "--robot is given twice"),
         (["shelf_drawers", *HSR, "--picture", "no_such_folder/end.png"], "no_such_folder: No such file"),
         (["shelf_drawers", *HSR, "--hand", "hsr/hnd_palm_link"], "hsr/hand_palm_link"),
+        (["shelf_drawers", *HSR, "--set", "hsr/hand_l_distal_joint=0"], "it follows 'hsr/hand_motor_joint'"),
+        (["shelf_drawers", *HSR, "--set", "hsr/hand_palm_joint=0"], "it is fixed"),
         (["shelf_drawers", *HSR, "--handle", "shelf_drawers/frame"], "shelf_drawers/"),
         (["shelf_drawers", *HSR, "--grasp", "tie"], "--world mujoco"),
         (["shelf_drawers", *HSR, "--noise", "3apples"], "Noise '3apples' is not readable"),

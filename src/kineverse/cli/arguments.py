@@ -6,12 +6,11 @@ import argparse
 import json
 import math
 import re
-import sys
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from kineverse.cli.output import format_cells
+from kineverse.cli.output import format_cells, print_line
 from kineverse.errors import DuplicateNameError, InvalidValueError
 from kineverse.expressions.printing import format_number
 
@@ -247,7 +246,7 @@ def find_limit_notes(model: ModelView, values: Mapping[str, float], texts: Itera
 def print_notes(lines: Iterable[str]) -> None:
     """Print remarks on standard error."""
     for line in lines:
-        print(f"kineverse: note: {line}", file=sys.stderr)
+        print_line(f"kineverse: note: {line}")
 
 
 def _suggest_unit(text: str, kind: str, lower: float, upper: float) -> str:

@@ -5,7 +5,6 @@ from __future__ import annotations
 import argparse
 import math
 import re
-import sys
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from itertools import product
@@ -13,6 +12,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from kineverse.cli.arguments import load_model, parse_assignments, parse_value, print_notes
+from kineverse.cli.output import print_line
 from kineverse.cli.plan_arguments import parse_robot, place_base
 from kineverse.errors import InvalidValueError, UnknownNameError, suggest
 
@@ -294,7 +294,7 @@ def _stand_free(model: kv.Model, robot: str, state: kv.State, base: dict[kv.Symb
     if found is not None:
         if problem:
             where = ", ".join(f"{found[s]:.2f}" for s in [*base][:2])
-            print(f"start: {problem} touch, so the robot begins at {where}", file=sys.stderr)
+            print_line(f"start: {problem} touch, so the robot begins at {where}")
         return found
     raise InvalidValueError(
         f"The robot '{robot}' begins in contact: {problem}. Give its base another place: "
@@ -347,16 +347,14 @@ def _find_pusher(
     """
     from kineverse.grasping import find_gripper
 
-    if hand is not None:
-        model.fk(hand)  # raises for an unknown frame
     try:
         gripper = find_gripper(model, robot, hand)
     except UnknownNameError as error:
         if hand is None:
             return None, f"{error} {_NEXT_STEP[skill == 'push']}", ()
         if skill == "push" and hand in model.bodies and hand.startswith(f"{robot}/"):
-            print(f"pusher: {hand}", file=sys.stderr)
+            print_line(f"pusher: {hand}")
             return None, "", (hand,)
         raise
-    print(f"gripper: {gripper}", file=sys.stderr)
+    print_line(f"gripper: {gripper}")
     return gripper, "", gripper.bodies

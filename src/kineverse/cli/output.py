@@ -127,3 +127,9 @@ def show_activity(what: str) -> Iterator[None]:
         yield
     finally:
         print("\r\033[K", end="", file=sys.stderr, flush=True)
+
+
+def print_line(text: str) -> None:
+    """Print a line on standard error, in the place of an activity that is shown there."""
+    clear = "\r\033[K" if sys.stderr.isatty() else ""
+    print(f"{clear}{text}", file=sys.stderr, flush=True)

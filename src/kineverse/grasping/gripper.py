@@ -123,9 +123,9 @@ def find_gripper(model: ModelView, robot: str, hand: str | None = None, srdf: Sr
         raise UnknownNameError(f"{name} has no gripper with two opposed fingers.{reasons}")
     if hand is None:
         return found[0]
-    model.fk(hand)  # raises for an unknown frame
     for gripper in found:
-        if hand in (gripper.hand, *gripper.bodies) or not model.speeds_of(hand, gripper.hand):
+        near = hand in model.frames and not model.speeds_of(hand, gripper.hand)
+        if hand in (gripper.hand, *gripper.bodies) or near:
             return gripper
     listed = ", ".join(repr(gripper.hand) for gripper in found)
     raise UnknownNameError(f"{name} has no gripper at '{hand}'. Its grippers are at: {listed}.")

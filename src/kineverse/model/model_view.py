@@ -194,6 +194,11 @@ class ModelView(SymbolicView):
         for speed in self.speeds:
             if speed.path == path and order >= 1:
                 return Symbol(path, order, speed.role)
+        if path in self.articulations:
+            joint = self.articulations[path]
+            drivers = [repr(str(s)) for s in self.symbols_of(joint.child, joint.parent)]
+            why = f"it follows {', '.join(drivers)}." if drivers else "it is fixed."
+            raise UnknownNameError(f"The joint {name!r} has no coordinate of its own: {why}")
         raise UnknownNameError(
             f"There is no symbol {name!r}. {suggest(name, map(str, coordinates), 'symbol')}"
         )
