@@ -66,7 +66,7 @@ def test_every_function_of_both_modules_is_a_twin():
 def test_stacks_equal_the_expressions_one_by_one(name):
     arguments = TWINS[name]
     found = getattr(lie, name)(*arguments)
-    for index in np.ndindex(4, 6):
+    for index in np.ndindex(4, 2):
         expected = np.asarray(getattr(spatial, name)(*(stack[index] for stack in arguments))())
         if expected.shape != found[index].shape:
             np.testing.assert_array_equal(expected[:3, 3], 0.0)

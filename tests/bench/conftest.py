@@ -3,11 +3,14 @@
 from __future__ import annotations
 
 import sys
+from functools import cache
 
 import pytest
 from small_robot import SMALL_ROBOT
 
 from kineverse.bench import BenchmarkSettings
+from kineverse.bench.clutter import make_clutter
+from kineverse.bench.workloads import make_kitchen_robot
 
 
 @pytest.fixture
@@ -27,8 +30,9 @@ def tiny(robot_file):
         rounds=2,
         processes=1,
         configurations=6,
+        steps=6,
         rows=40,
-        operations=60,
+        operations=20,
         boxes=90,
         problems=1,
         queries=2,
@@ -46,3 +50,13 @@ def without(monkeypatch):
             monkeypatch.setitem(sys.modules, module, None)
 
     return hide
+
+
+make_clutter_once, make_kitchen_robot_once = cache(make_clutter), cache(make_kitchen_robot)
+
+
+@pytest.fixture
+def clutter_made_once(monkeypatch):
+    """Have the benchmark of distances make its arm and its robot once for all tests."""
+    monkeypatch.setattr("kineverse.bench.measure_geometry.make_clutter", make_clutter_once)
+    monkeypatch.setattr("kineverse.bench.measure_geometry.make_kitchen_robot", make_kitchen_robot_once)

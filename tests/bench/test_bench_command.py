@@ -88,9 +88,9 @@ def test_missing_peers_are_named_once_at_the_end(run, asked, without):
 
 
 def test_options_reach_the_measurements(run, asked):
-    assert run("import", "--quick", "--robot", "r", "--frame", "f")[0] == 0
+    assert run("frames", "--quick", "--robot", "r", "--frame", "f")[0] == 0
     ((names, settings),) = asked
-    assert names == ["import"]
+    assert names == ["frames"]
     assert (settings.rounds, settings.robot, settings.frame) == (bench.QUICK.rounds, "r", "f")
 
 

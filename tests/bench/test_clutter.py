@@ -103,6 +103,7 @@ def test_further_boxes_keep_a_distance(arm):
     assert np.linalg.norm(many.poses[60:, :3, 3], axis=1).max() > 1.0
 
 
+@pytest.mark.usefixtures("clutter_made_once")
 def test_peers_that_are_not_installed_are_reported(tiny, without):
     without("mujoco", "pybullet")
     (result,) = run_benchmarks(["geometry"], tiny)

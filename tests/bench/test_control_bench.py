@@ -10,7 +10,7 @@ import pytest
 
 import kineverse as kv
 from kineverse.bench import measure_control, run_benchmarks
-from kineverse.bench.control_workloads import WORKLOADS
+from kineverse.bench.control_workloads import WORKLOADS, export_urdf
 from kineverse.bench.controller_loop import ControllerLoop
 from kineverse.bench.harness import Contender
 from kineverse.bench.measure_examples import EXAMPLES, make_example_loop
@@ -20,6 +20,14 @@ from kineverse.bench.timed_loop import TimedLoop
 pytest.importorskip("daqp")
 
 SHORT = "arm_panda_dof_freezing"
+
+export_urdf_once = cache(export_urdf)
+
+
+@pytest.fixture(autouse=True)
+def urdf_written_once(monkeypatch):
+    """Have each robot written as URDF once for all peers and tests."""
+    monkeypatch.setattr("kineverse.bench.control_workloads.export_urdf", export_urdf_once)
 
 
 def peer_loop(library, name, workload=None):

@@ -2,9 +2,18 @@
 
 from __future__ import annotations
 
+from functools import partial
+
 import pytest
 
 from kineverse.cli import main
+from kineverse.view import pictures
+
+
+@pytest.fixture(autouse=True)
+def _small_pictures(monkeypatch):
+    """Have commands draw small pictures: what is in them does not depend on the size, and is tested elsewhere."""
+    monkeypatch.setattr(pictures, "picture", partial(pictures.picture, size=(320, 240)))
 
 
 @pytest.fixture

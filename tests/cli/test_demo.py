@@ -93,6 +93,8 @@ def test_headless_demo_needs_the_core_only_and_prints_tables(tmp_path):
     code = (
         f"import sys\nfor name in {extras!r}: sys.modules[name] = None\n"
         f"from kineverse.cli import main\n"
+        f"from kineverse.view import pictures\n"
+        f"pictures.SAMPLES = 1\n"
         f"words = ['--living', '--headless', '--stranger', 'stool', '--seconds', '1']\n"
         f"sys.exit(main(['demo', *words, '--picture', {str(tmp_path / 'core.png')!r}]))"
     )

@@ -86,8 +86,7 @@ def test_failures_have_status_1_and_json_has_all_figures(run, asked, fails, tmp_
 
 def test_ctrl_c_prints_the_table_so_far(run, asked, fails, tmp_path):
     fails[2] = KeyboardInterrupt()
-    # Without a page it is one object of each kind, and this kitchen has drawers only.
-    status, out, _ = run("demo", "--headless", "--picture", tmp_path / "x.png")
+    status, out, _ = run("demo", "--headless", "--what", LOWER, "--picture", tmp_path / "x.png")
     assert (status, len(asked)) == (130, 2)
     assert out == "0 of 1 opened and closed by the hsr\n"
     assert not list(tmp_path.iterdir())

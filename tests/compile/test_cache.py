@@ -126,9 +126,9 @@ def run(constant: float, **environment: str) -> subprocess.Popen[str]:
 
 @pytest.mark.compiler
 def test_processes_share_a_folder(tmp_path: Path) -> None:
-    processes = [run(3.0 + i % 2, KINEVERSE_CACHE_DIR=str(tmp_path / "shared")) for i in range(4)]
+    processes = [run(constant, KINEVERSE_CACHE_DIR=str(tmp_path / "shared")) for constant in (3.0, 3.0, 4.0)]
     complaints = [process.communicate(timeout=120)[1] for process in processes]
-    assert [(p.returncode, said) for p, said in zip(processes, complaints, strict=True)] == [(0, "")] * 4
+    assert [(p.returncode, said) for p, said in zip(processes, complaints, strict=True)] == [(0, "")] * 3
     stored = list((tmp_path / "shared").iterdir())
     assert all(p.suffix == ".so" for p in stored)
     assert len(stored) in (2, 3)  # the extension is one, where Python's headers are installed
@@ -136,7 +136,14 @@ def test_processes_share_a_folder(tmp_path: Path) -> None:
 
 
 @pytest.mark.compiler
-@pytest.mark.parametrize("where", ["KINEVERSE_CACHE_DIR", "XDG_CACHE_HOME", "HOME"])
+@pytest.mark.parametrize(
+    "where",
+    [
+        "KINEVERSE_CACHE_DIR",
+        pytest.param("XDG_CACHE_HOME", marks=pytest.mark.long),
+        pytest.param("HOME", marks=pytest.mark.long),
+    ],
+)
 def test_a_folder_that_cannot_be_made_is_replaced_by_a_private_one(tmp_path: Path, where: str) -> None:
     # Not by permissions: they do not bind root, who may run this.
     blocked = tmp_path / "file"

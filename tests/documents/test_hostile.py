@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 
 import kineverse as kv
-from kineverse.formats.document import read_operations
+from kineverse.formats.document import budget, read_operations, traces
 
 ONE: list[Any] = ["constant", 1.0]
 A: list[Any] = ["symbol", "a", 0, "dof"]
@@ -204,49 +204,66 @@ def test_nesting_of_a_hundred_thousand_levels_is_refused(text: str) -> None:
         read_operations(text)
 
 
-USED = {
-    "sums of sums": repeated(50_000, lambda last: ["elementary", "add", last, last]),
-    "products of products": repeated(
-        300, lambda last: ["elementary", "mul", last, last], lambda last: ["elementary", "sin", last]
-    ),
-    "augmented again and again": repeated(
-        190,
-        lambda last: ["elementary", "mul", last, last],
-        lambda last: ["augment", last, False, False, [[2, last - 1]]],
-        start=[ONE, A, AV, ["elementary", "sin", 1]],
-    ),
-    "choices of choices": repeated(
-        190, lambda last: ["elementary", "sin", last], lambda last: ["select", last - 1, last, last - 1]
-    ),
-    "logic of logic": repeated(
-        190,
-        lambda last: ["less", last, last - 1, 1.0],
-        lambda last: ["and", last, last - 1],
-        start=[ONE, A, B],
-    ),
-    "smallest of largest": repeated(
-        190,
-        lambda last: ["extremum", "min", last, last - 1],
-        lambda last: ["extremum", "max", last - 1, last],
-        start=[ONE, A, B],
-    ),
-    "norms of norms": repeated(
-        190, lambda last: ["matrix", [3], [last, 1, last]], lambda last: ["norm", last]
-    ),
-    "profiles of profiles": repeated(
-        190, lambda last: ["piecewise", last, True, [0, 1, 2], [[1, 2, 3], [1, 2, 4]]]
-    ),
-    "compositions": composed(10),
-    "Newton in Newton": newton_in_newton(2, 3),
-    "a table of rates": ring_of_rates(60),
-}
+def used(levels: int, compositions: int) -> dict[str, str]:
+    """Return documents that are read, by name, of so many levels where these cost something."""
+    return {
+        "sums of sums": repeated(50_000, lambda last: ["elementary", "add", last, last]),
+        "products of products": repeated(
+            300, lambda last: ["elementary", "mul", last, last], lambda last: ["elementary", "sin", last]
+        ),
+        "augmented again and again": repeated(
+            levels,
+            lambda last: ["elementary", "mul", last, last],
+            lambda last: ["augment", last, False, False, [[2, last - 1]]],
+            start=[ONE, A, AV, ["elementary", "sin", 1]],
+        ),
+        "choices of choices": repeated(
+            levels,
+            lambda last: ["elementary", "sin", last],
+            lambda last: ["select", last - 1, last, last - 1],
+        ),
+        "logic of logic": repeated(
+            levels,
+            lambda last: ["less", last, last - 1, 1.0],
+            lambda last: ["and", last, last - 1],
+            start=[ONE, A, B],
+        ),
+        "smallest of largest": repeated(
+            levels,
+            lambda last: ["extremum", "min", last, last - 1],
+            lambda last: ["extremum", "max", last - 1, last],
+            start=[ONE, A, B],
+        ),
+        "norms of norms": repeated(
+            levels, lambda last: ["matrix", [3], [last, 1, last]], lambda last: ["norm", last]
+        ),
+        "profiles of profiles": repeated(
+            levels, lambda last: ["piecewise", last, True, [0, 1, 2], [[1, 2, 3], [1, 2, 4]]]
+        ),
+        "compositions": composed(compositions),
+        "Newton in Newton": newton_in_newton(2, 3),
+        "a table of rates": ring_of_rates(60),
+    }
 
 
-@pytest.mark.parametrize("name", USED)
-def test_accepted_document_can_be_evaluated(name: str, tmp_path: Any) -> None:
+USED, DEEP = used(60, 7), used(190, 10)
+
+
+@pytest.mark.parametrize(
+    "text",
+    [
+        *(pytest.param(text, id=name) for name, text in USED.items()),
+        *(
+            pytest.param(text, id=f"{name}, deep", marks=pytest.mark.long)
+            for name, text in DEEP.items()
+            if text != USED[name]
+        ),
+    ],
+)
+def test_accepted_document_can_be_evaluated(text: str, tmp_path: Any) -> None:
     """Poses, both gradients, evaluation, relevance, validity, saving, and an edit: nothing hangs or crashes."""
     path = tmp_path / "hostile.kv.json"
-    path.write_text(USED[name])
+    path.write_text(text)
     model = kv.load(path)
     for given in model.constraints.values():
         e = given.expression
@@ -287,7 +304,11 @@ def growing(question: Any, count: int) -> str:
 
 
 @pytest.mark.parametrize("look", [0, 2])
-def test_edit_upstream_of_an_exploding_trace_is_refused(look: int, tmp_path: Any) -> None:
+@pytest.mark.parametrize("work", [1_000_000, pytest.param(budget.MAX_WORK, id="all", marks=pytest.mark.long)])
+def test_edit_upstream_of_an_exploding_trace_is_refused(
+    work: int, look: int, tmp_path: Any, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(traces, "MAX_WORK", work)  # of reading; the edit has a limit of its own
     path = tmp_path / "hostile.kv.json"
     path.write_text(growing(lambda e, at: ["substitute", look, e, 3, at], 60))
     model = kv.load(path)
@@ -342,7 +363,7 @@ def test_very_long_kinematic_chain_is_read(tmp_path: Any) -> None:
 def test_random_tables_are_read_or_refused() -> None:
     """Tables by grammar: nodes of all types over anything that came before."""
     draw = random.Random(7)
-    for _ in range(60):
+    for _ in range(20):
         nodes: list[Any] = [ONE, ["constant", -0.5], A, B, ["symbol", "v", 1, "dof"]]
         for _ in range(30):
             ref = lambda: draw.randrange(len(nodes))  # noqa: E731, B023

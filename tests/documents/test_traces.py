@@ -118,7 +118,7 @@ def programs(draw: st.DrawFn) -> Callable[[kv.model.ReadRecorder], kv.model.Writ
 
 
 @given(programs(), st.sampled_from(CHANGES))
-@settings(max_examples=attempts(30), deadline=None)
+@settings(max_examples=attempts(15), deadline=None)
 def test_any_code_is_followed_rightly_or_the_change_refused(code: Any, change: dict[str, Any]) -> None:
     read = reloaded(build(code))
     before = read.snapshot()

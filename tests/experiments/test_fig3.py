@@ -53,7 +53,9 @@ def test_regular_form_has_a_finite_slope_at_the_closed_door(fig3):
     assert fig3.numbers["slope_regular_closed"] == pytest.approx(2)
 
 
-@pytest.mark.parametrize("suffix", ["png", "svg", "pdf"])
+@pytest.mark.parametrize(
+    "suffix", ["pdf", *(pytest.param(suffix, marks=pytest.mark.long) for suffix in ("png", "svg"))]
+)
 def test_the_figure_is_drawn(fig3, tmp_path, suffix):
     pytest.importorskip("matplotlib")
     file = tmp_path / f"door.{suffix}"
@@ -86,6 +88,7 @@ def test_the_command_prints_tables_and_writes_the_figure(tmp_path, monkeypatch, 
     assert "no bound" in out
     assert "fig3.png" in out
     assert (tmp_path / "fig3.png").stat().st_size > 5000
+    assert (tmp_path / "fig3.png").read_bytes().startswith(b"\x89PNG")
 
 
 def test_reproduce_as_json_is_one_object(tmp_path, monkeypatch, capsys):
@@ -103,6 +106,7 @@ def test_reproduce_as_json_writes_a_requested_figure(tmp_path, monkeypatch, caps
     assert main(["reproduce", "fig3", "--json", "--figure", "door.svg"]) == 0
     assert json.loads(capsys.readouterr().out)["figure"] == "door.svg"
     assert [file.name for file in tmp_path.iterdir()] == ["door.svg"]
+    assert (tmp_path / "door.svg").read_bytes().startswith(b"<?xml")
 
 
 def test_without_a_figure_nothing_is_written(tmp_path, monkeypatch, capsys):

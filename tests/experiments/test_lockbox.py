@@ -58,13 +58,13 @@ def test_report_of_few_boxes():
     explored = [
         one
         for rule in LOCK_RULES
-        for one in run_explorer(ExplorerJob(10, 2, 0.25 if rule == "undemanded" else 0.0, rule))
+        for one in run_explorer(ExplorerJob(6, 2, 0.25 if rule == "undemanded" else 0.0, rule))
     ]
     planned = [
         one
         for job in (
-            PlannerJob("monotone", 8, 0),
-            PlannerJob("negated", 8, 0),
+            PlannerJob("monotone", 5, 0),
+            PlannerJob("negated", 5, 0),
             PlannerJob("tangled", 4, 1),
             PlannerJob("rings", 3, 0),
         )

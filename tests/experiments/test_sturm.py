@@ -11,6 +11,7 @@ import pytest
 
 from kineverse.cli import main
 from kineverse.errors import FormatError
+from kineverse.estimation.identification.solver import solver
 from kineverse.estimation.recordings import RecordedPair
 from kineverse.experiments import Options, reproduce
 from kineverse.experiments.sturm.classify import (
@@ -45,6 +46,11 @@ def arc(radius, angle, count=60):
 def line(travel, count=60):
     points = np.linspace(0, travel, count)[:, None] * [0.6, 0.0, 0.8] + [1, 2, 3]
     return points + 0.002 * RNG.standard_normal(points.shape)
+
+
+@pytest.fixture(autouse=True, scope="module")
+def _compiled():
+    solver.prepare(wait=True)
 
 
 @pytest.fixture
@@ -132,7 +138,7 @@ def test_the_command_takes_the_folder(folder, capsys):
 
 
 def test_all_poses_are_judged_under_each_statement_of_the_noise():
-    points = arc(0.4, 1.5)
+    points = arc(0.4, 1.5, 25)
     pair = RecordedPair("world", "door", None, points, np.arange(len(points)))
     answers = answer_statements("an arc", "revolute", pair)
     assert [one.statement for one in answers] == [*STATEMENTS]
@@ -143,6 +149,14 @@ def test_all_poses_are_judged_under_each_statement_of_the_noise():
     assert statement_numbers(wrong)["half"]["not_right"] == {"an arc": "prismatic, wrong"}
 
 
+@pytest.mark.skipif(not TRACKS.exists(), reason=f"no {TRACKS}")
+def test_every_tenth_of_the_published_recordings_is_right():
+    found = list(read_labelled_recordings(TRACKS))
+    assert {recording.label for recording in found[::10]} == {"revolute", "prismatic"}
+    assert all(classify_recording(recording).is_correct for recording in found[::10])
+
+
+@pytest.mark.long
 @pytest.mark.skipif(not TRACKS.exists(), reason=f"no {TRACKS}")
 def test_at_least_95_percent_of_the_published_recordings_are_right():
     found = reproduce("sturm", options=Options(quick=True, data=TRACKS))

@@ -14,22 +14,22 @@ WORDS = lp.Vocabulary("law")
 
 
 def test_gradients_of_random_programs_equal_the_oracle():
-    lc.law(lc.general(), WORDS, 100)()
+    lc.law(lc.general(), WORDS, 40)()
 
 
 def test_augment_inside_augment():
-    lc.law(lc.nested(), WORDS, 80)()
+    lc.law(lc.nested(), WORDS, 25)()
 
 
 def test_composition():
-    lc.law(lc.compositions(), WORDS, 90)()
+    lc.law(lc.compositions(), WORDS, 30)()
 
 
 def test_third_order():
     lc.law(st.one_of(lp.programs(lp.S, 2), lp.nested(lp.S, 2)), WORDS, 30, order=3)()
 
 
-@lc.examples(40)
+@lc.examples(20)
 @lc.given(lc.SHAPES.flatmap(lambda shape: lp.programs(shape, 3, lp.SMOOTH)))
 def test_finite_differences(program):
     e = array(lp.build(program, WORDS))

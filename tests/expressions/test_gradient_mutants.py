@@ -30,7 +30,7 @@ from kineverse.logic import And, Less, Not, Or, weighted_sum
 @functools.cache
 def programs():
     """Return the programs that every mutant is put to; a worker that runs none of this does not draw them."""
-    corpora = (lc.corpus(strategy, 40) for strategy in (lc.general(), lc.nested(), lc.compositions()))
+    corpora = (lc.corpus(strategy, 20) for strategy in (lc.general(), lc.nested(), lc.compositions()))
     return [program for programs in zip(*corpora, strict=True) for program in programs]
 
 

@@ -177,7 +177,7 @@ def _solved(kind, arguments):
 ARGUMENTS = st.one_of(lp.programs(lp.S, 2), lp.nested(lp.S, 2))
 
 
-@lc.examples(30)
+@lc.examples(12)
 @given(st.sampled_from(["Kepler", "polar"]), ARGUMENTS, ARGUMENTS, st.booleans())
 def test_gradients_with_augmented_inputs_and_trends(kind, first, second, wrapped):
     programs = (first, second)
@@ -204,7 +204,7 @@ def test_gradients_with_augmented_inputs_and_trends(kind, first, second, wrapped
     lc.check(ours, theirs, WORDS.values)
 
 
-@lc.examples(20)
+@lc.examples(10)
 @given(st.sampled_from(["Kepler", "polar"]), ARGUMENTS, ARGUMENTS)
 def test_substitution_is_composition(kind, first, second):
     """The function of plain symbols, with programs in their places afterwards."""

@@ -295,7 +295,7 @@ def call_quietly(function, x, axis):
     return None if np.isnan(found).any() else found
 
 
-@few
+@settings(max_examples=attempts(9))
 @given(arrays())
 def test_reductions(x):
     x = x - 3

@@ -71,9 +71,11 @@ def assert_as_in_mujoco(model: kv.Model, file: Path, count: int = 2, tolerance: 
             )
 
 
-# Every other one: as URDF all of them are written and read again.
+# Every sixth one, or every other one: as URDF all of them are written and read again.
 @pytest.mark.parametrize(
-    "file", FILES[::2], ids=lambda f: "none" if f is None else str(f.relative_to(SHARED))
+    "file",
+    [pytest.param(f, marks=() if i % 3 == 0 else pytest.mark.long) for i, f in enumerate(FILES[::2])],
+    ids=lambda f: "none" if f is None else str(f.relative_to(SHARED)),
 )
 def test_urdf_files_saved_as_mjcf_move_alike(file: Path | None, tmp_path: Path) -> None:
     if file is None:
@@ -116,7 +118,13 @@ def turned(body: Body) -> np.ndarray:
     return turn @ np.array([[xx, xy, xz], [xy, yy, yz], [xz, yz, zz]]) @ turn.T
 
 
-@pytest.mark.parametrize("name", [*SHIPPED, *SCENES])
+LARGE = {f"articulations/{n}" for n in ("delta_robot", "jansen_leg", "parallel_gripper", "scissor_linkage")}
+"""Linkages that take long to be closed again; the others of :data:`.SCENES` show the same."""
+
+
+@pytest.mark.parametrize(
+    "name", [pytest.param(n, marks=pytest.mark.long if n in LARGE else ()) for n in (*SHIPPED, *SCENES)]
+)
 def test_shipped_models_are_written_or_refused_by_name(name: str, tmp_path: Path) -> None:
     model = load_cached(name)
     file = tmp_path / "m.xml"

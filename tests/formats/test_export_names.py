@@ -69,7 +69,14 @@ def test_names_are_kept_in_every_role(name: str, ending: str, tmp_path: Path) ->
         assert not again.violations({**{str(s): v for s, v in home.items()}, **speed})
 
 
-@pytest.mark.parametrize("name", ["obj:joint", "50%", "ünï 码"])
+@pytest.mark.parametrize(
+    "name",
+    [
+        pytest.param("obj:joint", marks=pytest.mark.long),
+        pytest.param("50%", marks=pytest.mark.long),
+        "ü:ï% 码",
+    ],
+)
 def test_names_of_loops_are_kept_below_prefixes(name: str, tmp_path: Path) -> None:
     pytest.importorskip("mujoco")
     model = kv.load("articulations/four_bar", prefix=name)

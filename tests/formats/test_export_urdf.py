@@ -63,7 +63,11 @@ def saved(model: kv.Model, folder: Path, **options: object) -> kv.Model:
     return kv.load(folder / "m.urdf")
 
 
-@pytest.mark.parametrize("file", FILES, ids=lambda f: "none" if f is None else str(f.relative_to(SHARED)))
+@pytest.mark.parametrize(
+    "file",
+    [pytest.param(f, marks=() if i % 5 == 0 else pytest.mark.long) for i, f in enumerate(FILES)],
+    ids=lambda f: "none" if f is None else str(f.relative_to(SHARED)),
+)
 def test_urdf_files_are_read_back_unchanged(file: Path | None, tmp_path: Path) -> None:
     if file is None:
         pytest.skip(f"no {SHARED}")
@@ -79,7 +83,14 @@ def test_urdf_files_are_read_back_unchanged(file: Path | None, tmp_path: Path) -
     assert all(not again.articulations[name].coordinates for name in further)
 
 
-@pytest.mark.parametrize("name", [*SHIPPED, *SCENES])
+LARGE = {f"articulations/{name}" for name in ("delta_robot", "jansen_leg", "scissor_linkage")}
+"""Linkages that take long to be closed, and are refused as the others are."""
+
+
+@pytest.mark.parametrize(
+    "name",
+    [pytest.param(name, marks=pytest.mark.long if name in LARGE else ()) for name in (*SHIPPED, *SCENES)],
+)
 def test_shipped_models_are_written_or_refused_by_name(name: str, tmp_path: Path) -> None:
     model = load_cached(name)
     if name in REFUSED:

@@ -31,7 +31,7 @@ from fuzz.minimise import minimise  # noqa: E402
 from fuzz.targets import TARGETS, Target  # noqa: E402
 from fuzz.worker import make_input_folder  # noqa: E402
 
-COUNTS = {"urdf": 100, "sdf": 60, "mjcf": 30, "document": 100}
+COUNTS = {"urdf": 40, "sdf": 40, "mjcf": 12, "document": 50}
 
 
 @pytest.fixture
@@ -42,7 +42,7 @@ def folder(tmp_path) -> Path:
 @pytest.mark.parametrize("name", TARGETS)
 def test_fuzzing_finds_no_violation(name, folder):
     target, counts = TARGETS[name], OutcomeCounts()
-    count = COUNTS.get(name, 60)
+    count = COUNTS.get(name, 40)
     for data in islice(inputs(target, target.own_seeds(), Random(7)), count):
         options = choose_options(data)
         assert check(target, data, folder, counts, options) is None, (options, data)

@@ -70,7 +70,10 @@ def test_massless_frames_are_read_back_without_mass(tmp_path: Path) -> None:
     )
 
 
-@pytest.mark.parametrize("saved", ["as it is", "from a document", "from a document, below a prefix"])
+@pytest.mark.parametrize(
+    "saved",
+    ["as it is", pytest.param("from a document", marks=pytest.mark.long), "from a document, below a prefix"],
+)
 def test_loops_are_solved_again_when_read_back(saved: str, tmp_path: Path) -> None:
     model = load_cached("articulations/parallel_gripper")
     if saved != "as it is":

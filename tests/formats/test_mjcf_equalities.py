@@ -140,7 +140,7 @@ def bars(ref: float = 0.0) -> str:
     return BARS.format(ref=ref, turn=-20, length=float(np.hypot(*reach)), lean=lean)
 
 
-@pytest.mark.parametrize("ref", [0.0, 30.0])
+@pytest.mark.parametrize("ref", [pytest.param(0.0, marks=pytest.mark.long), 30.0])
 @pytest.mark.parametrize(
     "equality",
     [

@@ -99,7 +99,7 @@ def trees(draw) -> str:
     return f"<mujoco>{compiler}<default>{defaults}</default><worldbody>{bodies}</worldbody></mujoco>"
 
 
-@settings(max_examples=attempts(12), deadline=None)
+@settings(max_examples=attempts(6), deadline=None)
 @given(trees())
 def test_random_trees_have_the_poses_of_mujoco(text):
     Pair.of_text(text).compare(samples=2)

@@ -20,7 +20,7 @@ from fuzz.targets import TARGETS
 from fuzz.worker import make_input_folder
 
 
-@pytest.mark.parametrize(("name", "tried", "read"), [("urdf", 400, 100), ("mjcf", 60, 1)])
+@pytest.mark.parametrize(("name", "tried", "read"), [("urdf", 200, 50), ("mjcf", 30, 1)])
 def test_files_that_other_parsers_read_are_refused_for_six_reasons_only(tmp_path, name, tried, read):
     target, folder = TARGETS[name], make_input_folder(tmp_path)
     with quiet():

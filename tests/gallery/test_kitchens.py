@@ -15,7 +15,7 @@ from kineverse.gallery.kitchens import layout
 from kineverse.geometry import Rule, Scene
 from kineverse.model.body import Body, Box, Cylinder
 
-SEEDS = (2, 11, 12, 89)
+SEEDS = (11, 89, pytest.param(2, marks=pytest.mark.long), pytest.param(12, marks=pytest.mark.long))
 """With most kinds of units; an island, a second row and a bare wall; a folding door and flaps above."""
 OPENED = (0.02, 0.25, 0.5, 0.75, 1.0)
 
@@ -53,7 +53,7 @@ def test_generate_kitchen_finds_contact_of_two_open_doors():
 
 def test_generate_kitchen_numbers_are_those_of_the_documentation():
     kinds, counts, aisles = set(), [], []
-    for seed in range(1000, 1060):
+    for seed in range(1000, 1030):
         model = kitchens.generate_kitchen(seed)
         shut = model.default_state()
         objects = model.degrees_of_freedom

@@ -99,9 +99,15 @@ def test_commands_take_the_name_of_a_scene(name, capsys):
     assert np.shape(json.loads(capsys.readouterr().out)["transform"]) == (4, 4)
 
 
-# Closing the loops of the last three takes most of the time; they come from the same module as the other linkages.
+# Closing loops takes most of the time; one linkage stands for the others, which come from the same module.
+LINKAGES = (
+    *("delta_robot", "jansen_leg", "scissor_linkage"),
+    *("parallel_gripper", "slider_crank", "spatial_four_bar"),
+)
+
+
 @pytest.mark.parametrize(
-    "name", [name for name in NAMES if name not in ("delta_robot", "jansen_leg", "scissor_linkage")]
+    "name", [pytest.param(name, marks=pytest.mark.long if name in LINKAGES else ()) for name in NAMES]
 )
 def test_scene_names_are_below_a_prefix_and_it_can_be_included_twice(name):
     model = kv.Model()

@@ -278,7 +278,7 @@ def narrower():
     return library
 
 
-@settings(max_examples=attempts(30))
+@settings(max_examples=attempts(15))
 @given(counts=st.tuples(*[st.integers(8, 90)] * 2), seed=seeds, spread=st.sampled_from([0.0, 0.3, 2.0]))
 def test_support_of_many_corners_is_independent_of_the_vector_width(narrower, counts, seed, spread):
     """Each corner is the furthest one in its direction: a ball of them leaves none out of what is measured."""

@@ -13,15 +13,16 @@ from kineverse.geometry import Scene
 
 def test_scene_of_the_shipped_robot_and_kitchen():
     model = kv.load("kitchen")
-    model.include("pr2")
+    model.include("fetch")
     scene = Scene(model)
     state = model.default_state()
     rng = np.random.default_rng(0)
-    robot = [s for s in model.degrees_of_freedom if str(s).startswith("pr2/")]
+    robot = [s for s in model.degrees_of_freedom if str(s).startswith("fetch/")]
     for step in range(3):
         state = state.updated({s: state[s] + float(rng.normal()) * 0.05 for s in robot})
         scene.update(state)
-        near = by_names(scene.pairs_between("pr2/base_footprint", "kitchen/kitchen", 0.3))
+        near = by_names(scene.pairs_between("fetch/base_link", "kitchen/kitchen", 0.3))
+        assert near
         assert all(len({name.split("/")[0] for name in names}) == 2 for names in near)
         if step == 2:
             expected = {frozenset(n): d for n, d in brute_force(scene, state).items() if d <= 0.3}

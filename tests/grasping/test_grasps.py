@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from dataclasses import replace
 from functools import cache
+from itertools import product
 
 import numpy as np
 import pytest
@@ -13,7 +14,7 @@ from grasp_oracle import GraspJudge
 import kineverse as kv
 from kineverse import lie
 from kineverse.errors import InvalidValueError
-from kineverse.grasping import Grasp, Handle, find_gripper, find_handle, sample_grasps
+from kineverse.grasping import Grasp, Gripper, Handle, find_gripper, find_handle, sample_grasps
 from kineverse.model.body import Body, Box, Pose, Shape
 
 KITCHEN = (
@@ -46,9 +47,18 @@ def check(judge: GraspJudge, grasp: Grasp) -> None:
     assert max(judge.finger_distances(grasp.handle.frame)) < 0.0, f"{grasp}: a finger does not touch"
 
 
-@pytest.mark.parametrize("robot", ["pr2", "fetch", "hsr"])
-@pytest.mark.parametrize("name", ["kitchen", "shelf_door", "shelf_drawers"])
-def test_every_object_can_be_grasped(robot: str, name: str) -> None:
+SHORT = {("kitchen", "fetch"), ("shelf_door", "hsr"), ("shelf_drawers", "pr2")}
+"""Each furniture and each robot once; the other pairs take long."""
+
+
+@pytest.mark.parametrize(
+    ("name", "robot"),
+    [
+        pytest.param(*pair, marks=() if pair in SHORT else pytest.mark.long)
+        for pair in product(("kitchen", "shelf_door", "shelf_drawers"), ("pr2", "fetch", "hsr"))
+    ],
+)
+def test_every_object_can_be_grasped(name: str, robot: str) -> None:
     model = kv.load(name)
     top = next(f for f, frame in model.frames.items() if frame.parent == "world")
     model.include(robot)
@@ -60,11 +70,17 @@ def test_every_object_can_be_grasped(robot: str, name: str) -> None:
         check(judge, grasps[-1])
 
 
-def test_grasps_differ_in_angle_place_and_half_turn() -> None:
+@cache
+def before_the_fridge() -> tuple[kv.Model, Gripper, Handle, GraspJudge]:
+    """Return the kitchen with the HSR, its gripper, the handle of the fridge, and a judge."""
     model = kv.load("kitchen")
     model.include("hsr")
     gripper, handle = find_gripper(model, "hsr"), find_handle(model, "kitchen/fridge_door")
-    judge = GraspJudge(model, "kitchen/kitchen", gripper)
+    return model, gripper, handle, GraspJudge(model, "kitchen/kitchen", gripper)
+
+
+def test_grasps_differ_in_angle_place_and_half_turn() -> None:
+    model, gripper, handle, judge = before_the_fridge()
     grasps = sample_grasps(model, gripper, handle, count=40, seed=3)
     again = sample_grasps(model, gripper, handle, count=40, seed=3)
     other = sample_grasps(model, gripper, handle, count=40, seed=4)
@@ -86,10 +102,7 @@ def test_grasps_differ_in_angle_place_and_half_turn() -> None:
 
 
 def test_slanted_grasps_come_from_along_the_bar() -> None:
-    model = kv.load("kitchen")
-    model.include("hsr")
-    gripper, handle = find_gripper(model, "hsr"), find_handle(model, "kitchen/fridge_door")
-    judge = GraspJudge(model, "kitchen/kitchen", gripper)
+    model, gripper, handle, judge = before_the_fridge()
     grasps = sample_grasps(model, gripper, handle, count=24, slant=0.9)
     slants = [grasp.slant for grasp in grasps]
     assert -0.9 <= min(slants) < -0.3

@@ -43,19 +43,17 @@ def test_a_closed_loop_needs_values_of_free_coordinates_only(model):
     assert record(model, "four-bar")["mobility"] == 1
 
 
-def test_dependent_coordinates_are_chosen_from_the_ends_or_given():
-    assert record(four_bar(), "four-bar")["dependent"] == ("coupler", "rocker")
+def test_dependent_coordinates_are_chosen_from_the_ends_or_given(model, rocks):
+    assert record(model, "four-bar")["dependent"] == ("coupler", "rocker")
     driven = four_bar(
         dependent=("coupler", "crank"), within={"rocker": (1.6, 1.9)}, home={"rocker": 1.8, "crank": 0.5}
     )
     assert driven.degrees_of_freedom == (rocker,)
     assert_closed_between(driven, 1.6, 1.9)
     # The same mechanism, asked the other way round.
-    bars = four_bar(home={"rocker": 1.5})
-    forth = function(bars, bars.rates.carried(rocker))
     for angle in (1.6, 1.7, 1.8, 1.9):
         (back,) = function(driven, driven.rates.carried(crank))([angle])
-        assert forth([back])[0] == pytest.approx(angle, abs=1e-10)
+        assert rocks([back])[0] == pytest.approx(angle, abs=1e-10)
 
 
 def assert_closed_between(model, lower, upper):
@@ -349,8 +347,8 @@ def test_many_inputs():
     assert dict(model.articulations["ring"].dynamics)["mobility"] == 4
     free = model.degrees_of_freedom
     assert [str(s) for s in free] == ["bar_0", "bar_1", "bar_2", "bar_3"]
-    assert_closed(model)
-    assert_moves_as_its_jacobian_says(model, "bar_4", 20)
+    assert_closed(model, 300)
+    assert_moves_as_its_jacobian_says(model, "bar_4", 16)
 
 
 def test_the_guess_is_periodic_over_full_revolutions():

@@ -15,9 +15,24 @@ import kineverse as kv
 crank, coupler, rocker = (kv.position(n) for n in ("crank", "coupler", "rocker"))
 
 
-@pytest.fixture
-def model():
+@pytest.fixture(scope="module")
+def bars():
     return four_bar(home={"rocker": 1.5})
+
+
+@pytest.fixture
+def model(bars):
+    return bars.copy()
+
+
+@pytest.fixture(scope="module")
+def limited_bars():
+    return limited_four_bar()
+
+
+@pytest.fixture
+def limited(limited_bars):
+    return limited_bars.copy()
 
 
 def meeting(model, angle=0.7):
@@ -73,8 +88,8 @@ def test_without_the_loop_coordinates_are_free_again(model):
     np.testing.assert_allclose(meeting(model), four_bar_by_circles(0.7, side=-1), rtol=0, atol=1e-11)
 
 
-def test_constraints_know_of_it_when_it_comes_and_goes():
-    model = limited_four_bar()
+def test_constraints_know_of_it_when_it_comes_and_goes(limited):
+    model = limited
     assert "rocker/position" in model.constraints_for([crank])
     assert "rocker/position" in [v.name for v in model.violations({"crank": 3.0})]
     with model.edit() as edit:
@@ -155,8 +170,8 @@ def bits(model, prefix=""):
     return [f.tobytes() for f in found]
 
 
-def test_copies_and_pickles():
-    model = limited_four_bar()
+def test_copies_and_pickles(limited):
+    model = limited
     for other in (model.copy(), pickle.loads(pickle.dumps(model)), copy.deepcopy(model)):
         assert other.snapshot() == model.snapshot()
         assert bits(other) == bits(model)
@@ -168,13 +183,22 @@ def test_copies_and_pickles():
     assert pickle.loads(pickle.dumps(frozen)) == frozen
 
 
-def test_made_twice_it_is_the_same():
-    assert limited_four_bar().snapshot() == limited_four_bar().snapshot()
-    assert bits(limited_four_bar()) == bits(limited_four_bar())
-    assert four_bar().snapshot() != four_bar(branch=1).snapshot()
+def test_made_twice_it_is_the_same(limited, model):
+    again = limited_four_bar()
+    assert again.snapshot() == limited.snapshot()
+    assert bits(again) == bits(limited)
+    assert model.snapshot() != four_bar(branch=1).snapshot()
 
 
-@pytest.mark.parametrize("name", ["four-bar", "scissor lift", "desk lamp", "parallel gripper"])
+@pytest.mark.parametrize(
+    "name",
+    [
+        "four-bar",
+        pytest.param("scissor lift", marks=pytest.mark.long),
+        "desk lamp",
+        pytest.param("parallel gripper", marks=pytest.mark.long),
+    ],
+)
 def test_documents_keep_every_bit(name, tmp_path):
     model = GALLERY[name]()
     path = tmp_path / "linkage.kv.json"
@@ -196,8 +220,8 @@ def test_documents_keep_every_bit(name, tmp_path):
     assert (tmp_path / "again.kv.json").read_bytes() == path.read_bytes()
 
 
-def test_documents_under_a_prefix(tmp_path):
-    model = limited_four_bar()
+def test_documents_under_a_prefix(tmp_path, limited):
+    model = limited
     model.save(tmp_path / "bars.kv.json")
     read = kv.load(tmp_path / "bars.kv.json", prefix="left")
     assert read.degrees_of_freedom == (kv.position("left/crank"),)

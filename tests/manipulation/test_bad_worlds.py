@@ -115,7 +115,7 @@ def test_steps_beyond_the_time_out_of_a_world_are_refused(world):
 def test_open_ends_when_the_object_moves_away(world):
     start(world, "moves away")
     session = Session(world)
-    outcome = open_object(session, DRAWER, target=0.2, seconds=40.0)
+    outcome = open_object(session, DRAWER, target=0.2, seconds=8.0)
     assert not outcome
     assert "slipped" in outcome.reason
     assert not any(session.commands.values())

@@ -139,7 +139,7 @@ def test_a_hand_from_below_opens_a_door_that_none_from_across_reaches():
     assert found.samples < 600  # no arm reached the handle at all
     world = KinematicWorld(model, "hsr")
     world.reset(state)
-    outcome = open_object(Session(world), DOOR, target=1.2)
+    outcome = open_object(Session(world), DOOR, target=0.6)
     assert outcome, outcome.reason
     assert not outcome.measures["pushed"]
     assert outcome.measures["penetration"] < 5e-4
@@ -187,15 +187,8 @@ def test_joints_at_their_limits_leave_the_rest_of_a_step_to_the_others():
     assert (found >= paths.lower).all()
 
 
-@pytest.fixture(scope="module")
-def door():
-    model = make_model("shelf_door")
-    gripper, handle = find_gripper(model, "hsr"), find_handle(model, DOOR)
-    return PlacementSearch(model, gripper, start(model)), sample_grasps(model, gripper, handle, 32)
-
-
-def test_fingers_that_close_and_open_keep_the_margin(door):
-    search, grasps = door
+def test_fingers_that_close_and_open_keep_the_margin(at_the_door):
+    search, _, _, grasps = at_the_door
     found = search.find(start(search.model), grasps, 1.2)
     handle, hand = grasps[0].handle.frame, search.gripper.bodies
     watch = search.scene.watch(hand, [b for b in search.others if b != handle], 0.05)
@@ -206,8 +199,8 @@ def test_fingers_that_close_and_open_keep_the_margin(door):
             assert all(pair.distance > search.margin - 1e-3 for pair in watch())
 
 
-def test_retreats_go_aside_where_the_arm_does_not_reach_straight_back(door, monkeypatch):
-    search, grasps = door
+def test_retreats_go_aside_where_the_arm_does_not_reach_straight_back(at_the_door, monkeypatch):
+    search, _, _, grasps = at_the_door
     follow, most = search.paths.follow, [1, 5, 5, 5, 5]
 
     def follow_less(Q, base, targets):
@@ -329,6 +322,7 @@ def test_an_object_that_is_never_seen_is_not_opened(model):
     assert world.state[DRAWER] == 0.1
 
 
+@pytest.mark.long  # with physics, it opens on estimates above
 def test_drawer_opens_by_estimates_from_noisy_poses(model):
     sensors = Sensors.parse("3mm+3mm/m,0.5deg,30Hz,drop=0.1,encoders=0.0002")
     world = KinematicWorld(model, "hsr", sensors=sensors)

@@ -144,7 +144,9 @@ def test_contact_slots_keep_a_margin_for_each_pair_and_know_velocities_of_points
         slots.set_margin(PUSHER, "drawer", 1.0)
 
 
-@pytest.mark.parametrize(("what", "value"), [("door", 0.6), ("flap", 0.7), ("drawer", 0.4)])
+@pytest.mark.parametrize(
+    ("what", "value"), [("door", 0.6), pytest.param("flap", 0.7, marks=pytest.mark.long), ("drawer", 0.4)]
+)
 def test_push_shuts_what_touch_alone_can_move(what: str, value: float) -> None:
     """The world reads no speed of the object; the finger stays where it touched, and nothing else is hit."""
     world = KinematicWorld(room(), "robot")
@@ -170,7 +172,9 @@ def test_push_on_estimates_feels_for_the_object() -> None:
     assert outcome.measures["losses"] <= 1
 
 
-@pytest.mark.parametrize("sensors", [None, SENSORS], ids=["truth", "estimates"])
+@pytest.mark.parametrize(
+    "sensors", [pytest.param(None, marks=pytest.mark.long), SENSORS], ids=["truth", "estimates"]
+)
 def test_push_with_physics_is_gentle(sensors: Sensors | None) -> None:
     """A drawer is shut, and one that sticks is told; neither is pressed with more than 100 N."""
     pytest.importorskip("mujoco")

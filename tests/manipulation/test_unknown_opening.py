@@ -160,9 +160,9 @@ def run(model, world_model, part=None, seed=1, **options):
 def test_door_that_was_believed_to_slide_is_relearned_and_opened(truth):
     model = truth.copy()
     believe_that_it_slides(model)
-    outcome = run(model, truth, turn=np.radians(25))
+    outcome = run(model, truth, turn=np.radians(15))
     assert outcome, outcome.reason
-    assert outcome.value == pytest.approx(np.radians(25), abs=0.05)
+    assert outcome.value == pytest.approx(np.radians(15), abs=0.05)
     assert outcome.measures["believed"] == "refuted"
     assert outcome.measures["decided_turn"] < np.radians(10)
     assert outcome.measures["opened_seconds"] < 15

@@ -5,10 +5,11 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import pytest
-from hypothesis import given
+from hypothesis import given, settings
 from hypothesis import strategies as st
 
 import kineverse as kv
+from hypothesis_profiles import attempts
 from kineverse.formats.document import to_json
 from kineverse.model.operation import KINDS
 
@@ -57,6 +58,7 @@ step = st.tuples(
 )
 
 
+@settings(max_examples=attempts(30))
 @given(st.lists(st.tuples(st.lists(step, min_size=1, max_size=3), st.booleans()), max_size=8))
 def test_random_edits(transactions: list[tuple[list[tuple[str, int, Several, bool]], bool]]) -> None:
     model, sequence, count = kv.Model(), list[tuple[str, kv.Operation]](), 0

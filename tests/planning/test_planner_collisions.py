@@ -36,7 +36,7 @@ def configurations(planner, count, seed=0):
 @pytest.mark.parametrize(("base", "tolerance"), [(0.0, 2e-6), (1000.0, 1e-3)])
 def test_valid_is_true_without_contact_and_false_at_one(arm, base, tolerance):
     arm.place({"base": base, "cart": 0.6})
-    Q = configurations(arm, 500, seed=int(base))
+    Q = configurations(arm, 200, seed=int(base))
     found, distances = arm.valid(Q), contacts(arm, Q)
     assert 0.2 < found.mean() < 0.95
     assert distances[found].min() > -1e-6
@@ -83,10 +83,10 @@ def test_path_of_an_arm_is_free_by_the_scene_and_the_same_for_one_seed(arm):
     arm.place({"base": 0.0, "cart": 0.6})
     Q = configurations(arm, 400, seed=5) / 2.5
     free = Q[arm.valid(Q)]
-    paths = [arm.plan(free[2 * k], free[2 * k + 1], seed=k, seconds=0.2) for k in range(12)]
+    paths = [arm.plan(free[2 * k], free[2 * k + 1], seed=k, seconds=0.2) for k in range(5)]
     found = [k for k, path in enumerate(paths) if path]
     # Some goals are enclosed.
-    assert len(found) >= 4
+    assert len(found) >= 2
     for k in found:
         assert is_free(arm, paths[k].points)
         np.testing.assert_array_equal(paths[k].points[[0, -1]], free[2 * k : 2 * k + 2])

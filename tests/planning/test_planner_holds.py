@@ -38,7 +38,15 @@ def flying():
     return Planner(model)
 
 
-@pytest.mark.parametrize("mask", ["rx", "z", "xz", "ry rz", "xyz rx rz", "rx ry rz", "xyz rx ry rz"])
+@pytest.mark.parametrize(
+    "mask",
+    [
+        "rx",
+        "ry rz",
+        "xyz rx rz",
+        *(pytest.param(mask, marks=pytest.mark.long) for mask in ("z", "xz", "rx ry rz", "xyz rx ry rz")),
+    ],
+)
 def test_solutions_of_holds_are_free_and_hold_what_the_mask_says(flying, mask):
     offset = kv.translation(0.01, 0.02, 0.03) @ kv.rotation_x(0.4)
     Q = flying.solutions(flying.hold("hand", "mark", mask, offset), 8, seconds=0.1)
@@ -94,7 +102,7 @@ def test_path_on_a_manifold_is_as_short_as_a_band(globe):
     # Great circles to the circle around the hill, and the way along it.
     straight = np.arccos(np.cos(away) / np.cos(radius))
     around = (np.pi - 2 * np.arccos(np.tan(radius) / np.tan(away))) * np.sin(radius)
-    for seed in range(5):
+    for seed in range(2):
         path = planner.plan(*ends, along=hold, seed=seed)
         assert path, path.why
         assert is_free(planner, path.points)
@@ -161,7 +169,7 @@ def test_latch_is_not_slipped_through():
     assert not Planner(model, move="oven/door").plan(closed, open_, seconds=0.2)
     path = planner.plan(closed, open_, seconds=5)
     assert path.found, path.why
-    for fraction in np.linspace(0.0, 1.0, 4001):
+    for fraction in np.linspace(0.0, 1.0, 1001):
         assert not model.violations(path.at(fraction), tolerance=2e-5)
     pressed = planner.plan({**closed, "oven/button": 0.006}, {**open_, "oven/button": 0.006})
     assert pressed, pressed.why
@@ -175,7 +183,7 @@ def test_door_stops_at_a_pin():
         place = kv.translation(0.9 * np.cos(1), 0.9 * np.sin(1), 0)
         edit.add_frame("pin", "world", place, body(Cylinder(0.002, 0.2)))
     planner = Planner(model)
-    for k in range(20):
+    for k in range(0, 20, 3):
         assert not planner.plan([0.002 * k], [1.5 + 0.01 * k], seconds=0.02)
     assert planner.plan([0.0], [0.9])
     assert planner.plan([1.1], [2.0])
@@ -222,7 +230,7 @@ def four_bar():
 
 def test_closed_loop_has_the_poses_of_the_model_and_no_collision_is_hidden(four_bar):
     rng = np.random.default_rng(0)
-    Q = rng.uniform(-3, 3, (400, 2))
+    Q = rng.uniform(-3, 3, (120, 2))
     found = four_bar.valid(Q)
     crank = [str(s) for s in four_bar.symbols].index("crank")
     assert not found[np.abs(Q[:, crank]) > 1.2].any()

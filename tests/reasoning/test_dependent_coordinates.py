@@ -27,12 +27,32 @@ def locked(name: str, truth: kv.Expression) -> kv.Model:
 
 
 @cache
-def rocker_locked() -> kv.Model:
-    return locked("four_bar", ROCKER < 1.9)
+def slider_locked() -> kv.Model:
+    return locked("slider_crank", kv.position("slider_crank/slider") > 0.3)
 
 
+def test_lock_on_a_slider_is_expressed_by_its_crank() -> None:
+    model = slider_locked()
+    found = interlocks(model)
+    assert found.undecided == ()
+    (lock,) = found
+    crank = kv.position("slider_crank/crank")
+    assert (lock.hold, lock.constraints, lock.keys) == ("stands still", ("lock",), (crank,))
+    ((axis, side),) = lock.when[0].items()
+    assert (
+        str(lock) == f"door:velocity stands still: when {side.describe('slider_crank/crank mod 2π')} (lock)"
+    )
+    # The law of cosines: crank 0.1, rod 0.3, slider at 0.3.
+    there = math.acos(0.1**2 / (2 * 0.1 * 0.3))
+    assert [side.lower, side.upper] == pytest.approx([there, math.tau - there], abs=1e-9)
+    assert reasoning.contradictions(model, found) == []
+    for turns in (-3, 0, 5):
+        assert axis({crank: 3.0 + turns * math.tau}) == pytest.approx(3.0, abs=1e-12)
+
+
+@pytest.mark.long
 def test_lock_on_a_rocker_is_expressed_by_its_crank() -> None:
-    model = rocker_locked()
+    model = locked("four_bar", ROCKER < 1.9)
     found = interlocks(model)
     assert found.undecided == ()
     (lock,) = found
@@ -64,7 +84,7 @@ def by_triangles() -> list[float]:
 
 
 def test_contradictions_reports_a_wrong_crank_interval() -> None:
-    model = rocker_locked()
+    model = slider_locked()
     (lock,) = interlocks(model)
     ((axis, side),) = lock.when[0].items()
     shifted = Interval(side.lower + 0.05, side.upper + 0.05)

@@ -58,7 +58,7 @@ truths = logic(atoms | sums)
 LIMITS = {str(x): (-1, x, 1) for x in SYMBOLS}
 
 
-@settings(max_examples=attempts(15))
+@settings(max_examples=attempts(8), derandomize=True)  # some examples are slow
 @given(truths, truths)
 def test_random_speed_locks_pass_the_checker(one: kv.Expression, other: kv.Expression) -> None:
     subject = model(**LIMITS, lock=(-0.5 * one, kv.velocity("x"), other))
@@ -67,7 +67,7 @@ def test_random_speed_locks_pass_the_checker(one: kv.Expression, other: kv.Expre
     assert reasoning.contradictions(subject, result) == []
 
 
-@settings(max_examples=attempts(12))
+@settings(max_examples=attempts(7))
 @given(truths, NUMBERS, NUMBERS)
 def test_random_position_ranges_pass_the_checker(truth: kv.Expression, low: float, high: float) -> None:
     x = kv.position("x")
@@ -78,7 +78,7 @@ def test_random_position_ranges_pass_the_checker(truth: kv.Expression, low: floa
     assert reasoning.contradictions(subject, result) == []
 
 
-@settings(max_examples=attempts(15))
+@settings(max_examples=attempts(8))
 @given(logic(comparisons(POLYNOMIALS)), logic(comparisons(POLYNOMIALS)))
 def test_de_morgan_gives_equal_interlocks(one: kv.Expression, other: kv.Expression) -> None:
     left, right = (
@@ -103,6 +103,7 @@ def holds(box: IntervalBox, point: list[float]) -> bool:
     return all(at[axis] in side for axis, side in box.items())
 
 
+@settings(max_examples=attempts(60))
 @given(st.lists(boxes, max_size=5), st.lists(boxes, max_size=3), points)
 def test_box_operations_obey_set_laws(
     some: list[IntervalBox], others: list[IntervalBox], point: list[float]
@@ -114,6 +115,7 @@ def test_box_operations_obey_set_laws(
     assert merge_boxes(subtract_boxes(some, [])) == merge_boxes(some)
 
 
+@settings(max_examples=attempts(40))
 @given(st.lists(st.integers(-12, 12).map(lambda k: Fraction(k, 4)), min_size=1, max_size=4), st.booleans())
 def test_roots_finds_all_roots_of_polynomials(wanted: list[Fraction], closed: bool) -> None:
     coefficients = [Fraction(1)]

@@ -128,7 +128,17 @@ def test_the_browser_shows_the_simulation_and_the_identified_joint(browser, monk
         until(tab, lambda: simulation.readings.visible.sum() < 20)
         tab.get_by_role("button", name="Forget, and learn again").click()
         until(tab, lambda: len(simulation.learner.history) < 3)
-        # A second browser continues where the first leaves.
+        tab.close()
+    assert errors == []
+    assert "kineverse-living" not in threads()
+
+
+@pytest.mark.long
+@pytest.mark.browser
+def test_a_second_browser_continues_where_the_first_leaves(browser):
+    simulation, errors = Simulation(), []
+    with SimulationPage(simulation, port=0) as page:
+        tab = opened(browser, page, errors)
         came, left = threading.Event(), threading.Event()
         page._server.on_client_connect(lambda _: came.set())
         page._server.on_client_disconnect(lambda _: left.set())

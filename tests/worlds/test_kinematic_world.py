@@ -188,7 +188,7 @@ def test_what_is_pushed_moves_at_most_twice_as_far_as_the_robot(model, hand):
     rng, dt, drawer, finger = np.random.default_rng(0), 0.02, "room/drawer", "robot/finger"
     names = [f"robot/{name}" for name in ("x", "y", "z", "turn")]
     pushed = inside = 0
-    for trial in range(24):
+    for trial in range(10):
         place = np.array([0.88, 0.0, 2.0, 0.0]) + rng.uniform(-1, 1, 4) * (0.03, 0.05, 0.05, 0.6)
         opened = 0.0 if trial % 2 else 0.05
         at = dict(zip(names, place, strict=True))
@@ -210,7 +210,7 @@ def test_what_is_pushed_moves_at_most_twice_as_far_as_the_robot(model, hand):
                     break
             if world.held:
                 break
-    assert min(pushed, inside) > 10
+    assert min(pushed, inside) > 4
 
 
 def test_fingers_side_by_side_push_and_do_not_hold(world):

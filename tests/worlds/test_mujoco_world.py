@@ -22,6 +22,13 @@ mujoco = pytest.importorskip("mujoco")
 
 DATA = Path(__file__).parents[3] / "shared" / "data"
 ROBOTS = ("pr2", "fetch", "hsr")
+ON_WHEELS = (
+    "fetch",
+    pytest.param("pr2", marks=pytest.mark.long),
+    pytest.param("hsr", marks=pytest.mark.long),
+)
+"""The robot with the least degrees of freedom and a base that cannot slip sideways; the others take long."""
+HANDS = ("fetch", "hsr", pytest.param("pr2", marks=pytest.mark.long))
 FORWARD = {
     "pr2": {"pr2/base/x:velocity": 1.0},
     "hsr": {"hsr/base/x:velocity": 1.0},
@@ -80,7 +87,7 @@ def joint_speeds(world: MujocoWorld) -> Array:
     return (world.state.vector(names) - before.vector(names)) / 0.002
 
 
-@pytest.mark.parametrize("robot", ROBOTS)
+@pytest.mark.parametrize("robot", ON_WHEELS)
 def test_gravity_moves_neither_robot_nor_doors(robot: str) -> None:
     world = kitchen_world(robot)
     ajar = {OVEN: 0.4, DISHWASHER: 0.9}
@@ -97,7 +104,7 @@ def test_gravity_moves_neither_robot_nor_doors(robot: str) -> None:
     assert checked.held is None
 
 
-@pytest.mark.parametrize("robot", ROBOTS)
+@pytest.mark.parametrize("robot", ON_WHEELS)
 def test_robot_moves_as_the_model_integrates(robot: str) -> None:
     world = kitchen_world(robot)
     model = world.model
@@ -162,7 +169,7 @@ def test_arm_that_sweeps_past_a_door_shuts_or_opens_it(
     assert np.abs(world.state.vector(others) - before.vector(others)).max() < 1e-3
 
 
-@pytest.mark.parametrize("robot", ROBOTS)
+@pytest.mark.parametrize("robot", HANDS)
 def test_fingers_hold_a_bar_with_the_stated_force_until_they_open(robot: str) -> None:
     world = world_with_bar(robot, grip=40.0)
     forward = {v: -0.1 * x for v, x in FORWARD[robot].items()}
@@ -407,9 +414,9 @@ def test_remarks_tell_what_was_added_and_left_out() -> None:
 @pytest.mark.parametrize(
     ("path", "still"),
     [
-        ("pr2/pr2_description/robots/pr2.urdf", 1e-4),
         ("fetch/fetch_description/robots/fetch.urdf", 1e-4),
-        ("hsrb/hsrb_description/robots/hsrb4s.urdf", 1e-4),
+        pytest.param("pr2/pr2_description/robots/pr2.urdf", 1e-4, marks=pytest.mark.long),
+        pytest.param("hsrb/hsrb_description/robots/hsrb4s.urdf", 1e-4, marks=pytest.mark.long),
     ],
 )
 def test_descriptions_of_others_stand_still(path: str, still: float) -> None:

@@ -128,13 +128,13 @@ def test_no_damage_goes_unnoticed_or_breaks_the_reader(run, tmp_path):
     data, path = run.read_bytes(), tmp_path / "damaged.mcap"
     times = read_run_recording(run).times
     reasons: list[str] = []
-    for place in np.linspace(8, len(data) - 9, 60).astype(int):
+    for place in np.linspace(8, len(data) - 9, 30).astype(int):
         path.write_bytes(data[:place] + bytes([data[place] ^ 0x55]) + data[place + 1 :])
         try:
             np.testing.assert_array_equal(read_run_recording(path).times, times)
         except KineverseError as error:
             reasons.append(str(error))
-    assert len(reasons) > 20
+    assert len(reasons) > 10
     assert all("damaged.mcap" in reason for reason in reasons)
 
 

@@ -76,7 +76,7 @@ def test_outliers_fill_a_cube_about_the_marker(model):
     assert abs(poses[stray, :3, :3].mean(axis=0)).max() < 0.15  # any orientation
 
 
-@pytest.mark.parametrize("steps", [4, 20])
+@pytest.mark.parametrize("steps", [4, 8, pytest.param(20, marks=pytest.mark.long)])
 def test_odometry_drifts_with_the_way_not_with_the_steps(model, steps):
     """After 2 m straight ahead: sd of x and heading = settings times √2; y has what the heading adds."""
     ends = []

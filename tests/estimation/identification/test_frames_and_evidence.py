@@ -18,7 +18,12 @@ CHANGE = 1.0
 CHANCE = 10.0
 
 # Families and how far the child's origin is off the axis.
-CASES = [("revolute", 0.0), ("revolute", 0.4), ("prismatic", 0.3), ("planar", 0.3), ("spherical", 0.0)]
+CASES = [
+    ("revolute", 0.0),
+    ("revolute", 0.4),
+    ("prismatic", 0.3),
+    *(pytest.param(*case, marks=pytest.mark.long) for case in (("planar", 0.3), ("spherical", 0.0))),
+]
 
 
 def somewhere(random: np.random.Generator) -> Array:

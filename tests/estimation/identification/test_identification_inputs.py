@@ -118,7 +118,7 @@ def test_a_fit_with_as_many_unknowns_as_measurements_is_not_determined(count: in
     assert not found["prismatic" if count == 2 else "revolute"].is_determined
 
 
-@pytest.mark.parametrize("stated", [True, False])
+@pytest.mark.parametrize("stated", [True, pytest.param(False, marks=pytest.mark.long)])
 def test_repeated_observations_count_once_with_their_correlation_time(stated: bool) -> None:
     """Each observation five times, with a correlation time of five, is as good as each once."""
     seen = recording("revolute", count=20, position=0.005, orientation=0.01, seed=6)

@@ -93,7 +93,7 @@ def test_exchanging_parent_and_child_inverts_the_model(family: str) -> None:
         assert off_axis(fit.parameters["point"], fit.parameters["axis"], point) < fit.deviation("point.x")
 
 
-@pytest.mark.parametrize("family", MOVING)
+@pytest.mark.parametrize("family", ["revolute", pytest.param("prismatic", marks=pytest.mark.long)])
 def test_the_likelihood_has_all_true_poses_as_unknowns(family: str) -> None:
     seen = seeded(family, 9, count=5)
     covariance = seen.covariance

@@ -157,14 +157,16 @@ def turned_by(axis: Array, other: Array) -> float:
 
 
 @pytest.mark.compiler
-def test_hinge_errors_agree_with_published_maximum_likelihood() -> None:
+@pytest.mark.parametrize("count", [100, pytest.param(400, marks=pytest.mark.long)])
+def test_hinge_errors_agree_with_published_maximum_likelihood(count: int) -> None:
     """Means of 1.74° and of 13 mm between the axes, with one of both poses known exactly.
 
     Of 3000 samples ours are 1.67 ± .02° and 13.1 ± .2 mm. Of 400 the means scatter by .044° and .5 mm, so a
     limit of 5 % more holds with 99.9 % for the angle and with 88 % for the distance, if the seed is drawn anew.
+    Of the first 100 they scatter by twice as much.
     """
     solver.prepare(wait=True)
-    samples = draw_samples(HINGE, 400, np.random.default_rng(1))
+    samples = draw_samples(HINGE, count, np.random.default_rng(1))
     relative = np.linalg.inv(samples.parents) @ samples.seen_children
     noise = pose_covariance(POSITION, ORIENTATION)
     degrees, metres = [], []
@@ -176,9 +178,13 @@ def test_hinge_errors_agree_with_published_maximum_likelihood() -> None:
     assert np.mean(metres) < 1.05 * 0.013
 
 
+@pytest.mark.long
 @pytest.mark.compiler
 def test_hinge_between_noisy_poses_reaches_the_bound() -> None:
-    """The squares of 300 errors in two directions are known to 6 %, so their root is to 3 %: 5 % is 95 %."""
+    """The squares of 300 errors in two directions are known to 6 %, so their root is to 3 %: 5 % is 95 %.
+
+    With wider limits, the short tests of the quality of identification say the same.
+    """
     solver.prepare(wait=True)
     samples = draw_samples(HINGE, 300, np.random.default_rng(1))
     noise = pose_covariance(POSITION, ORIENTATION)

@@ -20,14 +20,18 @@ REPEATS = 40
 # Family, how far it goes, position noise [m], orientation noise [rad], and how often it is seen.
 CLEAR = [
     ("revolute", math.pi / 2, 0.03, math.radians(3.0), 20),
-    ("revolute", math.pi / 4, 0.001, math.radians(1.0), 10),
-    ("prismatic", 0.4, 0.03, math.radians(3.0), 20),
+    pytest.param(("revolute", math.pi / 4, 0.001, math.radians(1.0), 10), marks=pytest.mark.long),
+    pytest.param(("prismatic", 0.4, 0.03, math.radians(3.0), 20), marks=pytest.mark.long),
     ("prismatic", 0.4, 0.001, math.radians(1.0), 10),
     # A lever and precise positions: the likelihood is a thin and curved valley.
-    ("revolute", math.pi / 2, 0.001, math.radians(10.0), 40),
+    ("revolute", math.pi / 2, 0.001, math.radians(10.0), 20),
+    pytest.param(("revolute", math.pi / 2, 0.001, math.radians(10.0), 40), marks=pytest.mark.long),
 ]
 # Shorter than the noise of an observation.
-SHORT = [("prismatic", 0.15, 0.03, math.radians(5.0), 100)]
+SHORT = [
+    ("prismatic", 0.15, 0.03, math.radians(5.0), 60),
+    pytest.param(("prismatic", 0.15, 0.03, math.radians(5.0), 100), marks=pytest.mark.long),
+]
 
 
 def errors(family: str, extent: float, position: float, orientation: float, count: int) -> tuple:
@@ -92,7 +96,7 @@ def test_a_motion_within_the_noise_is_rigid_or_ambiguous() -> None:
 
 def test_families_are_distinguished() -> None:
     wrong = 0
-    for seed in range(20):
+    for seed in range(10):
         for family, extent in (("revolute", math.pi / 4), ("prismatic", 0.4)):
             seen = recording(family, count=20, position=0.01, orientation=0.03, seed=seed, extent=extent)
             wrong += identify(seen.parent, seen.child, noise=seen.covariance).best.family != family

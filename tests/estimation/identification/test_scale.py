@@ -39,7 +39,14 @@ def test_identify_is_invariant_to_millimetres(family: str) -> None:
     assert found_of(seen, 1000.0).best.family == family
 
 
-@pytest.mark.parametrize("family", ["prismatic", "revolute", "screw", "planar"])
+@pytest.mark.parametrize(
+    "family",
+    [
+        "revolute",
+        "screw",
+        *(pytest.param(family, marks=pytest.mark.long) for family in ("prismatic", "planar")),
+    ],
+)
 def test_lengths_of_a_fit_scale_with_the_poses(family: str) -> None:
     seen = recording(family, count=20, position=0.002, orientation=0.01, seed=3)
     small, factor = found_of(seen, LARGE), 40.0

@@ -269,7 +269,7 @@ def test_linearise_refuses_joint_values_of_another_shape() -> None:
 
 
 @pytest.mark.compiler
-@pytest.mark.parametrize("family", ["prismatic", "revolute", "planar"])
+@pytest.mark.parametrize("family", [pytest.param("prismatic", marks=pytest.mark.long), "revolute", "planar"])
 def test_identify_without_a_compiler_agrees(family: str, monkeypatch: pytest.MonkeyPatch) -> None:
     seen = recording(family, count=12, position=0.02, orientation=0.05, seed=1)
     fast = identify(seen.parent, seen.child, noise=seen.covariance)

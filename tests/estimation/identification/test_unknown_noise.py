@@ -107,12 +107,15 @@ def test_arcs_of_positions_that_look_straight_are_solved_with_long_levers() -> N
     assert np.ptp(found.solution.values) < 2.0
 
 
-def test_sure_answers_without_stated_noise_are_right() -> None:
+@pytest.mark.parametrize(
+    ("cases", "right", "sure"), [(6, 5, 4), pytest.param(16, 14, 12, marks=pytest.mark.long)]
+)
+def test_sure_answers_without_stated_noise_are_right(cases: int, right: int, sure: int) -> None:
     setting = Setting(poses=True, stated=False)
-    answers = [identify_case(number, setting) for number in range(16)]
+    answers = [identify_case(number, setting) for number in range(cases)]
     assert not [answer for answer in answers if answer.is_sure and not answer.is_right]
-    assert sum(answer.is_right for answer in answers) >= 14
-    assert sum(answer.is_sure for answer in answers) >= 12
+    assert sum(answer.is_right for answer in answers) >= right
+    assert sum(answer.is_sure for answer in answers) >= sure
 
 
 def test_the_report_counts_right_answers_and_sure_errors() -> None:
@@ -158,7 +161,13 @@ def found_online(parent, child, noise, outliers):
     return identifier.result
 
 
-@pytest.mark.parametrize("what", NOTHING)
+# These take seconds.
+LONG = ("outliers of both", "outliers among positions")
+
+
+@pytest.mark.parametrize(
+    "what", [pytest.param(what, marks=pytest.mark.long if what in LONG else ()) for what in NOTHING]
+)
 @pytest.mark.parametrize("noise", [None, NOISE], ids=["unknown", "stated"])
 def test_observations_that_tell_nothing_have_no_sure_answer(what: str, noise) -> None:
     parent, child = NOTHING[what]
@@ -212,7 +221,7 @@ def test_identifier_without_stated_noise_agrees_with_identify() -> None:
     identifier = Identifier(sequential=False)
     for k, (parent, child) in enumerate(zip(seen.parent, seen.child, strict=True), start=1):
         identifier.add(parent, child)
-        if k not in (12, 13, 15, 21, 22, 29, 30):
+        if k not in (12, 13, 21, 30):
             continue
         found, whole = identifier.result, identify(seen.parent[:k], seen.child[:k])
         assert found.best.family == whole.best.family

@@ -60,7 +60,7 @@ def test_the_lead_of_a_screw_is_found_by_counted_revolutions(lead: float) -> Non
 
 
 def test_less_than_a_revolution_agrees_with_unordered_poses() -> None:
-    for start in (0.0, 2.0, 4.0):
+    for start in (0.0, 4.0):
         seen = seen_turning(0.9, 0.0, 30, start=start)
         one, other = found_of(seen), found_of(seen, sequential=True)
         assert one.best.family == other.best.family == "revolute"

@@ -181,9 +181,9 @@ def test_tracker_is_checked_and_its_model_repaired(kitchen: kv.Model) -> None:
 
     # Outliers only: nothing is proposed, and the repair says so.
     random = np.random.default_rng(0)
-    poses[HANDLE][:] = poses[HANDLE][0]
-    poses[HANDLE][:, :3, 3] = random.uniform(-1.0, 1.0, (50, 3))
-    lost = check_plausibility(track(model, poses[HANDLE]), families=SOME)
+    wrong = np.tile(poses[HANDLE][0], (20, 1, 1))
+    wrong[:, :3, 3] = random.uniform(-1.0, 1.0, (20, 3))
+    lost = check_plausibility(track(model, wrong), families=SOME)
     assert lost[TAG].probabilities == {}
     with pytest.raises(ImplausibleError, match="unrelated"):
         lost.repair(model)
@@ -195,9 +195,9 @@ def test_tracker_with_a_moving_camera_is_checked(kitchen: kv.Model) -> None:
     with model.edit() as edit:
         place = kv.translation(0.0, -1.0, 1.0) @ kv.rotation_z(kv.position("pan"))
         edit.add_frame("camera", parent="world", transform=place)
-    pans = 0.5 * np.sin(np.arange(50.0))
+    pans = 0.5 * np.sin(np.arange(30.0))
     cameras = kv.compile(model.fk("camera")).batch(pans[:, None])
-    observed = observe_frames(model, [HANDLE], {DOOR: np.linspace(0.0, 1.2, 50)}, 3)[HANDLE]
+    observed = observe_frames(model, [HANDLE], {DOOR: np.linspace(0.0, 1.2, 30)}, 3)[HANDLE]
     observed[:, 1, 3] += 0.05
     poses = np.linalg.inv(cameras) @ observed
     observation = ObservedPose(HANDLE, relative_to="camera", covariance=NOISE)

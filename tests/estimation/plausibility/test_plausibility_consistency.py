@@ -244,7 +244,7 @@ def served_linkage() -> kv.Model:
 
 def test_bars_of_a_linkage_are_tested_together_and_replaced(served_linkage: kv.Model) -> None:
     served, frames = served_linkage, ["rocker", "crank", "coupler"]
-    cranks = {"crank": np.random.default_rng(0).uniform(-3.0, 3.0, 40)}
+    cranks = {"crank": np.random.default_rng(0).uniform(-3.0, 3.0, 24)}
     report = check_plausibility(
         served, observe_frames(served, frames, cranks, 10), noise=NOISE, families=SOME
     )

@@ -78,7 +78,7 @@ def test_linear_model_equals_a_constant_velocity_kalman_filter():
         assert estimate.deviation["b:velocity"] == pytest.approx(np.sqrt(P[3, 3]))
 
 
-@pytest.mark.parametrize("wheels", [True, False])
+@pytest.mark.parametrize("wheels", [True, pytest.param(False, marks=pytest.mark.long)])
 def test_speeds_of_a_base_and_of_a_free_body_are_consistent(wheels):
     """Rates carry the body, speeds change at random, and errors have the covariance that is told."""
     model = make_body(wheels=wheels)

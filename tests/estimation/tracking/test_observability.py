@@ -37,28 +37,34 @@ def make_tip_tracker(model: kv.Model, observer: NoisyObserver, deviation: float,
     return Tracker(model, observed, start=BENT, uncertainty=dict.fromkeys(BENT, deviation), **options)
 
 
-def test_covariance_of_a_redundant_arm_is_consistent():
-    """The sample mean of NEES varies by 7 % between such runs; over many runs it is 0.95."""
+@pytest.mark.parametrize(("runs", "off"), [(24, 0.2), pytest.param(45, 0.1, marks=pytest.mark.long)])
+def test_covariance_of_a_redundant_arm_is_consistent(runs, off):
+    """The sample mean of NEES varies by 7 % between 45 runs, by 10 % between 24; over many it is 0.95."""
     model, rng = make_arm(), np.random.default_rng(1)
     observer = NoisyObserver(model, ["tip"], seed=1)
     first = make_tip_tracker(model, observer, 0.2)
+    first.wait()
     found = []
-    for _ in range(45):
+    for _ in range(runs):
         truth = {name: value + 0.2 * rng.standard_normal() for name, value in BENT.items()}
         tracker = first.copy()
         for _ in range(6):
             estimate = tracker.update(observer(truth))
         error = np.array([estimate.state[s] - truth[str(s)] for s in tracker.symbols])
         found.append(error @ estimate.information @ error / len(error))
-    assert 0.9 < np.mean(found) < 1.1
+    assert np.mean(found) == pytest.approx(1.0, abs=off)
 
 
-@pytest.mark.parametrize(("noise", "runs", "looks"), [(1e-4, 24, 10), (1e-2, 24, 10)])
+@pytest.mark.parametrize(
+    ("noise", "runs", "looks"),
+    [(1e-2, 24, 5), *(pytest.param(noise, 24, 10, marks=pytest.mark.long) for noise in (1e-4, 1e-2))],
+)
 def test_covariance_of_a_redundant_arm_with_process_noise_is_consistent(noise, runs, looks):
     """The sample mean of NEES varies by 12 %; over many runs it is 0.95 to 1.05."""
     model, rng = make_arm(), np.random.default_rng(2)
     observer = NoisyObserver(model, ["tip"], seed=2)
     first = make_tip_tracker(model, observer, 0.2, process_noise={f"{name}:velocity": noise for name in BENT})
+    first.wait()
     found = []
     for _ in range(runs):
         truth = {name: value + 0.2 * rng.standard_normal() for name, value in BENT.items()}
@@ -266,7 +272,7 @@ def test_estimate_at_a_limit_has_the_bias_of_the_truncated_gaussian():
     errors, means = [], []
     for _ in range(400):
         tracker = first.copy()
-        for _ in range(10):
+        for _ in range(3):
             estimate = tracker.update({"dial": 0.02 * rng.standard_normal()})
         errors.append(estimate.state["q"] / estimate.deviation["q"])
         means.append(errors[-1] + estimate.mean[0] / estimate.deviation["q"])

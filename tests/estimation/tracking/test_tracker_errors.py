@@ -9,6 +9,7 @@ from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
 import kineverse as kv
+from hypothesis_profiles import attempts
 from kineverse.estimation import (
     HypothesisBank,
     ObservedExpression,
@@ -217,7 +218,7 @@ steps = st.lists(st.dictionaries(st.sampled_from(["box", "lid"]), poses, min_siz
 
 
 @given(steps, st.booleans())
-@settings(max_examples=12)
+@settings(max_examples=attempts(10))
 def test_estimate_is_finite_for_any_measurement(steps, wrong):
     tracker = FIRST[wrong].copy()
     for k, step in enumerate(steps):

@@ -139,7 +139,7 @@ def fastest(path: BlendedPath, velocity: Array, acceleration: Array, steps: int)
     return float(sum(2 * c[0] / (a + b) for c, a, b in zip(cells, roots, roots[1:], strict=False)))
 
 
-@pytest.mark.parametrize("seed", [0, 2])
+@pytest.mark.parametrize("seed", [0, pytest.param(2, marks=pytest.mark.long)])
 def test_it_is_not_possible_faster(seed: int) -> None:
     points, velocity, acceleration = case(seed, 4, 3)
     path = round_corners(points, 0.3)
