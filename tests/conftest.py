@@ -31,7 +31,7 @@ sys.path.append(str(ROOT / "examples"))  # living_kitchen
 SHARED = ROOT.parent / "shared" / "data"
 BROWSERS = ("chromium", "chromium-browser", "google-chrome")
 
-settings.register_profile("kineverse", deadline=None, max_examples=70, derandomize=bool(os.environ.get("CI")))
+settings.register_profile("kineverse", deadline=None, max_examples=45, derandomize=bool(os.environ.get("CI")))
 settings.register_profile("thorough", settings.get_profile("kineverse"), max_examples=10 * USUAL)
 settings.load_profile("kineverse")
 

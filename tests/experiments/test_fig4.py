@@ -219,6 +219,7 @@ def commanded(cupboard, few):
     return printed.getvalue(), reports[0].numbers
 
 
+@pytest.mark.long
 def test_experiment_is_deterministic(report, commanded):
     """Last digits may differ, because compiled code may be ready earlier."""
     _, again = commanded

@@ -50,11 +50,12 @@ REFUSED = {
 
 
 def files() -> list[ParameterSet]:
-    """Return the files to read, each with its folder and its name in the lists."""
+    """Return the files to read, each with its name in the lists; two of three take long together."""
     found = []
     for folder in (SHARED, INSTALLED):
         below = [(folder / f, str(f)) for f in sorted(p.relative_to(folder) for p in folder.rglob("*.urdf"))]
-        found += [pytest.param(file, id=name) for file, name in below if is_readable(file, name)]
+        for number, (file, name) in enumerate(pair for pair in below if is_readable(*pair)):
+            found.append(pytest.param(file, id=name, marks=pytest.mark.long if number % 3 else ()))
         if not below:
             reason = f"no {folder}"
             found.append(pytest.param(folder, id=folder.name, marks=pytest.mark.skip(reason=reason)))

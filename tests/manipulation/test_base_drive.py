@@ -149,7 +149,8 @@ def test_drives_keep_the_limits_of_speeds(limits):
     assert world.state["robot/base/x"] == pytest.approx(0.3, abs=2e-3)
 
 
-def test_fetch_drives_to_a_drawer_and_back_to_it_with_its_arm_out():
+@pytest.mark.parametrize("targets", [(0.1,), pytest.param((0.2, 0.0), marks=pytest.mark.long)])
+def test_fetch_drives_to_a_drawer_and_back_to_it_with_its_arm_out(targets):
     model = kv.load("fetch")
     with model.edit() as edit:
         edit.include("shelf_drawers", "shelf_drawers")
@@ -165,7 +166,7 @@ def test_fetch_drives_to_a_drawer_and_back_to_it_with_its_arm_out():
         before.append(place)
 
     session = Session(world, on_step=look)
-    for target in (0.1, 0.0):
+    for target in targets:
         outcome = open_object(session, "shelf_drawers/upper_drawer", target=target)
         assert outcome, outcome.reason
         assert outcome.measures["resets"] == 0

@@ -20,6 +20,7 @@ def test_robots_and_kitchens_have_no_interlocks(name: str) -> None:
     assert reasoning.contradictions(model, Interlocks([]), points=3) == []
 
 
+@pytest.mark.long  # docs/interlocks.md has it, too
 def test_dependent_coordinate_as_key() -> None:
     model = kv.load("articulations/four_bar")
     door = kv.position("door")

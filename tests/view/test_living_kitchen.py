@@ -191,6 +191,7 @@ def test_an_unknown_mechanism_is_identified_and_then_tracked(name, chest):
     assert np.mean(off[-20:]) < 1.2 * simulation.sensor.noise
 
 
+@pytest.mark.long
 def test_an_unknown_mechanism_is_identified_despite_outliers():
     simulation, _ = simulate_mechanism(8.0, seed=2, sensor=SensorModel(0.03, outliers=0.2))
     best = simulation.learner.result.best
@@ -249,6 +250,7 @@ def test_the_true_axis_is_that_of_a_fit_of_exact_poses(name):
     assert distance < 1e-6
 
 
+@pytest.mark.long
 def test_axis_covariances_are_those_of_sampled_axes(chest):
     fit = chest[0].learner.result.best
     index = [fit.coordinates.index(n) for n in ("point.x", "point.y", "axis.x", "axis.y")]
