@@ -17,8 +17,7 @@ SATURATED = 1e-9
 """Multiplier from which a bound counts as active."""
 
 
-@dataclass(frozen=True, slots=True)
-class StepTimes:
+class StepTimes(NamedTuple):
     """Durations of the parts of a step [s]: distance queries, evaluation of the program, solution, all."""
 
     query: float

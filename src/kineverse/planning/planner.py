@@ -114,12 +114,12 @@ class Planner:
         self._separate: BodyPairs = frozenset()
         self.planning_scene = self._build(model.default_state())
 
-    @no_collection()
     def _build(self, state: State) -> PlanningScene:
-        return PlanningScene(
-            self.model, self._move, self._rules, self.margin, self._protrusion, self._options, state,
-            self._separate,
-        )  # fmt: skip
+        with no_collection():
+            return PlanningScene(
+                self.model, self._move, self._rules, self.margin, self._protrusion, self._options, state,
+                self._separate,
+            )  # fmt: skip
 
     def _check_separate_pairs(self, Q: Array) -> PlanningScene:
         """Return the scene in which pairs are checked that are apart at some of the configurations (N, n)."""

@@ -10,13 +10,14 @@ from __future__ import annotations
 import math
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 import numpy.typing as npt
 
 from kineverse.compile import compile  # noqa: A004
 from kineverse.errors import InvalidValueError
-from kineverse.expressions.expression import Expression, array
+from kineverse.expressions.expression import Expression, array, as_expression
 from kineverse.geometry import Scene
 from kineverse.geometry.objects import Exclusion
 from kineverse.geometry.shapes import Solid
@@ -24,9 +25,9 @@ from kineverse.geometry.support import smoothed_support
 from kineverse.lie import Array
 from kineverse.model.model_view import ModelView
 from kineverse.state import State
-from kineverse.symbols import Symbol
+from kineverse.symbols import Symbol, parameter
 
-from .vectors import Vector, inner_product, length, move_point, rotate, scale, transform_point
+from .vectors import Vector, inner_product, length
 
 _SPACING = 0.05
 """Distance of sampled points [m]."""
@@ -64,8 +65,7 @@ class PushContacts:
     leverage: Array
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class PushPoint:
+class PushPoint(NamedTuple):
     """One contact point at one state; see :class:`PushContacts`."""
 
     point: Vector
@@ -127,9 +127,8 @@ class PushSurface:
         poses = [model.fk(body)[:3, :] for body in bodies]
         twists = [model.jacobian(body, form="world", symbols=[speed]).ravel() for body in bodies]
         stacked = [array([e for pose in poses for e in pose.ravel()]), array([e for t in twists for e in t])]
-        self._function = compile([*stacked, tip])
+        self._function = compile(stacked)
         self._evaluate = self._function.bind()
-        self._inputs = self._function.inputs
         self.sign = 1.0 if values[-1] >= values[0] else -1.0
         scene = Scene(model, leave_out=tuple(ignored))
         states = [state.updated({coordinate: value}) for value in values]
@@ -143,6 +142,7 @@ class PushSurface:
         self.owner = np.array([k for k, *_ in found], dtype=np.intp)
         self._points = np.array([p for _, p, _ in found])
         self._normals = np.array([n for _, _, n in found])
+        self._compile_one(poses, twists, tip)
         self.room = np.min([self._find_room(scene, at) for at in states], axis=0)
 
     def __len__(self) -> int:
@@ -150,9 +150,9 @@ class PushSurface:
 
     def _place(self, state: State) -> tuple[Array, Array]:
         """Return poses (B, 3, 4) and twists (B, 6) of the bodies at a state, per unit of the coordinate."""
-        self._evaluate.input[:] = state.vector(self._inputs)
+        self._evaluate.input[:] = state.vector(self._function.inputs)
         self._evaluate()
-        poses, twists, _ = self._evaluate.outputs
+        poses, twists = self._evaluate.outputs
         return poses.reshape(-1, 3, 4), twists.reshape(-1, 6)
 
     def at(self, state: State) -> PushContacts:
@@ -173,28 +173,32 @@ class PushSurface:
 
     def point_at(self, state: State, index: int) -> PushPoint:
         """Return one point at a state."""
-        return self._point(index, *self._place(state))
+        return self.locate(state, index)[1]
 
-    def locate(self, state: State, index: int | None) -> tuple[Vector, PushPoint | None]:
-        """Return the tip of the pusher and one point, if any, at a state."""
-        placed = self._place(state)
-        x, y, z = self._evaluate.outputs[2].tolist()
-        return (x, y, z), None if index is None else self._point(index, *placed)
+    def locate(self, state: State, index: int) -> tuple[Vector, PushPoint]:
+        """Return the tip of the pusher and one point at a state."""
+        one, symbols = self._one, self._symbols
+        one.input[: len(symbols)] = state.vector(symbols)
+        one.input[len(symbols) :] = self._places[index]
+        one()
+        t, u, v, x, y, z, a, b, c, d, e, f = one.outputs[0].tolist()
+        normal, velocity = (a, b, c), (d, e, f)
+        return (t, u, v), PushPoint((x, y, z), normal, velocity, find_alignment(normal, velocity))
 
-    def _point(self, index: int, poses: Array, twists: Array) -> PushPoint:
-        body = self.owner[index]
-        pose = poses[body].tolist()
-        point, normal = (
-            transform_point(pose, self._one(self._points, index)),
-            rotate(pose, self._one(self._normals, index)),
-        )
-        velocity = scale(self.sign, move_point(twists[body].tolist(), point))
-        return PushPoint(point, normal, velocity, find_alignment(normal, velocity))
-
-    @staticmethod
-    def _one(vectors: Array, index: int) -> Vector:
-        x, y, z = vectors[index].tolist()
-        return x, y, z
+    def _compile_one(self, poses: list[Expression], twists: list[Expression], tip: Expression) -> None:
+        """Compile the tip, and a point with its normal and velocity, whose place on a body is an input."""
+        chosen = array([parameter(f"push/body/{k}", 0.0) for k in range(len(poses))])
+        point, normal = (array([parameter(f"push/{name}/{k}", 0.0) for k in range(3)]) for name in "pn")
+        pose = sum((w * pose for w, pose in zip(chosen, poses, strict=True)), as_expression(np.zeros((3, 4))))
+        twist = sum((w * twist for w, twist in zip(chosen, twists, strict=True)), as_expression(np.zeros(6)))
+        place, direction = pose[:, :3] @ point + pose[:, 3], pose[:, :3] @ normal
+        velocity = self.sign * (twist[:3] + np.cross(twist[3:], place))
+        own = {s for e in (*poses, *twists, tip) for s in e.symbols}
+        self._symbols = tuple(sorted(own, key=lambda s: s.sort_key))
+        inputs = (*self._symbols, *chosen, *point, *normal)
+        self._one = compile([array([*tip, *place, *direction, *velocity])], inputs).bind()
+        on_body = np.eye(len(poses))[self.owner]
+        self._places = np.hstack([on_body, self._points, self._normals])
 
     def _sample(self, scene: Scene, state: State) -> list[tuple[int, Array, Array]]:
         """Return body, point and normal in the body of the points that rays reach at a state."""

@@ -273,12 +273,12 @@ class Pushing:
         senses = press.deviation > 0.0
         read = None if observation is None else observation.joints
         press.report(senses and observation is not None and not observation.touching.isdisjoint(self.pusher))
-        tip, point = self.surface.locate(state, choice.chosen)
+        tip, point = self._locate(state)
         felt = tip if read is None else self._program.tip(state, read)
         value = press.advance(state[self.coordinate], felt, self.touching)
         if senses:
             state = state.updated({self.coordinate: min(max(value, self._limits[0]), self._limits[1])})
-            tip, point = self.surface.locate(state, choice.chosen)
+            tip, point = self._locate(state)
         contact, self.clearance = self._pairs.nearest(self._program.load(state))
         if point is not None and not self.retreating and self._is_stuck(state, tip, point):
             reaches = self.touching or point.alignment < CONE_END
@@ -295,6 +295,12 @@ class Pushing:
         press.plan(point.velocity, move_point(moved, tip))
         self._seen = contact, point, tip
         return command
+
+    def _locate(self, state: State) -> tuple[Vector, PushPoint | None]:
+        """Return the tip, and the chosen contact point if there is one."""
+        chosen = self.choice.chosen
+        tip, point = self.surface.locate(state, chosen or 0)
+        return tip, None if chosen is None else point
 
     def _update_touching(self, contact: PushPair | None) -> None:
         """Note that the pusher has come to touch, or has lost its contact."""

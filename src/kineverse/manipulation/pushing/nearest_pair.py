@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Collection, Sequence
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 
@@ -55,8 +56,7 @@ class PushView:
         return {"n": (self.p, self.n), "push": (self.p, self.push), "tangent": (self.p, self.tangent)}
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class PushPair:
+class PushPair(NamedTuple):
     """Body of a pusher and body of an object that are near each other.
 
     Attributes
