@@ -3,8 +3,8 @@
 A test that drives a browser carries the marker ``browser`` and asks for the fixture ``chromium``, the path of
 the system's Chromium. Without one it is skipped, or with ``KINEVERSE_REQUIRE_BROWSER=1`` it fails. A test that
 needs compiled code carries the marker ``compiler``; without a C compiler it is skipped as well. What reads data
-that is not ours is skipped where there is none. The summary has a line for each cause. What takes long beside
-what it tells carries the marker ``long``: it runs with ``--long``, or if it is named.
+that is not ours is skipped where there is none. The summary has a line for each cause. What is
+slow for what it checks carries the marker ``long``: it runs with ``--long``, or if it is asked for by its name.
 """
 
 from __future__ import annotations
@@ -38,7 +38,9 @@ settings.load_profile("kineverse")
 
 def pytest_addoption(parser: pytest.Parser) -> None:
     """Add the option for long tests."""
-    parser.addoption("--long", action="store_true", help="also run the tests that take long")
+    parser.addoption(
+        "--long", action="store_true", help="also run the tests that are slow for what they check"
+    )
 
 
 def pytest_configure(config: pytest.Config) -> None:
@@ -71,8 +73,10 @@ def pytest_collection() -> Generator[None, object, object]:
 
 
 def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item]) -> None:
-    """Leave out what takes long, unless it is asked for."""
-    if config.getoption("--long") or any("::" in argument for argument in config.args):
+    """Leave out what is slow for what it checks, unless it is asked for."""
+    option = config.option
+    asked = option.long or option.keyword or "long" in option.markexpr or getattr(option, "lf", False)
+    if asked or any("::" in argument for argument in config.args):
         return
     left_out = [item for item in items if item.get_closest_marker("long")]
     if left_out:

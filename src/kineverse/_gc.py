@@ -8,7 +8,7 @@ import gc
 class no_collection:  # noqa: N801
     """Pause the garbage collector, for code that creates many objects and no garbage.
 
-    It is a class since a generator takes several times as long, in each step of a controller.
+    A generator would do, but takes several times as long, and controllers pause it in each step.
     """
 
     __slots__ = ("_collecting",)

@@ -347,6 +347,8 @@ def _find_pusher(
     """
     from kineverse.grasping import find_gripper
 
+    if hand is not None and skill == "push":
+        model.fk(hand)  # raises for an unknown frame: any body can push
     try:
         gripper = find_gripper(model, robot, hand)
     except UnknownNameError as error:

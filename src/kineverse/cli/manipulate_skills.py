@@ -41,10 +41,11 @@ def grasp_object(
     from kineverse.manipulation.session import Session
 
     with ExitStack() as search:
-        search.enter_context(show_activity("searching a place for the robot and a way for its hand"))
+        search.enter_context(show_activity("searching for a place of the robot and a way of its hand"))
 
         def watch(step: RecordedStep) -> None:
-            search.close()  # the first step has been made
+            if step.phase != "look":
+                search.close()  # the first step on a way has been made
             look(step)
 
         outcome: Outcome = open_object(
@@ -126,7 +127,7 @@ def push_object(
         steps = round(arguments.seconds / 0.02)
         problem = pushing.first_contact(scene.start) or roll_out(pushing, scene.start, steps)[0]
         if problem:
-            with show_activity("searching a place for the robot"):
+            with show_activity("searching for a place of the robot"):
                 found = find_push_start(
                     pushing, scene.start, seconds=_PLACEMENT, steps=steps, seed=arguments.seed
                 )

@@ -119,6 +119,8 @@ def find_gripper(model: ModelView, robot: str, hand: str | None = None, srdf: Sr
     found, why = _search(model, robot, srdf)
     name = f"The robot '{robot}'" if robot else "The model"
     if not found:
+        if hand is not None:
+            model.fk(hand)  # raises for an unknown frame
         reasons = "".join(f"\n  {line}" for line in why) or " None of its links carries two moving branches."
         raise UnknownNameError(f"{name} has no gripper with two opposed fingers.{reasons}")
     if hand is None:

@@ -196,9 +196,11 @@ class ModelView(SymbolicView):
                 return Symbol(path, order, speed.role)
         if path in self.articulations:
             joint = self.articulations[path]
-            drivers = [repr(str(s)) for s in self.symbols_of(joint.child, joint.parent)]
-            why = f"it follows {', '.join(drivers)}." if drivers else "it is fixed."
-            raise UnknownNameError(f"The joint {name!r} has no coordinate of its own: {why}")
+            moved = ", ".join(repr(str(s)) for s in self.symbols_of(joint.child, joint.parent))
+            why = f"has no coordinate of its own: it follows {moved}." if moved else "is fixed."
+            if joint.coordinates:
+                why = f"has coordinates of other names: {moved}."
+            raise UnknownNameError(f"The joint {path!r} {why}")
         raise UnknownNameError(
             f"There is no symbol {name!r}. {suggest(name, map(str, coordinates), 'symbol')}"
         )

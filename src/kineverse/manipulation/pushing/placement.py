@@ -43,7 +43,8 @@ _DRAWS = 40
 """Number of times that a place is drawn at which the base touches nothing."""
 _MOST_UNMOVED, _MOST_NO_FURTHER = 60, 120
 """Numbers of roll-outs without motion of the object, and without more of it, after which none is expected."""
-_NO_ROOM, _UNREACHED = "too little room", "out of reach"
+_NO_ROOM, _UNREACHED, _LATE = "too little room", "out of reach", "out of time"
+_CLASSES = {_UNREACHED: "reach", _LATE: "time"}
 _MOVED = 0.01
 """Motion of an object that counts as one [m], [rad]."""
 
@@ -80,8 +81,10 @@ class PushStart:
 
     @property
     def failure(self) -> str:
-        """Class of the failure: ``"reach"`` if no sample reaches the object, otherwise ``"collision"``."""
-        return "reach" if {*self.reasons} == {_UNREACHED} else "collision"
+        """Class of what most samples failed by: ``"reach"``, ``"time"`` or ``"collision"``; else empty."""
+        if self or not self.reasons:
+            return ""  # a start was found, or none was sampled
+        return _CLASSES.get(self.reasons.most_common(1)[0][0], "collision")
 
     @property
     def why(self) -> str:
@@ -196,7 +199,7 @@ def roll_out(pushing: Pushing, start: State, steps: int, tolerance: float = 0.01
             elif pushing.clearance < _LEAST_CLEARANCE:
                 problem = _NO_ROOM
             elif taken + 1 == steps:
-                problem = "out of time"
+                problem = _LATE
             else:
                 state = pushing.model.integrate(state, command.speeds, pushing.controller.dt)
                 taken += 1

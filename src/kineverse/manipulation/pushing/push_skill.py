@@ -119,25 +119,29 @@ def push(
     seconds, target = check_positive("seconds", seconds), check_target(target)
     tolerance = limit_tolerance(model, coordinate, tolerance)
     first, begin = session.steps, world.time
+
+    def skip(done: bool, reason: str) -> Outcome:
+        """Return the outcome of a push that was not begun."""
+        measures = {} if done else {"failure": "other"}
+        steps, passed = session.steps - first, world.time - begin
+        return Outcome(done, world.state[coordinate], reason, world.name, passed, steps, measures)
+
     while session.deviation(coordinate) > _UNKNOWN:
         if world.time - begin > _LOOK:
             reason = (
                 f"'{coordinate}' is not known: its deviation is {session.deviation(coordinate):.2g} after "
                 f"{_LOOK:g} s. No camera sees a marker that it moves, or its track is lost."
             )
-            value, seconds = world.state[coordinate], world.time - begin
-            return Outcome(False, value, reason, world.name, seconds, session.steps - first)
+            return skip(False, reason)
         session.phase = "look"
         session.stop()
     if pushing is None:
         target = find_shut_value(model, coordinate) if target is None else target
         if abs(session.state[coordinate] - target) <= tolerance / 2:
-            value, reason = world.state[coordinate], f"'{coordinate}' is there from the start"
-            done = abs(value - target) <= tolerance
-            return Outcome(done, value, reason, world.name, world.time - begin, session.steps - first)
+            done = abs(world.state[coordinate] - target) <= tolerance
+            return skip(done, f"'{coordinate}' is there from the start")
         if fixed := explain_fixed(model, coordinate, session.state):
-            value, seconds = world.state[coordinate], world.time - begin
-            return Outcome(False, value, fixed, world.name, seconds, session.steps - first)
+            return skip(False, fixed)
         if bodies is None:
             bodies = find_gripper(model, world.robot).bodies
         pushing = Pushing(
@@ -160,6 +164,8 @@ def push(
         failure = run.push()
         if retreat:
             run.retreat()
+    except SkillError as error:
+        failure = error
     except KineverseError as error:
         failure = SkillError("other", f"{type(error).__name__}: {error}")
     session.stop()
@@ -244,7 +250,7 @@ class _Run:
                 return SkillError("other", "The estimate is at the target, and the world is not.")
             if pushing.choice.jammed >= _MOST_JAMMED:
                 return SkillError(
-                    "other",
+                    "collision",
                     f"The object does not move: pushed at {pushing.choice.jammed} points, it stays at "
                     f"{session.state[pushing.coordinate]:.3g}. It may be locked, jammed or blocked.",
                 )
