@@ -5,6 +5,7 @@ the system's Chromium. Without one it is skipped, or with ``KINEVERSE_REQUIRE_BR
 needs compiled code carries the marker ``compiler``; without a C compiler it is skipped as well. What reads data
 that is not ours is skipped where there is none. The summary has a line for each cause. What is
 slow for what it checks carries the marker ``long``: it runs with ``--long``, or if it is asked for by its name.
+So do most cases of a test with the marker ``sampled(n)``, all but every n-th.
 """
 
 from __future__ import annotations
@@ -72,8 +73,10 @@ def pytest_collection() -> Generator[None, object, object]:
         gc.enable()
 
 
+@pytest.hookimpl(tryfirst=True)  # before -m is applied
 def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item]) -> None:
     """Leave out what is slow for what it checks, unless it is asked for."""
+    _mark_samples(items)
     option = config.option
     asked = option.long or option.keyword or "long" in option.markexpr or getattr(option, "lf", False)
     if asked or any("::" in argument for argument in config.args):
@@ -82,6 +85,18 @@ def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item
     if left_out:
         items[:] = [item for item in items if not item.get_closest_marker("long")]
         config.hook.pytest_deselected(items=left_out)
+
+
+def _mark_samples(items: list[pytest.Item]) -> None:
+    """Mark as long all but every n-th case of the tests that are marked ``sampled(n)``."""
+    cases: Counter[str] = Counter()
+    for item in items:
+        sampled = item.get_closest_marker("sampled")
+        if sampled is not None:
+            name = item.nodeid.partition("[")[0]
+            if cases[name] % sampled.args[0]:
+                item.add_marker("long")
+            cases[name] += 1
 
 
 def pytest_collection_finish(session: pytest.Session) -> None:

@@ -52,6 +52,7 @@ def test_mechanism_base_is_at_its_origin(mechanism: Mechanism) -> None:
 
 
 @each
+@pytest.mark.sampled(2)
 def test_mechanism_jacobians_equal_finite_differences_over_the_whole_range(mechanism: Mechanism) -> None:
     model = model_of(mechanism)
     for at in across(mechanism):
@@ -97,6 +98,7 @@ def test_mechanism_limits_are_constraints(mechanism: Mechanism) -> None:
 
 @each
 @pytest.mark.parametrize("direction", [1.0, -1.0])
+@pytest.mark.sampled(2)
 def test_velocity_rows_keep_all_limits_of_mechanisms(mechanism: Mechanism, direction: float) -> None:
     model = model_of(mechanism)
     wish = {str(s): direction for s in model.speeds}

@@ -87,6 +87,7 @@ def test_a_peer_opens_the_fridge_with_few_joints_as_with_all(library):
 
 
 @pytest.mark.parametrize("name", [name for name in WORKLOADS if "g1" not in name and "cassie" not in name])
+@pytest.mark.sampled(2)
 def test_an_original_takes_a_step_towards_its_target(name):
     skip_without_robots()
     loop = peer_loop(EXAMPLES[name].library, name)

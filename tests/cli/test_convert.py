@@ -146,6 +146,7 @@ def test_convert_with_tolerance_approximates_curves_and_prints_the_error(run, tm
 
 @pytest.mark.parametrize("ending", ["urdf", "xml"])
 @pytest.mark.parametrize("name", ["pr2", "fetch", "hsr", "kitchen", "shelf_door"])
+@pytest.mark.sampled(2)
 def test_shipped_models_are_converted(run, tmp_path, monkeypatch, name, ending):
     if ending == "xml":
         pytest.importorskip("mujoco")

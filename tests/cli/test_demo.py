@@ -87,6 +87,7 @@ def test_the_example_is_found_beside_the_sources_only(tmp_path, monkeypatch, in_
     assert sys.path == [str(tmp_path / "examples")] * in_checkout
 
 
+@pytest.mark.long
 def test_headless_demo_needs_the_core_only_and_prints_tables(tmp_path):
     """Numbers of longer simulations are those of ``tests/view/test_living_kitchen.py``."""
     extras = ("viser", "trimesh", "PIL", "scipy", "collada")

@@ -95,6 +95,7 @@ def unless_large(name: str, *others: object) -> object:
 
 
 @pytest.mark.parametrize("name", [unless_large(name) for name in (*kv.shipped_models(), *gallery.names())])
+@pytest.mark.sampled(2)
 def test_shipped_models_and_scenes_survive_a_round_trip(name: str) -> None:
     try:
         model = kv.load(name)
@@ -112,6 +113,7 @@ def test_shipped_models_and_scenes_survive_a_round_trip(name: str) -> None:
         *(pytest.param(folder, 3, FOLDERS[folder], marks=pytest.mark.long) for folder in MANY),
     ],
 )
+@pytest.mark.sampled(2)
 def test_files_of_other_projects_survive_a_round_trip(folder: str, step: int, least: int) -> None:
     if not (SHARED / folder).is_dir():
         pytest.skip(f"no {SHARED / folder}")

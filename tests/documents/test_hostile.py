@@ -181,6 +181,7 @@ REFUSED = {
 
 
 @pytest.mark.parametrize("name", REFUSED)
+@pytest.mark.sampled(2)
 def test_document_beyond_the_budget_is_refused(name: str) -> None:
     text, reason = REFUSED[name]
     assert len(text) < 1_000_000

@@ -52,6 +52,7 @@ def test_round_trip_preserves_the_model(model, tmp_path):
     assert read.default_state() == model.default_state()
 
 
+@pytest.mark.sampled(2)
 def test_round_trip_preserves_every_bit_of_values_and_gradients(model, tmp_path):
     ours, theirs = everything(model), everything(saved(model, tmp_path))
     inputs = sorted({s for e in ours for s in e.symbols}, key=lambda s: s.sort_key)

@@ -186,6 +186,7 @@ def outcome(code: Code, document: str, name: str) -> bool:
 
 @of_changes
 @pytest.mark.parametrize("code", DECIDING.values(), ids=DECIDING)
+@pytest.mark.sampled(3)
 def test_accesses_that_decide_are_recorded(code: Code, changes: tuple[str, ...]) -> None:
     document = to_json(build(code))
     outcomes = [outcome(code, document, name) for name in changes]
@@ -195,6 +196,7 @@ def test_accesses_that_decide_are_recorded(code: Code, changes: tuple[str, ...])
 
 @of_changes
 @pytest.mark.parametrize("code", FOLLOWED.values(), ids=FOLLOWED)
+@pytest.mark.sampled(2)
 def test_common_code_is_followed_everywhere(code: Code, changes: tuple[str, ...]) -> None:
     document = to_json(build(code))
     for name in changes:

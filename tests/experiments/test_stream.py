@@ -33,6 +33,7 @@ def test_errors_are_correlated_as_stated():
         assert correlation == pytest.approx(0.7 * 0.95**lag, abs=0.04)
 
 
+@pytest.mark.long
 def test_trackers_follow_the_door_and_are_never_silently_lost(tracked):
     summaries = {summary.name: summary for summary in summarize_trackers(tracked)}
     textbook, velocity = summaries["textbook"], summaries["velocity"]

@@ -261,6 +261,7 @@ HIDING = {
 
 @pytest.mark.parametrize("name", HIDING)
 @pytest.mark.parametrize("tier", TIERS)
+@pytest.mark.sampled(2)
 def test_comparisons_do_not_hide_a_missing_solution(name, tier):
     e = HIDING[name]
     inputs = [a, b]

@@ -125,6 +125,7 @@ LARGE = {f"articulations/{n}" for n in ("delta_robot", "jansen_leg", "parallel_g
 @pytest.mark.parametrize(
     "name", [pytest.param(n, marks=pytest.mark.long if n in LARGE else ()) for n in (*SHIPPED, *SCENES)]
 )
+@pytest.mark.sampled(2)
 def test_shipped_models_are_written_or_refused_by_name(name: str, tmp_path: Path) -> None:
     model = load_cached(name)
     file = tmp_path / "m.xml"

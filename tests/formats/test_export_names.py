@@ -51,6 +51,7 @@ def named(name: str, formats: str) -> kv.Model:
 
 @pytest.mark.parametrize("name", NAMES)
 @pytest.mark.parametrize("ending", ["urdf", "xml"])
+@pytest.mark.sampled(2)
 def test_names_are_kept_in_every_role(name: str, ending: str, tmp_path: Path) -> None:
     if ending == "xml":
         pytest.importorskip("mujoco")

@@ -91,6 +91,7 @@ LARGE = {f"articulations/{name}" for name in ("delta_robot", "jansen_leg", "scis
     "name",
     [pytest.param(name, marks=pytest.mark.long if name in LARGE else ()) for name in (*SHIPPED, *SCENES)],
 )
+@pytest.mark.sampled(2)
 def test_shipped_models_are_written_or_refused_by_name(name: str, tmp_path: Path) -> None:
     model = load_cached(name)
     if name in REFUSED:

@@ -18,6 +18,7 @@ DRAKE = json.loads((Path(__file__).parent / "sdf_poses_of_drake.json").read_text
 
 
 @pytest.mark.parametrize("file", OUTCOMES)
+@pytest.mark.sampled(2)
 def test_frames_and_dofs_or_errors_of_all_files(file: str):
     path = shared(file)
     expected = OUTCOMES[file]
@@ -44,6 +45,7 @@ def known(name: str, names: object) -> str:
 
 
 @pytest.mark.parametrize("file", DRAKE)
+@pytest.mark.sampled(2)
 def test_poses_are_those_of_drake(file: str):
     model = kv.load(shared(file))
     state = dict(model.default_state())

@@ -20,6 +20,7 @@ DOCS = Path(__file__).parents[2] / "docs" / "urdf.md"
 
 @pytest.mark.parametrize("strict", [False, True], ids=["", "strict"])
 @pytest.mark.parametrize("file", FILES, ids=str)
+@pytest.mark.sampled(2)
 def test_dofs_or_errors_of_all_files(file: Path | None, strict: bool):
     if file is None:
         pytest.skip(f"no {FOLDER}")

@@ -47,6 +47,7 @@ def paths(model):
 
 
 @every
+@pytest.mark.sampled(2)
 def test_scene_has_bodies_and_violates_no_constraint_at_the_default_state(name):
     model = opened(name)
     assert model.bodies
@@ -88,6 +89,7 @@ def test_scene_loops_stay_closed_during_motion(name):
 
 
 @every
+@pytest.mark.sampled(3)
 def test_commands_take_the_name_of_a_scene(name, capsys):
     model = opened(name)
     assert main(["info", f"articulations/{name}", "--json"]) == 0

@@ -47,6 +47,7 @@ def measured(a, b, poses):
 
 
 @pytest.mark.parametrize(("one", "other"), PAIRS)
+@pytest.mark.sampled(2)
 def test_signed_distances_match_mujoco(one, other, shapes, mujoco_pairs):
     rng = np.random.default_rng([KINDS.index(one), KINDS.index(other)])
     exact = one in EXACT and other in EXACT

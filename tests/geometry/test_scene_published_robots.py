@@ -11,6 +11,7 @@ from formats.urdf_texts import shared
 from kineverse.geometry import Scene
 
 
+@pytest.mark.long
 def test_scene_of_the_shipped_robot_and_kitchen():
     model = kv.load("kitchen")
     model.include("fetch")

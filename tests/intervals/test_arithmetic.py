@@ -107,6 +107,7 @@ def test_functions_enclose_those_of_numbers(op, data):
 
 @pytest.mark.parametrize("op", set(FUNCTIONS) - {ca.OP_FLOOR}, ids=lambda op: FUNCTIONS[op].__name__)
 @given(data=st.data())
+@pytest.mark.sampled(2)
 def test_slopes_enclose_difference_quotients(op, data):
     low, high = BOUNDS.get(op, (-20, 20))
     a = data.draw(intervals(low, high))

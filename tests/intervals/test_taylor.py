@@ -45,6 +45,7 @@ def coefficients(name):
 
 @pytest.mark.parametrize("name", CURVES)
 @given(data=st.data())
+@pytest.mark.sampled(2)
 def test_series_enclose_the_coefficients_at_points(name, data):
     low = data.draw(st.floats(-1.5, 1.4))
     high = low + data.draw(st.floats(0.0, 0.4))

@@ -69,6 +69,7 @@ def poses(model, frame, points, relative_to="world"):
 # -- all of them -------------------------------------------------------------------------------------------
 
 
+@pytest.mark.sampled(2)
 def test_a_loop_is_closed_over_its_range(model):
     assert_closed(model)
 

@@ -150,6 +150,7 @@ def test_drives_keep_the_limits_of_speeds(limits):
 
 
 @pytest.mark.parametrize("targets", [(0.1,), pytest.param((0.2, 0.0), marks=pytest.mark.long)])
+@pytest.mark.long
 def test_fetch_drives_to_a_drawer_and_back_to_it_with_its_arm_out(targets):
     model = kv.load("fetch")
     with model.edit() as edit:

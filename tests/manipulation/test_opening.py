@@ -129,6 +129,7 @@ def test_placement_keeps_the_grasp_along_the_way(at_the_door):
         np.testing.assert_allclose(hand(at), bar(at) @ found.grasp.pose, atol=1e-3)
 
 
+@pytest.mark.long
 def test_a_hand_from_below_opens_a_door_that_none_from_across_reaches():
     model = make_model("shelf_door", 1.5)
     gripper, handle, state = find_gripper(model, "hsr"), find_handle(model, DOOR), start(model)
@@ -199,6 +200,7 @@ def test_fingers_that_close_and_open_keep_the_margin(at_the_door):
             assert all(pair.distance > search.margin - 1e-3 for pair in watch())
 
 
+@pytest.mark.long
 def test_retreats_go_aside_where_the_arm_does_not_reach_straight_back(at_the_door, monkeypatch):
     search, _, _, grasps = at_the_door
     follow, most = search.paths.follow, [1, 5, 5, 5, 5]

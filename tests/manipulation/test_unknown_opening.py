@@ -157,6 +157,7 @@ def run(model, world_model, part=None, seed=1, **options):
     return open_unknown(Session(world), HANDLE, model=model, part=part, sensors=sensors, **options)
 
 
+@pytest.mark.long
 def test_door_that_was_believed_to_slide_is_relearned_and_opened(truth):
     model = truth.copy()
     believe_that_it_slides(model)

@@ -226,6 +226,7 @@ def test_jacobians_on_a_base_move_as_their_gradients_say(base: str) -> None:
 
 @pytest.mark.parametrize("base", BASES)
 @pytest.mark.parametrize("seed", range(4))
+@pytest.mark.sampled(2)
 def test_random_expressions_on_a_base_move_as_their_gradients_say(base: str, seed: int) -> None:
     model = with_arm(base)
     rng = np.random.default_rng(seed)

@@ -147,6 +147,7 @@ def test_certificate_finds_a_plate_between_two_samples(plate):
         assert abs(at[column]) < 0.05
 
 
+@pytest.mark.long
 def test_leaning_pole_and_fast_thread_are_not_slipped_through():
     x, z, lift = (kv.position(name) for name in ("x", "z", "lift"))
     model = kv.Model()

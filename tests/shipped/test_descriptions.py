@@ -307,6 +307,7 @@ def test_furniture_parts_do_not_collide_when_closed(name: str) -> None:
 @pytest.mark.parametrize(
     ("name", "dof"), [(name, dof) for name in FURNITURE for dof in sorted(DOF[name])], ids=lambda part: part
 )
+@pytest.mark.sampled(2)
 def test_furniture_parts_do_not_collide_during_motion(name: str, dof: str) -> None:
     s = scene(name)
     body = s.model.getJointId(dof)

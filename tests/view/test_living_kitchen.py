@@ -119,6 +119,7 @@ def test_simulations_of_equal_seeds_are_equal():
 # -- tracking --------------------------------------------------------------------------------------------
 
 
+@pytest.mark.long
 def test_the_track_is_more_accurate_than_the_markers_and_consistent(chest):
     quality = average(chest[1][36:])
     assert quality.marker == pytest.approx(math.sqrt(3.0) * 0.03, rel=0.05)

@@ -97,6 +97,7 @@ def test_invalid_picture_sizes_are_refused(size):
 
 
 @pytest.mark.parametrize("name", kv.shipped_models())
+@pytest.mark.sampled(3)
 def test_every_shipped_model_makes_a_picture(name):
     image = picture(kv.load(name), size=SMALL)
     assert len(np.unique(image.reshape(-1, 3), axis=0)) > 200

@@ -374,6 +374,7 @@ def test_fetch_drives_by_its_wheels_and_closes_a_door():
 
 
 @pytest.mark.parametrize("scene", ["ball", "folding_door", "four_bar", "ratchet"])
+@pytest.mark.sampled(2)
 def test_mechanisms_of_all_kinds_keep_their_limits(scene):
     """A ball flies at each body: quaternions within a cone, a four-bar in closed form, a loop, a lock."""
     model = kv.Model()

@@ -13,6 +13,7 @@ COVARIANCE = pose_covariance(0.002, 0.01)
 
 
 @pytest.mark.parametrize("family", [*JOINTS])
+@pytest.mark.sampled(2)
 def test_identify_selects_the_true_family(family: str) -> None:
     seen = recording(family, count=30, position=0.002, orientation=0.01, seed=3)
     found = identify(seen.parent, seen.child, noise=COVARIANCE)
@@ -22,6 +23,7 @@ def test_identify_selects_the_true_family(family: str) -> None:
 
 
 @pytest.mark.parametrize("family", [*JOINTS])
+@pytest.mark.sampled(2)
 def test_operation_moves_as_its_fit(family: str) -> None:
     seen = recording(family, count=30, position=0.002, orientation=0.01, seed=4)
     fit = identify(seen.parent, seen.child, noise=COVARIANCE)[family]

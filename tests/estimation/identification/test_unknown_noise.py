@@ -38,6 +38,7 @@ def _compiled() -> None:
 @pytest.mark.parametrize(
     ("position", "orientation"), [(0.016, 0.4), (0.04, 1.0), (0.0025, 4.0), (0.001, 1.6)]
 )
+@pytest.mark.sampled(2)
 def test_noise_of_any_ratio_is_estimated(family: str, position: float, orientation: float) -> None:
     seen = recording(family, count=40, position=position, orientation=orientation * DEG, seed=1)
     found = identify(seen.parent, seen.child)
@@ -169,6 +170,7 @@ LONG = ("outliers of both", "outliers among positions")
     "what", [pytest.param(what, marks=pytest.mark.long if what in LONG else ()) for what in NOTHING]
 )
 @pytest.mark.parametrize("noise", [None, NOISE], ids=["unknown", "stated"])
+@pytest.mark.sampled(2)
 def test_observations_that_tell_nothing_have_no_sure_answer(what: str, noise) -> None:
     parent, child = NOTHING[what]
     for outliers in (None, True):

@@ -59,6 +59,7 @@ def test_covariance_of_a_redundant_arm_is_consistent(runs, off):
     ("noise", "runs", "looks"),
     [(1e-2, 24, 5), *(pytest.param(noise, 24, 10, marks=pytest.mark.long) for noise in (1e-4, 1e-2))],
 )
+@pytest.mark.long
 def test_covariance_of_a_redundant_arm_with_process_noise_is_consistent(noise, runs, looks):
     """The sample mean of NEES varies by 12 %; over many runs it is 0.95 to 1.05."""
     model, rng = make_arm(), np.random.default_rng(2)
