@@ -574,10 +574,8 @@ def test_the_checks_pass_without_a_mutant():
     suite(lp.Vocabulary("sound"))
 
 
-@pytest.mark.parametrize(
-    "name",
-    [pytest.param(name, marks=() if i % 3 == 0 else pytest.mark.long) for i, name in enumerate(MUTANTS)],
-)
+@pytest.mark.sampled(3)
+@pytest.mark.parametrize("name", MUTANTS)
 def test_the_checks_fail_with_a_mutant(name, monkeypatch):
     MUTANTS[name](monkeypatch.setattr)
     vocabulary = lp.Vocabulary(f"mutant/{name}")

@@ -71,10 +71,11 @@ def assert_as_in_mujoco(model: kv.Model, file: Path, count: int = 2, tolerance: 
             )
 
 
-# Every sixth one, or every other one: as URDF all of them are written and read again.
+# Every other one: as URDF all of them are written and read again.
+@pytest.mark.sampled(3)
 @pytest.mark.parametrize(
     "file",
-    [pytest.param(f, marks=() if i % 3 == 0 else pytest.mark.long) for i, f in enumerate(FILES[::2])],
+    FILES[::2],
     ids=lambda f: "none" if f is None else str(f.relative_to(SHARED)),
 )
 def test_urdf_files_saved_as_mjcf_move_alike(file: Path | None, tmp_path: Path) -> None:

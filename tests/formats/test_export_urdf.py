@@ -63,11 +63,8 @@ def saved(model: kv.Model, folder: Path, **options: object) -> kv.Model:
     return kv.load(folder / "m.urdf")
 
 
-@pytest.mark.parametrize(
-    "file",
-    [pytest.param(f, marks=() if i % 5 == 0 else pytest.mark.long) for i, f in enumerate(FILES)],
-    ids=lambda f: "none" if f is None else str(f.relative_to(SHARED)),
-)
+@pytest.mark.sampled(5)
+@pytest.mark.parametrize("file", FILES, ids=lambda f: "none" if f is None else str(f.relative_to(SHARED)))
 def test_urdf_files_are_read_back_unchanged(file: Path | None, tmp_path: Path) -> None:
     if file is None:
         pytest.skip(f"no {SHARED}")

@@ -50,12 +50,11 @@ REFUSED = {
 
 
 def files() -> list[ParameterSet]:
-    """Return the files to read, each with its name in the lists; two of three take long together."""
+    """Return the files to read, each with its folder and its name in the lists."""
     found = []
     for folder in (SHARED, INSTALLED):
         below = [(folder / f, str(f)) for f in sorted(p.relative_to(folder) for p in folder.rglob("*.urdf"))]
-        for number, (file, name) in enumerate(pair for pair in below if is_readable(*pair)):
-            found.append(pytest.param(file, id=name, marks=pytest.mark.long if number % 3 else ()))
+        found += [pytest.param(file, id=name) for file, name in below if is_readable(file, name)]
         if not below:
             reason = f"no {folder}"
             found.append(pytest.param(folder, id=folder.name, marks=pytest.mark.skip(reason=reason)))
@@ -114,6 +113,7 @@ def assert_equal_to_pinocchio(reference: PinocchioReference, description: UrdfRo
             assert_close(whole, reference.jacobian(link, form), f"{form} Jacobian of {link}")
 
 
+@pytest.mark.sampled(3)
 @pytest.mark.parametrize("file", files())
 def test_poses_and_jacobians_are_those_of_pinocchio(file: Path) -> None:
     assert_equal_to_pinocchio(PinocchioReference(file.read_text()), read_urdf(file), seed=len(file.name))

@@ -246,7 +246,7 @@ class RobotDemo:
 def _choose_objects(
     found: tuple[ArticulatedObject, ...], patterns: list[str] | None, headless: bool
 ) -> tuple[ArticulatedObject, ...]:
-    """Return the objects to open: those that are asked for, or all but knobs; without a page one a kind."""
+    """Return the objects to open: those that are asked for, or all but knobs, without a page a few."""
     from kineverse.manipulation.articulated_objects import select_objects
 
     if patterns is None and not headless:

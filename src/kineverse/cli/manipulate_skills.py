@@ -122,7 +122,7 @@ def push_object(
             target=scene.target,
             robot=scene.robot,
         )
-    placed, where, failure = 0, "", ""
+    placed, nowhere = 0, None
     if not scene.stays:
         steps = round(arguments.seconds / 0.02)
         problem = pushing.first_contact(scene.start) or roll_out(pushing, scene.start, steps)[0]
@@ -131,19 +131,19 @@ def push_object(
                 found = find_push_start(
                     pushing, scene.start, seconds=_PLACEMENT, steps=steps, seed=arguments.seed
                 )
-            placed, where = found.samples, f"Another place of the robot: {found.why}"
-            print(f"not from where the robot stands: {problem}. {where}", file=sys.stderr)
+            placed, why = found.samples, f"Another place of the robot: {found.why}"
+            print(f"not from where the robot stands: {problem}. {why}", file=sys.stderr)
             if found.state is not None:
                 world.reset(found.state)
-                where = ""
             else:
-                failure = found.failure
+                nowhere = found
 
     session = Session(world, belief=belief, on_step=look)
     outcome = push(session, scene.coordinate, seconds=arguments.seconds, pushing=pushing)
-    if not outcome and where:
-        measures = {**outcome.measures, "failure": failure}
-        outcome = replace(outcome, reason=f"{outcome.reason} {where}", measures=measures)
+    if not outcome and nowhere is not None:
+        measures = {**outcome.measures, "failure": nowhere.failure}
+        reason = f"{outcome.reason} Another place of the robot: {nowhere.why}"
+        outcome = replace(outcome, reason=reason, measures=measures)
     return replace(outcome, measures={**outcome.measures, "placed": placed})
 
 

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import gc
 import math
 from collections.abc import Callable, Iterable, Mapping
 from time import perf_counter
@@ -11,6 +10,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
+from kineverse._gc import no_collection
 from kineverse.compile import CompiledFunction
 from kineverse.compile.function import WantedTier
 from kineverse.errors import (
@@ -334,13 +334,8 @@ class Controller:
             For a state that lacks a value, or has another length, or a NaN.
         """
         # A collection of the whole program takes many times as long as a step; it has time between steps.
-        collecting = gc.isenabled()
-        gc.disable()
-        try:
+        with no_collection():
             return self._step(state)
-        finally:
-            if collecting:
-                gc.enable()
 
     def _step(self, state: StateLike | npt.ArrayLike) -> Command:
         start = perf_counter()

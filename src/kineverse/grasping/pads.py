@@ -230,12 +230,11 @@ def find_finger_range(model: ModelView, joint: Symbol) -> tuple[float, float]:
     if not np.isfinite(own).all() or low == high:
         return own
     for c in model.constraints_for(joint).values():
-        if c.order or c.expression.symbols != (joint,) or c.lower.symbols or c.upper.symbols:
+        if c.order or c.symbols != (joint,):
             continue
-        first, middle, last = (float(c.expression({joint: q})) for q in (own[0], sum(own) / 2, own[1]))
-        slope = (last - first) / (own[1] - own[0])
-        if slope and abs(first + last - 2.0 * middle) < 1e-9 * abs(last - first):  # it is linear
-            ends = sorted(own[0] + (float(bound) - first) / slope for bound in (c.lower, c.upper))
+        if c.line is not None:
+            slope, offset = c.line
+            ends = sorted((float(bound) - offset) / slope for bound in (c.lower, c.upper))
             low, high = max(low, ends[0]), min(high, ends[1])
     return (low, high) if low < high else own
 
