@@ -139,8 +139,7 @@ class ContactSlots:
                 "The model of the scene was edited since, so the rows of contacts are not about its bodies. "
                 "Build anew, or with a scene of model.snapshot()."
             )
-        self.scene.update(values[self._scene_values])
-        self.found = self._query(self.radius, self._facing)
+        self.found = self._query.at(values[self._scene_values], self.radius, self._facing)
         self._twists.input[:] = values[self._twist_values]
         self._twists()
 
@@ -182,6 +181,10 @@ class ContactSlots:
             Index of the body in the scene's ``bodies``.
         """
         return np.asarray(self._twists.outputs[0][self._group[body]])
+
+    def twists(self, bodies: Sequence[int]) -> Array:
+        """Return the twists of some bodies, (k, 6, n), see :meth:`twist`."""
+        return np.asarray(self._twists.outputs[0][self._group[bodies]])
 
     def bind(self, H: Array, f: Array, A: Array, lower: Array) -> None:
         """Choose the arrays of the program into which :meth:`write` writes.

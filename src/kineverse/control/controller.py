@@ -180,8 +180,10 @@ class Controller:
         if self._contacts is not None:
             self._functions.append(self._contacts.function)
         self._evaluate = self._program.function.bind()
+        H, f, A, lower, upper, self._residuals, self._check, self._largest, *rates = self._evaluate.outputs
+        self._quadratic_program = H, f, A, lower, upper
+        self._speed_goal_rates = tuple(rates)
         if self._contacts is not None:
-            H, f, A, lower, *_ = self._evaluate.outputs
             rows, first = self._program.contact_rows, self._program.columns
             self._contacts.bind(H, f, A[rows], lower[first + rows.start : first + rows.stop])
         n, first = len(self.speeds), len(self._program.inputs)
@@ -347,44 +349,40 @@ class Controller:
             self._queried = False
         read = perf_counter()
         self._evaluate()
-        H, f, A, lower, upper, residuals, check, largest, *_ = self._evaluate.outputs
         if self._contacts is not None:
-            self._contacts.write(self._costs.recovery, RECOVERY_WEIGHT * float(largest[()]))
-        if not math.isfinite(check[()]):
+            self._contacts.write(self._costs.recovery, RECOVERY_WEIGHT * self._largest.item())
+        if not math.isfinite(self._check.item()):
             raise self._diagnosis.not_finite()
         evaluated = perf_counter()
-        found = self._solver.solve(H, f, A, lower, upper)
+        found = self._solver.solve(*self._quadratic_program)
         if found.status != "solved" and self._relaxed is not self._solver:
-            found = self._relaxed.solve(H, f, A, lower, upper)
+            found = self._relaxed.solve(*self._quadratic_program)
         solved = perf_counter()
         times = StepTimes(read - start, evaluated - read, solved - evaluated, solved - start)
         if found.status != "solved":
             least = self._diagnosis.least_violation()
-            command = self._command(least.x, np.zeros(len(lower)), 0, residuals, times)
+            command = self._command(least.x, np.zeros(len(found.multipliers)), 0, times)
             if np.abs(least.violations).max() < _FEASIBLE:
                 return command  # the solver failed, not the problem
             raise self._diagnosis.infeasible(command)
-        return self._command(found.x, found.multipliers, found.iterations, residuals, times)
+        return self._command(found.x, found.multipliers, found.iterations, times)
 
-    def _command(
-        self, x: Array, multipliers: Array, iterations: int, residuals: Array, times: StepTimes
-    ) -> Command:
+    def _command(self, x: Array, multipliers: Array, iterations: int, times: StepTimes) -> Command:
         """Return the command of a solution, and remember it as the last one."""
         n = len(self.speeds)
         if len(self._before):
             self._before[:] = self._last
-        self._last[:] = x[:n]
-        program, jacobian, rate = self._program, None, None
-        if len(program.speed_goals):
-            jacobian, rate = (output.copy() for output in self._evaluate.outputs[-2:])
+        self._last[:] = vector = x[:n]
+        program, rates = self._program, self._speed_goal_rates
+        jacobian, rate = (rates[0].copy(), rates[1].copy()) if rates else (None, None)
         errors = TaskErrors(
-            program.residuals, residuals.copy(), program.speed_goals, program.speed_rows, jacobian, rate
+            program.residuals, self._residuals.copy(), program.speed_goals, program.speed_rows, jacobian, rate
         )
         values = x.tolist()
         return Command(
             dict(zip(self.speeds, values, strict=False)),
-            x[:n],
-            min(values[n:], default=1.0),
+            vector,
+            min(values[n:]) if len(values) > n else 1.0,
             times,
             iterations,
             multipliers,

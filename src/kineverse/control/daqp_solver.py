@@ -16,12 +16,9 @@ class DaqpSolver(QpSolver):
     """
 
     def _prepare(self) -> None:
-        entries = self.n + self.m
         self._daqp = import_solver("daqp", "control")
         self._model: Any = None
         self._warm = False
-        self._least, self._most = np.full(entries, -_INFINITY), np.full(entries, _INFINITY)
-        self._lower, self._upper = self._least.copy(), self._most.copy()
 
     def reset(self) -> None:  # noqa: D102
         self._warm = False
@@ -29,8 +26,7 @@ class DaqpSolver(QpSolver):
     def _solve(self, H: Vector, f: Vector, A: Vector, lower: Vector, upper: Vector) -> QpSolution:
         if self._warm:
             # A bound of the last active set that is infinite now gives wrong solutions, reported as solved.
-            low = np.maximum(lower, self._least, out=self._lower)
-            high = np.minimum(upper, self._most, out=self._upper)
+            low, high = self._bound_by(_INFINITY, lower, upper)
             # The solver keeps these arrays, and the active set of the last solve.
             model = self._model
             if model.update(H, f, A if self.m else None, high, low) == 0:
@@ -45,7 +41,7 @@ class DaqpSolver(QpSolver):
 
     def _solve_anew(self, H: Vector, f: Vector, A: Vector, lower: Vector, upper: Vector) -> QpSolution:
         one = np.ones(self.n + self.m)
-        usual = _SETTINGS if self._hard is None else _SOFT_SETTINGS
+        usual = _SOFT_SETTINGS if self._any_soft else _SETTINGS
         flags: set[int] = set()
         # Where equalities are nearly dependent, it succeeds after it has eliminated them.
         for settings in (usual, _REDUCED_SETTINGS):
@@ -91,7 +87,7 @@ class DaqpSolver(QpSolver):
         flag, _ = model.setup(H, f, A, upper, lower, sense)
         if flag < 0:
             return flag, np.zeros(self.n), np.zeros(self.n + self.m), 0
-        if self._hard is not None:
+        if self._any_soft:
             reciprocal, linear = scale**2 / self._weight, self._linear / scale
             model.soft_weights(reciprocal, reciprocal, linear, linear)
         x, _, flag, info = model.solve()

@@ -5,8 +5,6 @@ A pair that is further apart than a limit is not looked at again before the trav
 """
 
 ADVANCE = r"""
-typedef int (*Compute)(const double **, double **, long long *, double *, int);
-
 /* Object at one sample. The travel is that since the first sample. */
 typedef struct {
   double pose[12], place[3], low[3], high[3], travel;

@@ -73,6 +73,9 @@ class _NeighbourStruct(ctypes.Structure):
         ("travel", ctypes.c_void_p),
         ("pairs", ctypes.c_void_p),
         *((name, ctypes.c_int64) for name in ("found", "room", "resets")),
+        *((name, ctypes.c_void_p) for name in ("selected", "members", "first")),
+        ("count", ctypes.c_int64),
+        ("boxes", ctypes.c_void_p),
     )
 
 
@@ -266,15 +269,8 @@ class CollisionLibrary(SourceLibrary):
             pairs, lows = broadphase.find_near_pairs(table, reach, wanted)
             return (pairs, lows, *self.measure(table, pairs, radius)), None
         binding = _bind_table(table)
-        query, known = binding.query, None
-        query.reach, query.radius, query.all = reach, radius, per_shape
-        query.allowed = query.active = query.known = None
-        if selection is not None:
-            query.allowed, query.active = selection.addresses
-            known = selection.binding
-            if known is None:
-                known = selection.binding = _NeighbourBinding(table)
-            query.known = known.address
+        query = binding.query
+        known = binding.ask(table, reach, radius, selection, per_shape)
         while True:
             found = self._code.search(binding.address, binding.query_address)
             if found < 0 and known is not None:
@@ -287,6 +283,31 @@ class CollisionLibrary(SourceLibrary):
             pairs, lows = binding.pairs[:found], binding.lows[:found]
             return (pairs, lows, binding.distances[:found], binding.witnesses[:found]), None
         return None, binding.copy_ranked()
+
+    def search_at(
+        self,
+        table: ObjectTable,
+        kinematics: tuple[int, int, int],
+        reach: float,
+        radius: float,
+        selection: PairSelection,
+        per_shape: bool,
+        facing: FacingPoints | None,
+    ) -> RankedPairs | None:
+        """Apply :meth:`place` and :meth:`search` in one call.
+
+        ``kinematics`` has the addresses of the C function of poses, of its inputs and of its results. The
+        answer is None if both have to be called: without C, if pairs are left to coal, if a pose is not
+        finite, or if there is more than there is room for.
+        """
+        if self._code is None:
+            return None
+        binding = _bind_table(table)
+        binding.ask(table, reach, radius, selection, per_shape)
+        wanted = None if facing is None else facing.address
+        if self._code.search_at(binding.address, binding.query_address, wanted, *kinematics) < 0:
+            return None
+        return binding.copy_ranked()
 
 
 class _TableBinding:
@@ -328,6 +349,26 @@ class _TableBinding:
             setattr(self.query, name, array.ctypes.data)
         self.query.room = count
 
+    def ask(
+        self,
+        table: ObjectTable,
+        reach: float,
+        radius: float,
+        selection: PairSelection | None,
+        per_shape: bool,
+    ) -> _NeighbourBinding | None:
+        """Set the parameters of a query, and return the neighbours of its selected pairs."""
+        query, known = self.query, None
+        query.reach, query.radius, query.all = reach, radius, per_shape
+        query.allowed = query.active = query.known = None
+        if selection is not None:
+            query.allowed, query.active = selection.addresses
+            known = selection.binding
+            if known is None:
+                known = selection.binding = _NeighbourBinding(table, selection)
+            query.known = known.address
+        return known
+
     def take(self, ranked: RankedPairs) -> None:
         """Copy ranked pairs into the buffers of results."""
         kept = len(ranked[2])
@@ -348,9 +389,19 @@ class _TableBinding:
 class _NeighbourBinding:
     """List of neighbours among selected pairs, as C reads and writes it."""
 
-    def __init__(self, table: ObjectTable) -> None:
-        self._travel, self._struct = np.zeros(table.moving), _NeighbourStruct(resets=-1)
-        self._struct.travel = self._travel.ctypes.data
+    def __init__(self, table: ObjectTable, selection: PairSelection) -> None:
+        pairs = np.ascontiguousarray(np.argwhere(np.triu(selection.bodies)), dtype=np.int32)
+        first = np.searchsorted(np.sort(table.body), np.arange(len(selection.bodies) + 1)).astype(np.int32)
+        self._arrays = {
+            "travel": np.zeros(table.moving),
+            "selected": pairs,
+            "members": np.argsort(table.body, kind="stable").astype(np.int32),
+            "first": first,
+            "boxes": np.empty((len(selection.bodies), 6)),
+        }
+        self._struct = _NeighbourStruct(resets=-1, count=len(pairs))
+        for name, array in self._arrays.items():
+            setattr(self._struct, name, array.ctypes.data)
         self.address = ctypes.addressof(self._struct)
         self.reserve(1024)
 
@@ -383,6 +434,7 @@ def _declare_signatures(code: Any) -> None:
     code.gather.argtypes = (*(pointer,) * 5, ctypes.c_int64, *(pointer,) * 4)
     code.gather.restype = None
     code.search.argtypes, code.search.restype = (pointer, pointer), ctypes.c_int64
+    code.search_at.argtypes, code.search_at.restype = (pointer,) * 6, ctypes.c_int64
     code.trace.argtypes, code.trace.restype = (pointer, pointer, ctypes.c_int64), ctypes.c_int64
     code.settle.argtypes, code.settle.restype = (pointer, pointer, ctypes.c_int64), ctypes.c_int64
     code.advance.argtypes = (pointer, pointer, ctypes.c_int64, ctypes.c_int64)

@@ -29,9 +29,6 @@ MAX_BOUNDED_OBJECTS = 6000
 MEMORY_SLOTS = 2**13
 """Number of measured pairs that are remembered until an object moves; a power of two."""
 
-NO_STATIC_PARTNER = 2
-"""Flag of objects of selected pairs that are in none with a static object."""
-
 _MEMORY = np.dtype([("pair", np.int64), ("numbers", np.float64, 12)])
 
 _INHERITED = (
@@ -236,10 +233,7 @@ class PairSelection:
 
     def __init__(self, table: ObjectTable, bodies: Flags) -> None:
         self.bodies = np.ascontiguousarray(bodies)
-        static = np.zeros(len(self.bodies), dtype=bool)
-        static[table.body[table.moving :]] = True
-        flags = np.where(self.bodies[:, static].any(axis=1), 1, NO_STATIC_PARTNER) * self.bodies.any(axis=1)
-        self._objects = np.ascontiguousarray(flags.astype(np.uint8)[table.body])
+        self._objects = np.ascontiguousarray(self.bodies.any(axis=1)[table.body], dtype=np.uint8)
         self.addresses = self.bodies.ctypes.data, self._objects.ctypes.data
 
 

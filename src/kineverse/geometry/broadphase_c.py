@@ -1,6 +1,6 @@
 """C text: broad phase, with lists of neighbours for queries that are asked at one state after another."""
 
-from .broadphase import MEMORY_SLOTS, NO_STATIC_PARTNER, TREE_WIDTH
+from .broadphase import MEMORY_SLOTS, TREE_WIDTH
 
 SWEEP = (
     r"""
@@ -8,6 +8,9 @@ SWEEP = (
 #include <stdint.h>
 #include <stdlib.h>
 #include <string.h>
+
+/* Compiled function of one vector. */
+typedef int (*Compute)(const double **, double **, long long *, double *, int);
 
 /* Measured pair: the travel of both at that time, and the result. */
 typedef struct {
@@ -32,18 +35,19 @@ typedef struct {
   int64_t node_count, leaf_count, resets;
 } Table;
 
-/* Pairs that may be within a reach; see `near_again`. */
+/* Pairs of objects of selected bodies that may be within a reach; see `near_again`. */
 typedef struct {
   double reach;
   double *travel; /* of the moving objects when they were found */
   int32_t *pairs;
   int64_t found, room, resets;
+  const int32_t *selected, *members, *first; /* pairs of bodies; objects by body, and where each body begins */
+  int64_t count;                             /* of the pairs of bodies */
+  double *boxes;                             /* corners of the boxes of bodies */
 } Neighbours;
 
 #define MEMORY_BITS @BITS@
 #define TREE_WIDTH @WIDTH@
-/* Value of `active` for objects that are in no pair with a static one. */
-#define NO_STATIC_PARTNER @NO_STATIC@
 #define EXPORT __attribute__((visibility("default")))
 
 /* Slot of a pair, which another pair may have overwritten. */
@@ -67,7 +71,7 @@ static inline double larger(double x, double y) { return x > y ? x : y; }
 #define PLACED -1
 #define TRAVEL_EXCEEDED -2
 /* Difference of the reach of neighbours to that of a query. */
-#define SPARE 0.04
+#define SPARE 0.06
 
 EXPORT int64_t place(Table *t, const double *fresh) {
   int64_t outcome = PLACED;
@@ -220,7 +224,47 @@ EXPORT int64_t near(Table *t, double reach, int32_t *pairs, double *lows, int64_
     square_gaps(t, k, k + 1, end);
     for (int64_t m = k + 1; m < end; m++)
       if (gap[m] <= reach * reach) consider(t, one, t->order[m], &answer);
-    if (n < t->count && t->active[one] != NO_STATIC_PARTNER) consider_static(t, one, &answer);
+    if (n < t->count) consider_static(t, one, &answer);
+  }
+  return answer.found;
+}
+
+static inline double square_gap(const double *a, const double *b, const double *c, const double *d) {
+  double gap = 0.0;
+  for (int r = 0; r < 3; r++) gap += square(larger(larger(a[r] - d[r], c[r] - b[r]), 0.0));
+  return gap;
+}
+
+/* Finds the pairs that `near` finds, by the boxes of selected pairs of bodies. The bodies of a robot in a
+   kitchen have many objects, most of which are far from all others. */
+static int64_t near_selected(const Table *t, const Neighbours *known, double reach) {
+  Answer answer = {reach, known->pairs, NULL, known->room, 0};
+  for (int64_t b = 0; b < t->bodies; b++) {
+    double *low = known->boxes + 6 * b, *high = low + 3;
+    for (int r = 0; r < 3; r++) low[r] = INFINITY, high[r] = -INFINITY;
+    for (int32_t m = known->first[b]; m < known->first[b + 1]; m++) {
+      const int32_t i = known->members[m];
+      for (int r = 0; r < 3 && t->active[i]; r++) {
+        low[r] = t->low[3 * i + r] < low[r] ? t->low[3 * i + r] : low[r];
+        high[r] = larger(t->high[3 * i + r], high[r]);
+      }
+    }
+  }
+  for (int64_t k = 0; k < known->count; k++) {
+    const int32_t a = known->selected[2 * k], b = known->selected[2 * k + 1];
+    const double *one = known->boxes + 6 * a, *other = known->boxes + 6 * b;
+    if (!(square_gap(one, one + 3, other, other + 3) <= reach * reach)) continue;
+    for (int32_t m = known->first[a]; m < known->first[a + 1]; m++) {
+      const int32_t i = known->members[m];
+      if (!t->active[i] || !(square_gap(t->low + 3 * i, t->high + 3 * i, other, other + 3) <= reach * reach))
+        continue;
+      for (int32_t p = known->first[b]; p < known->first[b + 1]; p++) {
+        const int32_t j = known->members[p];
+        if ((i < t->moving || j < t->moving) &&
+            square_gap(t->low + 3 * i, t->high + 3 * i, t->low + 3 * j, t->high + 3 * j) <= reach * reach)
+          consider(t, i, j, &answer);
+      }
+    }
   }
   return answer.found;
 }
@@ -243,7 +287,7 @@ static int64_t near_again(
     Table *t, Neighbours *known, double reach, int32_t *pairs, double *lows, int64_t room) {
   if (known->resets != t->resets || !(reach + approached(t, known) <= known->reach)) {
     known->resets = -1;
-    const int64_t found = near(t, reach + SPARE, known->pairs, NULL, known->room);
+    const int64_t found = near_selected(t, known, reach + SPARE);
     if (found > known->room) return -found;
     known->found = found;
     known->reach = reach + SPARE;
@@ -253,15 +297,11 @@ static int64_t near_again(
   Answer answer = {reach, pairs, lows, room, 0};
   for (int64_t k = 0; k < known->found; k++) {
     const int32_t i = known->pairs[2 * k], j = known->pairs[2 * k + 1];
-    double gap = 0.0;
-    for (int r = 0; r < 3; r++)
-      gap += square(larger(larger(t->low[3 * i + r] - t->high[3 * j + r],
-                                  t->low[3 * j + r] - t->high[3 * i + r]), 0.0));
-    if (gap <= reach * reach) consider(t, i, j, &answer);
+    if (square_gap(t->low + 3 * i, t->high + 3 * i, t->low + 3 * j, t->high + 3 * j) <= reach * reach)
+      consider(t, i, j, &answer);
   }
   return answer.found;
 }
 """.replace("@BITS@", str(MEMORY_SLOTS.bit_length() - 1))
     .replace("@WIDTH@", str(TREE_WIDTH))
-    .replace("@NO_STATIC@", str(NO_STATIC_PARTNER))
 )

@@ -26,8 +26,8 @@ from kineverse.model.version_cache import cached_for_version
 from kineverse.state import State, StateLike
 from kineverse.symbols import Symbol
 
-from .bindings import collision_library
-from .broadphase import FURTHEST, TRAVEL_EXCEEDED, Indices, ObjectTable
+from .bindings import FacingPoints, RankedPairs, collision_library
+from .broadphase import FURTHEST, TRAVEL_EXCEEDED, Indices, ObjectTable, PairSelection
 from .collision_filter import (
     Rule,
     allowed_pairs,
@@ -180,7 +180,10 @@ class CollisionWorld:
             _, function = cached_for_version(self.model, key, lambda: (poses, _compile_poses(moving)))
         self._function = function
         self.inputs = function.inputs if function else ()
-        self._evaluator = function.bind() if function else None
+        self._evaluator = evaluator = function.bind() if function else None
+        self._addresses = (0, 0)
+        if evaluator is not None:
+            self._addresses = evaluator.input.ctypes.data, evaluator.outputs[0].ctypes.data
 
     def add_rules(self, rules: Iterable[Rule]) -> None:
         """Add rules behind all others, from now on."""
@@ -202,6 +205,32 @@ class CollisionWorld:
         elif not isinstance(state, Mapping) and len(state):
             raise InvalidValueError(f"Nothing moves in this scene, and {len(state)} values are given.")
         self._missing_state = ""
+
+    def search_at(
+        self,
+        values: Floats,
+        radius: float,
+        selection: PairSelection,
+        per_shape: bool,
+        facing: FacingPoints | None,
+    ) -> RankedPairs | None:
+        """Update to values of :attr:`inputs` and search the selected pairs, in one call of C.
+
+        None if an update and a search have to be made one after the other, see
+        :meth:`.CollisionLibrary.search_at`.
+        """
+        address = self.kinematics_address
+        if address is None or values.shape != self._evaluator.input.shape:
+            return None
+        self._evaluator.input[:] = values
+        kinematics = address, *self._addresses
+        found = collision_library.search_at(
+            self.table, kinematics, radius + ACCURACY, radius, selection, per_shape, facing
+        )
+        if found is not None:
+            self._placed_at, self._missing_state = (self.inputs, values.copy()), ""
+            self.narrowphase.invalidate_poses(self.table.moving)
+        return found
 
     @property
     def values(self) -> Floats:

@@ -146,4 +146,15 @@ EXPORT int64_t extend(Table *t, Query *q, const Facing *facing) {
   free(points);
   return kept + found;
 }
+
+/* Places the moving objects where a function of some inputs puts them, searches, and adds facing points unless
+   `facing` is NULL. Returns the number of results, or -1 if something is left to do in single steps. */
+EXPORT int64_t search_at(
+    Table *t, Query *q, const Facing *facing, Compute compute, const double *inputs, double *poses) {
+  if (compute(&inputs, &poses, NULL, NULL, 0) || place(t, poses) != PLACED) return -1;
+  const int64_t found = search(t, q);
+  if (found < 0 || found > q->room || q->kept < 0) return -1;
+  const int64_t kept = facing && q->kept ? extend(t, q, facing) : q->kept;
+  return kept <= q->room ? kept : -1;
+}
 """

@@ -65,6 +65,31 @@ class PreparedQuery:
         within = self.radius if radius is None else radius
         return find_pairs_within(self._world, within, self._select(), self.per_shape, facing)
 
+    def at(
+        self, values: Floats, radius: float | None = None, facing: FacingPoints | None = None
+    ) -> DistanceResults:
+        """Place the scene, and return the near pairs there: an update and a query in one.
+
+        Parameters
+        ----------
+        values
+            Values of the scene's ``inputs`` as a vector [m], [rad].
+        radius, facing
+            As for a call.
+
+        Raises
+        ------
+        UnknownNameError, ShapeError, InvalidValueError
+            As :meth:`.Scene.update`.
+        """
+        within = self.radius if radius is None else radius
+        check_radius(within)
+        found = self._world.search_at(values, within, self._select(), self.per_shape, facing)
+        if found is not None:
+            return DistanceResults(self._world, *found)
+        self._world.update(values)
+        return self(within, facing)
+
     def first_within(
         self, coordinates: Sequence[Symbol | str], Q: npt.ArrayLike, radius: float | None = None
     ) -> int | None:

@@ -27,6 +27,7 @@ from kineverse.control import Command
 from kineverse.errors import InvalidValueError, KineverseError
 from kineverse.geometry import Rule, Scene
 from kineverse.geometry.objects import Exclusion
+from kineverse.lie import Array
 from kineverse.manipulation.collision_rules import find_overlapping_links, furniture_rules, match_bodies
 from kineverse.model.frame import is_of_robot
 from kineverse.model.frame_dependence import FrameDependence
@@ -37,10 +38,10 @@ from kineverse.worlds import Observation
 
 from .contact_choice import CONE, CONE_END, ContactChoice
 from .contact_points import PushPoint, PushSurface, find_push_tool
-from .nearest_pair import PairFinder, PushPair, PushView, make_view
+from .nearest_pair import ContactRates, PairFinder, PushPair, PushView, make_view
 from .press import PushPress, TipAnchor
 from .program import LOST, NEAR, PRESS, TOUCHING, PushNumbers, PushProgram
-from .vectors import ZERO, Vector, add, apply_force, inner_product, length, move_point, scale, subtract
+from .vectors import ZERO, Vector, add, inner_product, length, move_point, scale, subtract
 
 _APART = 4e-3
 """Gap between pusher and object away from the contact [m]."""
@@ -187,8 +188,8 @@ class Pushing:
             self._program.object_column,
             self.surface.sign,
         )
-        self._far = [0.0] * (3 * len(self._program.columns))
         self._hand = self.scene.bodies.index(self._hand_body())
+        self._rates = ContactRates(slots, self._program.columns, self._hand)
         self._all = self.scene.watch(f"{self.robot}/*", "*", radius=0.0, moving=self.speeds)
         self.choice = ContactChoice(self.surface)
         self.press = PushPress(dt, self.surface.sign)
@@ -290,7 +291,7 @@ class Pushing:
         self._aside = length(add(offset, point.normal, -inner_product(point.normal, offset)))
         if not self.retreating:
             self._update_touching(contact)
-        command = self._program.step(self._numbers(tip, point, contact))
+        command = self._program.step(*self._numbers(tip, point, contact))
         moved: list[float] = (self._slots.twist(self._hand) @ command.vector).tolist()
         press.plan(point.velocity, move_point(moved, tip))
         self._seen = contact, point, tip
@@ -349,8 +350,8 @@ class Pushing:
             rest = length(subtract(point.point, tip))
         return self.choice.is_stuck(rest)
 
-    def _numbers(self, tip: Vector, point: PushPoint, contact: PushPair | None) -> PushNumbers:
-        """Return the numbers of the program."""
+    def _numbers(self, tip: Vector, point: PushPoint, contact: PushPair | None) -> tuple[PushNumbers, Array | None]:
+        """Return the numbers of the program, and the derivatives of a contact."""
         c, m, press = point.point, point.normal, self.press
         near, height = self._aside < NEAR and not self.retreating, inner_product(subtract(tip, c), m)
         standoff = _STANDOFF
@@ -361,7 +362,6 @@ class Pushing:
         self._keep_apart(contact, self.touching or (near and height < _LOW + press.slack))
         numbers = PushNumbers(
             gap=_FAR,
-            relative=self._far,
             slip=(0.0, 0.0),
             pushed=0.0,
             target=add(c, m, standoff),
@@ -376,30 +376,22 @@ class Pushing:
             pace=press.pace() / max(length(point.velocity), 1e-3),
             free=0.0,
         )
-        if contact is not None:
-            self._add_contact(numbers, contact, tip)
-        return numbers
+        return numbers, None if contact is None else self._add_contact(numbers, contact, tip)
 
-    def _add_contact(self, numbers: PushNumbers, contact: PushPair, tip: Vector) -> None:
-        """Set the numbers of a near pair of pusher and object."""
-        press, slots, thing, n = self.press, self._slots, contact.thing, contact.normal
+    def _add_contact(self, numbers: PushNumbers, contact: PushPair, tip: Vector) -> Array:
+        """Set the numbers of a near pair of pusher and object, and return the derivatives."""
+        press, thing = self.press, contact.thing
         allowed = -_JAMMED * press.depth - press.slack < contact.gap < LOST + press.slack
         numbers.free = float(self.touching and allowed)
-        tangents = contact.tangents
-        # Wrenches on the twists of the touching body, of the object, and of the hand.
-        nothing, back = (0.0,) * 6, scale(-1.0, n)
-        wrenches = [(*apply_force(n, contact.r), *apply_force(back, contact.p), *nothing)]
-        wrenches += [(*nothing, *apply_force(scale(-1.0, t), tip), *apply_force(t, tip)) for t in tangents]
-        twists = np.concatenate([slots.twist(body) for body in (contact.robot, thing, self._hand)])
-        relative = np.array(wrenches) @ twists
-        numbers.relative = relative[:, self._program.columns].ravel().tolist()
         # A press that is late enough is not increased by the goal about the gap either.
         most = -PRESS * (1.0 - min(max(press.reserve, 0.0), 1.0))
         deeper = press.depth - PRESS
         numbers.gap = most if press.touched and self.touching else contact.gap + deeper
-        numbers.pushed = inner_product(n, contact.velocity) * self.surface.sign
+        numbers.pushed = inner_product(contact.normal, contact.velocity) * self.surface.sign
         drift = self._anchor.drift(thing, self._fixed_to(thing), tip, press.weight)
-        numbers.slip = [inner_product(t, drift) for t in tangents]
+        one, other = tangents = contact.tangents
+        numbers.slip = inner_product(one, drift), inner_product(other, drift)
+        return self._rates(contact, tangents, tip)
 
     def _fixed_to(self, thing: int) -> list[list[float]]:
         """Return the pose (3, 4) of a shape of a body."""

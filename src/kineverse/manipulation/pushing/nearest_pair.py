@@ -9,9 +9,12 @@ from typing import NamedTuple
 
 import numpy as np
 
+from kineverse.compile import compile  # noqa: A004
 from kineverse.control.contact_slots import ContactSlots
+from kineverse.expressions.expression import Expression, array
 from kineverse.geometry.results import DistanceResults
 from kineverse.lie import Array
+from kineverse.symbols import parameter
 
 from .contact_points import PushPoint, find_alignment
 from .program import PRESS, TOUCHING
@@ -86,13 +89,15 @@ class PushPair(NamedTuple):
 
     @property
     def tangents(self) -> tuple[Vector, Vector]:
-        """Two unit vectors that are orthogonal to the normal and to each other."""
-        sizes = [abs(v) for v in self.normal]
-        side = [0.0, 0.0, 0.0]
-        side[sizes.index(min(sizes))] = 1.0
-        across = cross_product(self.normal, (side[0], side[1], side[2]))
-        across = scale(1.0 / length(across), across)
-        return across, cross_product(self.normal, across)
+        """Two unit vectors that are orthogonal to the normal and to each other.
+
+        Duff et al., "Building an Orthonormal Basis, Revisited" (2017).
+        """
+        x, y, z = self.normal
+        sign = math.copysign(1.0, z)
+        a = -1.0 / (sign + z)
+        b = a * x * y
+        return (1.0 + sign * a * x * x, sign * b, -sign * x), (b, sign + a * y * y, -y)
 
 
 def make_view(pair: PushPair | None, point: PushPoint, tip: Vector) -> PushView:
@@ -104,6 +109,56 @@ def make_view(pair: PushPair | None, point: PushPoint, tip: Vector) -> PushView:
     tangent = cross_product(cross_product(push, n), n)
     p_, r_, n_, push_, tangent_, target = np.array([p, r, n, push, tangent, point.point])
     return PushView(p_, r_, n_, push_, tangent_, target, distance)
+
+
+class ContactRates:
+    """Derivatives of a contact over speeds: of the gap, and of the way of a tip on the object.
+
+    They follow from the twists of the touching body, of the object and of the hand, by one compiled function.
+
+    Parameters
+    ----------
+    slots
+        Contact slots with the twists of bodies.
+    columns
+        Indices of the n speeds among the columns of the slots.
+    hand
+        Index of a body that moves with the tip.
+    """
+
+    def __init__(self, slots: ContactSlots, columns: Sequence[int], hand: int) -> None:
+        self._slots, self._hand = slots, hand
+        twists = _parameters("twist", 3, *slots.twist(hand).shape)
+        vectors = _parameters("vector", 6, 3)
+        r, p, normal, tip, *tangents = vectors
+        robot, thing, carrier = (twist[:, list(columns)] for twist in twists)
+        rows = [_along(normal, r, robot) - _along(normal, p, thing)]
+        rows += [_along(t, tip, carrier) - _along(t, tip, thing) for t in tangents]
+        self._first = twists.size
+        inputs = [s for e in (*twists.ravel(), *vectors.ravel()) for s in e.symbols]
+        self._rows = compile([array([e for row in rows for e in row])], inputs).bind()
+
+    def __call__(self, contact: PushPair, tangents: tuple[Vector, Vector], tip: Vector) -> Array:
+        """Return the derivatives (3 n) of the gap, and of the way along both tangents.
+
+        The array is overwritten by the next call.
+        """
+        rows, first = self._rows, self._first
+        rows.input[:first] = self._slots.twists([contact.robot, contact.thing, self._hand]).ravel()
+        one, other = tangents
+        rows.input[first:] = [*contact.r, *contact.p, *contact.normal, *tip, *one, *other]
+        rows()
+        return np.asarray(rows.outputs[0])
+
+
+def _parameters(name: str, *shape: int) -> Expression:
+    """Return an array of new parameters."""
+    return array([parameter(f"push/{name}/{k}", 0.0) for k in range(math.prod(shape))]).reshape(shape)
+
+
+def _along(direction: Expression, point: Expression, twist: Expression) -> Expression:
+    """Return the speeds (n,) along a direction of a point of a body with a twist (6, n)."""
+    return direction @ twist[:3] + np.cross(point, direction) @ twist[3:]
 
 
 class PairFinder:
@@ -171,10 +226,10 @@ class PairFinder:
     def _make_pair(self, found: DistanceResults, row: int, gap: float, swapped: bool) -> PushPair:
         """Return a pair of results as one of robot and object."""
         robot, thing = found.body_indices[row].tolist()
-        one, other, normal = (found.witnesses[row, k : k + 3].tolist() for k in (0, 3, 6))
-        r, p, n = tuple(one), tuple(other), scale(-1.0, normal)
+        a, b, c, d, e, f, u, v, w = found.witnesses[row].tolist()
+        r, p, n = (a, b, c), (d, e, f), (-u, -v, -w)
         if swapped:
-            robot, thing, r, p, n = thing, robot, p, r, tuple(normal)
+            robot, thing, r, p, n = thing, robot, p, r, (u, v, w)
         twist = self._slots.twist(thing)[:, self._column].tolist()
         velocity = scale(self._sign, move_point(twist, p))
         return PushPair(robot, thing, r, p, n, gap, velocity, find_alignment(n, velocity))

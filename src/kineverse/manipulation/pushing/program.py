@@ -44,6 +44,11 @@ _MARGIN, _RADIUS = 5e-3, 0.035
 _SMOOTH = 0.02
 _ANY = 1e3
 """Speed that restricts nothing."""
+_SIZES = {
+    "gap": 1, "slip": 2, "pushed": 1, "target": 3, "facing": 3, "normal": 3, "reach": 1, "touch": 1,
+    "hold": 1, "engaged": 1, "near": 1, "pace": 1, "free": 1,
+}  # fmt: skip
+"""Number of parameters of each number of a contact, in the order of :attr:`PushNumbers.listed`."""
 
 
 @dataclass(slots=True)
@@ -54,9 +59,6 @@ class PushNumbers:
     ----------
     gap
         Distance of pusher and object [m].
-    relative
-        Derivatives (3 n) of the gap, and of the motion of the tip on the object along two tangents, over the
-        speeds of the program.
     slip
         How far the tip has moved along both tangents since it touched [m].
     pushed
@@ -76,7 +78,6 @@ class PushNumbers:
     """
 
     gap: float
-    relative: Sequence[float]
     slip: Sequence[float]
     pushed: float
     target: Vector
@@ -89,6 +90,14 @@ class PushNumbers:
     near: float
     pace: float
     free: float
+
+    @property
+    def listed(self) -> list[float]:
+        """All numbers, one after the other."""
+        return [
+            self.gap, *self.slip, self.pushed, *self.target, *self.facing, *self.normal, self.reach,
+            self.touch, self.hold, self.engaged, self.near, self.pace, self.free,
+        ]  # fmt: skip
 
 
 class PushProgram:
@@ -110,7 +119,7 @@ class PushProgram:
     controller
         The controller.
     columns
-        Its speeds in the order of :attr:`PushNumbers.relative`, by their index.
+        Its speeds in the order of the derivatives of a contact, by their index.
     object_column
         Index of the object's speed among the speeds of the controller.
     """
@@ -134,44 +143,38 @@ class PushProgram:
         moving = set(model.rates.over_free_speeds(tip.gradient())) - resting - {speed}
         speeds = [*sorted(moving, key=lambda s: s.sort_key), speed]
 
-        parameters: dict[str, list[Symbol]] = {}
-
-        def numbers(name: str, count: int) -> list[Symbol]:
-            parameters[name] = [parameter(f"push/{name}/{k}", 0.0) for k in range(count)]
-            return parameters[name]
-
-        gap = numbers("gap", 1)[0]
-        relative = array(numbers("relative", 3 * len(speeds))).reshape(3, len(speeds))
-        slip = numbers("slip", 2)
-        pushed = numbers("pushed", 1)[0]
-        target, facing = array(numbers("target", 3)), array(numbers("facing", 3))
-        normal = array(numbers("normal", 3))
-        w_reach, w_touch, w_hold, engaged = (numbers(n, 1)[0] for n in ("reach", "touch", "hold", "engaged"))
-        d = gap.with_gradient({s: relative[0, k] for k, s in enumerate(speeds)})
+        parameters = {
+            name: [parameter(f"push/{name}/{k}", 0.0) for k in range(size)] for name, size in _SIZES.items()
+        }
+        one = {name: symbols[0] for name, symbols in parameters.items()}
+        target, facing, normal = (array(parameters[name]) for name in ("target", "facing", "normal"))
+        rates = [parameter(f"push/rate/{k}", 0.0) for k in range(3 * len(speeds))]
+        relative = array(rates).reshape(3, len(speeds))
+        d = one["gap"].with_gradient({s: relative[0, k] for k, s in enumerate(speeds)})
         slips = array(
             [
                 e.with_gradient({s: relative[i + 1, k] for k, s in enumerate(speeds)})
-                for i, e in enumerate(slip)
+                for i, e in enumerate(parameters["slip"])
             ]
         )
         offset = tip - target
         lateral = offset - normal * (normal @ offset)
         aside = sqrt(lateral @ lateral + 1e-8)
-        touched = less(d, numbers("near", 1)[0])
+        touched = less(d, one["near"])
         aligned = less(aside, NEAR)
         v = as_expression(speed)
         ḋ = sum((relative[0, k] * s for k, s in enumerate(speeds)), as_expression(0.0))
         twist = model.jacobian(tool.frame, form="world", symbols=speeds)
         turn = twist[3:] @ array(speeds)
-        most = _ANY * numbers("free", 1)[0]
-        far = _ANY * (1 - engaged)
+        most = _ANY * one["free"]
+        far = _ANY * (1 - one["engaged"])
         tasks: list[Task] = [
-            Goal(coordinate, target_value, name="object", gain=4.0, speed=numbers("pace", 1)[0]),
-            Goal(tip, target, name="reach", gain=3.0, speed=_REACH_SPEED, weight=w_reach),
-            Goal(slips, 0.0, name="no slip", gain=5.0, weight=w_hold),
-            Goal(d, -PRESS, name="press", gain=10.0, weight=w_hold),
+            Goal(coordinate, target_value, name="object", gain=4.0, speed=one["pace"]),
+            Goal(tip, target, name="reach", gain=3.0, speed=_REACH_SPEED, weight=one["reach"]),
+            Goal(slips, 0.0, name="no slip", gain=5.0, weight=one["hold"]),
+            Goal(d, -PRESS, name="press", gain=10.0, weight=one["hold"]),
             Keep(-most, v, most, name="still unless touched"),
-            Keep(-math.inf, pushed * v, far, name="push, never pull"),
+            Keep(-math.inf, one["pushed"] * v, far, name="push, never pull"),
             Keep(-math.inf, ḋ, far, name="object does not run away"),
         ]
         if axis.gradient():  # the pusher of a gantry keeps its direction
@@ -184,7 +187,7 @@ class PushProgram:
         elif logic == "product":
             truth = touched * aligned
         if truth is not None:
-            tasks.append(Goal(truth, 1.0, name="touch", gain=_TOUCH_SPEED, weight=w_touch))
+            tasks.append(Goal(truth, 1.0, name="touch", gain=_TOUCH_SPEED, weight=one["touch"]))
         self.controller = Controller(
             model,
             tasks,
@@ -203,8 +206,8 @@ class PushProgram:
         self._values = np.array([s.value or 0.0 for s in self.controller.inputs])
         self._coordinates = tuple(s for s in self.controller.inputs if s.value is None)
         # Parameters are kept in one vector, and without trends some of them serve nothing.
-        every = [symbol for symbols in parameters.values() for symbol in symbols]
-        self._names = tuple(parameters)
+        every = [*(symbol for symbols in parameters.values() for symbol in symbols), *rates]
+        self._numbers, self._first_rate = np.zeros(len(every)), len(every) - len(rates)
         self._used = np.array([k for k, s in enumerate(every) if s in place], dtype=np.intp)
         self._places = np.array([place[every[k]] for k in self._used], dtype=np.intp)
         self._tip_symbols = tuple(s for s in tip.symbols if not s.order)
@@ -216,16 +219,19 @@ class PushProgram:
         self._values[: len(self._coordinates)] = state.vector(self._coordinates)
         return self.controller.query_contacts(self._values)
 
-    def step(self, numbers: PushNumbers) -> Command:
-        """Return the command for one time step, at the state that was loaded."""
-        flat: list[float] = []
-        for name in self._names:
-            value = getattr(numbers, name)
-            if isinstance(value, float):
-                flat.append(value)
-            else:
-                flat.extend(value)
-        self._values[self._places] = np.array(flat)[self._used]
+    def step(self, numbers: PushNumbers, rates: Array | None) -> Command:
+        """Return the command for one time step, at the state that was loaded.
+
+        Parameters
+        ----------
+        numbers
+            The numbers.
+        rates
+            Derivatives of the contact, see :class:`.ContactRates`; None without a contact.
+        """
+        self._numbers[: self._first_rate] = numbers.listed
+        self._numbers[self._first_rate :] = 0.0 if rates is None else rates
+        self._values[self._places] = self._numbers[self._used]
         return self.controller.step(self._values)
 
     def tip(self, state: State, read: Mapping[Symbol, float] | None = None) -> Vector:

@@ -69,11 +69,3 @@ def move_point(twist: Sequence[float], point: Vector) -> Vector:
     u, v, w, a, b, c = twist
     x, y, z = point
     return u + b * z - c * y, v + c * x - a * z, w + a * y - b * x
-
-
-def apply_force(force: Vector, point: Vector) -> tuple[float, ...]:
-    """Return the wrench (f, p × f) about the origin of a force at a point.
-
-    Its product with a twist (v, ω) is the speed of the point of the body along the force.
-    """
-    return *force, *cross_product(point, force)
