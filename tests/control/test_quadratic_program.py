@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 import sys
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
 import pytest
 import scipy.optimize
 
+from kineverse.control import qp_solver
 from kineverse.control.quadratic_program import QpSolution, make_solver
 from kineverse.errors import InvalidValueError, MissingDependencyError, ShapeError, UnknownNameError
 
@@ -260,3 +262,37 @@ def test_missing_libraries_are_named(monkeypatch: pytest.MonkeyPatch, name_: str
     with pytest.raises(MissingDependencyError, match=rf"needs {library}.*install"):
         solver = make_solver(name_, N, M)
         solver.solve(*random_problem(np.random.default_rng(0)))
+
+
+@pytest.mark.compiler
+def test_solutions_are_checked_in_c_as_in_numpy(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Violations on both sides of the tolerance, soft entries, and what is not finite."""
+    assert qp_solver._library.prepare(wait=True)
+    rng, answers = np.random.default_rng(0), []
+    soft = np.zeros(N + M, bool)
+    soft[[1, N + 2]] = True
+    for case in range(200):
+        H, f, A, lower, upper = problem = random_problem(rng, equalities=2)
+        x = make_solver("daqp", N, M).solve(*problem).x
+        place, size = rng.integers(N + M), 10.0 ** rng.uniform(-10, -6)
+        lower[place] = np.concatenate([x, A @ x])[place] + size
+        upper[place] = max(upper[place], lower[place])
+        if case % 10 == 0:
+            [x, A, lower, upper][rng.integers(4)].flat[place % N] = [np.nan, np.inf, -np.inf][case // 10 % 3]
+        found = []
+        for library in (qp_solver._library, SimpleNamespace(code=None, prepare=lambda: None)):
+            monkeypatch.setattr(qp_solver, "_library", library)
+            solver = make_solver("daqp", N, M, soft=soft if case % 2 else None)
+            solver._bind(H, f, A, lower, upper)
+            with np.errstate(all="ignore"):
+                satisfied = solver._satisfies(x, A, lower, upper)
+            low, high = (bounds.copy() for bounds in solver._bound_by(0.5, lower, upper))
+            found.append((satisfied, low, high))
+        monkeypatch.undo()
+        assert found[0][0] == found[1][0]
+        np.testing.assert_array_equal(found[0][1], np.maximum(lower, -0.5))
+        np.testing.assert_array_equal(found[1][1], found[0][1])
+        np.testing.assert_array_equal(found[0][2], np.minimum(upper, 0.5))
+        np.testing.assert_array_equal(found[1][2], found[0][2])
+        answers.append(satisfied)
+    assert 20 < sum(answers) < 180

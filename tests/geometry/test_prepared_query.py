@@ -147,6 +147,43 @@ def test_motions_match_a_query_at_each_configuration(rows, monkeypatch, tmp_path
             question(coordinates, np.zeros((0, 3)), -1.0)
 
 
+def test_query_at_values_is_an_update_and_a_query(model, either_search):
+    together, apart = Scene(model), Scene(model)
+    facing = [bindings.FacingPoints(np.full((len(s.bodies),) * 2, 0.02), 0.02) for s in (together, apart)]
+    watches = [scene.watch(radius=0.3, per_shape=True) for scene in (together, apart)]
+    together.collision_world._function.wait()
+    rng, counts = np.random.default_rng(5), set()
+    for points in (False, True, False):
+        values = random_state(model, rng).vector(together.inputs)
+        apart.update(values)
+        want = watches[1](0.3, facing[1] if points else None)
+        found = watches[0].at(values, 0.3, facing[0] if points else None)
+        counts.add(len(found))
+        np.testing.assert_array_equal(found.body_indices, want.body_indices)
+        np.testing.assert_array_equal(found.shape_indices, want.shape_indices)
+        np.testing.assert_allclose(found.witnesses, want.witnesses, atol=1e-9)
+        np.testing.assert_array_equal(together.collision_world.values, values)
+        np.testing.assert_array_equal(together.pose("hand"), apart.pose("hand"))
+    assert max(counts) > 5
+    with pytest.raises(kv.errors.InvalidValueError, match="not finite"):
+        watches[0].at(np.full(len(values), np.nan))
+    np.testing.assert_array_equal(together.pose("hand"), apart.pose("hand"))
+    with pytest.raises(kv.errors.ShapeError):
+        watches[0].at(values[:-1])
+
+
+@pytest.mark.compiler
+def test_query_at_values_makes_room_for_its_results(model):
+    scene = Scene(model)
+    watch = scene.watch(radius=10.0, per_shape=True)
+    scene.collision_world._function.wait()
+    watch.prepare()
+    watch.at(random_state(model, np.random.default_rng(0)).vector(scene.inputs))
+    scene.collision_world.table.binding.reserve(3)
+    values = random_state(model, np.random.default_rng(1)).vector(scene.inputs)
+    assert len(watch.at(values)) == len(watch()) > 3
+
+
 @pytest.mark.compiler
 @pytest.mark.parametrize("step", [0.0005, 0.004, 0.3])
 def test_watch_matches_a_query_from_scratch_along_a_random_motion(model, step, monkeypatch):

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+from dataclasses import fields
 from functools import cache
 
 import numpy as np
@@ -13,12 +15,14 @@ from kineverse.control.contact_slots import ContactSlots
 from kineverse.errors import InvalidValueError, UnknownNameError
 from kineverse.geometry import Scene
 from kineverse.manipulation.outcome import Outcome
-from kineverse.manipulation.pushing import placement
+from kineverse.manipulation.pushing import placement, program
 from kineverse.manipulation.pushing.approach import plan_push_approach
 from kineverse.manipulation.pushing.contact_points import PushSurface, find_push_tool
 from kineverse.manipulation.pushing.controller import Pushing
+from kineverse.manipulation.pushing.nearest_pair import ContactRates, PushPair
 from kineverse.manipulation.pushing.placement import RollOut, find_push_start, roll_out
 from kineverse.manipulation.pushing.press import PushPress
+from kineverse.manipulation.pushing.program import PushNumbers
 from kineverse.manipulation.pushing.push_skill import push
 from kineverse.manipulation.pushing.trials import try_push
 from kineverse.manipulation.pushing.vectors import move_point
@@ -142,6 +146,47 @@ def test_contact_slots_keep_a_margin_for_each_pair_and_know_velocities_of_points
         slots.set_margin("robot/flnger", "*", 0.0)
     with pytest.raises(InvalidValueError, match="margin"):
         slots.set_margin(PUSHER, "drawer", 1.0)
+
+
+def test_rates_of_a_contact_are_those_of_finite_differences() -> None:
+    """Of the gap and of the way of the tip on the object, along tangents of any normal."""
+    model = room()
+    scene, speeds = Scene(model), tuple(model.speeds)
+    slots = ContactSlots(scene, speeds, 4, margin=0.005, radius=0.3, gain=10.0)
+    state = opened(flap=0.6) | {"robot/base/x": 0.8, "robot/base/angle": 0.2}
+    slots.update(state.vector(slots.inputs))
+    hand, thing = scene.bodies.index(PUSHER), scene.bodies.index("flap/panel")
+    columns = [3, 0, len(speeds) - 1, 1, 5]
+    rates = ContactRates(slots, columns, hand)
+
+    def place(at: kv.State, frame: str, point: Sequence[float]) -> np.ndarray:
+        """Return where a point of a body that is at `point` now is at another state."""
+        local = np.linalg.inv(model.fk(frame)(state)) @ [*point, 1.0]
+        return np.asarray(model.fk(frame)(at) @ local)[:3]
+
+    r, p, tip = (1.3, 0.1, 0.8), (1.5, 0.05, 0.7), (1.4, 0.2, 0.8)
+    for normal in (0.0, 0.0, -1.0), (0.6, 0.0, 0.8), (-0.36, 0.48, -0.8):
+        pair = PushPair(hand, thing, r, p, normal, 0.1, (0.0, 0.0, 0.0), 1.0)
+        frame = np.array([normal, *pair.tangents])
+        np.testing.assert_allclose(frame @ frame.T, np.eye(3), atol=1e-12)
+        found = rates(pair, pair.tangents, tip).reshape(3, -1)
+        for k, column in enumerate(columns):
+            after = model.integrate(state, {speeds[column]: 1.0}, 1e-6)
+            moved = {"r": place(after, PUSHER, r), "p": place(after, "flap/panel", p)}
+            gap = (moved["r"] - moved["p"] - np.subtract(r, p)) @ frame[0]
+            way = frame[1:] @ (place(after, PUSHER, tip) - place(after, "flap/panel", tip))
+            np.testing.assert_allclose(found[:, k], np.array([gap, *way]) / 1e-6, atol=1e-5)
+
+
+def test_numbers_of_a_push_are_listed_as_its_parameters_are_made() -> None:
+    sizes = program._SIZES
+    assert list(sizes) == [field.name for field in fields(PushNumbers)]
+    ends = np.cumsum(list(sizes.values())).tolist()
+    values = [
+        tuple(map(float, range(end - size, end))) for end, size in zip(ends, sizes.values(), strict=True)
+    ]
+    numbers = PushNumbers(*(v if len(v) > 1 else v[0] for v in values))  # type: ignore[arg-type]
+    assert numbers.listed == [float(k) for k in range(ends[-1])]
 
 
 @pytest.mark.parametrize(

@@ -71,8 +71,8 @@ __attribute__((visibility("default"))) double violation(const Rows *r) {
       r->values[k] = value;
     }
     const double value = r->values[k];
-    const double beyond =
-        !(value <= r->upper[k]) ? value - r->upper[k] : !(value >= r->lower[k]) ? value - r->lower[k] : 0.0;
+    const double above = value - r->upper[k], below = r->lower[k] - value;
+    const double beyond = !(above <= 0.0) ? above : !(below <= 0.0) ? below : 0.0;
     square += value * value;
     sum += r->hard[k] * beyond * beyond;
   }
@@ -215,11 +215,11 @@ class QpSolver(ABC):
         size = values.dot(values)
         if not size < np.inf:
             return False
-        violations = self._hard * (values - np.minimum(np.maximum(values, lower), upper))
+        violations = self._hard * np.maximum(np.maximum(values - upper, lower - values), 0.0)
         return bool(violations.dot(violations) <= _FEASIBLE * (1.0 + size))
 
     def _bound_by(self, limit: float, lower: Vector, upper: Vector) -> tuple[Vector, Vector]:
-        """Return the bounds, as far as they are beyond a limit replaced by it; overwritten by the next call."""
+        """Return the bounds, limited to an absolute value, in arrays that the next call overwrites."""
         code = _library.code
         if code is not None:
             code.bound(self._address, limit)

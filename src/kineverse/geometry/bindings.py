@@ -392,7 +392,7 @@ class _NeighbourBinding:
     def __init__(self, table: ObjectTable, selection: PairSelection) -> None:
         pairs = np.ascontiguousarray(np.argwhere(np.triu(selection.bodies)), dtype=np.int32)
         first = np.searchsorted(np.sort(table.body), np.arange(len(selection.bodies) + 1)).astype(np.int32)
-        self._arrays = {
+        self._arrays: dict[str, npt.NDArray[Any]] = {
             "travel": np.zeros(table.moving),
             "selected": pairs,
             "members": np.argsort(table.body, kind="stable").astype(np.int32),

@@ -233,7 +233,8 @@ class PairSelection:
 
     def __init__(self, table: ObjectTable, bodies: Flags) -> None:
         self.bodies = np.ascontiguousarray(bodies)
-        self._objects = np.ascontiguousarray(self.bodies.any(axis=1)[table.body], dtype=np.uint8)
+        involved = np.asarray(self.bodies.any(axis=1), dtype=np.uint8)
+        self._objects = involved[table.body]
         self.addresses = self.bodies.ctypes.data, self._objects.ctypes.data
 
 

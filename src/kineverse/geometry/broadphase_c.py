@@ -2,8 +2,7 @@
 
 from .broadphase import MEMORY_SLOTS, TREE_WIDTH
 
-SWEEP = (
-    r"""
+SWEEP = r"""
 #include <math.h>
 #include <stdint.h>
 #include <stdlib.h>
@@ -41,9 +40,10 @@ typedef struct {
   double *travel; /* of the moving objects when they were found */
   int32_t *pairs;
   int64_t found, room, resets;
-  const int32_t *selected, *members, *first; /* pairs of bodies; objects by body, and where each body begins */
-  int64_t count;                             /* of the pairs of bodies */
-  double *boxes;                             /* corners of the boxes of bodies */
+  const int32_t *selected;        /* pairs of bodies */
+  const int32_t *members, *first; /* objects by body, and where each body begins */
+  int64_t count;                  /* of the pairs of bodies */
+  double *boxes;                  /* corners of the boxes of bodies */
 } Neighbours;
 
 #define MEMORY_BITS @BITS@
@@ -302,6 +302,4 @@ static int64_t near_again(
   }
   return answer.found;
 }
-""".replace("@BITS@", str(MEMORY_SLOTS.bit_length() - 1))
-    .replace("@WIDTH@", str(TREE_WIDTH))
-)
+""".replace("@BITS@", str(MEMORY_SLOTS.bit_length() - 1)).replace("@WIDTH@", str(TREE_WIDTH))

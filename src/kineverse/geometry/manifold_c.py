@@ -147,8 +147,8 @@ EXPORT int64_t extend(Table *t, Query *q, const Facing *facing) {
   return kept + found;
 }
 
-/* Places the moving objects where a function of some inputs puts them, searches, and adds facing points unless
-   `facing` is NULL. Returns the number of results, or -1 if something is left to do in single steps. */
+/* Places the moving objects where a function of some inputs puts them, searches, and adds facing points,
+   unless `facing` is NULL. Returns the number of results, or -1 if something is left for single steps. */
 EXPORT int64_t search_at(
     Table *t, Query *q, const Facing *facing, Compute compute, const double *inputs, double *poses) {
   if (compute(&inputs, &poses, NULL, NULL, 0) || place(t, poses) != PLACED) return -1;

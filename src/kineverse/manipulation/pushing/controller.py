@@ -350,7 +350,9 @@ class Pushing:
             rest = length(subtract(point.point, tip))
         return self.choice.is_stuck(rest)
 
-    def _numbers(self, tip: Vector, point: PushPoint, contact: PushPair | None) -> tuple[PushNumbers, Array | None]:
+    def _numbers(
+        self, tip: Vector, point: PushPoint, contact: PushPair | None
+    ) -> tuple[PushNumbers, Array | None]:
         """Return the numbers of the program, and the derivatives of a contact."""
         c, m, press = point.point, point.normal, self.press
         near, height = self._aside < NEAR and not self.retreating, inner_product(subtract(tip, c), m)
