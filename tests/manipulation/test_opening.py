@@ -14,6 +14,7 @@ from kineverse.manipulation.base_samples import find_planar_base
 from kineverse.manipulation.belief import EstimateError
 from kineverse.manipulation.opening.hand_paths import HandPaths, find_least_time
 from kineverse.manipulation.opening.placement_samples import PlacementSamples
+from kineverse.manipulation.opening.way_check import WayCheck
 from kineverse.worlds import KinematicWorld, MujocoWorld, Sensors
 
 sys.path.insert(0, str(Path(__file__).parents[1] / "worlds"))
@@ -67,6 +68,7 @@ def test_drawer_closes_again(opened, session):
     closed = open_object(session, DRAWER, target=0.0)
     assert closed, closed.reason
     assert session.world.state[DRAWER] < 0.02
+    assert closed.measures["placements"] == 0  # the way of the opening, backwards
 
 
 def test_drawer_opens_by_friction_on_estimates(model):
@@ -172,6 +174,37 @@ def test_placement_says_how_far_it_leads_and_how_the_hand_goes_away(at_the_door)
     assert not refused
     assert refused.failure == "collision"
     assert not search.find_too_high(state, handle.coordinate, found.values)
+
+
+def test_a_way_is_made_back_where_it_leads_to_the_target(at_the_door):
+    search, handle, state, grasps = at_the_door
+    placement = search.find(state, grasps, 1.0, seed=1)
+    door = handle.coordinate
+    ended = state.updated({door: 1.01})  # not exactly where the way ends
+    back = search.retrace(ended, placement, 0.0)
+    assert back is not None
+    assert back.values[[0, -1]].tolist() == [1.01, 0.0]
+    bar, hand = search.model.fk(handle.frame), search.model.fk(search.gripper.hand)
+    for value, row in zip(back.values, back.way, strict=True):
+        at = ended.updated({door: value} | dict(zip(back.coordinates, row, strict=True)))
+        np.testing.assert_allclose(hand(at), bar(at) @ placement.grasp.pose, atol=1e-3)
+    np.testing.assert_allclose(back.approach, placement.retreat[-1], atol=0.05)
+    np.testing.assert_allclose(back.line[-1], back.way[0], atol=1e-3)
+    # A part of the way leads back as well; one that goes on, or begins elsewhere, does not.
+    assert search.retrace(ended, placement, 0.5).values[-1] == 0.5
+    assert search.retrace(ended, placement, -0.5).values[-1] == pytest.approx(0.0, abs=0.03)
+    assert search.retrace(ended, placement, 1.3) is None
+    assert search.retrace(state.updated({door: 0.6}), placement, 0.0) is None
+    assert search.retrace(ended, placement, 0.0, accept=lambda found: False) is None
+
+
+def test_a_way_back_is_looked_at_anew(at_the_door, monkeypatch):
+    search, handle, state, grasps = at_the_door
+    placement = search.find(state, grasps, 1.0, seed=1)
+    ended = state.updated({handle.coordinate: 1.0})
+    monkeypatch.setattr(WayCheck, "_find", lambda *_, **__: 0)
+    monkeypatch.setattr(WayCheck, "_note", lambda *_: "")
+    assert search.retrace(ended, placement, 0.0) is None
 
 
 def test_joints_at_their_limits_leave_the_rest_of_a_step_to_the_others():

@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 import math
+from collections import deque
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager, suppress
 from threading import Thread
 from time import perf_counter, thread_time
+from typing import TYPE_CHECKING
 
 from kineverse._checks import finite_number
 from kineverse.control import Command
@@ -21,6 +23,9 @@ from kineverse.worlds import Observation, World
 from .belief import Belief, TrueBelief
 from .hand_reference import HandReference
 from .outcome import SkillError
+
+if TYPE_CHECKING:
+    from .opening.base_placement import BasePlacement
 
 Speeds = Mapping[Symbol, float]
 
@@ -71,6 +76,9 @@ class Session:
         Number of steps.
     cpu, wall
         Durations of the computations of each step by the name given to :meth:`timed` [s].
+    made
+        Placements of the grasped motions that were made, by the frame of the handle, the last one at the end:
+        their ways lead back, too.
     answers
         Whether the world has answered the last step within the time-out.
 
@@ -114,6 +122,7 @@ class Session:
         self.phase, self.steps = "", 0
         self.cpu: dict[str, list[float]] = {}
         self.wall: dict[str, list[float]] = {}
+        self.made: dict[str, deque[BasePlacement]] = {}
 
     @property
     def observation(self) -> Observation | None:

@@ -103,6 +103,11 @@ class HandPaths:
         rest = e - (J @ center[:, :, None])[:, :, 0]
         return np.asarray(center + (WJt @ np.linalg.solve(damped, rest[:, :, None]))[:, :, 0])
 
+    def find_poses(self, Q: Array, base: Array) -> Array:
+        """Return poses world_T_hand (N, 4, 4) at configurations (N, n), with values (m,) of what stands."""
+        poses, _ = self._f.batch(np.hstack([Q, np.tile(base, (len(Q), 1))]))
+        return np.asarray(poses)
+
     def find_heights(self, Q: Array, base: Array, points: Array) -> tuple[Array, Array]:
         """Return the heights (N,) of the highest of some points of the hand, and their derivatives (N, n).
 

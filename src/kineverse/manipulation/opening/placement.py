@@ -24,7 +24,7 @@ from kineverse.symbols import Symbol
 
 from .base_placement import NO_WAY, BasePlacement
 from .hand_height import find_highest_passage, find_highest_reach
-from .hand_paths import HandPaths
+from .hand_paths import TOLERANCE, HandPaths
 from .placement_samples import PlacementSamples
 from .way_check import CandidateWay, WayCheck, interpolate_poses
 from .way_contacts import OWN_MARGIN, WayContacts
@@ -34,6 +34,8 @@ _STEP = 0.05
 _RANDOM_STATES = 24
 """Number of random states in which links that are always near to each other are sought."""
 _START_ITERATIONS = 30
+_CORRECTIONS = 6
+"""Iterations from a configuration to one near it."""
 _STARTS = 4
 """Arms that are tried for each base."""
 _MIDDLES = (0.5, 0.5, 0.25, 0.5, 0.0)
@@ -174,6 +176,32 @@ class PlacementSearch:
         return found or search.nothing
 
 
+    def retrace(
+        self,
+        state: State,
+        earlier: BasePlacement,
+        target: float,
+        accept: Callable[[BasePlacement], bool] = lambda placement: True,
+    ) -> BasePlacement | None:
+        """Return the way of an earlier placement backwards, as far as it leads to a target; None if it fails.
+
+        What was possible once is possible backwards, also where an open door leaves no way to another place.
+        Contacts are looked for anew.
+
+        Parameters
+        ----------
+        state
+            State of everything at the beginning.
+        earlier
+            Placement of a motion from about the target to about the present value of the object's coordinate.
+        target, accept
+            As for :meth:`find`.
+        """
+        assert earlier.grasp is not None
+        search = _Search(self, state, [earlier.grasp], target, accept, np.random.default_rng(0))
+        return search.retrace(earlier)
+
+
 class _Search:
     """Search for one grasped motion: candidates, the best first, and why the others failed."""
 
@@ -272,6 +300,34 @@ class _Search:
 
     def _push(self, candidate: CandidateWay, score: float) -> None:
         heappush(self.heap, (-candidate.end, score, next(self.number), candidate))
+
+    def retrace(self, earlier: BasePlacement) -> BasePlacement | None:
+        """Return the way of an earlier placement backwards, without contacts; None if there is none."""
+        paths, count = self.owner.paths, len(self.owner.moving)
+        first, last = earlier.values[[-1, 0]]
+        left = np.sign(last - first) * (last - self.values)
+        end = int((left > -_STEP / 2).sum()) - 1
+        if abs(self.values[0] - first) > _STEP / 2 or left[0] < left[-1] or end < self.least:
+            return None
+        base = earlier.way[0, count:]
+        order = np.argsort(earlier.values)
+        rows = [np.interp(self.values, earlier.values[order], q[order]) for q in earlier.way.T[:count]]
+        way = self._correct(np.stack(rows, axis=1), base, self.handles @ self.poses[0])
+        # The hand comes on the way on which it left, in the same place beside the handle.
+        retreat = earlier.retreat[:, :count]
+        handle = self.handles[0] @ self.poses[0]
+        poses = paths.find_poses(retreat, base)
+        back = self._correct(retreat, base, handle @ np.linalg.inv(poses[0]) @ poses)
+        if way is None or back is None:
+            return None
+        found = self._check(CandidateWay(0, base, back, way, end))
+        whole = found is not None and len(found.values) == end + 1
+        return found if whole and self.accept(found) else None
+
+    def _correct(self, Q: Array, base: Array, poses: Array) -> Array | None:
+        """Return configurations near to some (K, n) at which the hand is at poses; None if one fails."""
+        found, error = self.owner.paths.solve(Q, np.tile(base, (len(Q), 1)), poses, _CORRECTIONS)
+        return found if error.max() < TOLERANCE else None
 
     # -- checks --------------------------------------------------------------------------------------------
 
