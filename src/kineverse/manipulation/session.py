@@ -77,8 +77,8 @@ class Session:
     cpu, wall
         Durations of the computations of each step by the name given to :meth:`timed` [s].
     made
-        Placements of the grasped motions that were made, by the frame of the handle, the last one at the end:
-        their ways lead back, too.
+        Placements of the grasped motions that were made, by the version of the model and the frames of hand
+        and handle, the last one at the end: their ways lead back, too.
     answers
         Whether the world has answered the last step within the time-out.
 
@@ -122,7 +122,7 @@ class Session:
         self.phase, self.steps = "", 0
         self.cpu: dict[str, list[float]] = {}
         self.wall: dict[str, list[float]] = {}
-        self.made: dict[str, deque[BasePlacement]] = {}
+        self.made: dict[tuple[int, str, str], deque[BasePlacement]] = {}
 
     @property
     def observation(self) -> Observation | None:

@@ -209,7 +209,8 @@ class _Run:
         self._rest = math.inf
         self._earlier: list[Mapping[str, Any]] = []
         self._approach = Approach()
-        self._ways_back = list(session.made.get(handle.frame, ()))
+        self._made_by = self.model.version, self.gripper.hand, handle.frame
+        self._ways_back = list(session.made.get(self._made_by, ()))
         self.judge = Judge(self.model, session.world.robot, self.gripper, handle=handle.frame)
         self.judge.update(session.world.state)
         self.motion = HandMotion(
@@ -277,7 +278,7 @@ class _Run:
         try:
             if self.motion.close(placement.grasp):
                 move_held(self.motion, placement, self.tolerance)
-                self.session.made.setdefault(self.handle.frame, deque(maxlen=_WAYS)).append(placement)
+                self.session.made.setdefault(self._made_by, deque(maxlen=_WAYS)).append(placement)
         except SlipError as slip:
             self.slips.append(str(slip))
         except SkillError as error:

@@ -321,8 +321,9 @@ class _Search:
         if way is None or back is None:
             return None
         found = self._check(CandidateWay(0, base, back, way, end))
-        whole = found is not None and len(found.values) == end + 1
-        return found if whole and self.accept(found) else None
+        if found is None or len(found.values) <= end or not self.accept(found):
+            return None
+        return found
 
     def _correct(self, Q: Array, base: Array, poses: Array) -> Array | None:
         """Return configurations near to some (K, n) at which the hand is at poses; None if one fails."""
