@@ -345,6 +345,9 @@ def test_wrong_arguments_are_refused(session):
         open_object(session, DRAWER, target=3.0)
     with pytest.raises(KineverseError):
         open_object(session, DRAWER, handle="shelf_drawers/lower_drawer_handle")
+    for count in (0, 2.5, True):
+        with pytest.raises(InvalidValueError, match="placements= is an integer of at least 1"):
+            open_object(session, DRAWER, placements=count)
 
 
 def test_an_object_that_is_never_seen_is_not_opened(model):

@@ -419,6 +419,8 @@ def test_push_says_what_is_wrong() -> None:
     refuse(InvalidValueError, "moves no body", what="robot/lift", target=1.0)
     refuse(UnknownNameError, "object_frames=", object_frames="wall")
     refuse(UnknownNameError, "dor", what="dor")
+    with pytest.raises(InvalidValueError, match="samples= is an integer of at least 1"):
+        find_push_start(Pushing(model, "door", PUSHER, start, target=0.0), start, samples=0)
     world = KinematicWorld(model, "robot")
     world.reset(start | {"robot/base/x": 1.75})
     outcome = push(Session(world), "door", bodies=PUSHER)

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-from collections import deque
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager, suppress
 from threading import Thread
@@ -25,7 +24,7 @@ from .hand_reference import HandReference
 from .outcome import SkillError
 
 if TYPE_CHECKING:
-    from .opening.base_placement import BasePlacement
+    from .opening.base_placement import MadeWays
 
 Speeds = Mapping[Symbol, float]
 
@@ -77,8 +76,7 @@ class Session:
     cpu, wall
         Durations of the computations of each step by the name given to :meth:`timed` [s].
     made
-        Placements of the grasped motions that were made, by the version of the model and the frames of hand
-        and handle, the last one at the end: their ways lead back, too.
+        Placements of the grasped motions that were made: their ways lead back, too.
     answers
         Whether the world has answered the last step within the time-out.
 
@@ -122,7 +120,7 @@ class Session:
         self.phase, self.steps = "", 0
         self.cpu: dict[str, list[float]] = {}
         self.wall: dict[str, list[float]] = {}
-        self.made: dict[tuple[int, str, str], deque[BasePlacement]] = {}
+        self.made: MadeWays = {}
 
     @property
     def observation(self) -> Observation | None:

@@ -11,6 +11,7 @@ from typing import Any
 from kineverse.errors import KineverseError
 from kineverse.grasping import find_gripper, find_handle
 from kineverse.manipulation import Outcome, Session, open_object
+from kineverse.manipulation.opening.base_placement import MadeWays
 from kineverse.manipulation.pushing.controller import Pushing
 from kineverse.manipulation.pushing.trials import try_push
 from kineverse.model.model import Model
@@ -109,6 +110,8 @@ def open_then_close(
 ) -> list[Trial]:
     """Return the trials of opening an object in a world and, if that was done, of closing it.
 
+    Closing knows the ways on which the object was opened.
+
     Parameters
     ----------
     case
@@ -122,10 +125,12 @@ def open_then_close(
     """
     world.reset(start)
     trials: list[Trial] = []
+    made: MadeWays = {}
     for skill, target in zip(("open", "close"), targets, strict=True):
 
         def act(watch: TrialWatch, target: float = target) -> Outcome:
             session = watch.open_session(world, DT)
+            session.made = made
             return open_object(session, case.what, target=target, seed=case.seed)
 
         trials.append(case.run(skill, model, act))

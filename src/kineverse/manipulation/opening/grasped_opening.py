@@ -10,6 +10,7 @@ from typing import Any
 
 import numpy as np
 
+from kineverse._checks import as_count
 from kineverse.control import Controller
 from kineverse.errors import InfeasibleError, InvalidValueError, NotFiniteError
 from kineverse.grasping import Grasp, Gripper, Handle, find_gripper, find_handle, sample_grasps
@@ -108,11 +109,13 @@ def open_object(
     Raises
     ------
     UnknownNameError, InvalidValueError
-        Without a gripper or a handle, for a coordinate of the robot, or a target out of limits.
+        Without a gripper or a handle, for a coordinate of the robot, a target out of limits, or less than one
+        placement.
     """
     world, model = session.world, session.world.model
     coordinate = find_object_coordinate(world, what)
     seconds = check_positive("seconds", seconds)
+    placements, seed = as_count("placements", placements, 1), as_count("seed", seed, 0)
     fixed, here = explain_fixed(model, coordinate, session.state), float(world.state[coordinate])
     if fixed and (target is None or check_target(target) != here):
         return Outcome(False, here, fixed, world.name, 0.0, 0, {"failure": "other"})

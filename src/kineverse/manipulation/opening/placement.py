@@ -11,6 +11,7 @@ from time import perf_counter
 import numpy as np
 import numpy.typing as npt
 
+from kineverse._checks import as_count
 from kineverse.errors import InvalidValueError
 from kineverse.geometry import Scene
 from kineverse.grasping import Grasp, Gripper
@@ -159,8 +160,15 @@ class PlacementSearch:
             Largest number of bases, and how many are tried at once.
         seed
             Seed of the samples.
+
+        Raises
+        ------
+        InvalidValueError
+            For less than one sample.
         """
-        search = _Search(self, state, grasps, target, accept, np.random.default_rng(seed))
+        samples, batch = as_count("samples", samples, 1), as_count("batch", batch, 1)
+        random = np.random.default_rng(as_count("seed", seed, 0))
+        search = _Search(self, state, grasps, target, accept, random)
         if not self.base:
             samples = batch
         for number in count():
@@ -174,7 +182,6 @@ class PlacementSearch:
             if number == 1:
                 search.add_here()
         return found or search.nothing
-
 
     def retrace(
         self,

@@ -12,6 +12,7 @@ from typing import NamedTuple
 import numpy as np
 import numpy.typing as npt
 
+from kineverse._checks import as_count
 from kineverse.compile.build_queue import working_seconds
 from kineverse.control import Goal, Hold, InverseKinematics, Target
 from kineverse.control.tasks import Task
@@ -131,8 +132,14 @@ def find_push_start(
         Share of the motion from which on a start counts whose push goes the farthest, if none goes through.
     accept
         Further test of a start, such as a trial in a world: returns the reason against it, or nothing.
+
+    Raises
+    ------
+    InvalidValueError
+        For less than one sample.
     """
     begin, worked, reasons = perf_counter(), working_seconds(), Counter[str]()
+    samples, seed = as_count("samples", samples, 1), as_count("seed", seed, 0)
     sampler = _Sampler(pushing, state, np.random.default_rng(seed))
     if sampler.unreachable:
         reasons[_UNREACHED] = sampler.unreachable

@@ -159,7 +159,7 @@ def explore_locks(
         As :func:`kineverse.reasoning.plan_unlocking`; also for coordinates without limits.
     """
     goals = {model.degree_of_freedom(name): float(value) for name, value in goal.items()}
-    return _Explorer(model, state, move, as_count("seed=", seed, 0)).run(goals, as_count("most=", most, 1))
+    return _Explorer(model, state, move, as_count("seed", seed, 0)).run(goals, as_count("most", most, 1))
 
 
 class _Explorer:
