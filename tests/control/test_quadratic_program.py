@@ -285,8 +285,8 @@ def test_solutions_are_checked_in_c_as_in_numpy(monkeypatch: pytest.MonkeyPatch)
             solver = make_solver("daqp", N, M, soft=soft if case % 2 else None)
             solver._bind(H, f, A, lower, upper)
             with np.errstate(all="ignore"):
-                satisfied = solver._satisfies(x, A, lower, upper)
-            low, high = (bounds.copy() for bounds in solver._bound_by(0.5, lower, upper))
+                satisfied = solver._satisfies(x)
+            low, high = (bounds.copy() for bounds in solver._bound_by(0.5))
             found.append((satisfied, low, high))
         monkeypatch.undo()
         assert found[0][0] == found[1][0]

@@ -170,6 +170,57 @@ def test_query_at_values_is_an_update_and_a_query(model, either_search):
     np.testing.assert_array_equal(together.pose("hand"), apart.pose("hand"))
     with pytest.raises(kv.errors.ShapeError):
         watches[0].at(values[:-1])
+    apart.update(values)
+    found = watches[0].at(values.tolist())  # slower
+    np.testing.assert_array_equal(found.body_indices, watches[1]().body_indices)
+
+
+@pytest.mark.compiler
+@pytest.mark.parametrize("shapes", [1, 5])
+def test_neighbours_are_found_by_boxes_of_bodies_or_by_a_sweep(shapes):
+    """Bodies of several shapes have boxes of their own; what is near is the same from scratch."""
+    rng, model = np.random.default_rng(2), kv.Model()
+    rail = kv.position("rail")
+    with model.edit() as edit:
+        edit.add_frame("carriage", "world", kv.translation(rail, 0, 0))
+        for k in range(24):
+            parts = [
+                Shape(
+                    Box(tuple(rng.uniform(0.02, 0.2, 3).tolist())),
+                    Pose.from_matrix(np.vstack([np.c_[np.eye(3), rng.uniform(-0.2, 0.2, 3)], [0, 0, 0, 1]])),
+                )
+                for _ in range(shapes)
+            ]
+            at = kv.translation(*rng.uniform(-1, 1, 3)) @ kv.rpy(*rng.uniform(-3, 3, 3))
+            edit.add_frame(
+                f"body{k}", "carriage" if k % 3 else "world", at, body=Body(collisions=tuple(parts))
+            )
+    scene = Scene(model)
+    watch = scene.watch(radius=0.4, moving=[rail])
+    counts = set()
+    for value in np.cumsum(rng.normal(0.0, 0.2, 40)):
+        found = watch.at(np.array([value]))
+        fresh = Scene(model)
+        fresh.update({rail: value})
+        want = fresh.watch(radius=0.4, moving=[rail])()
+        np.testing.assert_array_equal(found.body_indices, want.body_indices)
+        np.testing.assert_allclose(found.distances, want.distances, atol=1e-9)
+        counts.add(len(found))
+    assert len(counts) > 3
+    assert (watch._selection.binding._struct.boxes is not None) == (shapes > 1)
+
+
+@pytest.mark.compiler
+def test_queries_at_values_reset_a_travel_that_is_too_long(model):
+    scene = Scene(model)
+    watch = scene.watch(radius=0.1)
+    scene.collision_world._function.wait()
+    state = random_state(model, np.random.default_rng(0))
+    for rail in (0.0, 2e4, 0.0):
+        watch.at(state.updated({"rail": rail}).vector(scene.inputs))
+    table = scene.collision_world.table
+    assert table.resets > 0
+    assert table.travel.max() < 2.1e4
 
 
 @pytest.mark.compiler

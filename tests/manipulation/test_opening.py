@@ -1,5 +1,6 @@
 import re
 import sys
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -181,7 +182,7 @@ def test_a_way_is_made_back_where_it_leads_to_the_target(at_the_door):
     placement = search.find(state, grasps, 1.0, seed=1)
     door = handle.coordinate
     ended = state.updated({door: 1.01})  # not exactly where the way ends
-    back = search.retrace(ended, placement, 0.0)
+    back = search.retrace(ended, placement, handle, 0.0)
     assert back is not None
     assert back.values[[0, -1]].tolist() == [1.01, 0.0]
     bar, hand = search.model.fk(handle.frame), search.model.fk(search.gripper.hand)
@@ -190,12 +191,16 @@ def test_a_way_is_made_back_where_it_leads_to_the_target(at_the_door):
         np.testing.assert_allclose(hand(at), bar(at) @ placement.grasp.pose, atol=1e-3)
     np.testing.assert_allclose(back.approach, placement.retreat[-1], atol=0.05)
     np.testing.assert_allclose(back.line[-1], back.way[0], atol=1e-3)
-    # A part of the way leads back as well; one that goes on, or begins elsewhere, does not.
-    assert search.retrace(ended, placement, 0.5).values[-1] == 0.5
-    assert search.retrace(ended, placement, -0.5).values[-1] == pytest.approx(0.0, abs=0.03)
-    assert search.retrace(ended, placement, 1.3) is None
-    assert search.retrace(state.updated({door: 0.6}), placement, 0.0) is None
-    assert search.retrace(ended, placement, 0.0, accept=lambda found: False) is None
+    assert search.retrace(ended, placement, handle, 0.5).values[-1] == 0.5
+    # Beyond its end the way leads a part of the way only; it neither goes on nor begins elsewhere.
+    assert search.retrace(ended, placement, handle, -0.5) is None
+    assert search.retrace(ended, placement, handle, -0.5, whole=False).values[-1] == 0.0
+    assert search.retrace(ended, placement, handle, -9.0, whole=False) is None
+    assert search.retrace(ended, placement, handle, 1.3, whole=False) is None
+    assert search.retrace(state.updated({door: 0.6}), placement, handle, 0.0) is None
+    assert search.retrace(ended, placement, handle, 0.0, accept=lambda found: False) is None
+    other = replace(handle, coordinate=kv.position("stage"))
+    assert search.retrace(ended | kv.State({other.coordinate: 1.0}), placement, other, 0.0) is None
 
 
 def test_a_way_back_is_looked_at_anew(at_the_door, monkeypatch):
@@ -204,7 +209,7 @@ def test_a_way_back_is_looked_at_anew(at_the_door, monkeypatch):
     ended = state.updated({handle.coordinate: 1.0})
     monkeypatch.setattr(WayCheck, "_find", lambda *_, **__: 0)
     monkeypatch.setattr(WayCheck, "_note", lambda *_: "")
-    assert search.retrace(ended, placement, 0.0) is None
+    assert search.retrace(ended, placement, handle, 0.0) is None
 
 
 def test_joints_at_their_limits_leave_the_rest_of_a_step_to_the_others():

@@ -26,12 +26,12 @@ class DaqpSolver(QpSolver):
     def _solve(self, H: Vector, f: Vector, A: Vector, lower: Vector, upper: Vector) -> QpSolution:
         if self._warm:
             # A bound of the last active set that is infinite now gives wrong solutions, reported as solved.
-            low, high = self._bound_by(_INFINITY, lower, upper)
+            low, high = self._bound_by(_INFINITY)
             # The solver keeps these arrays, and the active set of the last solve.
             model = self._model
             if model.update(H, f, A if self.m else None, high, low) == 0:
                 x, _, flag, info = model.solve()
-                if (flag == 1 or flag == 2) and self._satisfies(x, A, lower, upper):
+                if (flag == 1 or flag == 2) and self._satisfies(x):
                     return QpSolution(x, info["lam"], info["iterations"], "solved")
         self._warm = False
         status = self._unsolvable(H, f, A, lower, upper)
@@ -46,7 +46,7 @@ class DaqpSolver(QpSolver):
         # Where equalities are nearly dependent, it succeeds after it has eliminated them.
         for settings in (usual, _REDUCED_SETTINGS):
             flag, x, multipliers, iterations = self._start(H, f, A, lower, upper, one, settings)
-            if flag >= 1 and self._satisfies(x, A, lower, upper):
+            if flag >= 1 and self._satisfies(x):
                 self._warm = settings is usual
                 return QpSolution(x, multipliers, iterations, "solved")
             flags.add(flag)
@@ -61,7 +61,7 @@ class DaqpSolver(QpSolver):
                 *scaled, lower * scale, upper * scale, scale, settings
             )
             x = x * unit
-            if flag >= 1 and self._satisfies(x, A, lower, upper):
+            if flag >= 1 and self._satisfies(x):
                 return QpSolution(x, multipliers * scale, iterations, "solved")
             flags.add(flag)
             if flags <= _INFEASIBLE:

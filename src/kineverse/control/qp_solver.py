@@ -151,7 +151,7 @@ class QpSolver(ABC):
             raise InvalidValueError("The weights of soft rows are finite and above 0.")
         if not (np.isfinite(self._linear) & (self._linear >= 0)).all():
             raise InvalidValueError("The linear weights of soft rows are finite and at least 0.")
-        self._bound: tuple[object, ...] = (None,) * 5
+        self._bound: tuple[Any, ...] = (None,) * 5
         self._hard, self._any_soft = (~self.soft).astype(float), bool(self.soft.any())
         self._values, self._low, self._high = np.zeros((3, n + m))
         self._x = self._values[:n]
@@ -204,13 +204,13 @@ class QpSolver(ABC):
     def _solve(self, H: Vector, f: Vector, A: Vector, lower: Vector, upper: Vector) -> QpSolution:
         """Solve a problem with arrays of the right shapes and any numbers."""
 
-    def _satisfies(self, x: Vector, A: Vector, lower: Vector, upper: Vector) -> bool:
-        """Return whether x satisfies the hard rows; any NaN, in the data or in x, makes that False."""
+    def _satisfies(self, x: Vector) -> bool:
+        """Return whether x satisfies the problem's hard rows; any NaN, there or in x, makes that False."""
         self._x[:] = x
         code = _library.code
         if code is not None:
             return bool(code.violation(self._address) <= _FEASIBLE)
-        values = self._values
+        values, (_, _, A, lower, upper) = self._values, self._bound
         A.dot(x, values[self.n :])
         size = values.dot(values)
         if not size < np.inf:
@@ -218,9 +218,9 @@ class QpSolver(ABC):
         violations = self._hard * np.maximum(np.maximum(values - upper, lower - values), 0.0)
         return bool(violations.dot(violations) <= _FEASIBLE * (1.0 + size))
 
-    def _bound_by(self, limit: float, lower: Vector, upper: Vector) -> tuple[Vector, Vector]:
-        """Return the bounds, limited to an absolute value, in arrays that the next call overwrites."""
-        code = _library.code
+    def _bound_by(self, limit: float) -> tuple[Vector, Vector]:
+        """Return the problem's bounds within a limit, in arrays that the next call overwrites."""
+        code, (*_, lower, upper) = _library.code, self._bound
         if code is not None:
             code.bound(self._address, limit)
         else:

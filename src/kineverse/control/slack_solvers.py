@@ -37,7 +37,7 @@ class _SlackSolver(QpSolver):
         self._H[:n, :n], self._f[:n], self._C[n:entries, :n] = H, f, A
         self._lower[:entries], self._upper[:entries] = lower, upper
         x, multipliers, iterations, status = self._solve_hard()
-        if status == "solved" and not self._satisfies(x[:n], A, lower, upper):
+        if status == "solved" and not self._satisfies(x[:n]):
             status = "failed"
         if status != "solved":
             self.reset()

@@ -32,6 +32,9 @@ _ARRAYS = (
 )  # fmt: skip
 
 
+_SEVERAL, _MANY = 2, 16
+"""Objects of a body from which on near pairs are found by the boxes of bodies, and pairs of bodies for each
+object up to which they are; otherwise objects are swept."""
 _GATHERED = ("pieces", "bodies", "distance", "witness")
 
 RankedPairs: TypeAlias = tuple[Indices, Indices, Floats, Floats]
@@ -402,6 +405,8 @@ class _NeighbourBinding:
         self._struct = _NeighbourStruct(resets=-1, count=len(pairs))
         for name, array in self._arrays.items():
             setattr(self._struct, name, array.ctypes.data)
+        if table.count < _SEVERAL * len(selection.bodies) or len(pairs) > _MANY * table.count:
+            self._struct.boxes = None
         self.address = ctypes.addressof(self._struct)
         self.reserve(1024)
 

@@ -43,7 +43,7 @@ typedef struct {
   const int32_t *selected;        /* pairs of bodies */
   const int32_t *members, *first; /* objects by body, and where each body begins */
   int64_t count;                  /* of the pairs of bodies */
-  double *boxes;                  /* corners of the boxes of bodies */
+  double *boxes;                  /* corners of the boxes of bodies; NULL for a sweep */
 } Neighbours;
 
 #define MEMORY_BITS @BITS@
@@ -80,6 +80,7 @@ EXPORT int64_t place(Table *t, const double *fresh) {
   for (int64_t k = 0; k < t->moving; k++) {
     const double *new = fresh + 12 * k, *c = t->centre + 3 * k, *h = t->half + 3 * k;
     double *old = t->poses + 12 * k, turned = 0.0, shifted = 0.0;
+    if (t->travel[k] > LONGEST_TRAVEL) outcome = TRAVEL_EXCEEDED;
     if (!memcmp(new, old, 12 * sizeof(double))) continue;
     for (int r = 0; r < 3; r++) {
       const double *row = new + 4 * r;
@@ -287,7 +288,8 @@ static int64_t near_again(
     Table *t, Neighbours *known, double reach, int32_t *pairs, double *lows, int64_t room) {
   if (known->resets != t->resets || !(reach + approached(t, known) <= known->reach)) {
     known->resets = -1;
-    const int64_t found = near_selected(t, known, reach + SPARE);
+    const int64_t found = known->boxes ? near_selected(t, known, reach + SPARE)
+                                       : near(t, reach + SPARE, known->pairs, NULL, known->room);
     if (found > known->room) return -found;
     known->found = found;
     known->reach = reach + SPARE;

@@ -220,7 +220,8 @@ class CollisionWorld:
         :meth:`.CollisionLibrary.search_at`.
         """
         address = self.kinematics_address
-        if address is None or values.shape != self._evaluator.input.shape:
+        usable = type(values) is np.ndarray and values.dtype == np.float64
+        if address is None or not usable or values.shape != self._evaluator.input.shape:
             return None
         self._evaluator.input[:] = values
         kinematics = address, *self._addresses

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections import deque
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager, suppress
 from threading import Thread
@@ -24,12 +25,14 @@ from .hand_reference import HandReference
 from .outcome import SkillError
 
 if TYPE_CHECKING:
-    from .opening.base_placement import MadeWays
+    from .opening.base_placement import BasePlacement
 
 Speeds = Mapping[Symbol, float]
 
 STALE = 0.06
 """Age of the latest readings from which on a skill ends [s]."""
+_MADE = 64
+"""Number of motions that are remembered."""
 
 
 class Session:
@@ -76,7 +79,7 @@ class Session:
     cpu, wall
         Durations of the computations of each step by the name given to :meth:`timed` [s].
     made
-        Placements of the grasped motions that were made: their ways lead back, too.
+        Placements of the grasped motions that were made, the last one at the end: their ways lead back, too.
     answers
         Whether the world has answered the last step within the time-out.
 
@@ -120,7 +123,7 @@ class Session:
         self.phase, self.steps = "", 0
         self.cpu: dict[str, list[float]] = {}
         self.wall: dict[str, list[float]] = {}
-        self.made: MadeWays = {}
+        self.made: deque[BasePlacement] = deque(maxlen=_MADE)
 
     @property
     def observation(self) -> Observation | None:

@@ -11,7 +11,6 @@ from typing import Any
 from kineverse.errors import KineverseError
 from kineverse.grasping import find_gripper, find_handle
 from kineverse.manipulation import Outcome, Session, open_object
-from kineverse.manipulation.opening.base_placement import MadeWays
 from kineverse.manipulation.pushing.controller import Pushing
 from kineverse.manipulation.pushing.trials import try_push
 from kineverse.model.model import Model
@@ -125,12 +124,14 @@ def open_then_close(
     """
     world.reset(start)
     trials: list[Trial] = []
-    made: MadeWays = {}
+    session: Session | None = None
     for skill, target in zip(("open", "close"), targets, strict=True):
 
         def act(watch: TrialWatch, target: float = target) -> Outcome:
+            nonlocal session
+            made = () if session is None else session.made
             session = watch.open_session(world, DT)
-            session.made = made
+            session.made.extend(made)
             return open_object(session, case.what, target=target, seed=case.seed)
 
         trials.append(case.run(skill, model, act))

@@ -2,9 +2,8 @@
 
 from __future__ import annotations
 
-from collections import Counter, deque
+from collections import Counter
 from dataclasses import dataclass
-from typing import TypeAlias
 
 from kineverse.grasping import Grasp
 from kineverse.lie import Array
@@ -70,8 +69,3 @@ class BasePlacement:
             f"Found after {self.samples} {what}" if self else f"None of {self.samples} {what} goes through"
         )
         return f"{found}; failed: {failed}." if failed else f"{found}."
-
-
-MadeWays: TypeAlias = dict[tuple[int, str, str], deque[BasePlacement]]
-"""Placements of motions that were made, by the version of the model and the frames of hand and handle; the
-last one is at the end."""

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import contextlib
 import math
-from collections import deque
 from collections.abc import Hashable, Mapping
 from typing import Any
 
@@ -48,8 +47,8 @@ _LATE = 1.0
 """Time before the end at which it counts as up [s]."""
 _OVERLAP = 1e-3
 """Penetration from which on the reason says it [m]."""
-_KEPT, _WAYS = 15, 8
-"""Number of sets of grasps that are kept, and of the ways of each object."""
+_KEPT = 15
+"""Number of sets of grasps that are kept."""
 _MOST_SLIPS, _LEAST_PROGRESS = 2, 0.1
 """Number of slips from which on a grasp has to take an object further, by a share of the rest."""
 _HEIGHTS = 12
@@ -212,8 +211,7 @@ class _Run:
         self._rest = math.inf
         self._earlier: list[Mapping[str, Any]] = []
         self._approach = Approach()
-        self._made_by = self.model.version, self.gripper.hand, handle.frame
-        self._ways_back = list(session.made.get(self._made_by, ()))
+        self._ways_back = list(session.made)
         self.judge = Judge(self.model, session.world.robot, self.gripper, handle=handle.frame)
         self.judge.update(session.world.state)
         self.motion = HandMotion(
@@ -281,7 +279,7 @@ class _Run:
         try:
             if self.motion.close(placement.grasp):
                 move_held(self.motion, placement, self.tolerance)
-                self.session.made.setdefault(self._made_by, deque(maxlen=_WAYS)).append(placement)
+                self.session.made.append(placement)
         except SlipError as slip:
             self.slips.append(str(slip))
         except SkillError as error:
@@ -366,21 +364,34 @@ class _Run:
 
     def _place(self) -> BasePlacement:
         """Return a placement that leads as far as possible, and plan the way to the handle."""
-        found = self._retrace() or self._search(self.samples)
-        if not found:
-            raise SkillError(found.failure, f"{found.why}{self._approach.barrier}")
-        return found
+        back = self._retrace(whole=True)
+        if back is not None:
+            return back
+        try:
+            found = self._search(self.samples)
+            if found:
+                return found
+            failure = SkillError(found.failure, f"{found.why}{self._approach.barrier}")
+        except SkillError as error:  # no grasp has room
+            failure = error
+        back = self._retrace(whole=False)
+        if back is None:
+            raise failure
+        return back
 
-    def _retrace(self) -> BasePlacement | None:
-        """Return the way back of an earlier motion that ended here; None if none leads to the target."""
-        session = self.session
+    def _retrace(self, *, whole: bool) -> BasePlacement | None:
+        """Return the way back of a motion that ended here, to the target or at least on; None without any."""
+        session, search = self.session, self.opener.search
         session.phase = "place"
         with session.timed("place"):
             for earlier in reversed(self._ways_back):
-                found = self.opener.search.retrace(session.state, earlier, self.target, self._plan)
+                found = search.retrace(
+                    session.state, earlier, self.handle, self.target, whole=whole, accept=self._plan
+                )
                 if found is not None:
                     self._ways_back.remove(earlier)
                     return found
+        self._approach = Approach()
         return None
 
     def _search(self, samples: int) -> BasePlacement:

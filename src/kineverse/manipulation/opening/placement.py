@@ -14,7 +14,7 @@ import numpy.typing as npt
 from kineverse._checks import as_count
 from kineverse.errors import InvalidValueError
 from kineverse.geometry import Scene
-from kineverse.grasping import Grasp, Gripper
+from kineverse.grasping import Grasp, Gripper, Handle
 from kineverse.lie import Array
 from kineverse.manipulation.base_samples import BaseSamples, find_planar_base
 from kineverse.manipulation.collision_rules import find_overlapping_links, furniture_rules
@@ -187,10 +187,13 @@ class PlacementSearch:
         self,
         state: State,
         earlier: BasePlacement,
+        handle: Handle,
         target: float,
+        *,
+        whole: bool = True,
         accept: Callable[[BasePlacement], bool] = lambda placement: True,
     ) -> BasePlacement | None:
-        """Return the way of an earlier placement backwards, as far as it leads to a target; None if it fails.
+        """Return the way of an earlier placement backwards, to a target or towards it; None if it fails.
 
         What was possible once is possible backwards, also where an open door leaves no way to another place.
         Contacts are looked for anew.
@@ -200,13 +203,26 @@ class PlacementSearch:
         state
             State of everything at the beginning.
         earlier
-            Placement of a motion from about the target to about the present value of the object's coordinate.
-        target, accept
+            Placement of a motion that ended about here. That of another hand, handle or place leads nowhere.
+        handle, target, accept
             As for :meth:`find`.
+        whole
+            Whether only ways to the target count, or those towards it as well.
         """
-        assert earlier.grasp is not None
-        search = _Search(self, state, [earlier.grasp], target, accept, np.random.default_rng(0))
-        return search.retrace(earlier)
+        grasp, here = earlier.grasp, float(state[handle.coordinate])
+        if grasp is None or grasp.gripper.hand != self.gripper.hand or len(earlier.retreat) == 0:
+            return None
+        taken = grasp.handle.frame, grasp.handle.coordinate
+        ahead = math.copysign(1.0, target - here)
+        end, left = float(earlier.values[0]), ahead * (target - earlier.values[0])
+        # What ends a little before the target is led to it.
+        goal = target if left < _STEP / 2 else end
+        enough = not (whole and goal != target) and abs(goal - here) >= _LEAST_SHARE * abs(target - here)
+        begins = abs(here - earlier.values[-1]) < _STEP / 2 and ahead * (end - here) > 0.0
+        if taken != (handle.frame, handle.coordinate) or not enough or not begins:
+            return None
+        self.paths.ease = self.samples.eases[0]
+        return _Search(self, state, [grasp], goal, accept, np.random.default_rng(0)).retrace(earlier)
 
 
 class _Search:
@@ -311,11 +327,6 @@ class _Search:
     def retrace(self, earlier: BasePlacement) -> BasePlacement | None:
         """Return the way of an earlier placement backwards, without contacts; None if there is none."""
         paths, count = self.owner.paths, len(self.owner.moving)
-        first, last = earlier.values[[-1, 0]]
-        left = np.sign(last - first) * (last - self.values)
-        end = int((left > -_STEP / 2).sum()) - 1
-        if abs(self.values[0] - first) > _STEP / 2 or left[0] < left[-1] or end < self.least:
-            return None
         base = earlier.way[0, count:]
         order = np.argsort(earlier.values)
         rows = [np.interp(self.values, earlier.values[order], q[order]) for q in earlier.way.T[:count]]
@@ -327,8 +338,8 @@ class _Search:
         back = self._correct(retreat, base, handle @ np.linalg.inv(poses[0]) @ poses)
         if way is None or back is None:
             return None
-        found = self._check(CandidateWay(0, base, back, way, end))
-        if found is None or len(found.values) <= end or not self.accept(found):
+        found = self._check(CandidateWay(0, base, back, way, self.last))
+        if found is None or len(found.values) <= self.last or not self.accept(found):
             return None
         return found
 
