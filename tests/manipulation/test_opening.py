@@ -1,6 +1,5 @@
 import re
 import sys
-from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -182,7 +181,7 @@ def test_a_way_is_made_back_where_it_leads_to_the_target(at_the_door):
     placement = search.find(state, grasps, 1.0, seed=1)
     door = handle.coordinate
     ended = state.updated({door: 1.01})  # not exactly where the way ends
-    back = search.retrace(ended, placement, handle, 0.0)
+    back = search.retrace(ended, placement, 0.0)
     assert back is not None
     assert back.values[[0, -1]].tolist() == [1.01, 0.0]
     bar, hand = search.model.fk(handle.frame), search.model.fk(search.gripper.hand)
@@ -191,16 +190,43 @@ def test_a_way_is_made_back_where_it_leads_to_the_target(at_the_door):
         np.testing.assert_allclose(hand(at), bar(at) @ placement.grasp.pose, atol=1e-3)
     np.testing.assert_allclose(back.approach, placement.retreat[-1], atol=0.05)
     np.testing.assert_allclose(back.line[-1], back.way[0], atol=1e-3)
-    assert search.retrace(ended, placement, handle, 0.5).values[-1] == 0.5
-    # Beyond its end the way leads a part of the way only; it neither goes on nor begins elsewhere.
-    assert search.retrace(ended, placement, handle, -0.5) is None
-    assert search.retrace(ended, placement, handle, -0.5, whole=False).values[-1] == 0.0
-    assert search.retrace(ended, placement, handle, -9.0, whole=False) is None
-    assert search.retrace(ended, placement, handle, 1.3, whole=False) is None
-    assert search.retrace(state.updated({door: 0.6}), placement, handle, 0.0) is None
-    assert search.retrace(ended, placement, handle, 0.0, accept=lambda found: False) is None
-    other = replace(handle, coordinate=kv.position("stage"))
-    assert search.retrace(ended | kv.State({other.coordinate: 1.0}), placement, other, 0.0) is None
+    assert search.retrace(ended, placement, 0.5).values[-1] == 0.5
+    assert search.retrace(ended, placement, 0.0, accept=lambda found: False) is None
+    with pytest.raises(InvalidValueError, match="hand_palm_link"):
+        search.retrace(ended, search.find(state, grasps, 1.0, samples=1, accept=lambda found: False), 0.0)
+
+
+@pytest.mark.parametrize(
+    ("value", "target", "end"),
+    [
+        (1.01, 0.0, 0.0),
+        (1.01, 0.5, 0.5),
+        (0.99, -0.02, -0.02),
+        (1.0, -0.5, 0.0),  # a part of the way
+        (1.0, 1.3, None),  # it does not go on
+        (0.6, 0.0, None),  # it begins elsewhere
+    ],
+)
+def test_ways_lead_back_from_their_ends(at_the_door, value, target, end):
+    search, _, state, grasps = at_the_door
+    assert search.find(state, grasps, 1.0, seed=1).find_end_backwards(value, target) == end
+
+
+def test_ways_lead_back_for_their_own_coordinate_only():
+    """A stage that carries the door is not taken for the door, though its handle is the same."""
+    model = kv.load("hsr")
+    stage = kv.position("stage")
+    with model.edit() as edit:
+        edit.include("shelf_door", "shelf_door")
+        edit.attach("shelf_door/shelf", "world", kv.translation(1, 0, 0.7) @ kv.translation(-stage, 0, 0))
+        edit.constrain("stage/range", 0.0, stage, 0.3)
+    world = KinematicWorld(model, "hsr")
+    world.reset(start(model))
+    session = Session(world)
+    assert open_object(session, stage, target=0.3, handle="shelf_door/door_handle")
+    assert len(session.made) == 1
+    assert open_object(session, DOOR, target=0.1)
+    assert world.state[stage] == pytest.approx(0.3, abs=0.02)
 
 
 def test_a_way_back_is_looked_at_anew(at_the_door, monkeypatch):
@@ -209,7 +235,7 @@ def test_a_way_back_is_looked_at_anew(at_the_door, monkeypatch):
     ended = state.updated({handle.coordinate: 1.0})
     monkeypatch.setattr(WayCheck, "_find", lambda *_, **__: 0)
     monkeypatch.setattr(WayCheck, "_note", lambda *_: "")
-    assert search.retrace(ended, placement, handle, 0.0) is None
+    assert search.retrace(ended, placement, 0.0) is None
 
 
 def test_joints_at_their_limits_leave_the_rest_of_a_step_to_the_others():

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections import Counter
 from dataclasses import dataclass
 
@@ -11,6 +12,8 @@ from kineverse.symbols import Symbol
 
 NO_WAY = "no way to the handle"
 """Reason of placements that are refused."""
+_DIFFERENCE = 0.025
+"""Difference of the values at the ends of a way to those of the way back [m], [rad]."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -54,6 +57,17 @@ class BasePlacement:
 
     def __bool__(self) -> bool:
         return self.grasp is not None
+
+    def find_end_backwards(self, value: float, target: float) -> float | None:
+        """Return the value to which the way leads back from a value, towards a target; None if it does not.
+
+        It begins where the way ends, and small differences [m], [rad] at both ends are made up for.
+        """
+        ahead = math.copysign(1.0, target - value)
+        begin, end = float(self.values[-1]), float(self.values[0])
+        if abs(value - begin) >= _DIFFERENCE or ahead * (end - value) <= 0.0:
+            return None
+        return target if ahead * (target - end) < _DIFFERENCE else end
 
     @property
     def failure(self) -> str:

@@ -4,15 +4,14 @@ from __future__ import annotations
 
 import contextlib
 import math
-from collections.abc import Hashable, Mapping
+from collections.abc import Mapping
 from typing import Any
 
 import numpy as np
 
 from kineverse._checks import as_count
-from kineverse.control import Controller
 from kineverse.errors import InfeasibleError, InvalidValueError, NotFiniteError
-from kineverse.grasping import Grasp, Gripper, Handle, find_gripper, find_handle, sample_grasps
+from kineverse.grasping import Handle, find_gripper, find_handle
 from kineverse.manipulation.outcome import Outcome, SkillError, SlipError
 from kineverse.manipulation.session import Session
 from kineverse.manipulation.skill_arguments import (
@@ -23,21 +22,17 @@ from kineverse.manipulation.skill_arguments import (
     find_object_coordinate,
     limit_tolerance,
 )
-from kineverse.model.frame import is_of_robot
-from kineverse.model.model_view import ModelView
 from kineverse.model.version_cache import cached_for_version
-from kineverse.state import State
 from kineverse.symbols import Symbol
 from kineverse.worlds import Judge
 
-from .approach_planner import Approach, ApproachPlanner
+from .approach_planner import Approach
 from .base_placement import BasePlacement
 from .hand_motion import HandMotion
 from .held_motion import move_held
-from .placement import PlacementSearch
+from .opener import Opener
 from .push_fallback import PushFallback
 
-_GRASPS = 96
 _SLANT = math.radians(50.0)
 """Largest slant of grasps where those from across the handle lead nowhere [rad]."""
 _PROOF = 200
@@ -47,8 +42,6 @@ _LATE = 1.0
 """Time before the end at which it counts as up [s]."""
 _OVERLAP = 1e-3
 """Penetration from which on the reason says it [m]."""
-_KEPT = 15
-"""Number of sets of grasps that are kept."""
 _MOST_SLIPS, _LEAST_PROGRESS = 2, 0.1
 """Number of slips from which on a grasp has to take an object further, by a share of the rest."""
 _HEIGHTS = 12
@@ -123,7 +116,7 @@ def open_object(
     found = find_handle(model, coordinate, handle)
     gripper = find_gripper(model, world.robot, hand)
     opener = cached_for_version(
-        model, ("opener", gripper.hand), lambda: _Opener(model, gripper, session.state)
+        model, ("opener", gripper.hand), lambda: Opener(model, gripper, session.state)
     )
     run = _Run(session, opener, found, goal, seconds, tolerance, placements, seed)
     reason, kind = "", ""
@@ -157,41 +150,13 @@ def open_object(
     )
 
 
-class _Opener:
-    """Everything that openings of one model have in common: placements, planner and controllers."""
-
-    def __init__(self, model: ModelView, gripper: Gripper, state: State) -> None:
-        self.model, self.gripper = model, gripper
-        self.search = PlacementSearch(model, gripper, state)
-        self.controllers: dict[Hashable, tuple[Controller, Any]] = {}
-        self._approaches: ApproachPlanner | None = None
-        self._grasps: dict[tuple[object, ...], tuple[Grasp, ...]] = {}
-
-    @property
-    def approaches(self) -> ApproachPlanner:
-        """Planner of the robot's ways with the hand empty."""
-        if self._approaches is None:
-            self._approaches = ApproachPlanner(self.search)
-        return self._approaches
-
-    def grasps(self, handle: Handle, state: State, seed: int, slant: float = 0.0) -> tuple[Grasp, ...]:
-        """Return the grasps of a handle where everything but the robot is as in a state, up to a slant."""
-        robot = self.gripper.robot
-        others = tuple(v for s, v in state.items() if not robot or not is_of_robot(s.path, robot))
-        key = handle.frame, handle.coordinate, seed, slant, others
-        if key not in self._grasps:
-            found = sample_grasps(self.model, self.gripper, handle, _GRASPS, seed, state=state, slant=slant)
-            self._grasps = {**dict([*self._grasps.items()][-_KEPT:]), key: found}
-        return self._grasps[key]
-
-
 class _Run:
     """One opening: its phases, and what was measured on the way."""
 
     def __init__(
         self,
         session: Session,
-        opener: _Opener,
+        opener: Opener,
         handle: Handle,
         target: float,
         seconds: float,
@@ -211,7 +176,7 @@ class _Run:
         self._rest = math.inf
         self._earlier: list[Mapping[str, Any]] = []
         self._approach = Approach()
-        self._ways_back = list(session.made)
+        self._ways_back = [made for made in session.made if self._is_of_this(made)]
         self.judge = Judge(self.model, session.world.robot, self.gripper, handle=handle.frame)
         self.judge.update(session.world.state)
         self.motion = HandMotion(
@@ -379,15 +344,25 @@ class _Run:
             raise failure
         return back
 
+    def _is_of_this(self, made: BasePlacement) -> bool:
+        """Return whether a placement is one of this hand, handle and coordinate."""
+        grasp, own = made.grasp, (self.gripper.hand, self.handle.frame, self.handle.coordinate)
+        return grasp is not None and (grasp.gripper.hand, grasp.handle.frame, grasp.handle.coordinate) == own
+
     def _retrace(self, *, whole: bool) -> BasePlacement | None:
         """Return the way back of a motion that ended here, to the target or at least on; None without any."""
-        session, search = self.session, self.opener.search
+        session, here = self.session, float(self.session.state[self.handle.coordinate])
         session.phase = "place"
         with session.timed("place"):
             for earlier in reversed(self._ways_back):
-                found = search.retrace(
-                    session.state, earlier, self.handle, self.target, whole=whole, accept=self._plan
-                )
+                end = earlier.find_end_backwards(here, self.target)
+                if (
+                    end is None
+                    or (whole and end != self.target)
+                    or abs(end - here) < _LEAST_PROGRESS * self.left
+                ):
+                    continue
+                found = self.opener.search.retrace(session.state, earlier, end, self._plan)
                 if found is not None:
                     self._ways_back.remove(earlier)
                     return found

@@ -14,7 +14,7 @@ import numpy.typing as npt
 from kineverse._checks import as_count
 from kineverse.errors import InvalidValueError
 from kineverse.geometry import Scene
-from kineverse.grasping import Grasp, Gripper, Handle
+from kineverse.grasping import Grasp, Gripper
 from kineverse.lie import Array
 from kineverse.manipulation.base_samples import BaseSamples, find_planar_base
 from kineverse.manipulation.collision_rules import find_overlapping_links, furniture_rules
@@ -187,42 +187,33 @@ class PlacementSearch:
         self,
         state: State,
         earlier: BasePlacement,
-        handle: Handle,
         target: float,
-        *,
-        whole: bool = True,
         accept: Callable[[BasePlacement], bool] = lambda placement: True,
     ) -> BasePlacement | None:
-        """Return the way of an earlier placement backwards, to a target or towards it; None if it fails.
+        """Return the way of an earlier placement backwards, from the object's value to a target.
 
         What was possible once is possible backwards, also where an open door leaves no way to another place.
-        Contacts are looked for anew.
+        Contacts are looked for anew, and None is returned if there are any.
 
         Parameters
         ----------
         state
             State of everything at the beginning.
         earlier
-            Placement of a motion that ended about here. That of another hand, handle or place leads nowhere.
-        handle, target, accept
+            Placement whose way leads back to the target, see :meth:`.BasePlacement.find_end_backwards`.
+        target, accept
             As for :meth:`find`.
-        whole
-            Whether only ways to the target count, or those towards it as well.
+
+        Raises
+        ------
+        InvalidValueError
+            For a placement of another hand, or one that was not found.
         """
-        grasp, here = earlier.grasp, float(state[handle.coordinate])
-        if grasp is None or grasp.gripper.hand != self.gripper.hand or len(earlier.retreat) == 0:
-            return None
-        taken = grasp.handle.frame, grasp.handle.coordinate
-        ahead = math.copysign(1.0, target - here)
-        end, left = float(earlier.values[0]), ahead * (target - earlier.values[0])
-        # What ends a little before the target is led to it.
-        goal = target if left < _STEP / 2 else end
-        enough = not (whole and goal != target) and abs(goal - here) >= _LEAST_SHARE * abs(target - here)
-        begins = abs(here - earlier.values[-1]) < _STEP / 2 and ahead * (end - here) > 0.0
-        if taken != (handle.frame, handle.coordinate) or not enough or not begins:
-            return None
+        grasp = earlier.grasp
+        if grasp is None or grasp.gripper.hand != self.gripper.hand:
+            raise InvalidValueError(f"The placement that leads back has to be one of '{self.gripper.hand}'.")
         self.paths.ease = self.samples.eases[0]
-        return _Search(self, state, [grasp], goal, accept, np.random.default_rng(0)).retrace(earlier)
+        return _Search(self, state, [grasp], target, accept, np.random.default_rng(0)).retrace(earlier)
 
 
 class _Search:
