@@ -1,4 +1,4 @@
-"""What openings by one gripper have in common: placements, planner, grasps and controllers."""
+"""Shared parts of openings by one gripper: placements, planner, grasps and controllers."""
 
 from __future__ import annotations
 
