@@ -91,7 +91,8 @@ class PushPair(NamedTuple):
     def tangents(self) -> tuple[Vector, Vector]:
         """Two unit vectors that are orthogonal to the normal and to each other.
 
-        Duff et al., "Building an Orthonormal Basis, Revisited" (2017).
+        They may turn about the normal between two steps: both count alike. Duff et al., "Building an
+        Orthonormal Basis, Revisited" (2017).
         """
         x, y, z = self.normal
         sign = math.copysign(1.0, z)
