@@ -321,12 +321,12 @@ class _Search:
         base = earlier.way[0, count:]
         order = np.argsort(earlier.values)
         rows = [np.interp(self.values, earlier.values[order], q[order]) for q in earlier.way.T[:count]]
-        way = self._correct(np.stack(rows, axis=1), base, self.handles @ self.poses[0])
+        hands = self.handles @ self.poses[0]
+        way = self._correct(np.stack(rows, axis=1), base, hands)
         # The hand comes on the way on which it left, in the same place beside the handle.
         retreat = earlier.retreat[:, :count]
-        handle = self.handles[0] @ self.poses[0]
         poses = paths.find_poses(retreat, base)
-        back = self._correct(retreat, base, handle @ np.linalg.inv(poses[0]) @ poses)
+        back = self._correct(retreat, base, hands[0] @ np.linalg.inv(poses[0]) @ poses)
         if way is None or back is None:
             return None
         found = self._check(CandidateWay(0, base, back, way, self.last))

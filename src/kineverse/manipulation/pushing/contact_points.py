@@ -16,6 +16,7 @@ import numpy as np
 import numpy.typing as npt
 
 from kineverse.compile import compile  # noqa: A004
+from kineverse.control import Target
 from kineverse.errors import InvalidValueError
 from kineverse.expressions.expression import Expression, array, as_expression
 from kineverse.geometry import Scene
@@ -25,7 +26,7 @@ from kineverse.geometry.support import smoothed_support
 from kineverse.lie import Array
 from kineverse.model.model_view import ModelView
 from kineverse.state import State
-from kineverse.symbols import Symbol, parameter
+from kineverse.symbols import Symbol
 
 from .vectors import Vector, inner_product, length
 
@@ -187,15 +188,17 @@ class PushSurface:
 
     def _compile_one(self, poses: list[Expression], twists: list[Expression], tip: Expression) -> None:
         """Compile the tip, and a point with its normal and velocity, whose place on a body is an input."""
-        chosen = array([parameter(f"push/body/{k}", 0.0) for k in range(len(poses))])
-        point, normal = (array([parameter(f"push/{name}/{k}", 0.0) for k in range(3)]) for name in "pn")
-        pose = sum((w * pose for w, pose in zip(chosen, poses, strict=True)), as_expression(np.zeros((3, 4))))
-        twist = sum((w * twist for w, twist in zip(chosen, twists, strict=True)), as_expression(np.zeros(6)))
+        sizes = {"body": len(poses), "p": 3, "n": 3}
+        chosen = [Target(f"push/{name}", np.zeros(size)) for name, size in sizes.items()]
+        weights, point, normal = (target.expression for target in chosen)
+        nowhere, resting = as_expression(np.zeros((3, 4))), as_expression(np.zeros(6))
+        pose = sum((w * pose for w, pose in zip(weights, poses, strict=True)), nowhere)
+        twist = sum((w * twist for w, twist in zip(weights, twists, strict=True)), resting)
         place, direction = pose[:, :3] @ point + pose[:, 3], pose[:, :3] @ normal
         velocity = self.sign * (twist[:3] + np.cross(twist[3:], place))
         own = {s for e in (*poses, *twists, tip) for s in e.symbols}
         self._symbols = tuple(sorted(own, key=lambda s: s.sort_key))
-        inputs = (*self._symbols, *chosen, *point, *normal)
+        inputs = (*self._symbols, *(symbol for target in chosen for symbol in target.parameters))
         self._one = compile([array([*tip, *place, *direction, *velocity])], inputs).bind()
         on_body = np.eye(len(poses))[self.owner]
         self._places = np.hstack([on_body, self._points, self._normals])

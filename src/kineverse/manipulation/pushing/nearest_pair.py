@@ -10,11 +10,11 @@ from typing import NamedTuple
 import numpy as np
 
 from kineverse.compile import compile  # noqa: A004
+from kineverse.control import Target
 from kineverse.control.contact_slots import ContactSlots
 from kineverse.expressions.expression import Expression, array
 from kineverse.geometry.results import DistanceResults
 from kineverse.lie import Array
-from kineverse.symbols import parameter
 
 from .contact_points import PushPoint, find_alignment
 from .program import PRESS, TOUCHING
@@ -129,14 +129,14 @@ class ContactRates:
 
     def __init__(self, slots: ContactSlots, columns: Sequence[int], hand: int) -> None:
         self._slots, self._hand = slots, hand
-        twists = _parameters("twist", 3, *slots.twist(hand).shape)
-        vectors = _parameters("vector", 6, 3)
-        r, p, normal, tip, *tangents = vectors
-        robot, thing, carrier = (twist[:, list(columns)] for twist in twists)
+        twists = Target("push/twist", np.zeros((3, *slots.twist(hand).shape)))
+        vectors = Target("push/vector", np.zeros((6, 3)))
+        r, p, normal, tip, *tangents = vectors.expression
+        robot, thing, carrier = (twist[:, list(columns)] for twist in twists.expression)
         rows = [_along(normal, r, robot) - _along(normal, p, thing)]
         rows += [_along(t, tip, carrier) - _along(t, tip, thing) for t in tangents]
-        self._first = twists.size
-        inputs = [s for e in (*twists.ravel(), *vectors.ravel()) for s in e.symbols]
+        self._first = len(twists.parameters)
+        inputs = (*twists.parameters, *vectors.parameters)
         self._rows = compile([array([e for row in rows for e in row])], inputs).bind()
 
     def __call__(self, contact: PushPair, tangents: tuple[Vector, Vector], tip: Vector) -> Array:
@@ -150,11 +150,6 @@ class ContactRates:
         rows.input[first:] = [*contact.r, *contact.p, *contact.normal, *tip, *one, *other]
         rows()
         return np.asarray(rows.outputs[0])
-
-
-def _parameters(name: str, *shape: int) -> Expression:
-    """Return an array of new parameters."""
-    return array([parameter(f"push/{name}/{k}", 0.0) for k in range(math.prod(shape))]).reshape(shape)
 
 
 def _along(direction: Expression, point: Expression, twist: Expression) -> Expression:

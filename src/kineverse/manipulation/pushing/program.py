@@ -9,7 +9,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from kineverse.compile import compile  # noqa: A004
-from kineverse.control import Command, Controller, Goal, Keep
+from kineverse.control import Command, Controller, Goal, Keep, Target
 from kineverse.control.formulation import find_speeds
 from kineverse.control.tasks import Task
 from kineverse.expressions.expression import Expression, array, as_expression
@@ -20,7 +20,7 @@ from kineverse.lie import Array
 from kineverse.logic import less
 from kineverse.model.model_view import ModelView
 from kineverse.state import State
-from kineverse.symbols import Symbol, parameter
+from kineverse.symbols import Symbol
 
 from .contact_points import PushTool
 from .vectors import Vector
@@ -143,18 +143,16 @@ class PushProgram:
         moving = set(model.rates.over_free_speeds(tip.gradient())) - resting - {speed}
         speeds = [*sorted(moving, key=lambda s: s.sort_key), speed]
 
-        parameters = {
-            name: [parameter(f"push/{name}/{k}", 0.0) for k in range(size)] for name, size in _SIZES.items()
-        }
-        one = {name: symbols[0] for name, symbols in parameters.items()}
-        target, facing, normal = (array(parameters[name]) for name in ("target", "facing", "normal"))
-        rates = [parameter(f"push/rate/{k}", 0.0) for k in range(3 * len(speeds))]
-        relative = array(rates).reshape(3, len(speeds))
+        numbers = {name: Target(f"push/{name}", np.zeros(size)) for name, size in _SIZES.items()}
+        one = {name: number.parameters[0] for name, number in numbers.items()}
+        target, facing, normal = (numbers[name].expression for name in ("target", "facing", "normal"))
+        rates = Target("push/rate", np.zeros((3, len(speeds))))
+        relative = rates.expression
         d = one["gap"].with_gradient({s: relative[0, k] for k, s in enumerate(speeds)})
         slips = array(
             [
                 e.with_gradient({s: relative[i + 1, k] for k, s in enumerate(speeds)})
-                for i, e in enumerate(parameters["slip"])
+                for i, e in enumerate(numbers["slip"].parameters)
             ]
         )
         offset = tip - target
@@ -206,8 +204,8 @@ class PushProgram:
         self._values = np.array([s.value or 0.0 for s in self.controller.inputs])
         self._coordinates = tuple(s for s in self.controller.inputs if s.value is None)
         # Parameters are kept in one vector, and without trends some of them serve nothing.
-        every = [*(symbol for symbols in parameters.values() for symbol in symbols), *rates]
-        self._numbers, self._first_rate = np.zeros(len(every)), len(every) - len(rates)
+        every = [symbol for number in (*numbers.values(), rates) for symbol in number.parameters]
+        self._numbers, self._first_rate = np.zeros(len(every)), len(every) - len(rates.parameters)
         self._used = np.array([k for k, s in enumerate(every) if s in place], dtype=np.intp)
         self._places = np.array([place[every[k]] for k in self._used], dtype=np.intp)
         self._tip_symbols = tuple(s for s in tip.symbols if not s.order)
