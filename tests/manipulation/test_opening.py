@@ -2,6 +2,7 @@ import re
 import sys
 from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -13,6 +14,7 @@ from kineverse.grasping import find_gripper, find_handle, sample_grasps
 from kineverse.manipulation import PlacementSearch, Session, TrackedBelief, open_object
 from kineverse.manipulation.base_samples import find_planar_base
 from kineverse.manipulation.belief import EstimateError
+from kineverse.manipulation.opening.grasped_opening import _Run
 from kineverse.manipulation.opening.hand_paths import HandPaths, find_least_time
 from kineverse.manipulation.opening.placement_samples import PlacementSamples
 from kineverse.manipulation.opening.way_check import WayCheck
@@ -360,6 +362,21 @@ def test_start_in_contact_is_refused(model):
     assert not outcome
     assert "begins in contact" in outcome.reason
     assert outcome.measures["grasps"] == 0
+
+
+def test_measures_of_several_parts_name_what_was_worst():
+    """A robot that begins in contact is put elsewhere, and what it touched is said all the same."""
+    part = dict.fromkeys(("grasp_error", "grasp_rotation", "jitter"), np.nan)
+    part |= dict.fromkeys(("reversals", "contact_losses", "distance", "hand_distance"), 1.0) | {
+        "excepted": ()
+    }
+    first = part | {"penetration": 0.1, "penetrating": ("robot", "wall"), "limit_violation": 0.0, "limit": ""}
+    then = part | {"penetration": 0.0, "penetrating": ("", ""), "limit_violation": 1e-9, "limit": "arm"}
+    run = SimpleNamespace(_earlier=[first], judge=SimpleNamespace(measures=then))
+    measures = _Run.measures.fget(run)
+    assert (measures["penetration"], measures["penetrating"]) == (0.1, ("robot", "wall"))
+    assert (measures["limit_violation"], measures["limit"]) == (1e-9, "arm")
+    assert measures["distance"] == 2.0
 
 
 def test_wrong_arguments_are_refused(session):

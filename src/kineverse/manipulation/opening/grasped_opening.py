@@ -48,7 +48,8 @@ _HEIGHTS = 12
 """Number of values at which the height of an object is compared with that of the hand."""
 _LARGEST = ("limit_violation", "penetration", "grasp_error", "grasp_rotation", "jitter", "reversals")
 _SUMS = ("contact_losses", "distance", "hand_distance")
-"""Measures of the parts of a run: the largest, or the sum."""
+_NAMED = {"limit_violation": "limit", "penetration": "penetrating"}
+"""Measures of the parts of a run: the largest, or the sum; and what belongs to the largest."""
 
 
 def open_object(
@@ -191,6 +192,8 @@ class _Run:
         last = dict(found[-1])
         for name in _LARGEST:
             last[name] = max((m[name] for m in found if not math.isnan(m[name])), default=math.nan)
+        for name, what in _NAMED.items():
+            last[what] = max(found, key=lambda m: float(m[name]))[what]
         for name in _SUMS:
             last[name] = sum(m[name] for m in found)
         last["excepted"] = tuple(dict.fromkeys(pair for m in found for pair in m["excepted"]))
