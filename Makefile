@@ -7,8 +7,11 @@ VENV := .venv
 BIN := $(VENV)/bin
 INSTALL := $(BIN)/python -m pip install --quiet --no-input --disable-pip-version-check --no-deps
 
+# One file is unpacked by one core, the largest first.
+INSTALL_FILES = printf '%s\n' $(filter %.txt,$^) | xargs -P $(JOBS) -I {} $(INSTALL) -r {}
+
 # What the demo and every command in the README need.
-DEMO := $(patsubst %,requirements/%.txt,build core view figures geometry control recording)
+DEMO := $(patsubst %,requirements/%.txt,geometry core view figures build control recording)
 
 .PHONY: help demo test fuzz format clean
 .NOTPARALLEL:
@@ -52,15 +55,15 @@ $(BIN)/python:
 # The package goes in last and as it lies here, so that an edit needs no second installation.
 $(VENV)/demo.installed: $(DEMO) pyproject.toml | $(BIN)/python
 	@echo "Installing into $(VENV); this takes a minute, once."
-	$(INSTALL) $(DEMO:%=-r %)
+	@$(INSTALL_FILES)
 	$(INSTALL) --no-build-isolation --editable .
 	@touch $@
 
-$(VENV)/test.installed: requirements/test.txt $(VENV)/demo.installed | $(BIN)/python
-	@echo "Installing what the tests need into $(VENV); this takes a few minutes, once."
-	$(INSTALL) -r requirements/test.txt
+$(VENV)/test.installed: requirements/peers.txt requirements/test.txt $(VENV)/demo.installed | $(BIN)/python
+	@echo "Installing what the tests need into $(VENV); this takes a minute, once."
+	@$(INSTALL_FILES)
 	@touch $@
 
 $(VENV)/fuzz.installed: requirements/fuzz.txt $(VENV)/test.installed
-	$(INSTALL) -r requirements/fuzz.txt
+	@$(INSTALL_FILES)
 	@touch $@

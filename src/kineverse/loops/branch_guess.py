@@ -21,7 +21,7 @@ from kineverse.expressions.functions import cos, sin
 from kineverse.lie import Array
 from kineverse.symbols import Symbol
 
-from .branches import continue_solution
+from .branches import FIRST, continue_solution
 from .equations import Equations
 
 FEW = 3
@@ -254,8 +254,8 @@ class BranchSamples:
         self.worst = everywhere[inside][int(ratios.argmin())]
 
     def all_inputs(self, q: Array) -> Array:
-        """Return the free coordinates, followed by the parameters."""
-        return np.concatenate([q, self._given])
+        """Return free coordinates (..., k) followed by the parameters."""
+        return np.concatenate([q, np.broadcast_to(self._given, (*q.shape[:-1], len(self._given)))], axis=-1)
 
     def changes_sign(self, rows: Sequence[int]) -> bool:
         """Return whether det ∂r/∂x of these rows changes its sign, so that it is zero in between."""
@@ -263,8 +263,9 @@ class BranchSamples:
         matrices = (self.equations(x, self.all_inputs(q))[1][list(rows)] for q, x in points)
         return len({float(np.linalg.slogdet(matrix)[0]) for matrix in matrices}) > 1
 
-    def _continue(self, x: Array, start: Array, end: Array) -> Array:
-        reached = continue_solution(self.equations, x, self.all_inputs(start), self.all_inputs(end))
+    def _continue(self, x: Array, start: Array, end: Array, first: float = FIRST) -> Array:
+        inputs = self.all_inputs(start), self.all_inputs(end)
+        reached = continue_solution(self.equations, x, *inputs, first)
         if reached.part < 1.0:
             there = start + reached.part * (end - start)
             at, to = (
@@ -288,7 +289,7 @@ class BranchSamples:
         while len(left):
             position = int(distance[left].argmin())
             i, left = left[position], np.delete(left, position)
-            solutions[i] = self._continue(solutions[nearest[i]], points[nearest[i]], points[i])
+            solutions[i] = self._continue(solutions[nearest[i]], points[nearest[i]], points[i], first=1.0)
             closer = np.abs((points - points[i]) / scale).max(axis=1, initial=0.0)
             better = closer < distance
             nearest[better], distance[better] = i, closer[better]

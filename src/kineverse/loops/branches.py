@@ -10,7 +10,7 @@ import numpy.typing as npt
 
 from kineverse.lie import Array
 
-from .equations import CLOSURE_TOLERANCE, Equations
+from .equations import CLOSURE_TOLERANCE, Equations, least_squares
 
 _TRIES = 60
 _SAME = 1e-4
@@ -91,7 +91,7 @@ def _distance(a: Array, b: Array, angles: npt.NDArray[np.bool_]) -> float:
 
 
 _SHORTEST = 1e-5
-_FIRST = 1 / 16
+FIRST = 1 / 16
 
 
 @dataclass(frozen=True)
@@ -110,20 +110,22 @@ class ContinuationResult:
     part: float
 
 
-def continue_solution(equations: Equations, x: Array, start: Array, end: Array) -> ContinuationResult:
+def continue_solution(
+    equations: Equations, x: Array, start: Array, end: Array, first: float = FIRST
+) -> ContinuationResult:
     """Continue a solution along a straight line of inputs.
 
     Each step has a predictor along the tangent and a Newton corrector. It is accepted if the correction is
-    small relative to the step, so that it stays on the branch.
+    small relative to the step, so that it stays on the branch. The first one is a given fraction of the line.
     """
     direction = end - start
-    done, step = 0.0, _FIRST
+    done, step = 0.0, first
     _, by_x, by_u = equations(x, start)
     if not direction.any():
         return ContinuationResult(x, 1.0)
     while done < 1.0:
         step = min(step, 1.0 - done)
-        tangent = -np.linalg.lstsq(by_x, by_u @ direction, rcond=1e-12)[0]
+        tangent = -least_squares(by_x, by_u @ direction)
         predicted = x + step * tangent
         u = start + (done + step) * direction
         found, gap = equations.close(predicted, u, 8)

@@ -78,6 +78,8 @@ CLOSURE_TOLERANCE = 1e-11
 
 _NEWTON = 30
 _SINGULAR = 1e-9
+_WELL_CONDITIONED = 1e10
+"""Condition of JJᵀ or JᵀJ up to which steps have enough digits without a singular value decomposition."""
 
 
 MOST_EFFORT = 150_000.0
@@ -114,6 +116,20 @@ class WorkBudget:
             )
 
 
+def least_squares(J: Array, r: Array) -> Array:
+    """Return the shortest of the x (n,) with the least |Jx - r|, for J (m, n) and r (m,)."""
+    tall = J.shape[0] >= J.shape[1]
+    product = J.T @ J if tall else J @ J.T
+    try:
+        inverse = np.linalg.inv(product)
+    except np.linalg.LinAlgError:
+        return np.asarray(np.linalg.lstsq(J, r, rcond=_SINGULAR)[0], dtype=float)
+    a, b = product.ravel(), inverse.ravel()
+    if not a.dot(a) * b.dot(b) < _WELL_CONDITIONED**2:
+        return np.asarray(np.linalg.lstsq(J, r, rcond=_SINGULAR)[0], dtype=float)
+    return np.asarray(inverse @ (J.T @ r) if tall else J.T @ (inverse @ r), dtype=float)
+
+
 class Equations:
     """Numeric residual r(x, u) with its derivatives.
 
@@ -134,7 +150,7 @@ class Equations:
         self._effort, self._size = effort, 1 + residual.size * len(self.unknowns) / 100
         by_all = residual.partial([*unknowns, *inputs])
         function = compile([residual, by_all], [*unknowns, *inputs], tier="interpreter")
-        self._evaluate = function.bind()
+        self._evaluate, self._batch = function.bind(), function.batch
 
     def __call__(self, x: Array, u: Array) -> tuple[Array, Array, Array]:
         """Return r, ∂r/∂x and ∂r/∂u; r is infinite if they are undefined."""
@@ -148,8 +164,18 @@ class Equations:
             # An earlier loop, which this one depends on, does not close there.
             m, n_all = self._evaluate.outputs[1].shape
             return np.full(m, np.inf), np.zeros((m, n)), np.zeros((m, n_all - n))
-        residual, derivative = self._evaluate.outputs
-        return residual.copy(), derivative[:, :n].copy(), derivative[:, n:].copy()
+        residual, derivative = self._evaluate.outputs[0].copy(), self._evaluate.outputs[1].copy()
+        return residual, derivative[:, :n], derivative[:, n:]
+
+    def evaluate_all(self, x: Array, u: Array) -> tuple[Array, Array]:
+        """Return r (N, m) and ∂r/∂x (N, m, n) at unknowns (N, n) and inputs (N, k); see :meth:`__call__`."""
+        self._effort.spend(len(x) * self._size)
+        try:
+            residual, derivative = self._batch(np.hstack([x, u]))
+        except NoSolutionError:
+            m = self._evaluate.outputs[0].size
+            return np.full((len(x), m), np.inf), np.zeros((len(x), m, len(self.unknowns)))
+        return residual, derivative[..., : len(self.unknowns)]
 
     def gap(self, x: Array, u: Array) -> float:
         """Return the norm of the residual."""
@@ -168,7 +194,7 @@ class Equations:
             if gap < 1e-15 or gap == np.inf:
                 break
             if damping == 0.0:
-                step = -np.linalg.lstsq(by_x, residual, rcond=_SINGULAR)[0]
+                step = -least_squares(by_x, residual)
             else:
                 matrix = by_x.T @ by_x
                 scale = max(float(np.trace(matrix)) / len(x), 1e-30)

@@ -357,19 +357,17 @@ def _rows(samples: BranchSamples) -> tuple[int, ...]:
 
 def _steps(samples: BranchSamples, seed: BranchGuess, rows: tuple[int, ...], most: float) -> int | None:
     """Return the number of Newton steps that suffices at all samples; None if it is larger than ``most``."""
-    needed = 0
+    x, u, wanted = seed.evaluate(samples.tried), samples.all_inputs(samples.tried), samples.wanted
     chosen = list(rows)
-    for q, x, wanted in zip(samples.tried, seed.evaluate(samples.tried), samples.wanted, strict=True):
-        u = samples.all_inputs(q)
-        for step in range(math.floor(most) + 1):  # noqa: B007 - how many it took
-            residual, by_x, _ = samples.equations(x, u)
-            if math.sqrt(residual.dot(residual)) < 1e-12 and np.abs(x - wanted).max(initial=0.0) < 1e-5:
-                break
-            try:
-                x = x - np.linalg.solve(by_x[chosen], residual[chosen])
-            except np.linalg.LinAlgError:
-                return None
-        else:
+    for step in range(math.floor(most) + 1):
+        residual, by_x = samples.equations.evaluate_all(x, u)
+        near = np.abs(x - wanted).max(axis=1, initial=0.0) < 1e-5
+        left = ~(near & (np.linalg.norm(residual, axis=1) < 1e-12))
+        if not left.any():
+            return next(s for s in _STEPS if s >= step)
+        x, u, wanted = x[left], u[left], wanted[left]
+        try:
+            x -= np.linalg.solve(by_x[left][:, chosen], residual[left][:, chosen, None])[..., 0]
+        except np.linalg.LinAlgError:
             return None
-        needed = max(needed, step)
-    return next(s for s in _STEPS if s >= needed)
+    return None
