@@ -198,7 +198,8 @@ class Equations:
             else:
                 matrix = by_x.T @ by_x
                 scale = max(float(np.trace(matrix)) / len(x), 1e-30)
-                step = -np.linalg.solve(matrix + damping * scale * np.eye(len(x)), by_x.T @ residual)
+                damped = matrix + damping * scale * np.eye(len(x))
+                step = -np.asarray(np.linalg.solve(damped, by_x.T @ residual), dtype=float)
             tried = x + step
             after, derivative, _ = self(tried, u)
             left = math.sqrt(after.dot(after))
