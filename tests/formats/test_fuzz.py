@@ -45,7 +45,8 @@ def test_fuzzing_finds_no_violation(name, folder):
     count = COUNTS.get(name, 40)
     for data in islice(inputs(target, target.own_seeds(), Random(7)), count):
         options = choose_options(data)
-        assert check(target, data, folder, counts, options) is None, (options, data)
+        found = check(target, data, folder, counts, options)
+        assert found is None, (found, options, data)
     # Neither all good nor all bad, or the grammars would test nothing.
     assert counts.models > count / 20
     assert counts.errors > count / 20

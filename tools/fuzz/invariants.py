@@ -11,6 +11,7 @@ import os
 import re
 import resource
 import sys
+import threading
 import time
 import traceback
 import warnings
@@ -219,7 +220,7 @@ def _place(error: BaseException) -> str:
 
 
 # An audit hook cannot be removed, so there is one, which records for the current watch.
-_watch: tuple[str, list[str]] | None = None
+_watch: tuple[str, list[str], frozenset[int | None]] | None = None
 _hooked = False
 
 
@@ -227,7 +228,9 @@ def _hook(event: str, arguments: tuple[Any, ...]) -> None:
     """Record file accesses outside of the watched folder, and external calls."""
     if _watch is None:
         return
-    folder, reached = _watch
+    folder, reached, others = _watch
+    if threading.get_ident() in others:
+        return
     if event.startswith(_EXTERNAL_CALLS):
         reached.append(f"{event} {arguments!r}"[:300])
     elif event in _OPENING and isinstance(arguments[0], (str, bytes)):
@@ -241,13 +244,17 @@ def _hook(event: str, arguments: tuple[Any, ...]) -> None:
 
 @contextmanager
 def _watching(folder: Path) -> Iterator[list[str]]:
-    """Record the files that are opened outside of a folder, and external calls."""
+    """Record the files that are opened outside of a folder, and external calls.
+
+    Threads that have begun before, such as one that waits for a compiler, do not count.
+    """
     global _watch, _hooked
     if not _hooked:
         sys.addaudithook(_hook)
         _hooked = True
     reached: list[str] = []
-    _watch = str(folder), reached
+    others = frozenset(t.ident for t in threading.enumerate()) - {threading.get_ident()}
+    _watch = str(folder), reached, others
     try:
         yield reached
     finally:
