@@ -29,12 +29,13 @@ demo: $(VENV)/demo.installed
 test: $(VENV)/test.installed
 	$(BIN)/ruff format --check .
 	$(BIN)/ruff check .
-	$(BIN)/mypy
+	$(BIN)/mypy --num-workers $(JOBS)
 	$(BIN)/lint-imports --no-logo
 	@# Tests start commands by the dozen: each would compile the package anew where Python is told to keep nothing.
 	$(BIN)/python -m compileall -q -j $(JOBS) src tests
 	@# To have the values in a failed assertion printed takes each worker 13 s: only what fails is run with it, again.
-	$(BIN)/python -m pytest -q -n $(JOBS) --assert=plain $(ARGS) || \
+	@# The tests of a file share what takes long to make, so that they stay in one process.
+	$(BIN)/python -m pytest -q -n $(JOBS) --dist loadfile --no-loadscope-reorder --assert=plain $(ARGS) || \
 	    { $(BIN)/python -m pytest -q --last-failed --last-failed-no-failures=none $(ARGS); exit 1; }
 
 fuzz: $(VENV)/fuzz.installed
