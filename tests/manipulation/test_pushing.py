@@ -18,11 +18,11 @@ from kineverse.manipulation.outcome import Outcome
 from kineverse.manipulation.pushing import placement, program
 from kineverse.manipulation.pushing.approach import plan_push_approach
 from kineverse.manipulation.pushing.contact_points import PushSurface, find_push_tool
-from kineverse.manipulation.pushing.controller import Pushing
 from kineverse.manipulation.pushing.nearest_pair import ContactRates, PushPair
-from kineverse.manipulation.pushing.placement import RollOut, find_push_start, roll_out
 from kineverse.manipulation.pushing.press import PushPress
-from kineverse.manipulation.pushing.program import PushNumbers
+from kineverse.manipulation.pushing.push_controller import Pushing
+from kineverse.manipulation.pushing.push_placement import RollOut, find_push_start, roll_out
+from kineverse.manipulation.pushing.push_program import PushNumbers
 from kineverse.manipulation.pushing.push_skill import push
 from kineverse.manipulation.pushing.trials import try_push
 from kineverse.manipulation.pushing.vectors import move_point

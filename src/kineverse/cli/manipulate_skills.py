@@ -106,8 +106,8 @@ def push_object(
     look: Callable[[RecordedStep], None],
 ) -> Outcome:
     """Push the object, from where the robot stands or from a place that is searched."""
-    from kineverse.manipulation.pushing.controller import Pushing
-    from kineverse.manipulation.pushing.placement import find_push_start, roll_out
+    from kineverse.manipulation.pushing.push_controller import Pushing
+    from kineverse.manipulation.pushing.push_placement import find_push_start, roll_out
     from kineverse.manipulation.pushing.push_skill import push
     from kineverse.manipulation.session import Session
 

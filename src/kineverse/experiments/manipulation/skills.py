@@ -11,7 +11,7 @@ from typing import Any
 from kineverse.errors import KineverseError
 from kineverse.grasping import find_gripper, find_handle
 from kineverse.manipulation import Outcome, Session, open_object
-from kineverse.manipulation.pushing.controller import Pushing
+from kineverse.manipulation.pushing.push_controller import Pushing
 from kineverse.manipulation.pushing.trials import try_push
 from kineverse.model.model import Model
 from kineverse.state import State

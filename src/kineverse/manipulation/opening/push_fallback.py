@@ -6,8 +6,8 @@ import math
 
 from kineverse.errors import InvalidValueError
 from kineverse.manipulation.outcome import SkillError
-from kineverse.manipulation.pushing.controller import Pushing
-from kineverse.manipulation.pushing.placement import find_push_start
+from kineverse.manipulation.pushing.push_controller import Pushing
+from kineverse.manipulation.pushing.push_placement import find_push_start
 from kineverse.manipulation.pushing.push_skill import push
 from kineverse.state import State
 

@@ -10,7 +10,7 @@ from kineverse.control import Goal
 from kineverse.planning import Path, Planner
 from kineverse.state import State
 
-from .controller import Pushing
+from .push_controller import Pushing
 
 _STANDOFF = 0.03
 _TILT = math.radians(60.0)

@@ -17,7 +17,7 @@ from kineverse.geometry.results import DistanceResults
 from kineverse.lie import Array
 
 from .contact_points import PushPoint, find_alignment
-from .program import PRESS, TOUCHING
+from .push_program import PRESS, TOUCHING
 from .vectors import Vector, cross_product, length, move_point, scale
 
 _MOST_PAIRS = 6

@@ -17,7 +17,7 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 
-from .program import PRESS
+from .push_program import PRESS
 from .vectors import ZERO, Vector, add, inner_product, length, rotate_back, scale, subtract, transform_point
 
 RAMP = 0.02

@@ -28,8 +28,8 @@ from kineverse.state import State
 from kineverse.symbols import Symbol
 
 from .approach import plan_push_approach
-from .controller import Pushing
 from .press import STILL
+from .push_controller import Pushing
 
 _SETTLED, _SETTLED_ESTIMATE = 5, 25
 """Number of steps for which the value, or its estimate, is within half of the tolerance when a push ends."""

@@ -40,7 +40,7 @@ from .contact_choice import CONE, CONE_END, ContactChoice
 from .contact_points import PushPoint, PushSurface, find_push_tool
 from .nearest_pair import ContactRates, PairFinder, PushPair, PushView, make_view
 from .press import PushPress, TipAnchor
-from .program import LOST, NEAR, PRESS, TOUCHING, PushNumbers, PushProgram
+from .push_program import LOST, NEAR, PRESS, TOUCHING, PushNumbers, PushProgram
 from .vectors import ZERO, Vector, add, inner_product, length, move_point, scale, subtract
 
 _APART = 4e-3

@@ -23,7 +23,7 @@ from kineverse.model.frame import is_of_robot
 from kineverse.state import State
 from kineverse.symbols import Symbol
 
-from .controller import Pushing
+from .push_controller import Pushing
 
 _STANDOFF = 0.03
 """Distance of the tip from the contact point at the start [m]."""
