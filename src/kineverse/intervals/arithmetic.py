@@ -39,10 +39,13 @@ def interval_hull(a: RealInterval, b: RealInterval) -> RealInterval:
 
 def interval_add(a: RealInterval, b: RealInterval) -> RealInterval:
     """Return the range of x + y."""
-    low, high = round_outwards(_number(a[0] + b[0], -math.inf), _number(a[1] + b[1], math.inf))
-    if a[0] >= 0 and b[0] >= 0:
+    (p, q), (r, s) = a, b
+    low, high = p + r, q + s
+    low = math.nextafter(low, -math.inf) if low == low else -math.inf
+    high = math.nextafter(high, math.inf) if high == high else math.inf
+    if p >= 0 and r >= 0:
         low = max(0.0, low)
-    return low, min(0.0, high) if a[1] <= 0 and b[1] <= 0 else high
+    return low, min(0.0, high) if q <= 0 and s <= 0 else high
 
 
 def interval_negate(a: RealInterval) -> RealInterval:
@@ -52,13 +55,16 @@ def interval_negate(a: RealInterval) -> RealInterval:
 
 def interval_multiply(a: RealInterval, b: RealInterval) -> RealInterval:
     """Return the range of x·y, with 0 times infinity equal to 0."""
-    if ZERO_INTERVAL in (a, b):
+    (p, q), (r, s) = a, b
+    if p == q == 0 or r == s == 0:
         return ZERO_INTERVAL
-    ends = [0.0 if 0 in (x, y) else x * y for x in a for y in b]
-    low, high = round_outwards(min(ends), max(ends))
-    if (a[0] >= 0 and b[0] >= 0) or (a[1] <= 0 and b[1] <= 0):
+    ends = [p * r, p * s, q * r, q * s]
+    if math.isnan(sum(ends)):
+        ends = [0.0 if 0 in (x, y) else x * y for x in a for y in b]
+    low, high = math.nextafter(min(ends), -math.inf), math.nextafter(max(ends), math.inf)
+    if (p >= 0 and r >= 0) or (q <= 0 and s <= 0):
         return max(0.0, low), high
-    if (a[0] >= 0 and b[1] <= 0) or (a[1] <= 0 and b[0] >= 0):
+    if (p >= 0 and s <= 0) or (q <= 0 and r >= 0):
         return low, min(0.0, high)
     return low, high
 

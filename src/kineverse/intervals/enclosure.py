@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
+from typing import TypeAlias
 
 import casadi as ca
 import numpy as np
@@ -39,6 +40,8 @@ from .taylor import (
     taylor_unary,
 )
 
+_Box: TypeAlias = tuple[list[RealInterval], Array, float]
+
 _UNKNOWN: TaylorSeries = (REALS,)
 _REGULAR = 1e12
 _CONTRACTS = 0.9
@@ -56,22 +59,18 @@ class Enclosures:
 
     def __init__(self, terms: TermGraph) -> None:
         self._terms = terms
+        self._orders: dict[tuple[int, ...], list[Term]] = {}
+        self._constants: dict[int, TaylorSeries] = {}
         self._solvers: dict[ImplicitFunction, _Solver] = {}
 
     def enclose(self, roots: list[Term], values: Mapping[Symbol, TaylorSeries]) -> list[TaylorSeries]:
         """Return the series of terms, from those of their symbols."""
-        known: dict[int, TaylorSeries] = {}
+        key = tuple(term.index for term in roots)
+        if key not in self._orders:
+            self._orders[key] = self._order(roots)
+        known = self._constants.copy()
         solved: dict[object, list[TaylorSeries]] = {}
-        waiting = list(roots)
-        while waiting:
-            term = waiting[-1]
-            missing = [a for a in term.args if a.index not in known]
-            if missing:
-                waiting += missing
-                continue
-            waiting.pop()
-            if term.index in known:
-                continue
+        for term in self._orders[key]:
             if term.op == ca.OP_PARAMETER:
                 known[term.index] = values[term.data]
             elif term.op == "implicit":
@@ -82,6 +81,27 @@ class Enclosures:
             else:
                 known[term.index] = _step(term, [known[a.index] for a in term.args])
         return [known[term.index] for term in roots]
+
+    def _order(self, roots: list[Term]) -> list[Term]:
+        """Return the terms below some, each after its arguments; constants are evaluated here."""
+        order: list[Term] = []
+        seen = set(self._constants)
+        waiting = list(roots)
+        while waiting:
+            term = waiting[-1]
+            missing = [a for a in term.args if a.index not in seen]
+            if missing:
+                waiting += missing
+                continue
+            waiting.pop()
+            if term.index in seen:
+                continue
+            seen.add(term.index)
+            if term.op == ca.OP_CONST:
+                self._constants[term.index] = _constant(term)
+            else:
+                order.append(term)
+        return order
 
     def enclose_implicit(self, function: ImplicitFunction, inputs: list[TaylorSeries]) -> list[TaylorSeries]:
         """Return the series of the unknowns of an implicit function, from those of its inputs."""
@@ -101,25 +121,24 @@ class _Solver:
     def __init__(self, function: ImplicitFunction, terms: TermGraph, enclosures: Enclosures) -> None:
         self._function, self._enclosures = function, enclosures
         self._equations = terms.elements(function.equations)
-        self._by_unknowns = terms.elements(function.by_unknowns)
-        self._by_inputs = terms.elements(function.by_inputs)
+        # Evaluated together: they have most of their terms in common.
+        self._slopes = [*terms.elements(function.by_unknowns), *terms.elements(function.by_inputs)]
         inputs = ca.vertcat(*(s.sx for s in function.inputs))
         solution = ca.densify(expand_nodes(function.apply(function.inputs)))
         self._solve = ca.Function("solve", [inputs], [solution])
+        self._last: tuple[list[RealInterval], _Box | None] | None = None
 
     def enclose(self, inputs: list[TaylorSeries]) -> list[TaylorSeries]:
         """Return the series of the unknowns, from those of the inputs."""
         n = len(self._function.unknowns)
         if not all(math.isfinite(low) and math.isfinite(high) for (low, high), *_ in inputs):
             return [_UNKNOWN] * n
-        middle = [_middle(s[0]) for s in inputs]
-        x = np.array(self._solve(np.array(middle))).ravel()
-        if not np.isfinite(x).all():
+        spans, last = [s[0] for s in inputs], self._last
+        if last is None or last[0] != spans:  # slopes are asked for after values
+            last = self._last = spans, self._find_box(spans)
+        if last[1] is None:
             return [_UNKNOWN] * n
-        found = self._krawczyk(x, middle, [s[0] for s in inputs])
-        if found is None:
-            return [_UNKNOWN] * n
-        box, inverse, slack = found
+        box, inverse, slack = last[1]
         unknowns: list[list[RealInterval]] = [[r] for r in box]
         for k in range(1, min(len(s) for s in inputs)):
             trial = [(*u, ZERO_INTERVAL) for u in unknowns]
@@ -132,26 +151,29 @@ class _Solver:
                 unknown.append(interval_add((-high, -low), (-size, size)))
         return [tuple(u) for u in unknowns]
 
-    def _krawczyk(
-        self, x: Array, middle: list[float], inputs: list[RealInterval]
-    ) -> tuple[list[RealInterval], Array, float] | None:
+    def _find_box(self, inputs: list[RealInterval]) -> _Box | None:
         """Return a box with one solution for each input, Y, and β/(1 - β) with β = |1 - Y ∂r/∂x|.
 
         The box is centred on the tangent D at the middle m, which is far closer to the solution than x is.
         The residual along it is r(x, m) + (∂r/∂u + ∂r/∂x D)(u - m).
         """
+        middle = [_middle(u) for u in inputs]
+        x = np.array(self._solve(np.array(middle))).ravel()
+        if not np.isfinite(x).all():
+            return None
         n, count = len(x), len(inputs)
         there: list[TaylorSeries] = [((float(v), float(v)),) for v in x]
         here: list[TaylorSeries] = [((u, u),) for u in middle]
-        slope = self._matrix(self._by_unknowns, there, here)
-        by_inputs = self._matrix(self._by_inputs, there, here)
-        if slope is None or by_inputs is None or not np.linalg.cond(slope) < _REGULAR:
+        *slopes, residual = self._ranges([*self._slopes, *self._equations], there, here, n)
+        slope, by_inputs = np.split(
+            np.array([[_middle(s) for s in column] for column in slopes]).T, [n], axis=1
+        )
+        if not (np.isfinite(slopes).all() and np.linalg.cond(slope) < _REGULAR):
             return None
         inverse: Array = np.asarray(np.linalg.inv(slope), dtype=np.float64)
         tangent = -inverse @ by_inputs
         away = [round_outwards(u[0] - m, u[1] - m) for u, m in zip(inputs, middle, strict=True)]
         straight = _multiply_column(tangent, away)
-        residual = [s[0] for s in self._at(self._equations, there, here)]
         radius = [1e-14] * n
         for _ in range(_ATTEMPTS):
             box = [
@@ -160,25 +182,25 @@ class _Solver:
             ]
             points: list[TaylorSeries] = [(b,) for b in box]
             wide: list[TaylorSeries] = [(u,) for u in inputs]
-            a = [s[0] for s in self._at(self._by_unknowns, points, wide)]
-            b = [s[0] for s in self._at(self._by_inputs, points, wide)]
+            columns = self._ranges(self._slopes, points, wide, n)
+            by_unknowns = columns[:n]
             along_tangent = list(residual)
             for j in range(count):
-                turned = [b[i + n * j] for i in range(n)]
+                turned = columns[n + j]
                 for k in range(n):
                     scale = float(tangent[k, j])
                     turned = [
-                        interval_add(t, interval_multiply((scale, scale), a[i + n * k]))
-                        for i, t in enumerate(turned)
+                        interval_add(t, interval_multiply((scale, scale), a))
+                        for t, a in zip(turned, by_unknowns[k], strict=True)
                     ]
                 along_tangent = [
                     interval_add(r, interval_multiply(t, away[j]))
                     for r, t in zip(along_tangent, turned, strict=True)
                 ]
             shift = [interval_negate(s) for s in _multiply_column(inverse, along_tangent)]
-            columns = [_multiply_column(inverse, a[n * j : n * (j + 1)]) for j in range(n)]
+            scaled = [_multiply_column(inverse, column) for column in by_unknowns]
             rest = [
-                [interval_add((float(i == j),) * 2, interval_negate(columns[j][i])) for j in range(n)]
+                [interval_add((float(i == j),) * 2, interval_negate(scaled[j][i])) for j in range(n)]
                 for i in range(n)
             ]
             norm = max(sum(max(-low, high) for low, high in row) for row in rest)
@@ -196,12 +218,12 @@ class _Solver:
             radius = [1.2 * furthest / (1 - norm) + 1e-14] * n
         return None
 
-    def _matrix(
-        self, roots: list[Term], unknowns: list[TaylorSeries], inputs: list[TaylorSeries]
-    ) -> Array | None:
-        entries = [_middle(s[0]) for s in self._at(roots, unknowns, inputs)]
-        matrix = np.reshape(entries, (-1, len(unknowns))).T
-        return matrix if np.isfinite(matrix).all() else None
+    def _ranges(
+        self, roots: list[Term], unknowns: list[TaylorSeries], inputs: list[TaylorSeries], rows: int
+    ) -> list[list[RealInterval]]:
+        """Return the ranges of terms, in columns of some rows."""
+        ranges = [s[0] for s in self._at(roots, unknowns, inputs)]
+        return [ranges[k : k + rows] for k in range(0, len(ranges), rows)]
 
     def _at(
         self, roots: list[Term], unknowns: list[TaylorSeries], inputs: list[TaylorSeries]
@@ -225,21 +247,24 @@ def _multiply_column(matrix: Array, column: list[RealInterval]) -> list[RealInte
     return result
 
 
+def _constant(term: Term) -> TaylorSeries:
+    return taylor_constant(term.data) if math.isfinite(term.data) else _UNKNOWN
+
+
+_RATIONAL: dict[object, Callable[..., TaylorSeries]] = {
+    ca.OP_ADD: taylor_add,
+    ca.OP_SUB: taylor_subtract,
+    ca.OP_MUL: taylor_multiply,
+    ca.OP_DIV: taylor_divide,
+    ca.OP_NEG: taylor_negate,
+}
+
+
 def _step(term: Term, args: list[TaylorSeries]) -> TaylorSeries:
     """Return the series of a step from those of its arguments."""
     op = term.op
-    if op == ca.OP_CONST:
-        return taylor_constant(term.data) if math.isfinite(term.data) else _UNKNOWN
-    if op == ca.OP_ADD:
-        return taylor_add(*args)
-    if op == ca.OP_SUB:
-        return taylor_subtract(*args)
-    if op == ca.OP_MUL:
-        return taylor_multiply(*args)
-    if op == ca.OP_DIV:
-        return taylor_divide(*args)
-    if op == ca.OP_NEG:
-        return taylor_negate(args[0])
+    if op in _RATIONAL:
+        return _RATIONAL[op](*args)
     if op == ca.OP_POW:
         return taylor_power(args[0], args[1][0])
     if op == ca.OP_ATAN2:

@@ -100,10 +100,10 @@ def taylor_power(a: TaylorSeries, exponent: RealInterval) -> TaylorSeries:
 
 def taylor_unary(op: int, a: TaylorSeries) -> TaylorSeries:
     """Return the series of a unary CasADi operation on f."""
-    value = interval_unary(op, a[0])
     if op in (ca.OP_SIN, ca.OP_COS):
         sine, cosine = _sine_and_cosine(a)
         return sine if op == ca.OP_SIN else cosine
+    value = interval_unary(op, a[0])
     if op == ca.OP_TAN:
         sine, cosine = _sine_and_cosine(a)
         return _with_value(taylor_divide(sine, cosine), value)
