@@ -360,3 +360,27 @@ def test_the_guess_is_periodic_over_full_revolutions():
     far = 1e17
     near = math.atan2(math.sin(far), math.cos(far))
     assert guess([far]) == pytest.approx(guess([near]), abs=1e-9)
+
+
+@pytest.mark.parametrize(("lower", "upper"), [(-2.354, 3.5467), (-2.2, 3.4)])
+@pytest.mark.parametrize("names", [[""], ["", "other "]])
+def test_branches_that_come_close_are_told_apart(names, lower, upper):
+    # The bars are nearly in line on the way. Of twins no determinant shows that both change their branch.
+    a, b, c = 0.5707049918, 0.9098700426, 0.6058904411
+    d = b + c - a - 1e-5
+    model = kv.Model()
+    with model.edit() as edit:
+        bar(edit, "crank", "world", at(0), lower=lower, upper=upper)
+        for name in names:
+            bar(edit, f"{name}coupler", "crank", at(a))
+            edit.add_frame(f"{name}coupler_tip", f"{name}coupler", kv.translation(b, 0, 0))
+            bar(edit, f"{name}rocker", "world", at(d))
+            edit.add_frame(f"{name}rocker_tip", f"{name}rocker", kv.translation(c, 0, 0))
+        first, *more = ((f"{name}coupler_tip", f"{name}rocker_tip") for name in names)
+        edit.close_loop(*first, name="four-bar", more=tuple(more), home={"crank": 1.5})
+    tips = kv.compile([model.fk(f"{name}coupler_tip")[:2, 3] for name in names], [crank])
+    cranks = np.linspace(lower, upper, 41)
+    side = min((1, -1), key=lambda s: np.abs(tips([1.5])[0] - four_bar_by_circles(1.5, a, b, c, d, s)).max())
+    wanted = [four_bar_by_circles(angle, a, b, c, d, side) for angle in cranks]
+    for found in tips.batch(cranks[:, None]):
+        np.testing.assert_allclose(found, wanted, atol=1e-6)

@@ -101,8 +101,9 @@ def test_cover_solid_contains_the_solid_and_keeps_to_its_protrusion(solid, protr
     assert reached <= cover.protrusion + 1e-6
     assert len(cover) <= most
     wanted = default_protrusion([(solid, np.eye(4))]) if protrusion is None else protrusion
-    # One sphere may cover a stout cylinder as well as six do.
-    assert cover.protrusion <= wanted + 1e-9 or len(cover) >= {1: 1, 6: 1, 32: 20}[most]
+    # Two spheres may cover a cone as well as six do, and one a stout cylinder.
+    fewest = 1 if isinstance(solid.surface, Cylinder) and most == 6 else {1: 1, 6: 2, 32: 20}[most]
+    assert cover.protrusion <= wanted + 1e-9 or len(cover) >= fewest
     assert cover.excess >= 0.0
 
 

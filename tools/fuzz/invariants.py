@@ -220,7 +220,7 @@ def _place(error: BaseException) -> str:
 
 
 # An audit hook cannot be removed, so there is one, which records for the current watch.
-_watch: tuple[str, list[str], frozenset[int | None]] | None = None
+_watch: tuple[str, list[str], frozenset[threading.Thread]] | None = None
 _hooked = False
 
 
@@ -229,7 +229,7 @@ def _hook(event: str, arguments: tuple[Any, ...]) -> None:
     if _watch is None:
         return
     folder, reached, others = _watch
-    if threading.get_ident() in others:
+    if threading.current_thread() in others:
         return
     if event.startswith(_EXTERNAL_CALLS):
         reached.append(f"{event} {arguments!r}"[:300])
@@ -253,7 +253,7 @@ def _watching(folder: Path) -> Iterator[list[str]]:
         sys.addaudithook(_hook)
         _hooked = True
     reached: list[str] = []
-    others = frozenset(t.ident for t in threading.enumerate()) - {threading.get_ident()}
+    others = frozenset(threading.enumerate()) - {threading.current_thread()}
     _watch = str(folder), reached, others
     try:
         yield reached

@@ -83,7 +83,7 @@ class Enclosures:
         return [known[term.index] for term in roots]
 
     def _order(self, roots: list[Term]) -> list[Term]:
-        """Return the terms below some, each after its arguments; constants are evaluated here."""
+        """Sort the terms that others depend on, arguments first, and evaluate the constants."""
         order: list[Term] = []
         seen = set(self._constants)
         waiting = list(roots)

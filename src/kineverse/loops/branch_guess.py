@@ -21,7 +21,7 @@ from kineverse.expressions.functions import cos, sin
 from kineverse.lie import Array
 from kineverse.symbols import Symbol
 
-from .branches import FIRST, continue_solution
+from .branches import FIRST_STEP, continue_solution
 from .equations import Equations
 
 FEW = 3
@@ -263,9 +263,9 @@ class BranchSamples:
         matrices = (self.equations(x, self.all_inputs(q))[1][list(rows)] for q, x in points)
         return len({float(np.linalg.slogdet(matrix)[0]) for matrix in matrices}) > 1
 
-    def _continue(self, x: Array, start: Array, end: Array, first: float = FIRST) -> Array:
+    def _continue(self, x: Array, start: Array, end: Array, first_step: float = FIRST_STEP) -> Array:
         inputs = self.all_inputs(start), self.all_inputs(end)
-        reached = continue_solution(self.equations, x, *inputs, first)
+        reached = continue_solution(self.equations, x, *inputs, first_step)
         if reached.part < 1.0:
             there = start + reached.part * (end - start)
             at, to = (
@@ -289,7 +289,9 @@ class BranchSamples:
         while len(left):
             position = int(distance[left].argmin())
             i, left = left[position], np.delete(left, position)
-            solutions[i] = self._continue(solutions[nearest[i]], points[nearest[i]], points[i], first=1.0)
+            solutions[i] = self._continue(
+                solutions[nearest[i]], points[nearest[i]], points[i], first_step=1.0
+            )
             closer = np.abs((points - points[i]) / scale).max(axis=1, initial=0.0)
             better = closer < distance
             nearest[better], distance[better] = i, closer[better]

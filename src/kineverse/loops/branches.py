@@ -91,7 +91,10 @@ def _distance(a: Array, b: Array, angles: npt.NDArray[np.bool_]) -> float:
 
 
 _SHORTEST = 1e-5
-FIRST = 1 / 16
+FIRST_STEP = 1 / 16
+"""First step of a continuation, as a fraction of the line."""
+_LITTLE = 0.5
+"""Change of ∂r/∂x over a whole line, relative to itself, up to which its end is on the same branch."""
 
 
 @dataclass(frozen=True)
@@ -111,15 +114,27 @@ class ContinuationResult:
 
 
 def continue_solution(
-    equations: Equations, x: Array, start: Array, end: Array, first: float = FIRST
+    equations: Equations, x: Array, start: Array, end: Array, first_step: float = FIRST_STEP
 ) -> ContinuationResult:
     """Continue a solution along a straight line of inputs.
 
     Each step has a predictor along the tangent and a Newton corrector. It is accepted if the correction is
-    small relative to the step, so that it stays on the branch. The first one is a given fraction of the line.
+    small relative to the step, so that it stays on the branch. Where two branches come close to each other,
+    the other one lies along the tangent, so that a whole line is accepted only if ∂r/∂x changes little.
+
+    Parameters
+    ----------
+    equations
+        Equations of the loop.
+    x
+        Solution at the start.
+    start, end
+        Inputs at both ends of the line.
+    first_step
+        First step, as a fraction of the line.
     """
     direction = end - start
-    done, step = 0.0, first
+    done, step = 0.0, first_step
     _, by_x, by_u = equations(x, start)
     if not direction.any():
         return ContinuationResult(x, 1.0)
@@ -131,16 +146,23 @@ def continue_solution(
         found, gap = equations.close(predicted, u, 8)
         moved = float(np.linalg.norm(found - x))
         wrong = float(np.linalg.norm(found - predicted))
-        if gap < CLOSURE_TOLERANCE and wrong <= 0.1 * max(moved, 1e-6) + 1e-9:
-            x, done = found, done + step
-            _, by_x, by_u = equations(x, u)
-            step *= 2
+        near = gap < CLOSURE_TOLERANCE and wrong <= 0.1 * max(moved, 1e-6) + 1e-9
+        # Near a singularity the tangent is unreliable, but such short steps stay on the branch.
+        if near or (step <= _SHORTEST and gap < CLOSURE_TOLERANCE and wrong < 0.05):
+            _, next_by_x, by_u = equations(found, u)
+            if step == 1.0 and _change(by_x, next_by_x) > _LITTLE:
+                step = FIRST_STEP
+                _, by_x, by_u = equations(x, start)
+                continue
+            x, done, by_x = found, done + step, next_by_x
+            step *= 2 if near else 1
         elif step > _SHORTEST:
             step /= 2
-        elif gap < CLOSURE_TOLERANCE and wrong < 0.05:
-            # Near a singularity the tangent is unreliable, but such short steps stay on the branch.
-            x, done = found, done + step
-            _, by_x, by_u = equations(x, u)
         else:
             return ContinuationResult(x, done)
     return ContinuationResult(x, 1.0)
+
+
+def _change(J: Array, other: Array) -> float:
+    """Return the norm of J⁺(other - J); below 1, nothing between the two is singular."""
+    return float(np.linalg.norm(least_squares(J, other - J)))

@@ -79,7 +79,7 @@ CLOSURE_TOLERANCE = 1e-11
 _NEWTON = 30
 _SINGULAR = 1e-9
 _WELL_CONDITIONED = 1e10
-"""Condition of JJᵀ or JᵀJ up to which steps have enough digits without a singular value decomposition."""
+"""Bound on the condition of JJᵀ or JᵀJ up to which no singular value decomposition is needed."""
 
 
 MOST_EFFORT = 150_000.0
@@ -117,14 +117,14 @@ class WorkBudget:
 
 
 def least_squares(J: Array, r: Array) -> Array:
-    """Return the shortest of the x (n,) with the least |Jx - r|, for J (m, n) and r (m,)."""
+    """Return the least-squares solution x of Jx = r of least norm, for J (m, n) and r (m,) or (m, k)."""
     tall = J.shape[0] >= J.shape[1]
     product = J.T @ J if tall else J @ J.T
     try:
         inverse = np.linalg.inv(product)
     except np.linalg.LinAlgError:
         return np.asarray(np.linalg.lstsq(J, r, rcond=_SINGULAR)[0], dtype=float)
-    a, b = product.ravel(), inverse.ravel()
+    a, b = product.ravel(), inverse.ravel()  # of their norms, whose product bounds the condition
     if not a.dot(a) * b.dot(b) < _WELL_CONDITIONED**2:
         return np.asarray(np.linalg.lstsq(J, r, rcond=_SINGULAR)[0], dtype=float)
     return np.asarray(inverse @ (J.T @ r) if tall else J.T @ (inverse @ r), dtype=float)

@@ -30,6 +30,8 @@ _SMALL = 1e-3
 _DEGREES = (2, 3, 4, 6, 8, 10, 12, 16, 20, 24, 32)
 _MORE_STEPS = 4
 _STEPS = (1, 2, 3, 4, 5, 6, 8, 10)
+_FEW = 16
+"""Number of samples that a guess is tried at first."""
 
 _PARTS = (1.0, 0.6, 0.3, 0.1, 0.03)
 """Fractions of the margin to try, largest first."""
@@ -357,14 +359,28 @@ def _rows(samples: BranchSamples) -> tuple[int, ...]:
 
 def _steps(samples: BranchSamples, seed: BranchGuess, rows: tuple[int, ...], most: float) -> int | None:
     """Return the number of Newton steps that suffices at all samples; None if it is larger than ``most``."""
-    x, u, wanted = seed.evaluate(samples.tried), samples.all_inputs(samples.tried), samples.wanted
-    chosen = list(rows)
+    needed = 0
+    # The corners come first: most guesses that fail do so there.
+    for part in (slice(_FEW), slice(_FEW, None)):
+        steps = _steps_of(samples, seed, rows, most, part)
+        if steps is None:
+            return None
+        needed = max(needed, steps)
+    return next(s for s in _STEPS if s >= needed)
+
+
+def _steps_of(
+    samples: BranchSamples, seed: BranchGuess, rows: tuple[int, ...], most: float, part: slice
+) -> int | None:
+    """Return the number of Newton steps that suffices at some samples."""
+    tried, wanted, chosen = samples.tried[part], samples.wanted[part], list(rows)
+    x, u = seed.evaluate(tried), samples.all_inputs(tried)
     for step in range(math.floor(most) + 1):
         residual, by_x = samples.equations.evaluate_all(x, u)
         near = np.abs(x - wanted).max(axis=1, initial=0.0) < 1e-5
         left = ~(near & (np.linalg.norm(residual, axis=1) < 1e-12))
         if not left.any():
-            return next(s for s in _STEPS if s >= step)
+            return step
         x, u, wanted = x[left], u[left], wanted[left]
         try:
             x -= np.linalg.solve(by_x[left][:, chosen], residual[left][:, chosen, None])[..., 0]
