@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
-import io
 import re
 
+import browsers
 import numpy as np
 import pytest
+from browsers import PATIENCE, until
 from small_models import cabinet, held_door
 
 from kineverse.view import Camera, view
@@ -14,26 +15,11 @@ from kineverse.view.drawables import collect_drawables
 from kineverse.view.rasterizer import TriangleSoup
 
 pytest.importorskip("viser", reason="the page needs the extra 'view'")
-playwright = pytest.importorskip("playwright.sync_api", reason="driving a browser needs playwright")
-imaging = pytest.importorskip("PIL.Image")
 
 pytestmark = pytest.mark.browser
 
-PATIENCE = 60_000
-"""Longest wait for anything on the page [ms]: software rendering on a busy machine is slow."""
-
-ARGUMENTS = ["--no-sandbox", "--headless=new", "--use-angle=swiftshader", "--enable-unsafe-swiftshader"]
-
 SLIDERS = "xpath=//*[@role='tablist']/following::*[@role='slider']"
 """Those of degrees of freedom: in the tabs, not in the folder above them."""
-
-
-@pytest.fixture(scope="module")
-def browser(chromium):
-    with playwright.sync_playwright() as driver:
-        browser = driver.chromium.launch(executable_path=chromium, args=ARGUMENTS, timeout=PATIENCE)
-        yield browser
-        browser.close()
 
 
 @pytest.fixture(scope="module")
@@ -67,20 +53,9 @@ def opened(cabinet_page):
     assert errors == []
 
 
-def until(page, condition):
-    """Wait for a condition on what is seen, frame by frame of the browser."""
-    for _ in range(600):
-        if condition():
-            return
-        page.evaluate("() => new Promise(done => requestAnimationFrame(() => requestAnimationFrame(done)))")
-    pytest.fail("waited in vain for the page")
-
-
 def shot(page):
     """The left of the page, where nothing but the scene is drawn."""
-    clip = {"x": 0, "y": 0, "width": 270, "height": 400}
-    data = page.screenshot(clip=clip)
-    return np.asarray(imaging.open(io.BytesIO(data)).convert("RGB")).astype(int)
+    return browsers.shot(page, 270, 400)
 
 
 def reddish(image):

@@ -5,6 +5,7 @@ from __future__ import annotations
 from html import escape
 
 import pytest
+from browsers import PATIENCE, launched, until
 
 import kineverse as kv
 from kineverse.model.body import Body, Box, Mesh, Shape
@@ -12,21 +13,11 @@ from kineverse.view import view
 from kineverse.view.access_control import AccessControl
 
 pytest.importorskip("viser", reason="the page needs the extra 'view'")
-playwright = pytest.importorskip("playwright.sync_api", reason="driving a browser needs playwright")
 
 pytestmark = pytest.mark.browser
 
-PATIENCE = 60_000
-"""Longest wait for anything on the page [ms]: software rendering on a busy machine is slow."""
-
-ARGUMENTS = [
-    "--no-sandbox",
-    "--headless=new",
-    "--use-angle=swiftshader",
-    "--enable-unsafe-swiftshader",
-    # Every name there is points to this computer: rebinding, and no way out.
-    "--host-resolver-rules=MAP * 127.0.0.1",
-]
+# Every name there is points to this computer: rebinding, and no way out.
+HERE = "--host-resolver-rules=MAP * 127.0.0.1"
 
 IMAGE = """<img src=x onerror="window.owned='{}'">"""
 FRAME = """<iframe srcdoc="<script>parent.owned='{}'</script>"></iframe>"""
@@ -47,10 +38,8 @@ URDF = """<robot name="{robot}">
 
 @pytest.fixture(scope="module")
 def browser(chromium):
-    with playwright.sync_playwright() as driver:
-        browser = driver.chromium.launch(executable_path=chromium, args=ARGUMENTS, timeout=PATIENCE)
+    with launched(chromium, HERE) as browser:
         yield browser
-        browser.close()
 
 
 @pytest.fixture
@@ -82,15 +71,6 @@ def hostile(tmp_path):
 def inside(page):
     """The text of the page, whether it is seen or not."""
     return page.evaluate("() => document.body.textContent")
-
-
-def until(page, condition):
-    """Wait for a condition, frame by frame of the browser."""
-    for _ in range(300):
-        if condition():
-            return
-        page.evaluate("() => new Promise(done => requestAnimationFrame(() => requestAnimationFrame(done)))")
-    pytest.fail(f"waited in vain for the page:\n{inside(page)[-3000:]}")
 
 
 def test_html_in_names_is_shown_as_text(browser, hostile):

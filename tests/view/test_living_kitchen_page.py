@@ -5,8 +5,10 @@ from __future__ import annotations
 import socket
 import threading
 
+import browsers
 import numpy as np
 import pytest
+from browsers import PATIENCE, until
 from living_kitchen.simulation import Simulation
 
 import kineverse as kv
@@ -14,11 +16,6 @@ import kineverse as kv
 pytest.importorskip("viser", reason="the page needs the extra 'view'")
 
 from living_kitchen.page import SimulationPage
-
-PATIENCE = 60_000
-"""Longest wait for anything on the page [ms]: software rendering on a busy machine is slow."""
-
-ARGUMENTS = ["--no-sandbox", "--headless=new", "--use-angle=swiftshader", "--enable-unsafe-swiftshader"]
 
 
 def threads():
@@ -66,15 +63,6 @@ def test_a_failed_step_is_logged_and_the_simulation_continues(monkeypatch, caplo
     assert any("could not go on" in record.message for record in caplog.records)
 
 
-@pytest.fixture(scope="module")
-def browser(chromium):
-    playwright = pytest.importorskip("playwright.sync_api", reason="driving a browser needs playwright")
-    with playwright.sync_playwright() as driver:
-        browser = driver.chromium.launch(executable_path=chromium, args=ARGUMENTS, timeout=PATIENCE)
-        yield browser
-        browser.close()
-
-
 def opened(browser, page, errors):
     """Return a tab that shows a page; what goes wrong on it is noted."""
     tab = browser.new_page(viewport={"width": 640, "height": 300})
@@ -86,21 +74,9 @@ def opened(browser, page, errors):
     return tab
 
 
-def until(tab, condition):
-    """Wait for a condition, frame by frame of the browser."""
-    for _ in range(1500):
-        if condition():
-            return
-        tab.evaluate("() => new Promise(done => requestAnimationFrame(() => requestAnimationFrame(done)))")
-    pytest.fail("waited in vain for the page")
-
-
 def shot(tab):
-    imaging = pytest.importorskip("PIL.Image")
-    import io
-
-    data = tab.screenshot(clip={"x": 0, "y": 0, "width": 250, "height": 300})
-    return np.asarray(imaging.open(io.BytesIO(data)).convert("RGB")).astype(int)
+    """The left of the page, where nothing but the scene is drawn."""
+    return browsers.shot(tab, 250, 300)
 
 
 @pytest.mark.browser
