@@ -15,7 +15,7 @@ from kineverse.view.triangle_mesh import Floats, Integers, Singles, dot_rows
 SHADOW_PIXELS = 1024
 
 LAMP_SHADOW = True
-"""Whether the lamp of the page casts a shadow, which takes half of the time where software draws it."""
+"""The lamp of the page casts a shadow, which takes half of the time where software draws it."""
 
 KEY_LIGHT = np.array([1.0, 0.965, 0.91]) * 1.6
 SKY_LIGHT = np.array([0.86, 0.92, 1.0]) * 0.80
