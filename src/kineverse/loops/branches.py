@@ -149,12 +149,11 @@ def continue_solution(
         near = gap < CLOSURE_TOLERANCE and wrong <= 0.1 * max(moved, 1e-6) + 1e-9
         # Near a singularity the tangent is unreliable, but such short steps stay on the branch.
         if near or (step <= _SHORTEST and gap < CLOSURE_TOLERANCE and wrong < 0.05):
-            _, next_by_x, by_u = equations(found, u)
+            _, next_by_x, next_by_u = equations(found, u)
             if step == 1.0 and _change(by_x, next_by_x) > _LITTLE:
                 step = FIRST_STEP
-                _, by_x, by_u = equations(x, start)
                 continue
-            x, done, by_x = found, done + step, next_by_x
+            x, done, by_x, by_u = found, done + step, next_by_x, next_by_u
             step *= 2 if near else 1
         elif step > _SHORTEST:
             step /= 2
