@@ -2,8 +2,9 @@
 
 A test that drives a browser carries the marker ``browser`` and asks for the fixture ``chromium``, the path of
 the system's Chromium. Without one it is skipped, or with ``KINEVERSE_REQUIRE_BROWSER=1`` it fails. A test that
-needs compiled code carries the marker ``compiler``; without a C compiler it is skipped as well. What reads data
-that is not ours is skipped where there is none. The summary has a line for each cause. What is
+needs compiled code carries the marker ``compiler``; without a C compiler it is skipped as well. A test that reads
+data of other people asks for the fixture ``published``, a function from a path below ``KINEVERSE_TEST_DATA``, which
+gives it the marker ``data``; without the data it is skipped. The summary has a line for each cause. What is
 slow for what it checks carries the marker ``long``: it runs with ``--long``, or if it is asked for by its name.
 So do most cases of a test with the marker ``sampled(n)``, all but every n-th.
 """
@@ -18,18 +19,18 @@ import shutil
 import sys
 import tempfile
 from collections import Counter
-from collections.abc import Generator
+from collections.abc import Callable, Generator
 from pathlib import Path
 
 import pytest
 from hypothesis import settings
 
+import published_data
 from hypothesis_profiles import USUAL
 from native_libraries import compile_native_libraries
 
 ROOT = Path(__file__).parents[1]
 sys.path.append(str(ROOT / "examples"))  # living_kitchen
-SHARED = ROOT.parent / "shared" / "data"
 BROWSERS = ("chromium", "chromium-browser", "google-chrome")
 
 settings.register_profile("kineverse", deadline=None, max_examples=45, derandomize=bool(os.environ.get("CI")))
@@ -48,9 +49,11 @@ def pytest_configure(config: pytest.Config) -> None:
     """Set the environment, once: the workers of xdist inherit it."""
     if hasattr(config, "workerinput"):
         return
-    places = os.environ.get("KINEVERSE_MODEL_PATH", "").split(os.pathsep)
-    if SHARED.is_dir() and str(SHARED) not in places:
-        os.environ["KINEVERSE_MODEL_PATH"] = os.pathsep.join([*filter(None, places), str(SHARED)])
+    if published_data.FOLDER and not published_data.FOLDER.is_dir():
+        raise pytest.UsageError(f"{published_data.VARIABLE} is {published_data.FOLDER}, which is no folder")
+    # Nothing is found but what ships, what is installed, and what a test asks for.
+    for name in ("KINEVERSE_MODEL_PATH", "KINEVERSE_PACKAGE_PATH", "KINEVERSE_ROOT", "ROS_PACKAGE_PATH"):
+        os.environ.pop(name, None)
     folder = tempfile.mkdtemp(prefix="kineverse-tests-")
     os.environ["KINEVERSE_CACHE_DIR"] = folder
     # A worker has one core. BLAS would take all of them for small matrices, and have them wait for each other.
@@ -77,6 +80,9 @@ def pytest_collection() -> Generator[None, object, object]:
 def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item]) -> None:
     """Leave out what is slow for what it checks, unless it is asked for."""
     _mark_samples(items)
+    for item in items:
+        if "published" in getattr(item, "fixturenames", ()):
+            item.add_marker("data")
     option = config.option
     asked = option.long or option.keyword or "long" in option.markexpr or getattr(option, "lf", False)
     if asked or any("::" in argument for argument in config.args):
@@ -129,8 +135,8 @@ def pytest_terminal_summary(terminalreporter: pytest.TerminalReporter) -> None:
 def _cause(report: pytest.TestReport) -> str:
     """Return why a test did not run, and how to have it run."""
     why = str(report.longrepr[2] if isinstance(report.longrepr, tuple) else report.longrepr)
-    if SHARED.as_posix() in why:
-        return "what they read is not ours and not in ../shared/data; tests/DATA.md says where to get it"
+    if "data" in report.keywords and published_data.VARIABLE in why:
+        return f"what they read is not ours; {published_data.VARIABLE} names its folder, see tests/DATA.md"
     for marker, cause in (
         ("browser", "there is no Chromium; install the package 'chromium'"),
         ("compiler", "there is no C compiler; install the package 'gcc'"),
@@ -157,6 +163,14 @@ def chromium() -> str:
     if path is None:
         pytest.skip("There is no Chromium: install the package 'chromium'.")
     return path
+
+
+@pytest.fixture
+def published(monkeypatch: pytest.MonkeyPatch) -> Callable[..., Path]:
+    """Function to a file or folder of the published data, whose models are found by name in this test."""
+    if published_data.FOLDER:
+        monkeypatch.setenv("KINEVERSE_MODEL_PATH", str(published_data.FOLDER))
+    return published_data.published_path
 
 
 def _has_compiler() -> bool:

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 import math
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -13,7 +12,6 @@ from scipy.spatial.transform import Rotation
 import kineverse as kv
 from kineverse.cli import main
 
-TRACKS = Path(__file__).parents[3] / "shared" / "data" / "sturm_tracks"
 DOOR = ("--parent", "cupboard", "--child", "door")
 # All families take seconds: they are tried where the choice among them is the subject.
 TWO = ("--families", "prismatic,revolute")
@@ -353,11 +351,9 @@ def test_poses_anywhere_are_no_joint(tmp_path, capsys):
     assert answer([table, *TWO], capsys, status=1)["told"] is False
 
 
-def test_correlated_errors_do_not_make_a_screw(capsys):
+def test_correlated_errors_do_not_make_a_screw(capsys, published):
     """Deviations of a hand from a circle are correlated over seconds, and count by effective sample size."""
-    handle = TRACKS / "microwave" / "microwave1.log"
-    if not handle.exists():
-        pytest.skip(f"no {handle}")
+    handle = published("sturm_tracks", "microwave", "microwave1.log")
     main(["fit", str(handle), "--json"])
     found = json.loads(capsys.readouterr().out)
     assert found["judged"] < 20

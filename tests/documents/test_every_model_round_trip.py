@@ -1,9 +1,10 @@
-"""Every model there is survives: what ships, every scene of the gallery, every file of the shared data that loads."""
+"""Every model there is survives: what ships, every scene of the gallery, every published file that loads."""
 
 from __future__ import annotations
 
 import json
 import random
+from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
@@ -13,7 +14,6 @@ import kineverse as kv
 from kineverse import gallery
 from kineverse.formats.document import read_operations, to_json
 
-SHARED = Path(__file__).parents[3] / "shared" / "data"
 FOLDERS = {
     "articulated_objects": 5,
     "fetch": 1,
@@ -114,11 +114,11 @@ def test_shipped_models_and_scenes_survive_a_round_trip(name: str) -> None:
     ],
 )
 @pytest.mark.sampled(2)
-def test_files_of_other_projects_survive_a_round_trip(folder: str, step: int, least: int) -> None:
-    if not (SHARED / folder).is_dir():
-        pytest.skip(f"no {SHARED / folder}")
+def test_files_of_other_projects_survive_a_round_trip(
+    folder: str, step: int, least: int, published: Callable[..., Path]
+) -> None:
     loaded = 0
-    paths = sorted(p for p in (SHARED / folder).rglob("*") if p.suffix in SUFFIXES and p.is_file())
+    paths = sorted(p for p in published(folder).rglob("*") if p.suffix in SUFFIXES and p.is_file())
     for path in paths[::step]:
         try:
             model = kv.load(path, prefix="")

@@ -118,11 +118,11 @@ def test_cramer_rao_bound_equals_that_of_the_models_jacobians(kitchen):
 
 
 @pytest.mark.parametrize("seeds", [1, pytest.param(4, marks=pytest.mark.long)])
-def test_the_published_filter_is_within_5_percent_of_the_authors_code(seeds):
+def test_the_published_filter_is_within_5_percent_of_the_authors_code(seeds, published):
     """Compare mean errors over all seeds, on the papers' kitchen with their noise."""
-    from formats.urdf_texts import shared
-
-    scene = make_observed_model(kv.load(shared("iai_kitchen", "iai_kitchen", "urdf_obj", "IAI_kitchen.urdf")))
+    scene = make_observed_model(
+        kv.load(published("iai_kitchen", "iai_kitchen", "urdf_obj", "IAI_kitchen.urdf"))
+    )
     for noise, reported in zip(LEVELS, REPORTED_MEAN, strict=True):
         means = []
         for seed in range(seeds):

@@ -16,7 +16,7 @@ from kineverse.experiments import Options, kitchens, reproduce, table1_open, tab
 from kineverse.experiments.lockbox.unlocking_runs import RULES, run_unlocking
 from kineverse.experiments.manipulation import setting, skills
 from kineverse.experiments.manipulation.film import draw_vectors, find_telling_moment
-from kineverse.experiments.manipulation.robots import SHIPPED, find_data, find_robots
+from kineverse.experiments.manipulation.robots import SHIPPED, check_data, find_robots
 from kineverse.experiments.manipulation.setting import TrialSetting, TrialWatch, list_series, make_settings
 from kineverse.experiments.manipulation.tables import make_exception_table, make_trial_tables
 from kineverse.experiments.manipulation.trial_pool import run_jobs
@@ -222,9 +222,9 @@ def test_find_robots_and_options_name_what_there_is(tmp_path):
     with pytest.raises(UnknownNameError, match="Did you mean 'fetch'"):
         find_robots(["fetsch"])
     with pytest.raises(InvalidValueError, match="There is no folder"):
-        find_data(tmp_path / "none")
+        check_data(tmp_path / "none")
     with pytest.raises(InvalidValueError, match="has none of pr2, fetch"):
-        find_data(tmp_path)
+        check_data(tmp_path)
     (tmp_path / "file").touch()
     for options, error, wrong in (
         (Options(count=0), InvalidValueError, "--count"),

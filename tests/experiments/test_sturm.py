@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 from dataclasses import replace
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -33,7 +32,6 @@ from kineverse.experiments.sturm.recordings import (
     read_labelled_recordings,
 )
 
-TRACKS = Path(__file__).parents[3] / "shared" / "data" / "sturm_tracks"
 RNG = np.random.default_rng(0)
 
 
@@ -149,16 +147,14 @@ def test_all_poses_are_judged_under_each_statement_of_the_noise():
     assert statement_numbers(wrong)["half"]["not_right"] == {"an arc": "prismatic, wrong"}
 
 
-@pytest.mark.skipif(not TRACKS.exists(), reason=f"no {TRACKS}")
-def test_every_tenth_of_the_published_recordings_is_right():
-    found = list(read_labelled_recordings(TRACKS))
+def test_every_tenth_of_the_published_recordings_is_right(published):
+    found = list(read_labelled_recordings(published("sturm_tracks")))
     assert {recording.label for recording in found[::10]} == {"revolute", "prismatic"}
     assert all(classify_recording(recording).is_correct for recording in found[::10])
 
 
 @pytest.mark.long
-@pytest.mark.skipif(not TRACKS.exists(), reason=f"no {TRACKS}")
-def test_at_least_95_percent_of_the_published_recordings_are_right():
-    found = reproduce("sturm", options=Options(quick=True, data=TRACKS))
+def test_at_least_95_percent_of_the_published_recordings_are_right(published):
+    found = reproduce("sturm", options=Options(quick=True, data=published("sturm_tracks")))
     assert len(found.numbers["recordings"]) == 60
     assert found.numbers["right"] >= 0.95

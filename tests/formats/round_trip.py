@@ -8,12 +8,12 @@ from pathlib import Path
 
 import numpy as np
 from urdf_outcomes import expected_outcome
-from urdf_texts import SHARED
 
 import kineverse as kv
 from kineverse import gallery
 from kineverse.formats.locate import shipped_models
 from kineverse.formats.resource_paths import locate_resource
+from published_data import published_files
 
 EXACT = 1e-12
 SCENES = [f"articulations/{name}" for name in gallery.names()]
@@ -21,9 +21,9 @@ SHIPPED = list(shipped_models())
 
 
 def readable_urdf_files() -> list[Path | None]:
-    """Return the URDF files of the shared data that can be read; None alone if there are no data."""
+    """Return the published URDF files that can be read; None alone if there are none."""
     # To read them all would take every worker seconds before its first test.
-    files = sorted(SHARED.rglob("*.urdf"))
+    files = published_files(".urdf")
     return [
         f for f in files if "urdf_conformance" not in f.parts or isinstance(expected_outcome(f), int)
     ] or [None]

@@ -1,4 +1,4 @@
-"""Expected outcome of each SDF of the shared data: its frames and degrees of freedom, or its error message."""
+"""Expected outcome of each published SDF: its frames and degrees of freedom, or its error message."""
 
 from __future__ import annotations
 

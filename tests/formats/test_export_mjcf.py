@@ -21,12 +21,12 @@ from round_trip import (
     random_values,
     readable_urdf_files,
 )
-from urdf_texts import SHARED
 
 import kineverse as kv
 from hypothesis_profiles import attempts
 from kineverse.model.body import Body, Box, Ellipsoid, Inertia, Mesh, Shape
 from kineverse.model.operations import SetBody
+from published_data import published_path, relative_name
 
 FILES = readable_urdf_files()
 
@@ -73,14 +73,11 @@ def assert_as_in_mujoco(model: kv.Model, file: Path, count: int = 2, tolerance: 
 
 # Every other one: as URDF all of them are written and read again.
 @pytest.mark.sampled(3)
-@pytest.mark.parametrize(
-    "file",
-    FILES[::2],
-    ids=lambda f: "none" if f is None else str(f.relative_to(SHARED)),
-)
+@pytest.mark.data
+@pytest.mark.parametrize("file", FILES[::2], ids=relative_name)
 def test_urdf_files_saved_as_mjcf_move_alike(file: Path | None, tmp_path: Path) -> None:
     if file is None:
-        pytest.skip(f"no {SHARED}")
+        file = published_path()
     model = kv.load(file)
     model.save(tmp_path / "m.xml")
     assert_as_in_mujoco(model, tmp_path / "m.xml", count=1)

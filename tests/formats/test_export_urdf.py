@@ -19,11 +19,11 @@ from round_trip import (
     poses,
     readable_urdf_files,
 )
-from urdf_texts import SHARED
 
 import kineverse as kv
 from hypothesis_profiles import attempts
 from kineverse.formats.urdf import read_urdf
+from published_data import published_path, relative_name
 
 FILES = readable_urdf_files()
 
@@ -64,10 +64,11 @@ def saved(model: kv.Model, folder: Path, **options: object) -> kv.Model:
 
 
 @pytest.mark.sampled(5)
-@pytest.mark.parametrize("file", FILES, ids=lambda f: "none" if f is None else str(f.relative_to(SHARED)))
+@pytest.mark.data
+@pytest.mark.parametrize("file", FILES, ids=relative_name)
 def test_urdf_files_are_read_back_unchanged(file: Path | None, tmp_path: Path) -> None:
     if file is None:
-        pytest.skip(f"no {SHARED}")
+        file = published_path()
     model = kv.load(file)
     again = saved(model, tmp_path)
     assert_same_motion(model, again, count=1)

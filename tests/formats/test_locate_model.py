@@ -3,10 +3,11 @@
 from __future__ import annotations
 
 import os
+from collections.abc import Callable
 from pathlib import Path
 
 import pytest
-from urdf_texts import SHARED, pair
+from urdf_texts import pair
 
 import kineverse as kv
 from kineverse.formats.locate import Source, locate_model, model_folders
@@ -124,10 +125,8 @@ def test_robots_of_the_installed_package_are_found_by_name() -> None:
     assert kv.load("talos_full_v2", prefix="talos").fk("talos/gripper_left_base_link").shape == (4, 4)
 
 
-def test_shared_data_is_found_by_name() -> None:
-    if not SHARED.is_dir():
-        pytest.skip(f"no {SHARED}")
-    path = SHARED / "iai_kitchen/iai_kitchen/urdf_obj/IAI_kitchen.urdf"
+def test_published_data_are_found_by_name(published: Callable[..., Path]) -> None:
+    path = published("iai_kitchen/iai_kitchen/urdf_obj/IAI_kitchen.urdf")
     assert locate_model("urdf_obj/IAI_kitchen").path == path.resolve()  # the folder may be a link
     message = miss("IAI_kitchen")
     for folder in ("urdf", "urdf_obj"):

@@ -1,10 +1,10 @@
 from __future__ import annotations
 
+from collections.abc import Callable
 from pathlib import Path
 
 import pytest
 from mujoco_oracle import Pair, mujoco
-from urdf_texts import SHARED, shared
 
 import kineverse as kv
 
@@ -35,14 +35,14 @@ furniture_sim/furniture_sim/slidecabinet.xml | 5 1
 """
 
 OUTCOMES: dict[str, str] = dict(line.split(" | ", 1) for line in _TABLE.strip().splitlines())  # type: ignore[misc]
-"""Every MJCF of the shared data has its frames and degrees of freedom, or is refused for its reason."""
+"""Every published MJCF has its frames and degrees of freedom, or is refused for its reason."""
 
 LOADED = [file for file, outcome in OUTCOMES.items() if outcome[0].isdecimal()]
 
 
 @pytest.mark.parametrize("file", OUTCOMES)
-def test_dofs_or_errors_of_all_files(file: str):
-    path, expected = shared(file), OUTCOMES[file]
+def test_dofs_or_errors_of_all_files(file: str, published: Callable[..., Path]):
+    path, expected = published(file), OUTCOMES[file]
     if file in LOADED:
         model = kv.load(path, prefix="p")
         assert f"{len(model.frames)} {len(model.degrees_of_freedom)}" == expected
@@ -52,16 +52,18 @@ def test_dofs_or_errors_of_all_files(file: str):
     assert str(info.value).startswith(f"{path.name}, {expected}")
 
 
-def test_no_file_is_left_out():
-    folders = [shared(name) for name in ("furniture_sim", "articulated_objects", "kineverse_shelf_objects")]
-    files = {path.relative_to(SHARED).as_posix() for folder in folders for path in folder.rglob("*.xml")}
-    files = {file for file in files if b"<mujoco" in (SHARED / file).read_bytes()}
+def test_no_file_is_left_out(published: Callable[..., Path]):
+    folders = [
+        published(name) for name in ("furniture_sim", "articulated_objects", "kineverse_shelf_objects")
+    ]
+    files = {path.relative_to(published()).as_posix() for folder in folders for path in folder.rglob("*.xml")}
+    files = {file for file in files if b"<mujoco" in published(file).read_bytes()}
     assert files == set(OUTCOMES)
 
 
 @pytest.mark.parametrize("file", LOADED)
-def test_poses_and_jacobians_are_those_of_mujoco(file: str):
-    Pair.of_file(shared(file)).compare()
+def test_poses_and_jacobians_are_those_of_mujoco(file: str, published: Callable[..., Path]):
+    Pair.of_file(published(file)).compare()
 
 
 def test_models_that_come_with_mujoco():

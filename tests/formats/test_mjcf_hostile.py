@@ -9,7 +9,6 @@ import sys
 import pytest
 from mujoco_oracle import model_of, mujoco
 from test_mjcf_kinematics import GEOM, body, mjcf
-from urdf_texts import shared
 
 import kineverse as kv
 from kineverse.formats.mjcf import parse_mjcf, read_mjcf
@@ -255,8 +254,8 @@ def test_names_and_numbers_reach_mujoco_unchanged():
     assert f"p/{name}" in model.frames
 
 
-def test_truncated_files_are_format_errors():
-    whole = shared("articulated_objects/robosuite_mit/objects/door.xml").read_bytes()
+def test_truncated_files_are_format_errors(published):
+    whole = published("articulated_objects/robosuite_mit/objects/door.xml").read_bytes()
     for length in range(0, len(whole.rstrip()), 41):
         assert outcome(whole[:length]).startswith("x.xml, line ")
 

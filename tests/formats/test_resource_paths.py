@@ -5,7 +5,6 @@ from __future__ import annotations
 import os
 
 import pytest
-from urdf_texts import shared
 
 from kineverse.errors import FormatError
 from kineverse.formats import resource_paths
@@ -219,8 +218,8 @@ def test_missing_resources_are_errors(tmp_path, uri, expected):
 @pytest.mark.parametrize(
     "file", ["pr2/pr2_description/robots/pr2.urdf", "iai_kitchen/iai_kitchen/urdf_obj/kitchen.urdf"]
 )
-def test_all_meshes_of_large_descriptions_are_found(file):
-    description = read_urdf(shared(*file.split("/")))
+def test_all_meshes_of_large_descriptions_are_found(file, published):
+    description = read_urdf(published(*file.split("/")))
     meshes = [
         shape.geometry
         for link in description.links

@@ -1,14 +1,14 @@
-"""Every SDF of the shared data has its frames and degrees of freedom, or is refused for its reason."""
+"""Every published SDF has its frames and degrees of freedom, or is refused for its reason."""
 
 from __future__ import annotations
 
 import json
+from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
 import pytest
 from sdf_outcomes import OUTCOMES
-from urdf_texts import SHARED, shared
 
 import kineverse as kv
 
@@ -19,8 +19,8 @@ DRAKE = json.loads((Path(__file__).parent / "sdf_poses_of_drake.json").read_text
 
 @pytest.mark.parametrize("file", OUTCOMES)
 @pytest.mark.sampled(2)
-def test_frames_and_dofs_or_errors_of_all_files(file: str):
-    path = shared(file)
+def test_frames_and_dofs_or_errors_of_all_files(file: str, published: Callable[..., Path]):
+    path = published(file)
     expected = OUTCOMES[file]
     if expected[0].isdecimal():
         model = kv.load(path, prefix="p")
@@ -32,9 +32,9 @@ def test_frames_and_dofs_or_errors_of_all_files(file: str):
         assert str(info.value).startswith(path.name)
 
 
-def test_no_file_is_left_out():
-    folders = [shared("sdf_joint_types"), shared("articulated_objects")]
-    files = {path.relative_to(SHARED).as_posix() for folder in folders for path in folder.rglob("*.sdf")}
+def test_no_file_is_left_out(published: Callable[..., Path]):
+    folders = [published("sdf_joint_types"), published("articulated_objects")]
+    files = {path.relative_to(published()).as_posix() for folder in folders for path in folder.rglob("*.sdf")}
     assert files == set(OUTCOMES)
 
 
@@ -46,8 +46,8 @@ def known(name: str, names: object) -> str:
 
 @pytest.mark.parametrize("file", DRAKE)
 @pytest.mark.sampled(2)
-def test_poses_are_those_of_drake(file: str):
-    model = kv.load(shared(file))
+def test_poses_are_those_of_drake(file: str, published: Callable[..., Path]):
+    model = kv.load(published(file))
     state = dict(model.default_state())
     for name, values in DRAKE[file]["q"].items():
         joints = {n.removesuffix("/first") for n in model.articulations}

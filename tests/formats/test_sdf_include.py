@@ -7,7 +7,6 @@ from pathlib import Path
 import numpy as np
 import pytest
 from test_sdf_pose_graph import at, link, pose, sdf
-from urdf_texts import shared
 
 import kineverse as kv
 from kineverse.formats.sdf import read_sdf
@@ -145,8 +144,8 @@ FRAMES = f"""<sdf version="1.8"><model name="test_model_with_frames">
 <joint name="J2" type="fixed"><pose>0 0 1 0 0 0</pose><parent>L2</parent><child>L3</child></joint></model></sdf>"""
 
 
-def test_placement_frames_of_sdformat(models, monkeypatch):
-    path = shared("sdf_joint_types", "sdformat_test", "placement_frame.sdf")
+def test_placement_frames_of_sdformat(models, monkeypatch, published):
+    path = published("sdf_joint_types", "sdformat_test", "placement_frame.sdf")
     folder = models / "test_model_with_frames"
     folder.mkdir()
     (folder / "model.sdf").write_text(FRAMES)

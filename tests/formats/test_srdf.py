@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import pickle
+from collections.abc import Callable
 from pathlib import Path
 
 import pytest
@@ -11,8 +12,6 @@ import kineverse as kv
 from kineverse.errors import FormatError, UnknownNameError
 from kineverse.formats.srdf import EndEffector, Srdf, VirtualJoint, parse_srdf, read_srdf
 from kineverse.formats.srdf.groups import MOST_GROUPS
-
-PROBLEMS = Path(__file__).parents[3] / "shared" / "data" / "planning_problems"
 
 
 def joint(name: str, parent: str, child: str, kind: str = "revolute", more: str = "") -> str:
@@ -249,12 +248,13 @@ def test_an_empty_description_is_none_of_these_errors(model: kv.Model) -> None:
 @pytest.mark.parametrize(
     ("robot", "rules", "group", "free"), [("panda", 34, "panda_arm", 7), ("fetch", 75, "arm_with_torso", 8)]
 )
-def test_published_descriptions(robot: str, rules: int, group: str, free: int) -> None:
-    if not PROBLEMS.is_dir():
-        pytest.skip(f"{PROBLEMS.as_posix()} is missing")
+def test_published_descriptions(
+    robot: str, rules: int, group: str, free: int, published: Callable[..., Path]
+) -> None:
+    folder = published("planning_problems", robot)
     model = kv.Model()
-    model.include(PROBLEMS / robot / f"{robot}_spherized.urdf", "one")
-    srdf = read_srdf(PROBLEMS / robot / f"{robot}.srdf", model, "one")
+    model.include(folder / f"{robot}_spherized.urdf", "one")
+    srdf = read_srdf(folder / f"{robot}.srdf", model, "one")
     assert len(srdf.rules) == rules
     assert len(srdf.groups[group].coordinates) == free
     assert kv.geometry.Scene(model, rules=srdf.rules).rules

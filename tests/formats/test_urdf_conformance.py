@@ -7,40 +7,41 @@ from pathlib import Path
 
 import pytest
 from urdf_outcomes import COUNT, expected_outcome
-from urdf_texts import SHARED, shared
 
 import kineverse as kv
 from kineverse.formats.reader_warnings import Fault, collect_warnings
 from kineverse.formats.urdf import read_urdf
+from published_data import published_files, published_path, relative_name
 
-FOLDER = SHARED / "urdf_conformance"
-FILES = sorted(path.relative_to(FOLDER) for path in FOLDER.rglob("*.urdf")) if FOLDER.is_dir() else [None]
+pytestmark = pytest.mark.data
+
+FOLDER = "urdf_conformance"
+FILES = [relative_name(path) for path in published_files(".urdf", FOLDER)] or [f"{FOLDER}/none.urdf"]
 DOCS = Path(__file__).parents[2] / "docs" / "urdf.md"
 
 
 @pytest.mark.parametrize("strict", [False, True], ids=["", "strict"])
-@pytest.mark.parametrize("file", FILES, ids=str)
+@pytest.mark.parametrize("name", FILES)
 @pytest.mark.sampled(2)
-def test_dofs_or_errors_of_all_files(file: Path | None, strict: bool):
-    if file is None:
-        pytest.skip(f"no {FOLDER}")
+def test_dofs_or_errors_of_all_files(name: str, strict: bool):
+    path, file = published_path(name), Path(name)
     expected = expected_outcome(file, strict)
     if isinstance(expected, str):
         with pytest.raises(kv.errors.FormatError) as info:
-            kv.load(FOLDER / file, strict=strict)
+            kv.load(path, strict=strict)
         assert str(info.value).startswith(f"{file.name}, {expected}")
     else:
         with collect_warnings() as remarks:
-            model = kv.load(FOLDER / file, prefix="p", strict=strict)
+            model = kv.load(path, prefix="p", strict=strict)
         refused = isinstance(expected_outcome(file, strict=True), str)
         assert any(isinstance(remark, Fault) for remark in remarks) == refused
         assert sum(len(record.speeds) for record in model.articulations.values()) == expected
-        assert len(model.frames) == len(read_urdf(FOLDER / file).links)
+        assert len(model.frames) == len(read_urdf(path).links)
 
 
 def parsers() -> dict[str, list[str]]:
     """Return what five parsers say of each file: ``ok``, ``fail:...``, ``nv=...``, ``dof=...``."""
-    with (shared("urdf_conformance") / "verdicts.tsv").open() as table:
+    with published_path(FOLDER, "verdicts.tsv").open() as table:
         return {row[0]: row[1:6] for row in list(csv.reader(table, delimiter="\t"))[1:]}
 
 

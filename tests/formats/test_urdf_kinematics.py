@@ -11,12 +11,13 @@ from _pytest.mark import ParameterSet
 from pinocchio_oracle import FORMS, PinocchioReference, pin
 from scipy.spatial.transform import Rotation
 from urdf_outcomes import expected_outcome
-from urdf_texts import LIMIT, SHARED, robot
+from urdf_texts import LIMIT, robot
 from urdf_texts import joint as joint_text
 
 import kineverse as kv
 from kineverse.formats.urdf import UrdfRobot, parse_urdf, read_urdf
 from kineverse.formats.urdf.operations import urdf_operations
+from published_data import published_files, published_path, relative_name
 
 DOCS = Path(__file__).parents[2] / "docs" / "urdf.md"
 INSTALLED = Path(sysconfig.get_path("purelib"), "cmeel.prefix/share/example-robot-data/robots")
@@ -50,30 +51,30 @@ REFUSED = {
 
 
 def files() -> list[ParameterSet]:
-    """Return the files to read, each with its folder and its name in the lists."""
+    """Return the files to read, each with its name in the lists."""
     found = []
-    for folder in (SHARED, INSTALLED):
-        below = [(folder / f, str(f)) for f in sorted(p.relative_to(folder) for p in folder.rglob("*.urdf"))]
-        found += [pytest.param(file, id=name) for file, name in below if is_readable(file, name)]
+    for source, marks in (("the published data", pytest.mark.data), ("example-robot-data", ())):
+        below = installed_files() if not marks else {relative_name(f): f for f in published_files(".urdf")}
+        found += [
+            pytest.param(file, id=name, marks=marks)
+            for name, file in below.items()
+            if is_readable(file, name)
+        ]
         if not below:
-            reason = f"no {folder}"
-            found.append(pytest.param(folder, id=folder.name, marks=pytest.mark.skip(reason=reason)))
+            skip = pytest.mark.skip(reason=f"no URDF files of {source}")
+            found.append(pytest.param(None, id=source, marks=[skip, *([marks] if marks else [])]))
     return found
+
+
+def installed_files() -> dict[str, Path]:
+    """Return the URDF files of example-robot-data by their path in it."""
+    return {str(file.relative_to(INSTALLED)): file for file in sorted(INSTALLED.rglob("*.urdf"))}
 
 
 def is_readable(file: Path, name: str) -> bool:
     if name.startswith("urdf_conformance"):
         return isinstance(expected_outcome(file), int) and file.name not in (*NOT_IN_PINOCCHIO, *ONLY_HERE)
     return name not in REFUSED
-
-
-def with_name(name: str) -> Path:
-    found = [
-        p for folder in (SHARED, INSTALLED) for p in folder.rglob("*.urdf") if p.as_posix().endswith(name)
-    ]
-    if not found:
-        pytest.skip(f"no {name} below {SHARED} or {INSTALLED}")
-    return found[0]
 
 
 def assert_close(result: np.ndarray, expected: np.ndarray, what: str) -> None:
@@ -119,9 +120,10 @@ def test_poses_and_jacobians_are_those_of_pinocchio(file: Path) -> None:
     assert_equal_to_pinocchio(PinocchioReference(file.read_text()), read_urdf(file), seed=len(file.name))
 
 
+@pytest.mark.data
 @pytest.mark.parametrize("name", NOT_IN_PINOCCHIO)
 def test_files_that_pinocchio_cannot_read_are_listed(name: str) -> None:
-    file = with_name(name)
+    file = next(iter(published_files(name)), None) or published_path(name)
     with pytest.raises(ValueError, match=NOT_IN_PINOCCHIO[name]):
         PinocchioReference(file.read_text())
     assert read_urdf(file).dof == expected_outcome(file)
@@ -129,14 +131,17 @@ def test_files_that_pinocchio_cannot_read_are_listed(name: str) -> None:
 
 @pytest.mark.parametrize("name", REFUSED)
 def test_robots_that_break_the_specification_are_read_with_a_remark(name: str) -> None:
+    file = INSTALLED / name
+    if not file.exists():
+        pytest.skip(f"no {name} of example-robot-data")
     with pytest.raises(kv.errors.FormatError) as info:
-        read_urdf(with_name(name), strict=True)
+        read_urdf(file, strict=True)
     assert REFUSED[name] in str(info.value)
     if name.endswith("ur3.urdf"):
         with pytest.raises(kv.errors.FormatError, match=r"has no <link>.*Run xacro first"):
-            read_urdf(with_name(name))
+            read_urdf(file)
     else:
-        assert REFUSED[name] in "".join(read_urdf(with_name(name)).remarks)
+        assert REFUSED[name] in "".join(read_urdf(file).remarks)
 
 
 @pytest.mark.parametrize("name", [*NOT_IN_PINOCCHIO, *REFUSED])

@@ -1,21 +1,6 @@
-"""Small URDF texts for the tests, and the folder of the shared data."""
+"""Small URDF texts for the tests."""
 
 from __future__ import annotations
-
-from pathlib import Path
-
-import pytest
-
-SHARED = Path(__file__).parents[3] / "shared" / "data"
-
-
-def shared(*parts: str) -> Path:
-    """Return a folder or file of the shared data, or skip the test by its name."""
-    path = SHARED.joinpath(*parts)
-    if not path.exists():
-        pytest.skip(f"no {path}")
-    return path
-
 
 LIMIT = '<limit lower="-1" upper="2" effort="10" velocity="3"/>'
 

@@ -7,7 +7,6 @@ import pytest
 from scene_models import brute_force, by_names
 
 import kineverse as kv
-from formats.urdf_texts import shared
 from kineverse.geometry import Scene
 
 
@@ -34,8 +33,8 @@ def test_scene_of_the_shipped_robot_and_kitchen():
             }
 
 
-def test_scene_of_the_pr2_in_the_iai_kitchen(monkeypatch):
-    packages = [shared("pr2"), shared("iai_kitchen")]
+def test_scene_of_the_pr2_in_the_iai_kitchen(monkeypatch, published):
+    packages = [published("pr2"), published("iai_kitchen")]
     monkeypatch.setenv("KINEVERSE_PACKAGE_PATH", ":".join(map(str, packages)))
     robot = next(path for path in packages[0].rglob("*.urdf"))
     kitchen = next(path for path in packages[1].rglob("kitchen.urdf"))

@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
+from pathlib import Path
+
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
 import kineverse as kv
-from formats.urdf_texts import shared
 from kineverse import lie
 from kineverse.errors import UnknownNameError
 from kineverse.expressions.expression import Expression
@@ -184,16 +186,18 @@ def test_fingers_without_readable_shapes_are_where_their_frames_are() -> None:
         ),
     ],
 )
-def test_published_grippers(path: str, hand: str, joints: list[str], width: float) -> None:
-    model = kv.load(str(shared(*path.split("/"))), prefix="r")
+def test_published_grippers(
+    path: str, hand: str, joints: list[str], width: float, published: Callable[..., Path]
+) -> None:
+    model = kv.load(str(published(*path.split("/"))), prefix="r")
     gripper = find_grippers(model, "r")[0]
     assert gripper.hand == f"r/{hand}"
     assert [str(s) for s in gripper.joints] == [f"r/{name}" for name in joints]
     assert gripper.width == pytest.approx(width, abs=1e-3)
 
 
-def test_a_gripper_opens_within_the_limits_of_joints_that_mimic() -> None:
-    model = kv.load(str(shared("hsrb", "hsrb_description", "robots", "hsrb4s.urdf")), prefix="r")
+def test_a_gripper_opens_within_the_limits_of_joints_that_mimic(published: Callable[..., Path]) -> None:
+    model = kv.load(str(published("hsrb", "hsrb_description", "robots", "hsrb4s.urdf")), prefix="r")
     gripper, start = find_grippers(model, "r")[0], model.default_state()
     assert max(gripper.opened.values()) < model.limits("r/hand_motor_joint")[1] - 0.05
     for values in (gripper.opened, gripper.closed):

@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
+from pathlib import Path
+
 import numpy as np
 import pytest
 from hypothesis import given, settings
@@ -9,7 +12,6 @@ from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
 import kineverse as kv
-from formats.urdf_texts import shared
 from kineverse import lie
 from kineverse.articulations.mechanisms import FoldingDoor
 from kineverse.errors import UnknownNameError
@@ -160,10 +162,10 @@ def test_objects_without_a_handle_are_told_why() -> None:
     ],
 )
 def test_handles_of_published_furniture(
-    path: str, frames: dict[str, str], monkeypatch: pytest.MonkeyPatch
+    path: str, frames: dict[str, str], monkeypatch: pytest.MonkeyPatch, published: Callable[..., Path]
 ) -> None:
-    file = shared(*path.split("/"))
-    monkeypatch.setenv("KINEVERSE_PACKAGE_PATH", str(shared("iai_kitchen")))
+    file = published(*path.split("/"))
+    monkeypatch.setenv("KINEVERSE_PACKAGE_PATH", str(published("iai_kitchen")))
     model = kv.load(str(file), prefix="o")
     for coordinate, frame in frames.items():
         handle = find_handle(model, f"o/{coordinate}")

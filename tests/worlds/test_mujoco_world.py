@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 from functools import cache
 from pathlib import Path
 from typing import Any
@@ -20,7 +21,6 @@ from kineverse.worlds import MujocoWorld, Sensors, World
 
 mujoco = pytest.importorskip("mujoco")
 
-DATA = Path(__file__).parents[3] / "shared" / "data"
 ROBOTS = ("pr2", "fetch", "hsr")
 ON_WHEELS = (
     "fetch",
@@ -419,10 +419,8 @@ def test_remarks_tell_what_was_added_and_left_out() -> None:
         pytest.param("hsrb/hsrb_description/robots/hsrb4s.urdf", 1e-4, marks=pytest.mark.long),
     ],
 )
-def test_descriptions_of_others_stand_still(path: str, still: float) -> None:
-    if not (DATA / path).is_file():
-        pytest.skip(f"{path} is not there")
-    model = kv.load(DATA / path, prefix="robot")
+def test_descriptions_of_others_stand_still(path: str, still: float, published: Callable[..., Path]) -> None:
+    model = kv.load(published(path), prefix="robot")
     world = MujocoWorld(model, "robot")
     before = world.state
     world.apply({}, 0.5)

@@ -16,7 +16,7 @@ import numpy as np
 from kineverse.experiments.lockbox.figure import FIGURE_SIZE, draw_boxes
 from kineverse.experiments.lockbox.unlocking_runs import RULES, Rule, UnlockingRun, run_unlocking
 from kineverse.experiments.manipulation.columns import QUALITY, ROW, TIMES, Column
-from kineverse.experiments.manipulation.robots import find_data, find_robots
+from kineverse.experiments.manipulation.robots import check_data, find_robots
 from kineverse.experiments.manipulation.setting import SettingOptions, make_settings
 from kineverse.experiments.manipulation.tables import (
     make_exception_table,
@@ -45,7 +45,7 @@ _PUSH_LOGIC: dict[Rule, str | None] = {"and": "and", "product": "product", "none
 def run(progress: Progress, options: Options) -> Report:
     """Open boxes and push objects with each rule; ``quick`` takes few boxes, one robot and one object."""
     settings = make_settings(options)
-    robots = find_robots(options.robot, find_data(options.data, options.quick))
+    robots = find_robots(options.robot, check_data(options.data))
     boxes = options.count or (QUICK_BOXES if options.quick else BOXES)
     thesis = {rule: run_unlocking(THESIS, rule) for rule in RULES}
     runs = run_boxes(boxes, options.seed, progress)

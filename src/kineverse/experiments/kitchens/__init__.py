@@ -12,7 +12,7 @@ from dataclasses import dataclass, field
 from itertools import product
 
 from kineverse.errors import KineverseError, NoSolutionError
-from kineverse.experiments.manipulation.robots import RobotSource, find_data, find_robots
+from kineverse.experiments.manipulation.robots import RobotSource, check_data, find_robots
 from kineverse.experiments.manipulation.setting import SettingOptions, TrialSetting, make_settings
 from kineverse.experiments.manipulation.skills import TrialCase, open_then_close
 from kineverse.experiments.manipulation.tables import (
@@ -70,7 +70,7 @@ class KitchenJob:
 def run(progress: Progress, options: Options) -> Report:
     """Open and close everything; the option ``quick`` takes two objects of one kitchen, and one robot."""
     count = options.count or (QUICK_COUNT if options.quick else COUNT)
-    robots = find_robots(options.robot, options.data and find_data(options.data))
+    robots = find_robots(options.robot, check_data(options.data))
     if options.quick and not options.robot:
         robots = robots[-1:]
     names = [options.model] if options.model else name_kitchens(options.seed, count)

@@ -143,8 +143,6 @@ _AUTHORS = {
 }
 
 
-DEFAULT_DATA = Path("../shared/data")
-"""Folder of the authors' files, relative to the current one."""
 DATA_FOLDERS = ("pr2", "fetch", "hsrb", "iai_kitchen")
 
 
@@ -160,10 +158,8 @@ def remove_unusable_shapes(model: Model) -> tuple[str, ...]:
     return tuple(f"{name}: {why}" for name, why in label_unusable_shapes(model, unusable).items())
 
 
-def find_data(data: Path | None, quick: bool = False) -> Path | None:
-    """Return the folder of the authors' files; without a given one :data:`DEFAULT_DATA`, or None if missing.
-
-    A quick experiment takes what ships, unless a folder is given.
+def check_data(data: Path | None) -> Path | None:
+    """Return the folder of the authors' files; None if none is given.
 
     Raises
     ------
@@ -171,7 +167,7 @@ def find_data(data: Path | None, quick: bool = False) -> Path | None:
         If a given folder does not exist, or has nothing of the authors in it.
     """
     if data is None:
-        return DEFAULT_DATA if DEFAULT_DATA.is_dir() and not quick else None
+        return None
     if not data.is_dir():
         raise InvalidValueError(
             f"There is no folder {data} with robots. Leave --data out for the shipped ones."
@@ -191,7 +187,7 @@ def find_robots(names: Iterable[str] = (), data: Path | None = None) -> tuple[Ro
     names
         Names of robots; by default the three that ship, and those of the authors where their files are.
     data
-        Folder with the folders ``pr2``, ``fetch`` and ``hsrb`` of the authors' robots, see :func:`find_data`;
+        Folder with the folders ``pr2``, ``fetch`` and ``hsrb`` of the authors' robots, see :func:`check_data`;
         None for none.
 
     Raises

@@ -10,7 +10,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 from kineverse.errors import NoSolutionError
-from kineverse.experiments.manipulation.robots import RobotSource, find_data, find_robots
+from kineverse.experiments.manipulation.robots import RobotSource, check_data, find_robots
 from kineverse.experiments.manipulation.setting import SettingOptions, TrialSetting, make_settings
 from kineverse.experiments.manipulation.skills import TrialCase, open_then_close
 from kineverse.experiments.manipulation.trial_pool import run_jobs
@@ -45,7 +45,7 @@ def run(progress: Progress, options: Options) -> Report:
     """Open the objects; the option ``quick`` takes one start of each, ``count`` so many."""
     starts = options.count or (QUICK_STARTS if options.quick else STARTS)
     settings = make_settings(options)
-    robots = find_robots(options.robot, find_data(options.data, options.quick))
+    robots = find_robots(options.robot, check_data(options.data))
     jobs = [OpeningJob(robot, thing, starts, options.seed, settings) for robot in robots for thing in OBJECTS]
     trials = run_jobs(run_openings, jobs, progress, "table1-open", "object", options.processes)
     return make_opening_report(trials, starts, options.seed)

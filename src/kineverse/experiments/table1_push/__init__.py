@@ -9,7 +9,7 @@ from __future__ import annotations
 from dataclasses import dataclass, field
 from pathlib import Path
 
-from kineverse.experiments.manipulation.robots import RobotSource, find_data, find_robots
+from kineverse.experiments.manipulation.robots import RobotSource, check_data, find_robots
 from kineverse.experiments.manipulation.setting import SettingOptions, TrialSetting, make_settings
 from kineverse.experiments.manipulation.skills import TrialCase, run_push_trial
 from kineverse.experiments.manipulation.trial_pool import run_jobs
@@ -62,7 +62,7 @@ class PushJob:
 
 def run(progress: Progress, options: Options) -> Report:
     """Push all objects shut; the option ``quick`` takes two of them, and the period of the 2022 paper."""
-    data = find_data(options.data, options.quick)
+    data = check_data(options.data)
     jobs = [
         PushJob(robot, kitchen, data, thing, paper, setting, options.seed)
         for setting in make_settings(options)

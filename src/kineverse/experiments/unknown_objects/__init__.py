@@ -11,7 +11,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 from kineverse.experiments.manipulation.columns import ROW, Column, worst
-from kineverse.experiments.manipulation.robots import RobotSource, find_data, find_robots
+from kineverse.experiments.manipulation.robots import RobotSource, check_data, find_robots
 from kineverse.experiments.manipulation.setting import SettingOptions, TrialSetting, TrialWatch, make_settings
 from kineverse.experiments.manipulation.skills import DT, TrialCase
 from kineverse.experiments.manipulation.tables import (
@@ -83,7 +83,7 @@ def run(progress: Progress, options: Options) -> Report:
     """Open the objects; the option ``quick`` takes one seed and the last robot, ``count`` so many seeds."""
     count = options.count or (QUICK_COUNT if options.quick else COUNT)
     settings = make_settings(replace(options, noise=options.noise or NOISE))
-    robots = find_robots(options.robot, options.data and find_data(options.data))
+    robots = find_robots(options.robot, check_data(options.data))
     if options.quick and not options.robot:
         robots = robots[-1:]
     jobs = [
