@@ -13,6 +13,7 @@ from kineverse.bench.control_workloads import WORKLOADS
 from kineverse.bench.harness import ProgramError, has_peer, run_program
 from kineverse.bench.large_models import READERS, count_reruns, make_large_model
 from kineverse.bench.reaching import ARMS
+from kineverse.compile.toolchain import require_compiler
 
 HAS_PEERS = all(importlib.util.find_spec(name) for name in ("pinocchio", "mujoco"))
 # One of those it compares is casadi's map in C.
@@ -49,7 +50,7 @@ def test_a_benchmark_measures_all_installed_peers(name, tiny, monkeypatch):
     workload = replace(WORKLOADS[tiny.examples[0]], steps=40)
     monkeypatch.setattr("kineverse.bench.measure_examples.WORKLOADS", {tiny.examples[0]: workload})
     for module in ("measure_inverse_kinematics", "reaching"):
-        arms = {arm: ARMS[arm] for arm in ("ur5", "fetch")}  # one without a base and one with
+        arms = {arm: ARMS[arm] for arm in ("ur5", "tiago")}  # one without a base and one with
         monkeypatch.setattr(f"kineverse.bench.{module}.ARMS", arms)
     (result,) = run_benchmarks([name], tiny)
     assert result.name == name
@@ -91,6 +92,19 @@ def test_a_benchmark_without_its_extra_is_left_out(tiny, without):
     (line,) = result.missing
     assert line.startswith("geometry is left out: distances need coal: ")
     assert line.endswith("[geometry]'")
+
+
+def test_a_benchmark_that_needs_a_compiler_is_left_out_without_one(tiny, monkeypatch, tmp_path):
+    monkeypatch.delenv("CC", raising=False)
+    monkeypatch.setenv("PATH", str(tmp_path))
+
+    def measure(settings):
+        require_compiler("Planning")
+
+    monkeypatch.setattr("kineverse.bench.measure_planning.measure", measure)
+    (result,) = run_benchmarks(["planning"], tiny)
+    assert result.measurements == ()
+    assert result.missing[0].startswith("planning is left out: Planning needs a C compiler")
 
 
 def test_a_missing_compiler_is_reported(tiny, monkeypatch, tmp_path):

@@ -206,6 +206,19 @@ def test_a_motion_without_grasps_has_no_value():
     assert median.status == "missing"
 
 
+def test_the_planner_of_a_shipped_robot_is_built_where_no_other_is_found(tmp_path, monkeypatch, tiny):
+    monkeypatch.setenv("KINEVERSE_MODEL_PATH", str(tmp_path))
+    built = []
+    monkeypatch.setattr(
+        measure_planning, "run_program", lambda *words, cache: built.append(words) or {"seconds": 1.0}
+    )
+    result = measure_planning.measure(tiny, parts=("build",))
+    assert {*built} == {("build_planner", "pr2 (shipped)")}
+    assert [m.name for m in result.measurements] == [
+        f"pr2 (shipped): {n}" for n in (measure_planning.FIRST, measure_planning.AGAIN)
+    ]
+
+
 def test_missing_robots_and_peers_are_reported(tmp_path, monkeypatch, tiny, without):
     without("ompl", "vamp")
     monkeypatch.setenv("KINEVERSE_MODEL_PATH", str(tmp_path))

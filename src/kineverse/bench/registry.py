@@ -6,7 +6,8 @@ import importlib
 from collections.abc import Iterator, Mapping, Sequence
 from types import MappingProxyType
 
-from kineverse.errors import MissingDependencyError, UnknownNameError, suggest
+from kineverse.compile.toolchain import toolchain
+from kineverse.errors import CompileError, MissingDependencyError, UnknownNameError, suggest
 
 from .harness import BenchmarkSettings
 from .result import BenchmarkResult
@@ -57,7 +58,8 @@ def run_benchmarks(
 ) -> Iterator[BenchmarkResult]:
     """Run benchmarks, and yield each result.
 
-    The result of a benchmark whose extra is not installed has only a line that names it.
+    The result of a benchmark whose extra is not installed, or that needs a C compiler where there is none, has
+    only a line that names it.
 
     Parameters
     ----------
@@ -78,6 +80,8 @@ def run_benchmarks(
         module = importlib.import_module(f"{__package__}.measure_{name}")
         try:
             result: BenchmarkResult = module.measure(settings or BenchmarkSettings())
-        except MissingDependencyError as error:
+        except (MissingDependencyError, CompileError) as error:
+            if isinstance(error, CompileError) and toolchain() is not None:
+                raise
             result = BenchmarkResult(name, BENCHMARKS[name], (), (), (f"{name} is left out: {error}",))
         yield result

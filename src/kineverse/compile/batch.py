@@ -21,7 +21,7 @@ from kineverse.expressions.layout import ArrayShape
 from kineverse.lie import Array
 
 from .batch_codegen import BATCH_KIND, generate_batch_source
-from .c_library import ProgramLibrary
+from .c_library import ProgramLibrary, open_library
 from .evaluator import bind
 from .parallel import cores, parallel_rows
 from .program import CasadiFunction, Program
@@ -280,7 +280,7 @@ def _address(array: Array) -> int:
 
 
 def _load(path: str) -> BatchFunction:
-    code = ctypes.CDLL(path).kineverse_batch
+    code = open_library(path).kineverse_batch
     code.argtypes = (ctypes.c_void_p, ctypes.c_void_p, ctypes.c_longlong, ctypes.c_int)
     code.restype = ctypes.c_int
     return code

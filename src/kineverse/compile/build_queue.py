@@ -11,6 +11,7 @@ from __future__ import annotations
 
 import atexit
 import contextlib
+import errno
 import itertools
 import logging
 import os
@@ -24,16 +25,49 @@ from collections.abc import Callable, Sequence
 from typing import TypeAlias
 from weakref import WeakMethod
 
-from .cache import library_cache
+from .cache import avoid_full_cache, library_cache
 from .toolchain import Toolchain
 
 logger = logging.getLogger("kineverse.compile")
 
 MAXIMUM_WAITING = 256
-TIME_LIMIT = 120.0
+# Time of the processor, for each program that the compiler starts [s]: what else runs makes no difference to it.
+TIME_LIMIT = 120
+# For a compiler that waits for something [s].
+_WALL_LIMIT = 3600.0
+
+# What the system says where a file cannot be written for lack of room.
+_ROOM = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG, errno.EROFS)
+_SIGNALLED = "File size limit exceeded"
+_NO_ROOM_TEXTS = (*map(os.strerror, _ROOM), _SIGNALLED)
+
+# Compiles within the limit of time; ends, and removes its folder, when this process does, whatever ends it: that
+# closes the other end of the pipe "$1", and with it ends the "read".
+_GUARD = """
+ulimit -S -t "$2" 2>/dev/null
+(if [ -e "$1" ]; then
+    trap '' TERM; read -r nothing < "$1"; kill -TERM 0; rm -rf "$TMPDIR"; kill -KILL 0
+fi) > /dev/null 2>&1 &
+guard=$!
+shift 2
+"$@"
+status=$?
+kill -KILL $guard
+exit $status
+"""
 
 
 BuildCallback: TypeAlias = Callable[["BuildJob"], object]
+
+
+class NoRoomError(Exception):
+    """Failure to write a file for lack of room; ``reason`` is what the system says."""
+
+    def __init__(self, reason: str) -> None:
+        self.reason = (
+            f"{reason}, by 'ulimit -f'" if reason in (_SIGNALLED, os.strerror(errno.EFBIG)) else reason
+        )
+        super().__init__(f"there is no room to compile in: {self.reason}")
 
 
 class _Waits(threading.local):
@@ -211,17 +245,37 @@ class _Worker:
         path, error = None, None
         try:
             # Another process may have compiled it meanwhile.
-            path = None if build.forgotten else build.cache.find(build.key) or self._compile(build)
+            path = None if build.forgotten else build.cache.find(build.key) or self._compile_somewhere(build)
         except Exception as problem:
-            error = str(problem)
+            error = getattr(problem, "strerror", None) or str(problem)
             self._log_failure(error)
         with self._lock:
             if self._wanted.get(build.key) is build:
                 del self._wanted[build.key]
         build.finish(path, error)
 
+    def _compile_somewhere(self, build: BuildJob) -> str:
+        """Compile a library in the cache, or where there is room, and return its path."""
+        try:
+            return self._compile(build)
+        except NoRoomError as error:
+            try:
+                build.cache = avoid_full_cache(build.cache, error.reason)
+            except OSError:
+                raise error from None
+            return self._compile(build)
+
     def _compile(self, build: BuildJob) -> str:
+        try:
+            return self._run_compiler(build)
+        except OSError as error:
+            if error.errno in _ROOM:
+                raise NoRoomError(error.strerror) from None
+            raise
+
+    def _run_compiler(self, build: BuildJob) -> str:
         source, build_folder = build.source().encode(), ""
+        ends: tuple[int, ...] = ()
         try:
             with self._starting:
                 if self._closing:
@@ -229,8 +283,10 @@ class _Worker:
                 build_folder = build.cache.create_build_folder()
                 self._build_folders.add(build_folder)
                 output = os.path.join(build_folder, "library.so")
+                ends = alive, _ = os.pipe()
                 compiler = subprocess.Popen(
-                    build.compiler.arguments(build.flags, output),
+                    _guarded(build.compiler.arguments(build.flags, output), alive),
+                    pass_fds=(alive,) if os.name == "posix" else (),
                     stdin=subprocess.PIPE,
                     stdout=subprocess.DEVNULL,
                     stderr=subprocess.PIPE,
@@ -245,19 +301,26 @@ class _Worker:
                         _lower_priority(compiler.pid)
             began = time.monotonic()
             try:
-                _, messages = compiler.communicate(source, timeout=TIME_LIMIT)
+                _, messages = compiler.communicate(source, timeout=_WALL_LIMIT)
             except subprocess.TimeoutExpired:
-                raise RuntimeError(f"the C compiler needed more than {TIME_LIMIT:.0f} s.") from None
+                raise RuntimeError(f"the C compiler needed more than {_WALL_LIMIT:.0f} s.") from None
             finally:
                 _end(compiler)
                 with self._lock:
                     del self._compilers[build]
             if compiler.returncode or not os.path.exists(output):
                 text = messages.decode(errors="replace").strip()
+                for words in _NO_ROOM_TEXTS:
+                    if words in text:
+                        raise NoRoomError(words)
+                if "CPU time limit" in text or compiler.returncode - 128 == signal.SIGXCPU:
+                    raise RuntimeError(f"the C compiler needed more than {TIME_LIMIT} s of processor time.")
                 raise RuntimeError(f"the C compiler failed ({compiler.returncode}): {text[:500]}")
             logger.debug("Compiled %s in %.2f s.", build.key[:12], time.monotonic() - began)
             return build.cache.store(build.key, output)
         finally:
+            for end in ends:
+                os.close(end)
             if build_folder:
                 shutil.rmtree(build_folder, ignore_errors=True)
                 self._build_folders.discard(build_folder)
@@ -285,6 +348,13 @@ class _Worker:
             build._done = threading.Event()
             build.forgotten = True
             build._done.set()
+
+
+def _guarded(command: list[str], alive: int) -> list[str]:
+    """Return the command line that ends with this process, which has the other end of a pipe."""
+    if not os.path.exists("/bin/sh"):
+        return command
+    return ["/bin/sh", "-c", _GUARD, "sh", f"/dev/fd/{alive}", str(TIME_LIMIT), *command]
 
 
 def _start_thread(target: Callable[..., object], *arguments: object) -> threading.Thread:

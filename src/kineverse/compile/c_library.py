@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+import contextlib
 import ctypes
 import hashlib
 import threading
 import time
+import weakref
 from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any, Generic, TypeVar
@@ -15,11 +17,31 @@ from .build_queue import BuildJob, request
 from .cache import library_cache
 from .parallel import cores
 from .program import Program
-from .toolchain import FLOATING_POINT_FLAGS, NO_UNDEFINED_FLAGS, Toolchain, optimisation_level, toolchain
+from .toolchain import (
+    FLOATING_POINT_FLAGS,
+    NO_COMPILER,
+    NO_UNDEFINED_FLAGS,
+    Toolchain,
+    optimisation_level,
+    toolchain,
+)
 
 Code = TypeVar("Code")
 
-NO_COMPILER = "there is no C compiler (cc, gcc or clang) on the PATH"
+
+def open_library(path: str) -> ctypes.CDLL:
+    """Return a library, which is unloaded with the last reference to it or to one of its functions.
+
+    Not so what was made of the address of a function.
+    """
+    library = ctypes.CDLL(path)
+    with contextlib.suppress(
+        ImportError
+    ):  # ctypes itself never unloads; on Windows the call has another name
+        from _ctypes import dlclose
+
+        weakref.finalize(library, dlclose, library._handle).atexit = False
+    return library
 
 
 class ProgramLibrary(Generic[Code]):
@@ -128,6 +150,11 @@ class SourceLibrary:
         Function that sets the argument types of the loaded functions.
     flags
         Flags of the compiler.
+
+    Attributes
+    ----------
+    error
+        The reason why there are no compiled functions; None while there is none.
     """
 
     def __init__(
@@ -139,7 +166,7 @@ class SourceLibrary:
         self._source, self._declare, self._flags = source, declare, flags
         self._code: Any = None
         self._build: BuildJob | None = None
-        self._failed = False
+        self.error: str | None = None
         self._lock = threading.Lock()
 
     @property
@@ -166,9 +193,11 @@ class SourceLibrary:
         return self.is_native
 
     def _find_or_request(self) -> BuildJob | None:
-        compiler = None if self._failed else toolchain()
+        if self.error is not None:
+            return None
+        compiler = toolchain()
         if compiler is None:
-            self._failed = True
+            self.error = NO_COMPILER
             return None
         version = (self._source, self._flags, compiler.identity)
         key = hashlib.sha256(repr(version).encode()).hexdigest()[:40]
@@ -181,7 +210,8 @@ class SourceLibrary:
     def _built(self, build: BuildJob) -> None:
         if build.path is not None and self._code is None:
             self._code = build.cache.load(build.key, self._load)
-        self._failed = self._code is None and not build.forgotten
+        if self._code is None and not build.forgotten:
+            self.error = build.error or "its library cannot be loaded"
         self._build = None
 
     def _load(self, path: str) -> Any:

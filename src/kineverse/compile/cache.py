@@ -24,6 +24,9 @@ from .private_folder import NotPrivateError, PrivateFolder
 
 logger = logging.getLogger("kineverse.compile")
 
+# Folders in which compilation has failed for lack of room, with the reason.
+_without_room: dict[Path, str] = {}
+
 MAXIMUM_BYTES = 512 * 2**20
 
 # The end of every library: this, then the SHA-256 of everything before it. Loaders ignore what follows the
@@ -118,8 +121,9 @@ def library_cache() -> LibraryCache:
     """Return the cache of this user.
 
     The folder is ``KINEVERSE_CACHE_DIR``, else ``kineverse`` in ``XDG_CACHE_HOME``, else
-    ``~/.cache/kineverse``. If that cannot be used, which is logged, it is a private folder that is removed
-    when the process ends.
+    ``.cache/kineverse`` in ``HOME``, else in the home folder of the account; the last three are absolute
+    paths, or ignored. If the folder cannot be used, which is logged, it is a private one that is removed when
+    the process ends.
     """
     get = os.environ.get
     where = get("KINEVERSE_CACHE_DIR"), get("XDG_CACHE_HOME"), get("HOME")
@@ -128,6 +132,28 @@ def library_cache() -> LibraryCache:
         _open.cache_clear()
         cache = _open(*where)
     return cache
+
+
+def avoid_full_cache(cache: LibraryCache, reason: str) -> LibraryCache:
+    """Return a cache in place of one without room, for this process; log the reason, once.
+
+    Raises
+    ------
+    OSError
+        If there is no other one.
+    """
+    if cache.folder not in _without_room:
+        if _private_folder.cache_info().currsize and cache.folder == Path(_private_folder().name):
+            raise OSError(reason)
+        _private_folder()  # raises if there is no folder for temporary files
+        _without_room[cache.folder] = reason
+        logger.warning(
+            "Compiled functions are not kept for other processes: the cache folder %s has no room (%s).",
+            cache.folder,
+            reason,
+        )
+        _open.cache_clear()
+    return library_cache()
 
 
 def private_subfolder(name: str) -> PrivateFolder:
@@ -152,17 +178,56 @@ def _open(folder: str | None, caches: str | None, home: str | None) -> LibraryCa
     elif caches and os.path.isabs(caches):
         wanted = Path(caches) / "kineverse"
     else:
-        wanted = Path(home or os.path.expanduser("~")).absolute() / ".cache" / "kineverse"
-    try:
-        return LibraryCache(wanted)
-    except (NotPrivateError, OSError) as error:
-        logger.warning(
-            "Compiled functions are not kept for other processes: the cache folder %s",
-            _describe_failure(wanted, error),
-        )
+        wanted = _home(home) / ".cache" / "kineverse"
+    if wanted not in _without_room:
+        try:
+            return LibraryCache(wanted)
+        except (NotPrivateError, OSError) as error:
+            logger.warning(
+                "Compiled functions are not kept for other processes: the cache folder %s",
+                _describe_failure(wanted, error),
+            )
     if not _private_folder_is_there():
         _private_folder.cache_clear()
-    return LibraryCache(Path(_private_folder().name), made=True)
+    try:
+        return LibraryCache(Path(_private_folder().name), made=True)
+    except OSError as error:
+        return _NoCache(error)
+
+
+class _NoCache(LibraryCache):
+    """A cache without a folder: empty, and nothing can be compiled in it."""
+
+    def __init__(self, error: OSError) -> None:
+        self.folder, self._error = Path(os.devnull), error
+
+    @property
+    def is_still_private(self) -> bool:
+        return False  # there may be a folder next time
+
+    def find(self, key: str) -> None:
+        return None
+
+    def load(self, key: str, load: Callable[[str], Code]) -> None:
+        return None
+
+    def store(self, key: str, library: str) -> str:
+        raise self._error
+
+    def create_build_folder(self) -> str:
+        raise self._error
+
+
+def _home(home: str | None) -> Path:
+    """Return the home folder: the given one if it is absolute, else that of the account."""
+    if home and os.path.isabs(home):
+        return Path(home)
+    try:
+        import pwd
+
+        return Path(pwd.getpwuid(os.getuid()).pw_dir)
+    except (ImportError, KeyError):  # Windows, or a user without an account
+        return Path.home() if os.name == "nt" else Path(os.sep)
 
 
 def _describe_failure(folder: Path, error: Exception) -> str:

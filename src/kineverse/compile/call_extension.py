@@ -81,7 +81,7 @@ static int checked(PyObject *check, PyObject *vector, PyObject *arrays) {
   return 0;
 }
 
-/* ---- Call(address, n, shapes, single, lengthy, convert, check): fresh arrays, any thread ---- */
+/* ---- Call(address, n, shapes, single, lengthy, convert, check, library): fresh arrays, any thread ---- */
 
 typedef struct {
   PyObject_HEAD
@@ -91,7 +91,7 @@ typedef struct {
   int outputs, single, lengthy;
   int *dimensions;
   npy_intp *shapes;
-  PyObject *convert, *check;
+  PyObject *convert, *check, *library;
 } Call;
 
 #define MOST_OUTPUTS 256
@@ -135,15 +135,16 @@ static void call_dealloc(PyObject *object) {
   PyMem_Free(self->shapes);
   Py_XDECREF(self->convert);
   Py_XDECREF(self->check);
+  Py_XDECREF(self->library);
   Py_TYPE(object)->tp_free(object);
 }
 
 static PyObject *call_new(PyTypeObject *type, PyObject *args, PyObject *names) {
-  PyObject *address, *shapes, *convert, *check;
+  PyObject *address, *shapes, *convert, *check, *library;
   Py_ssize_t n;
   int single, lengthy;
-  if (!PyArg_ParseTuple(args, "OnO!ppOO", &address, &n, &PyTuple_Type, &shapes, &single, &lengthy, &convert,
-                        &check))
+  if (!PyArg_ParseTuple(args, "OnO!ppOOO", &address, &n, &PyTuple_Type, &shapes, &single, &lengthy, &convert,
+                        &check, &library))
     return NULL;
   Py_ssize_t outputs = PyTuple_GET_SIZE(shapes), total = 0;
   if (outputs < 1 || outputs > MOST_OUTPUTS) {
@@ -161,6 +162,7 @@ static PyObject *call_new(PyTypeObject *type, PyObject *args, PyObject *names) {
   self->lengthy = lengthy;
   self->convert = Py_NewRef(convert);
   self->check = Py_NewRef(check);
+  self->library = Py_NewRef(library);
   self->dimensions = PyMem_Calloc(outputs, sizeof(int));
   self->shapes = PyMem_Calloc(total + 1, sizeof(npy_intp));
   if (!self->dimensions || !self->shapes) {
@@ -190,7 +192,7 @@ static PyTypeObject CallType = {
     .tp_new = call_new,
 };
 
-/* ---- Evaluator(address, input, outputs, lengthy, convert, check): in place, one thread ---- */
+/* ---- Evaluator(address, input, outputs, lengthy, convert, check, library): in place, one thread ---- */
 
 typedef struct {
   PyObject_HEAD
@@ -200,7 +202,7 @@ typedef struct {
   npy_intp n;
   int lengthy;
   double **results;
-  PyObject *input, *outputs, *convert, *check;
+  PyObject *input, *outputs, *convert, *check, *library;
 } Evaluator;
 
 static PyObject *evaluator_vectorcall(PyObject *object, PyObject *const *args, size_t count,
@@ -230,14 +232,15 @@ static void evaluator_dealloc(PyObject *object) {
   Py_XDECREF(self->outputs);
   Py_XDECREF(self->convert);
   Py_XDECREF(self->check);
+  Py_XDECREF(self->library);
   Py_TYPE(object)->tp_free(object);
 }
 
 static PyObject *evaluator_new(PyTypeObject *type, PyObject *args, PyObject *names) {
-  PyObject *address, *input, *outputs, *convert, *check;
+  PyObject *address, *input, *outputs, *convert, *check, *library;
   int lengthy;
-  if (!PyArg_ParseTuple(args, "OO!O!pOO", &address, &PyArray_Type, &input, &PyTuple_Type, &outputs, &lengthy,
-                        &convert, &check))
+  if (!PyArg_ParseTuple(args, "OO!O!pOOO", &address, &PyArray_Type, &input, &PyTuple_Type, &outputs, &lengthy,
+                        &convert, &check, &library))
     return NULL;
   Evaluator *self = (Evaluator *)type->tp_alloc(type, 0);
   if (!self) return NULL;
@@ -250,6 +253,7 @@ static PyObject *evaluator_new(PyTypeObject *type, PyObject *args, PyObject *nam
   self->outputs = Py_NewRef(outputs);
   self->convert = Py_NewRef(convert);
   self->check = Py_NewRef(check);
+  self->library = Py_NewRef(library);
   const Py_ssize_t count = PyTuple_GET_SIZE(outputs);
   self->results = PyMem_Calloc(count + 1, sizeof(double *));
   if (!self->results) {

@@ -22,7 +22,7 @@ from kineverse.lie import Array
 from kineverse.symbols import Symbol
 
 from .batch import Batch
-from .c_library import ProgramLibrary
+from .c_library import ProgramLibrary, open_library
 from .call_extension import MOST_OUTPUTS, call_extension
 from .evaluator import Evaluator, bind, make_pooled_call
 from .program import FUNCTION_NAME, SINGLE_KIND, CasadiFunction, Program
@@ -257,9 +257,9 @@ class CompiledFunction(Generic[Results]):
         """Return an evaluator for one thread, which writes its results in place."""
         size, convert = self._signature.size, self._signature.vector
         with self._lock:
-            if self._native:
+            if self._native is not None:
                 outputs = tuple(np.zeros(shape) for shape in self.shapes)
-                return self._native_evaluator(np.zeros(size), outputs)
+                return self._native_evaluator(self._native, np.zeros(size), outputs)
             evaluator = Evaluator(self.shapes, size, convert)
             self._set_function(evaluator)
             if self.tier != "c":
@@ -298,32 +298,40 @@ class CompiledFunction(Generic[Results]):
     def _ready(self) -> None:
         """Switch to C, or to the extension that calls it; called in any thread."""
         if self._library is not None and self._library.code is not None:
-            self._evaluate_by(self._library.code.function, self._library.code.address)
+            self._evaluate_by(self._library.code.function, self._library.code)
 
-    def _evaluate_by(self, function: CasadiFunction, address: int | None) -> None:
+    def _evaluate_by(self, function: CasadiFunction, code: _Code | None) -> None:
         """Replace the function from the next call on.
 
         Parameters
         ----------
         function
             CasADi's function.
-        address
-            The address of its C, if it is compiled.
+        code
+            Its C, if it is compiled.
         """
         shapes, check, convert = self.shapes, self._program.checked, self._signature.vector
-        direct = address is not None and len(shapes) <= MOST_OUTPUTS and call_extension.module is not None
-        if direct:
-            lengthy = self._program.instructions > _LENGTHY
-            size = self._signature.size
-            call = call_extension.module.Call(address, size, shapes, self._single, lengthy, convert, check)
+        if code is not None and len(shapes) <= MOST_OUTPUTS and call_extension.module is not None:
+            native: _Code | None = code
+            call = call_extension.module.Call(
+                code.address,
+                self._signature.size,
+                shapes,
+                self._single,
+                self._program.instructions > _LENGTHY,
+                convert,
+                check,
+                code,
+            )
         else:
+            native = None
             call = make_pooled_call(function, self._signature.size, shapes, self._single, convert, check)
         with self._lock:
             self._function = function
-            self._native = address if direct else None
+            self._native = native
             # One assignment: a call uses the old function with its bindings or the new one with its own.
             self._call = call
-            self.tier = "interpreter" if address is None else "c"
+            self.tier = "interpreter" if code is None else "c"
             if self.tier == "c":
                 for evaluator in self._evaluators:
                     self._set_function(evaluator)
@@ -331,17 +339,17 @@ class CompiledFunction(Generic[Results]):
 
     def _set_function(self, evaluator: Evaluator) -> None:
         """Set the present function of an evaluator."""
-        if self._native:
-            run = self._native_evaluator(evaluator.input, evaluator.outputs)
+        if self._native is not None:
+            run = self._native_evaluator(self._native, evaluator.input, evaluator.outputs)
             evaluator._evaluate_by(run, None)
         else:
             check = self._program.checked
             evaluator._evaluate_by(*bind(self._function, evaluator.input, evaluator.outputs, check))
 
-    def _native_evaluator(self, vector: Array, outputs: tuple[Array, ...]) -> Evaluator:
+    def _native_evaluator(self, code: _Code, vector: Array, outputs: tuple[Array, ...]) -> Evaluator:
         lengthy = self._program.instructions > _LENGTHY
         evaluator: Evaluator = call_extension.module.Evaluator(
-            self._native, vector, outputs, lengthy, self._signature.vector, self._program.checked
+            code.address, vector, outputs, lengthy, self._signature.vector, self._program.checked, code
         )
         return evaluator
 
@@ -362,15 +370,17 @@ class CompiledFunction(Generic[Results]):
 
 @dataclass(frozen=True, slots=True)
 class _Code:
-    """A compiled function: CasADi's, and its address."""
+    """A compiled function: CasADi's, its address, and the library, which stays as long as this."""
 
     function: CasadiFunction
     address: int
+    library: ctypes.CDLL
 
 
 def _load(path: str) -> _Code:
-    address = ctypes.cast(ctypes.CDLL(path)[FUNCTION_NAME], ctypes.c_void_p).value
-    return _Code(ca.external(FUNCTION_NAME, path), address or 0)
+    library = open_library(path)
+    address = ctypes.cast(library[FUNCTION_NAME], ctypes.c_void_p).value
+    return _Code(ca.external(FUNCTION_NAME, path), address or 0, library)
 
 
 def _restore(

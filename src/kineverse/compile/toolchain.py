@@ -20,12 +20,17 @@ import sys
 from collections.abc import Sequence
 from dataclasses import dataclass
 
+from kineverse.errors import CompileError
+
 logger = logging.getLogger(__name__)
 
 # Flags with which C and interpreter agree to the last bit. No -ffast-math, which also deletes checks for NaN;
 # no contraction to fused operations; no constant folding of functions by the compiler (-frounding-math),
 # which rounds them better than the C library.
 FLOATING_POINT_FLAGS = ("-march=native", "-ffp-contract=off", "-fno-math-errno", "-frounding-math")
+NO_COMPILER = "there is no C compiler (cc, gcc or clang) on the PATH. Install one; on Debian and Ubuntu: apt install gcc"
+"""Reason, and remedy."""
+
 # Undefined names fail when a library is linked and not when a function is called.
 NO_UNDEFINED_FLAGS = ("-Wl,-z,defs",) if sys.platform.startswith("linux") else ()
 
@@ -101,6 +106,18 @@ def toolchain() -> Toolchain | None:
     return _find(os.environ.get("CC", ""), os.environ.get("PATH", os.defpath))
 
 
+def require_compiler(what: str) -> None:
+    """Raise if there is no C compiler, for what cannot do without.
+
+    Raises
+    ------
+    CompileError
+        "Planning needs a C compiler, and there is none ...", with how to install one.
+    """
+    if toolchain() is None:
+        raise CompileError(f"{what} needs a C compiler, and {NO_COMPILER}.")
+
+
 def optimisation_level(instructions: int) -> str | None:
     """Return the optimisation flag for a program of some size; None if it is too large for a compiler.
 
@@ -133,7 +150,11 @@ def vector_optimisation_level(instructions: int) -> str | None:
 @functools.lru_cache(maxsize=16)
 def _find(preferred: str, path: str) -> Toolchain | None:
     for candidate in (preferred, "cc", "gcc", "clang"):
-        words = shlex.split(candidate)
+        try:
+            words = shlex.split(candidate)
+        except ValueError as error:
+            logger.warning("CC is %r, which is no command (%s), and is ignored.", candidate, error)
+            continue
         found = shutil.which(words[0], path=path) if words else None
         if found:
             command = (os.path.abspath(found), *words[1:])
@@ -153,7 +174,7 @@ def _identity(command: tuple[str, ...]) -> str:
 def _cpu() -> str:
     """Return the description of the processor that determines its instructions."""
     try:
-        with open("/proc/cpuinfo") as file:
+        with open("/proc/cpuinfo", encoding="utf-8", errors="replace") as file:
             # One processor is enough, and the kernel generates the text of the others only when it is read.
             lines = file.read(8192).split("\n\n", 1)[0].splitlines()
     except OSError:

@@ -24,7 +24,7 @@ from kineverse.symbols import Symbol
 
 from . import vector_codegen
 from .batch import allocate_aligned
-from .c_library import ProgramLibrary
+from .c_library import ProgramLibrary, open_library
 from .program import Program
 from .schedule import read_instructions, relax_residuals, schedule, separate_parameters
 from .signature import Signature, as_doubles, make_signature
@@ -314,7 +314,7 @@ def vector_source(program: VectorProgram, *, name: str) -> str:
 
 
 def _load(path: str) -> _Code:
-    library = ctypes.CDLL(path)
+    library = open_library(path)
     lanes, kept, stored = (
         ctypes.c_int.in_dll(library, f"kineverse_{name}").value for name in ("lanes", "kept", "stored")
     )

@@ -142,9 +142,8 @@ def planning_functions() -> Any:
     library = _library()
     if not library.prepare(wait=True):
         raise CompileError(
-            f"Planning needs a C compiler, and {NO_COMPILER}. Install one (gcc or clang), or do without "
-            "planning: kv.control.inverse_kinematics ('kineverse reach') finds configurations, and "
-            "kv.control.Controller moves towards them; both work without a compiler."
+            f"Planning needs compiled C, and {library.error or NO_COMPILER}. Inverse kinematics "
+            "('kineverse reach') and controllers work without it."
         )
     return library.code
 
