@@ -15,21 +15,23 @@ DISTRIBUTION = "kineverse-articulation"
 _EXTRA = re.compile(r"""(?:\s*and\s*)?extra\s*==\s*["'](?P<name>[^"']+)["']""")
 
 
-def install_command(extra: str) -> str:
-    """Return the command that adds an extra to the running installation.
+def install_command(*extras: str) -> str:
+    """Return the command that adds extras to the running installation.
 
     The package is on no index, so pip cannot find it by name. A checkout is installed again, editable, with
-    the extra; for other installations, the requirements of the extra are installed.
+    the extras; for other installations, the requirements of the extras are installed.
 
     Parameters
     ----------
-    extra
-        One of ``[project.optional-dependencies]``, such as ``figures``.
+    extras
+        Some of ``[project.optional-dependencies]``, such as ``figures``.
     """
+    extra = ",".join(extras)
     here = checkout(Path(__file__))
     if here is not None:
         return f"{_pip()} install -e {shlex.quote(f'{_relative_to_cwd(here)}[{extra}]')}"
-    wanted = requirements(extra, _declared())
+    declared = _declared()
+    wanted = [*dict.fromkeys(line for extra in extras for line in requirements(extra, declared))]
     if not wanted:  # the package is not installed, but on the path
         return f"{_pip()} install -e '.[{extra}]' in a checkout"
     return f"{_pip()} install {' '.join(map(shlex.quote, wanted))}"

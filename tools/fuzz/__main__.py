@@ -86,14 +86,14 @@ class _Search:
         for path in died:
             self._confirm_death(path)
         if status.exists():
-            counts = json.loads(status.read_text())
+            counts = json.loads(status.read_text("utf-8"))
             self._models, self._errors = self._models + counts["models"], self._errors + counts["errors"]
         elif process.returncode:
-            raise SystemExit(f"the search ended at once:\n{log.read_text(errors='replace')[-3000:]}")
+            raise SystemExit(f"the search ended at once:\n{log.read_text('utf-8', 'replace')[-3000:]}")
         if process.returncode and not died:
             _say(f"{self._target.name}: the fuzzer itself failed, see {log.rename(folder / 'failed.txt')}")
             return
-        reached = _COVERAGE.findall(log.read_text(errors="replace")) or [("0", "0", "0")]
+        reached = _COVERAGE.findall(log.read_text("utf-8", "replace")) or [("0", "0", "0")]
         _say(f"{self._line()}; branches {reached[-1][0]}, inputs kept {reached[-1][2]}")
 
     def summary(self) -> list[str]:

@@ -75,7 +75,8 @@ def _search(name: str, folder: Path, seconds: int, seed: int) -> None:
         if finding is not None and records.add(finding, data):
             sys.stderr.write(f"FOUND {finding.signature}\n")
         if (counts.models + counts.errors) % 100 == 0:
-            status.write_text(json.dumps({"models": counts.models, "errors": counts.errors}))
+            counted = {"models": counts.models, "errors": counts.errors}
+            status.write_text(json.dumps(counted), encoding="utf-8")
 
     def mutate(data: bytes, max_size: int, chance: int) -> bytes:
         random = Random(chance)
@@ -110,17 +111,20 @@ def make_input_folder(folder: Path) -> Path:
     folder = folder.resolve() / "inputs"
     part = folder / "part"
     part.mkdir(parents=True)
-    (part / "model.config").write_text('<model><sdf version="1.7">model.sdf</sdf></model>')
+    (part / "model.config").write_text('<model><sdf version="1.7">model.sdf</sdf></model>', "utf-8")
     (part / "model.sdf").write_text(
         '<sdf version="1.7"><model name="part"><link name="a"/><link name="b"/>'
-        '<joint name="j0" type="revolute"><parent>a</parent><child>b</child></joint></model></sdf>'
+        '<joint name="j0" type="revolute"><parent>a</parent><child>b</child></joint></model></sdf>',
+        "utf-8",
     )
     (folder / "bodies.xml").write_text(
-        '<mujocoinclude><body name="i"><geom size="1"/></body></mujocoinclude>'
+        '<mujocoinclude><body name="i"><geom size="1"/></body></mujocoinclude>',
+        "utf-8",
     )
     (folder / "part.xml").write_text(
         '<mujoco model="part"><worldbody><body name="x"><joint name="j"/><geom size="1"/>'
-        '<body name="y" pos="1 0 0"/></body></worldbody></mujoco>'
+        '<body name="y" pos="1 0 0"/></body></worldbody></mujoco>',
+        "utf-8",
     )
     return folder
 

@@ -319,7 +319,9 @@ def run_program(name: str, *arguments: str, cache: str | None = None) -> dict[st
         environment["KINEVERSE_CACHE_DIR"] = cache
     # -P keeps the file's folder off the import path.
     command = [sys.executable, "-P", str(FRESH_PROCESS), name, *arguments]
-    done = subprocess.run(command, env=environment, capture_output=True, text=True, check=False)
+    done = subprocess.run(
+        command, env=environment, capture_output=True, encoding="utf-8", errors="replace", check=False
+    )
     try:
         output: dict[str, Any] = json.loads(done.stdout)
     except ValueError:

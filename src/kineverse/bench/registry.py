@@ -58,8 +58,8 @@ def run_benchmarks(
 ) -> Iterator[BenchmarkResult]:
     """Run benchmarks, and yield each result.
 
-    The result of a benchmark whose extra is not installed, or that needs a C compiler where there is none, has
-    only a line that names it.
+    The result of a benchmark whose extra is not installed, or for which there is no C compiler, has only a
+    line that names it.
 
     Parameters
     ----------

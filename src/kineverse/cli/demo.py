@@ -5,6 +5,7 @@ from __future__ import annotations
 import argparse
 
 from kineverse.cli import demo_living, demo_robot
+from kineverse.cli.requirements import require
 from kineverse.cli.view import add_page_options
 from kineverse.errors import InvalidValueError
 
@@ -53,6 +54,8 @@ def run(arguments: argparse.Namespace) -> int:
         _refuse(arguments, demo_robot.OPTIONS, f"is for the robot, not for {other}")
     if not arguments.living:
         _refuse(arguments, demo_living.OPTIONS, "is for --living")
+    extras = {"control": not other, "geometry": not other, "view": not arguments.headless}
+    require("kineverse demo", extras, compiler=not other)
     return demo_living.run(arguments) if other else demo_robot.run(arguments)
 
 

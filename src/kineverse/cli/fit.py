@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Any
 
 from kineverse.cli.arguments import parse_length, parse_value
 from kineverse.cli.output import show_activity
+from kineverse.cli.requirements import require
 from kineverse.errors import InvalidValueError
 
 if TYPE_CHECKING:
@@ -83,6 +84,7 @@ def run(arguments: argparse.Namespace) -> int:
             f"--document {arguments.document!r}: the joint is written as a document, whose name ends in "
             ".kv.json. Then: kineverse convert joint.kv.json joint.urdf"
         )
+    require("kineverse fit --picture", {"figures": arguments.picture is not None})
     stated = None if arguments.noise is None else parse_noise(arguments.noise)
     recording = read_recording(arguments.poses, arguments.columns)
     if recording.ignored:

@@ -6,6 +6,7 @@ import argparse
 import logging
 import os
 import re
+import signal
 import sys
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
@@ -32,7 +33,8 @@ from kineverse.cli import (
     view,
 )
 from kineverse.cli.output import join_lines
-from kineverse.errors import KineverseError, UnknownNameError, suggest
+from kineverse.cli.streams import safe_streams
+from kineverse.errors import FormatError, KineverseError, UnknownNameError, suggest
 
 
 class CommandModule(Protocol):
@@ -111,22 +113,38 @@ def main(argv: Sequence[str] | None = None) -> int:
     after Ctrl-C; 141 if the output pipe was closed.
     """
     words = sys.argv[1:] if argv is None else list(argv)
-    if not set(words) - {"-v", "--verbose"}:
-        make_parser().print_help()
-        return 0
     try:
-        arguments = _parse_arguments(words)
-    except SystemExit as stop:  # argparse would end the process.
-        return stop.code if isinstance(stop.code, int) else ERROR
-    except KineverseError as error:
+        with safe_streams(), _end_by_exception(argv is None):
+            status = _run(words)
+            try:
+                sys.stdout.flush()
+            except BrokenPipeError:
+                status = PIPE_CLOSED
+            except OSError as error:
+                if status != ERROR:
+                    print(f"kineverse: {format_error(error)}", file=sys.stderr)
+                status = ERROR
+            else:
+                return status
+    except FormatError as error:  # standard output is closed
         print(f"kineverse: {format_error(error)}", file=sys.stderr)
         return ERROR
+    _discard_stdout()
+    return status
+
+
+def _run(words: Sequence[str]) -> int:
+    """Run the command of some words and return its status; print the reason of a failure."""
     try:
+        if not set(words) - {"-v", "--verbose"}:
+            make_parser().print_help()
+            return 0
+        arguments = _parse_arguments(words)
         with _log_warnings_to(sys.stderr, arguments.verbose):
             status: int = arguments.run(arguments)
-        sys.stdout.flush()
+    except SystemExit as stop:  # argparse would end the process.
+        return stop.code if isinstance(stop.code, int) else ERROR
     except BrokenPipeError:
-        _discard_stdout()
         return PIPE_CLOSED
     except KeyboardInterrupt:
         print(file=sys.stderr)
@@ -135,6 +153,26 @@ def main(argv: Sequence[str] | None = None) -> int:
         print(f"kineverse: {format_error(error)}", file=sys.stderr)
         return ERROR
     return status
+
+
+@contextmanager
+def _end_by_exception(enabled: bool) -> Iterator[None]:
+    """Have SIGTERM and SIGHUP end the process like an exception, so that temporary folders are removed."""
+    numbers = [getattr(signal, name) for name in ("SIGTERM", "SIGHUP") if hasattr(signal, name)]
+
+    def end(number: int, frame: object) -> None:
+        signal.signal(number, signal.SIG_DFL)  # the next one ends it at once
+        raise SystemExit(128 + number)
+
+    # A process that was started to outlive its terminal ignores SIGHUP, and goes on to do so.
+    before = {n: signal.getsignal(n) for n in numbers if enabled and signal.getsignal(n) == signal.SIG_DFL}
+    for number in before:
+        signal.signal(number, end)
+    try:
+        yield
+    finally:
+        for number, handler in before.items():
+            signal.signal(number, handler)
 
 
 def make_parser() -> argparse.ArgumentParser:

@@ -17,6 +17,7 @@ from kineverse.cli.manipulate_output import PhaseLines, report_outcome
 from kineverse.cli.manipulate_setup import ManipulationScene, make_scene
 from kineverse.cli.manipulate_skills import grasp_object, open_as_unknown, push_object, skip_skill
 from kineverse.cli.output import show_activity
+from kineverse.cli.requirements import is_mjcf, require
 from kineverse.cli.view import (
     add_page_options,
     handle_interrupts,
@@ -182,7 +183,7 @@ def _add_arguments(parser: argparse.ArgumentParser, skill: str) -> None:
 def _run(arguments: argparse.Namespace, skill: str) -> int:
     from kineverse.planning.bindings import request_planner
 
-    _check(arguments)
+    _check(arguments, skill)
     request_planner()
     with show_activity(f"reading {arguments.model} and {arguments.robot}"):
         scene = make_scene(arguments, skill)
@@ -207,8 +208,18 @@ def _run(arguments: argparse.Namespace, skill: str) -> int:
     return DONE if outcome else NOT_DONE
 
 
-def _check(arguments: argparse.Namespace) -> None:
-    """Check options before anything is loaded."""
+def _check(arguments: argparse.Namespace, skill: str) -> None:
+    """Check requirements and options before anything is loaded."""
+    models = (arguments.model, arguments.robot.rpartition("@")[0] or arguments.robot)
+    extras = {
+        "control": True,
+        "geometry": True,
+        "mjcf": arguments.world == "mujoco" or any(map(is_mjcf, models)),
+        "recording": arguments.record is not None,
+        "view": arguments.view,
+    }
+    # A push takes what stands in its way into account without a planner.
+    require(f"kineverse {skill}", extras, compiler=skill != "push")
     if not arguments.seconds > 0 or math.isinf(arguments.seconds):
         raise InvalidValueError(f"--seconds is a positive number, not {arguments.seconds:g}.")
     if arguments.seed < 0:
@@ -224,10 +235,9 @@ def _check(arguments: argparse.Namespace) -> None:
 
         check_png_name(arguments.picture)
     if arguments.record is not None:
-        from kineverse.worlds.recorder import check_recording_name, import_mcap
+        from kineverse.worlds.recorder import check_recording_name
 
         check_recording_name(arguments.record)
-        import_mcap("mcap.writer")  # says at once which extra is missing
 
 
 def _make_world(arguments: argparse.Namespace, scene: ManipulationScene) -> World:

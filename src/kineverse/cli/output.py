@@ -9,6 +9,8 @@ from collections.abc import Iterable, Iterator, Sequence, Sized
 from contextlib import contextmanager
 from typing import Literal, TypeVar
 
+from kineverse.cli.streams import unwrap_stream
+
 _CODES = {"+": "32", "-": "31", "~": "33", ">": "36", "!": "31", "bold": "1"}
 
 
@@ -28,6 +30,9 @@ def truncate_lines(lines: Sequence[str], most: int | None, indent: str = "  ") -
         return list(lines)
     return [*lines[:most], f"{indent}… and {len(lines) - most} more (--all)"]
 
+
+# Names from files may have line feeds; a row is one line.
+_NO_LINES = str.maketrans({"\n": "\\n", "\r": "\\r", "\t": "\\t"})
 
 Align = Literal["<", ">"]
 
@@ -49,7 +54,7 @@ def format_table(
         Width of the screen; the terminal's if None. If the table is wider, its first column is cut in the
         middle, where names of frames differ least. In a pipe nothing is cut.
     """
-    cells = [list(head), *(list(row) for row in rows)]
+    cells = [list(head), *([cell.translate(_NO_LINES) for cell in row] for row in rows)]
     sides: list[str] = [align[k] if k < len(align) else "<" for k in range(len(head))]
     widths = [max(len(row[k]) for row in cells) for k in range(len(head))]
     available = (terminal_width() if width is None else width) - sum(widths[1:]) - 2 * (len(head) - 1)
@@ -113,7 +118,15 @@ def show_progress(
 
     if isinstance(items, Sized):
         total = len(items)
-    yield from tqdm(items, desc=what, total=total, unit=f" {unit}" if unit else "it", leave=False)
+    # The stream of commands would escape the moves of the cursor.
+    yield from tqdm(
+        items,
+        file=unwrap_stream(sys.stderr),
+        desc=what,
+        total=total,
+        unit=f" {unit}" if unit else "it",
+        leave=False,
+    )
 
 
 @contextmanager

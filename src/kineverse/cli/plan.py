@@ -26,6 +26,7 @@ from kineverse.cli.plan_arguments import (
     parse_request,
 )
 from kineverse.cli.plan_output import path_to_json, print_path
+from kineverse.cli.requirements import is_mjcf, require
 from kineverse.cli.view import (
     add_page_options,
     handle_interrupts,
@@ -179,6 +180,9 @@ def run(arguments: argparse.Namespace) -> int:
     # Parsed before the model is loaded, so that a typing error is reported at once.
     if arguments.model is None:
         raise InvalidValueError("MODEL comes first, before options that take several words, such as --to.")
+    models = (arguments.model, arguments.robot or "")
+    extras = {"geometry": True, "mjcf": any(map(is_mjcf, models)), "view": arguments.view}
+    require("kineverse plan", extras, compiler=True)
     start = parse_request(arguments.start, "--from", read_files=True)
     goal = parse_request(arguments.to, "--to")
     holds = [parse_frame_target(word, "--along") for word in arguments.along]
@@ -197,7 +201,7 @@ def run(arguments: argparse.Namespace) -> int:
     from kineverse.planning.bindings import planning_functions
 
     with show_activity("compiling the planner"):
-        planning_functions()  # says at once that there is no compiler
+        planning_functions()
     begin = perf_counter()
     problem = _prepare(arguments, start, goal, holds, margin)
     path = _plan(problem, arguments.seconds, arguments.seed, arguments.optimize)

@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from kineverse.cli.output import format_table, show_progress
+from kineverse.cli.requirements import require
 from kineverse.errors import MissingDependencyError, UnknownNameError
 from kineverse.expressions.printing import format_number
 
@@ -61,7 +62,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 def run(arguments: argparse.Namespace) -> int:
     """Run the experiment, print its tables, write its figure."""
     from kineverse.experiments import EXPERIMENTS, Options, reproduce
-    from kineverse.experiments.report import check_drawing
+    from kineverse.experiments.registry import PLANNED, REQUIRED_EXTRAS
 
     if arguments.list:
         listing = dict(EXPERIMENTS)
@@ -85,8 +86,15 @@ def run(arguments: argparse.Namespace) -> int:
         noise=arguments.noise,
         record=arguments.record,
     )
-    if arguments.figure is not None:
-        check_drawing()  # before minutes of computation
+    needed = REQUIRED_EXTRAS.get(arguments.name, ())
+    extras = {
+        "control": "control" in needed,
+        "figures": arguments.figure is not None,
+        "geometry": "geometry" in needed,
+        "mjcf": "geometry" in needed and arguments.world != "kinematic",
+        "recording": arguments.record is not None,
+    }
+    require(f"kineverse reproduce {arguments.name}", extras, compiler=arguments.name in PLANNED)
     report = reproduce(arguments.name, show_progress, options)
     if arguments.json:
         if arguments.figure is not None:

@@ -23,6 +23,7 @@ from kineverse.cli.arguments import (
 from kineverse.cli.info import is_gallery_list, print_articulations, print_models
 from kineverse.cli.output import show_progress
 from kineverse.cli.plan_arguments import add_robot_option, include_robot
+from kineverse.cli.requirements import is_mjcf, require
 from kineverse.errors import InvalidValueError
 
 if TYPE_CHECKING:
@@ -115,10 +116,16 @@ def run(arguments: argparse.Namespace) -> int:
     if is_gallery_list(arguments.model):
         return print_articulations()
 
+    extras = {
+        "geometry": near is not None or arguments.decomposed,
+        "figures": arguments.plot is not None,
+        "mjcf": is_mjcf(arguments.model),
+        "view": arguments.picture is None and arguments.plot is None,
+    }
+    require("kineverse view", extras)
     from kineverse.view import meshes
     from kineverse.view.poses import complete
     from kineverse.view.title import read_title
-    from kineverse.view.viewer import Viewer
 
     label = read_title(arguments.model)
     recording = _read_recording(arguments)
@@ -143,6 +150,8 @@ def run(arguments: argparse.Namespace) -> int:
         meshes.load_mesh(mesh)  # cached for the drawing
     if arguments.picture is not None:
         return _write_picture(arguments, model, assigned, near, motion)
+    from kineverse.view.viewer import Viewer
+
     options = page_options(arguments)
     with (
         handle_interrupts(),

@@ -31,7 +31,7 @@ from .toolchain import Toolchain
 logger = logging.getLogger("kineverse.compile")
 
 MAXIMUM_WAITING = 256
-# Time of the processor, for each program that the compiler starts [s]: what else runs makes no difference to it.
+# Time of the processor for each program that the compiler starts [s]; what else runs makes no difference.
 TIME_LIMIT = 120
 # For a compiler that waits for something [s].
 _WALL_LIMIT = 3600.0
@@ -41,8 +41,8 @@ _ROOM = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG, errno.EROFS)
 _SIGNALLED = "File size limit exceeded"
 _NO_ROOM_TEXTS = (*map(os.strerror, _ROOM), _SIGNALLED)
 
-# Compiles within the limit of time; ends, and removes its folder, when this process does, whatever ends it: that
-# closes the other end of the pipe "$1", and with it ends the "read".
+# Compiles within the limit of time. When this process ends, by whatever, the other end of the pipe "$1" is
+# closed, and so ends the "read": then the compiler is ended, and its folder removed.
 _GUARD = """
 ulimit -S -t "$2" 2>/dev/null
 (if [ -e "$1" ]; then
@@ -374,8 +374,8 @@ def _set_session_niceness(leader: int, niceness: int) -> None:
 
     There, the niceness of a process counts within its session only, and a compiler has one of its own.
     """
-    with contextlib.suppress(OSError), open(f"/proc/{leader}/autogroup", "w") as file:
-        file.write(str(niceness))
+    with contextlib.suppress(OSError), open(f"/proc/{leader}/autogroup", "wb") as file:
+        file.write(b"%d" % niceness)
 
 
 def _end(compiler: subprocess.Popen[bytes]) -> None:

@@ -28,7 +28,9 @@ logger = logging.getLogger(__name__)
 # no contraction to fused operations; no constant folding of functions by the compiler (-frounding-math),
 # which rounds them better than the C library.
 FLOATING_POINT_FLAGS = ("-march=native", "-ffp-contract=off", "-fno-math-errno", "-frounding-math")
-NO_COMPILER = "there is no C compiler (cc, gcc or clang) on the PATH. Install one; on Debian and Ubuntu: apt install gcc"
+NO_COMPILER = (
+    "there is no C compiler (cc, gcc or clang) on the PATH. Install one, such as by 'apt install gcc'"
+)
 """Reason, and remedy."""
 
 # Undefined names fail when a library is linked and not when a function is called.
@@ -89,7 +91,8 @@ class Toolchain:
             answer = subprocess.run(
                 [*self.command, *arguments],
                 capture_output=True,
-                text=True,
+                encoding="utf-8",
+                errors="replace",
                 timeout=20,
                 stdin=subprocess.DEVNULL,
             )

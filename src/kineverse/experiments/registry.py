@@ -97,6 +97,21 @@ EXPERIMENTS: Mapping[str, str] = MappingProxyType(
 )
 """Descriptions of experiments by name; the names are modules of this package, with dashes for underscores."""
 
+REQUIRED_EXTRAS: Mapping[str, tuple[str, ...]] = MappingProxyType(
+    {
+        "ablations": ("control", "geometry"),
+        "kitchens": ("control", "geometry"),
+        "lockbox": ("control",),
+        "table1-open": ("control", "geometry"),
+        "table1-push": ("control", "geometry"),
+        "unknown-objects": ("control", "geometry"),
+    }
+)
+"""Extras without which an experiment cannot run."""
+
+PLANNED = ("kitchens", "table1-open", "unknown-objects")
+"""Experiments with a planner, which needs a C compiler."""
+
 
 def reproduce(name: str, progress: Progress | None = None, options: Options | None = None) -> Report:
     """Run an experiment.

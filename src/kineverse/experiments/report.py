@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import io
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -10,6 +11,7 @@ from typing import TYPE_CHECKING, Any
 
 from kineverse._extras import install_command
 from kineverse.errors import FormatError, MissingDependencyError
+from kineverse.formats.files import replace_file
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure as Canvas
@@ -49,7 +51,7 @@ class Figure:
     draw: Callable[[Canvas], None]
     size: tuple[float, float]
 
-    def save(self, path: Path) -> None:
+    def save(self, path: str | Path) -> None:
         """Write the picture to a file, in the format of its suffix.
 
         Raises
@@ -62,10 +64,12 @@ class Figure:
         # Not with pyplot, which would search for a display and keep a reference to the figure.
         canvas = _matplotlib("matplotlib.figure").Figure(figsize=self.size, layout="constrained")
         self.draw(canvas)
+        content = io.BytesIO()
         try:
-            canvas.savefig(path, dpi=150)
-        except (OSError, ValueError) as error:
+            canvas.savefig(content, format=Path(path).suffix.removeprefix(".") or "png", dpi=150)
+        except ValueError as error:
             raise FormatError(f"The figure cannot be written to '{path}': {error}") from None
+        replace_file(Path(path), content.getvalue())
 
 
 @dataclass(frozen=True)
@@ -92,17 +96,6 @@ class Report:
     numbers: Mapping[str, Any]
     figure: Figure
     pictures: Mapping[str, Figure] = field(default_factory=dict)
-
-
-def check_drawing() -> None:
-    """Check that figures can be drawn.
-
-    Raises
-    ------
-    MissingDependencyError
-        If matplotlib is not installed.
-    """
-    _matplotlib("matplotlib.figure")
 
 
 def _matplotlib(module: str) -> ModuleType:

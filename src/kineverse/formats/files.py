@@ -53,6 +53,9 @@ def replace_file(path: Path, content: bytes) -> None:
 
 
 def _replace(target: Path, content: bytes) -> None:
+    if target.exists() and not target.is_file():  # a device or a pipe, which has to stay what it is
+        target.write_bytes(content)
+        return
     # In the folder of the target, because replacement is atomic only within one file system.
     beside = target.with_name(f".{target.name[:100]}.{uuid.uuid4().hex}")
     try:

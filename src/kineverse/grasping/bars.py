@@ -5,6 +5,7 @@ All poses, points and directions are in the world [m].
 
 from __future__ import annotations
 
+import functools
 import math
 from collections.abc import Collection, Sequence
 from dataclasses import dataclass, replace
@@ -67,7 +68,7 @@ class Part:
 
     def extent(self, directions: Array) -> Array:
         """Return the largest coordinates (n,) along unit directions (n, 3)."""
-        return -directional_gaps((_POINT, np.eye(3), np.zeros(3)), self.placed, -directions) - _POINT_RADIUS
+        return -directional_gaps((_point(), np.eye(3), np.zeros(3)), self.placed, -directions) - _POINT_RADIUS
 
     def touches(self, other: Part) -> bool:
         """Return True if another part is in contact, up to some 2 mm."""
@@ -119,7 +120,12 @@ def _make_part(item: CollisionObject, solid: Solid, pose: Array) -> Part:
 
 
 _POINT_RADIUS = 1e-7
-_POINT = solid_from_geometry(Sphere(_POINT_RADIUS))
+
+
+@functools.cache
+def _point() -> Solid:
+    """Return a point as a solid, once it is needed: pictures import this without the extra for solids."""
+    return solid_from_geometry(Sphere(_POINT_RADIUS))
 
 
 @dataclass(frozen=True, slots=True, eq=False)

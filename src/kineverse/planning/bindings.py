@@ -115,7 +115,9 @@ class PlanningLibrary(SourceLibrary):
 
     def __init__(self) -> None:
         folder = resources.files("kineverse.planning") / "c_source"
-        source = "\n".join([vector_header("float"), *((folder / name).read_text() for name in SOURCES)])
+        source = "\n".join(
+            [vector_header("float"), *((folder / name).read_text("utf-8") for name in SOURCES)]
+        )
         flags = ("-O3", "-ffp-contract=fast", "-fno-rounding-math", *NO_UNDEFINED_FLAGS)
         super().__init__(source, _declare_signatures, flags)
 

@@ -14,6 +14,7 @@ import numpy as np
 import numpy.typing as npt
 
 from kineverse.errors import FormatError, InvalidValueError, ShapeError
+from kineverse.formats.files import replace_file
 from kineverse.model.model_view import ModelView
 from kineverse.state import StateLike
 from kineverse.view.auto_camera import choose_camera, weigh_drawables
@@ -42,10 +43,11 @@ def write_png(path: str | Path, pixels: npt.NDArray[np.uint8]) -> None:
     ShapeError
         If the array is not an image of 8 bits a channel.
     FormatError
-        If the name has the suffix of another format, see :func:`check_png_name`.
+        If the name has the suffix of another format, see :func:`check_png_name`; if the file cannot be
+        written, which leaves an old one as it is.
     """
     check_png_name(path)
-    Path(path).write_bytes(encode_png(pixels))
+    replace_file(Path(path), encode_png(pixels))
 
 
 def check_png_name(path: str | Path) -> None:

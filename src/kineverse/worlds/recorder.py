@@ -14,11 +14,12 @@ Topics and their messages, times in [s] of the world:
 
 from __future__ import annotations
 
+import contextlib
 import dataclasses
 import json
 import math
 import os
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from pathlib import Path
 from types import TracebackType
 from typing import Any, Protocol
@@ -131,7 +132,8 @@ class Recorder:
     MissingDependencyError
         If the extra ``recording`` is not installed.
     FormatError
-        If the file cannot be written, or the model is of a kind that a document cannot carry.
+        If the file cannot be written, or the model is of a kind that a document cannot carry. Methods
+        raise it too, such as on a full disk; what was written before can be read.
     """
 
     def __init__(
@@ -145,11 +147,12 @@ class Recorder:
             self._file = self.path.open("wb")
         except (OSError, ValueError) as error:
             raise FormatError(f"{path} cannot be written: {getattr(error, 'strerror', error)}.") from None
-        self._writer: Any = writer.Writer(self._file, chunk_size=1 << 18)
-        self._writer.start(profile=PROFILE)
-        self._writer.add_metadata("run", {str(key): str(value) for key, value in (about or {}).items()})
-        self._channels = {topic: self._register(topic) for topic in TOPICS}
         self._time, self._flushed, self._count = 0.0, -math.inf, 0
+        self._writer: Any = writer.Writer(self._file, chunk_size=1 << 18)
+        with self._closing_on_failure():
+            self._writer.start(profile=PROFILE)
+            self._writer.add_metadata("run", {str(key): str(value) for key, value in (about or {}).items()})
+        self._channels = {topic: self._register(topic) for topic in TOPICS}
         self._phase: str | None = None
         self._send("/model", 0.0, document)
 
@@ -240,8 +243,9 @@ class Recorder:
     def close(self) -> None:
         """Finish the file; further calls do nothing."""
         if not self._file.closed:
-            self._writer.finish()
-            self._file.close()
+            with self._closing_on_failure():
+                self._writer.finish()
+                self._file.close()
 
     def __enter__(self) -> Recorder:
         return self
@@ -268,10 +272,24 @@ class Recorder:
         self._time = max(self._time, time)
         self._count += 1
         nanoseconds = round(time * 1e9)
-        self._writer.add_message(self._channels[topic], nanoseconds, data, nanoseconds, self._count)
-        if abs(time - self._flushed) >= _FLUSH:
-            self._flushed = time
-            self._writer.flush()
+        with self._closing_on_failure():
+            self._writer.add_message(self._channels[topic], nanoseconds, data, nanoseconds, self._count)
+            if abs(time - self._flushed) >= _FLUSH:
+                self._writer.flush()
+                self._flushed = time
+
+    @contextlib.contextmanager
+    def _closing_on_failure(self) -> Iterator[None]:
+        """Close a file that cannot be written, and say up to where it can be read."""
+        try:
+            yield
+        except OSError as error:
+            with contextlib.suppress(OSError):  # it cannot write its buffer either
+                self._file.close()
+            raise FormatError(
+                f"{self.path} cannot be written: {error.strerror}. The recording ends at "
+                f"{max(self._flushed, 0.0):.4g} s of the run."
+            ) from None
 
 
 def check_recording_name(path: str | os.PathLike[str]) -> None:

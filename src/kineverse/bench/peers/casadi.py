@@ -46,7 +46,7 @@ def compile_map(function: Any, rows: int, folder: Path) -> Any:
     source.write_text(generator.dump(), encoding="utf-8")
     compiler = compiler_information().compiler or "cc"
     command = [compiler, *COMPILER_FLAGS, str(source), "-o", str(library), "-lm"]
-    done = subprocess.run(command, capture_output=True, text=True, check=False)
+    done = subprocess.run(command, capture_output=True, encoding="utf-8", errors="replace", check=False)
     if done.returncode:
         raise CompileError(f"CasADi's map cannot be compiled: {done.stderr.strip().splitlines()[0]}")
     return ca.external(mapped.name(), str(library))

@@ -187,8 +187,8 @@ def find_robots(names: Iterable[str] = (), data: Path | None = None) -> tuple[Ro
     names
         Names of robots; by default the three that ship, and those of the authors where their files are.
     data
-        Folder with the folders ``pr2``, ``fetch`` and ``hsrb`` of the authors' robots, see :func:`check_data`;
-        None for none.
+        Folder with the folders ``pr2``, ``fetch`` and ``hsrb`` of the authors' robots, None for
+        none.
 
     Raises
     ------

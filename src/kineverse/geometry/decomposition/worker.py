@@ -16,9 +16,11 @@ from pathlib import Path
 import numpy as np
 
 from kineverse._extras import install_command
+from kineverse.compile.content_cache import UNFINISHED
 from kineverse.errors import KineverseError, MissingDependencyError
 from kineverse.geometry.mesh_files import Floats
 
+from .hull_cache import DECOMPOSITIONS
 from .mesh_cleanup import CleanMesh
 
 PROGRAM = Path(__file__).with_name("_coacd_main.py")
@@ -79,7 +81,9 @@ def run_coacd(
     """
     if importlib.util.find_spec("coacd") is None:
         raise MissingDependencyError(f"decomposing meshes needs CoACD: {install_command('decomposition')}")
-    with tempfile.TemporaryDirectory(prefix="kineverse-decompose-", ignore_cleanup_errors=True) as folder:
+    # In the cache, which removes what killed processes have left.
+    place = DECOMPOSITIONS.folder.path
+    with tempfile.TemporaryDirectory(prefix=UNFINISHED, dir=place, ignore_cleanup_errors=True) as folder:
         source, target, said = (Path(folder) / name for name in ("in.npz", "out.npz", "said.txt"))
         np.savez(source, vertices=surface.faces.vertices, faces=surface.faces.faces, parts=surface.parts)
         with said.open("wb") as errors:
