@@ -2,13 +2,16 @@
 
 from __future__ import annotations
 
+import errno
 import hashlib
 import logging
 import os
 import shutil
 import subprocess
 import sys
+import time
 from pathlib import Path
+from types import SimpleNamespace
 
 import pytest
 from processes import states_of_group
@@ -16,6 +19,7 @@ from processes import states_of_group
 import kineverse as kv
 from kineverse.compile import c_library, cache, call_extension, compiler_information
 from kineverse.compile.cache import LibraryCache, library_cache
+from kineverse.compile.toolchain import toolchain
 
 a, b = kv.position("door/a"), kv.position("door/b")
 
@@ -210,22 +214,129 @@ def test_build_folders_of_killed_processes_are_removed(folder: Path) -> None:
     assert new.exists()
 
 
-def test_the_end_of_the_process_ends_the_compiler(tmp_path: Path) -> None:
+@pytest.mark.parametrize(
+    "end", ["", "os.kill(os.getpid(), signal.SIGTERM)", "os.kill(os.getpid(), signal.SIGKILL)"]
+)
+@pytest.mark.skipif(not os.path.exists("/proc/self/stat"), reason="there is no /proc")
+def test_the_end_of_the_process_ends_the_compiler(tmp_path: Path, end: str) -> None:
     compiler = tmp_path / "cc"
     alive = tmp_path / "alive"
-    compiler.write_text(f"#!/bin/sh\n(echo $$ > {alive}; while :; do sleep 0.1; done) & wait\n")
+    # The number of its group is the fifth in what the system says of a process.
+    write = f"cut -d' ' -f5 /proc/$$/stat > {alive}"
+    compiler.write_text(f"#!/bin/sh\n({write}; while :; do sleep 0.1; done) & wait\n")
     compiler.chmod(0o755)
     program = f"""
-import pathlib, kineverse as kv
+import os, pathlib, signal, kineverse as kv
 f = kv.compile(kv.position("a") * 3.5 + 1)
 alive = pathlib.Path({str(alive)!r})
 while not (alive.exists() and alive.read_text().strip()):
     assert not f.wait(0.01)
+{end}
 """
     environment = {**os.environ, "CC": str(compiler), "KINEVERSE_CACHE_DIR": str(tmp_path / "folder")}
-    subprocess.run([sys.executable, "-c", program], env=environment, timeout=60, check=True)
+    subprocess.run([sys.executable, "-c", program], env=environment, timeout=60, check=not end)
+    # A killed process cannot wait for its compiler: the shell around that sees the end of a pipe.
+    deadline = time.monotonic() + 60.0
+    while {*states_of_group(int(alive.read_text()))} - {"Z"} and time.monotonic() < deadline:
+        time.sleep(0.01)
     assert set(states_of_group(int(alive.read_text()))) <= {"Z"}
     assert list((tmp_path / "folder").iterdir()) == []
+
+
+LIMITED = """
+import resource, sys
+import kineverse as kv
+resource.setrlimit(resource.RLIMIT_FSIZE, ({bytes}, resource.RLIM_INFINITY))
+f = kv.compile(kv.position("a") * 3.25 + 1, wait=True)
+assert f([2.0]) == 7.5
+print(f.tier)
+"""
+
+
+@pytest.mark.compiler
+def test_a_limit_on_files_leaves_the_interpreter_with_the_reason(tmp_path: Path) -> None:
+    for size in (0, 1000):
+        done = subprocess.run(
+            [sys.executable, "-c", LIMITED.format(bytes=size)],
+            env={**os.environ, "KINEVERSE_CACHE_DIR": str(tmp_path / "folder")},
+            capture_output=True,
+            encoding="utf-8",
+            timeout=120,
+            check=True,
+        )
+        assert done.stdout == "interpreter\n"
+        assert "A function stays with CasADi's interpreter: there is no room to compile in: " in done.stderr
+        assert "'ulimit -f'" in done.stderr
+    assert list((tmp_path / "folder").iterdir()) == []
+
+
+@pytest.mark.compiler
+def test_a_cache_without_room_is_replaced_by_a_private_folder(
+    folder: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    store = LibraryCache.store
+
+    def store_unless_full(self: LibraryCache, key: str, library: str) -> str:
+        if self.folder == folder:
+            raise OSError(errno.ENOSPC, "No space left on device", library)
+        return store(self, key, library)
+
+    monkeypatch.setattr(LibraryCache, "store", store_unless_full)
+    monkeypatch.setattr(cache, "_without_room", {})
+    cache._open.cache_clear()
+    with caplog.at_level(logging.WARNING, "kineverse.compile"):
+        compiled()
+        compiled()
+    assert [r.getMessage() for r in caplog.records] == [
+        "Compiled functions are not kept for other processes: the cache folder "
+        f"{folder} has no room (No space left on device)."
+    ]
+    assert library_cache().folder != folder
+    assert libraries(folder) == []
+    cache._open.cache_clear()
+
+
+def test_without_any_folder_functions_are_interpreted(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    (tmp_path / "file").touch()
+    monkeypatch.setenv("KINEVERSE_CACHE_DIR", str(tmp_path / "file" / "folder"))
+
+    def no_folder() -> None:
+        raise FileNotFoundError(errno.ENOENT, "No usable temporary directory found")
+
+    no_folder.cache_info = cache._private_folder.cache_info  # type: ignore[attr-defined]
+    no_folder.cache_clear = cache._private_folder.cache_clear  # type: ignore[attr-defined]
+    monkeypatch.setattr(cache, "_private_folder", no_folder)
+    cache._open.cache_clear()
+    f = kv.compile(a * 2.75 + a * a, wait=True)
+    assert f.tier == "interpreter"
+    assert f([0.0]) == 0.0
+    cache._open.cache_clear()
+
+
+@pytest.mark.parametrize("home", ["", "relative", None])
+def test_a_home_that_is_no_absolute_path_is_ignored(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, home: str | None
+) -> None:
+    pwd = pytest.importorskip("pwd")
+    monkeypatch.setattr(pwd, "getpwuid", lambda user: SimpleNamespace(pw_dir=str(tmp_path / "account")))
+    monkeypatch.delenv("KINEVERSE_CACHE_DIR")
+    monkeypatch.setenv("XDG_CACHE_HOME", "also/relative")
+    monkeypatch.delenv("HOME") if home is None else monkeypatch.setenv("HOME", home)
+    monkeypatch.chdir(tmp_path)
+    assert library_cache().folder == tmp_path / "account" / ".cache" / "kineverse"
+    assert [p.name for p in tmp_path.iterdir()] == ["account"]
+
+
+@pytest.mark.compiler
+def test_a_compiler_that_cannot_be_read_as_a_command_is_ignored(
+    monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    monkeypatch.setenv("CC", "'unclosed")
+    with caplog.at_level(logging.WARNING, "kineverse.compile"):
+        assert toolchain() is not None
+    assert 'CC is "\'unclosed", which is no command (No closing quotation)' in caplog.text
 
 
 @pytest.mark.compiler

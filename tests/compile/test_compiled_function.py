@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import copy
+import gc
 import pickle
 from array import array as plain_array
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -233,3 +235,23 @@ def test_a_function_of_constants_is_called_without_arguments():
         match=r"Nothing is given; a call takes a vector of 1 numbers \('q'\), or a mapping",
     ):
         kv.compile(kv.position("q"))()
+
+
+@pytest.mark.compiler
+@pytest.mark.skipif(not Path("/proc/self/maps").exists(), reason="there is no /proc")
+def test_a_library_is_unloaded_with_the_last_that_needs_it() -> None:
+    def loaded() -> int:
+        return Path("/proc/self/maps").read_text().count(f"/{key}.so")
+
+    f = kv.compile([a * b + 7.125, np.sin(b)], tier="c", wait=True)
+    key = f._library._key
+    assert loaded() > 0
+    evaluator = f.bind()
+    del f
+    gc.collect()
+    evaluator([2.0, 3.0])
+    assert evaluator.outputs[0] == 13.125
+    assert loaded() > 0
+    del evaluator
+    gc.collect()
+    assert loaded() == 0

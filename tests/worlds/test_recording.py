@@ -220,3 +220,34 @@ def test_the_recorder_refuses_what_cannot_be_read_again(model, tmp_path):
     with pytest.raises(KineverseError, match="closed"):
         recorder.write_state(0.0, {})
     assert len(read_run_recording(tmp_path / "run.mcap").states) == 0
+
+
+def test_a_full_disk_ends_a_recording_that_can_be_read_up_to_there(model, tmp_path):
+    resource = pytest.importorskip("resource")
+    path = tmp_path / "run.mcap"
+    before = resource.getrlimit(resource.RLIMIT_FSIZE)
+    recorder = Recorder(path, model)
+    recorder.write_state(0.0, state(model))
+    recorder.write_state(1.0, state(model))
+    resource.setrlimit(resource.RLIMIT_FSIZE, (path.stat().st_size + 1000, before[1]))
+    try:
+        with pytest.raises(
+            FormatError, match=r"run.mcap cannot be written: File too large. .* ends at [1-9]"
+        ) as info:
+            for k in range(2, 2000):
+                recorder.write_state(float(k), state(model))
+                recorder.write_vectors(float(k), {"noise": (np.random.default_rng(k).random(3), np.zeros(3))})
+        recorder.close()  # does nothing
+        with pytest.raises(KineverseError, match="is closed"):
+            recorder.write_phase(3000.0, "late")
+        with (
+            pytest.raises(FormatError, match="cannot be written"),
+            Recorder(tmp_path / "b.mcap", model) as other,
+        ):
+            for k in range(2000):
+                other.write_phase(float(k), f"{k}")
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, before)
+    found = read_run_recording(path)
+    assert not found.complete
+    assert found.duration >= float(str(info.value).rpartition("ends at ")[2].partition(" s")[0])

@@ -270,7 +270,7 @@ class _Worker:
             return self._run_compiler(build)
         except OSError as error:
             if error.errno in _ROOM:
-                raise NoRoomError(error.strerror) from None
+                raise NoRoomError(os.strerror(error.errno)) from None
             raise
 
     def _run_compiler(self, build: BuildJob) -> str:
