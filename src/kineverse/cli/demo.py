@@ -15,8 +15,8 @@ A robot that ships opens and closes the doors and drawers of the kitchen that sh
 in the browser until Ctrl-C: the robot and the true kitchen, what it believes of it from noisy poses, and what
 its controller wants. Each object is reported on the terminal, and all of them in a table at the end. With
 --headless it opens and closes one object of each kind without a browser, and writes a picture. The exit
-status is 0 if all was opened and closed, else 1. This needs the extras 'control' and 'geometry', the page
-'view'.
+status is 0 if all was opened and closed, else 1. This needs the extras 'control' and 'geometry', a C
+compiler, and for the page the extra 'view'.
 
 With --living it shows a kitchen in motion without a robot, tracked from noisy markers, and a joint that is
 identified; with --headless that needs nothing beyond the core. With --sliders it shows the kitchen and a

@@ -40,7 +40,8 @@ _COMMON = """
 MODEL is any model or file, ROBOT any shipped robot or robot file; ROBOT@X,Y,ANGLE places its base. The world
 gets the speeds of the robot alone, and judges by its own truth: kinematic (the default), or mujoco with
 contacts, forces and friction. The exit status is 0 if it is done, 1 if not, 2 if the request is wrong. This
-needs the extras 'control' and 'geometry', the other world 'mjcf', and --record 'recording'.
+needs the extras 'control' and 'geometry', the other world 'mjcf', --record 'recording', and opening and
+closing a C compiler.
 
 examples:
 """
