@@ -250,10 +250,6 @@ class UrdfWriter:
             Naming all features that URDF cannot represent.
         """
         links = self._description.links
-        if any(key in joint.dynamics for joint in self._description.joints for key in _NEWER) or any(
-            key in link.dynamics for link in links for key in _NEWER
-        ):
-            self._root.give("version", "1.2")
         root = self._root_link()
         if root is None:
             self._bodies.write(self._root.add("link", name=WORLD), self._description.world_body)
@@ -261,7 +257,24 @@ class UrdfWriter:
             self._link(link, link is root)
         self._unsupported.check(self._path.name)
         self._description.remarks += self._unsupported.remarks
+        self._root.give("version", self._version())
         return format_xml(self._root, [*self._description.remarks, *self._description.error_lines])
+
+    def _version(self) -> str | None:
+        """Return the version of URDF that the file needs; None for the first, which all parsers read."""
+        tags = list(self._root.inside)
+        for tag in tags:
+            tags += tag.inside
+        limits = [tag.attributes for tag in tags if tag.name == "limit"]
+        if any(key in attributes for attributes in limits for key in _NEWER):
+            return "1.2"
+        if any(tag.name == "capsule" for tag in tags):
+            # urdfdom passes over all shapes of a link with a capsule in a file of version 1.0.
+            self._description.remarks.append(
+                "the capsules need version 1.1 of URDF, which urdfdom reads since 5.1 only"
+            )
+            return "1.1"
+        return None
 
     def _root_link(self) -> LinkDescription | None:
         """Return the link that is fixed at the world's origin and carries all others; None without one."""
