@@ -178,15 +178,26 @@ def _check_root(root: Element, source: str) -> None:
 _ESCAPED = {"\n": "&#10;", "\r": "&#13;", "\t": "&#9;"}
 
 
-def serialize_elements(root: MjcfElement, first: int = 1) -> tuple[str, list[MjcfElement]]:
-    """Return the text of a document, one element a line from line ``first`` on, and the elements in order."""
+def serialize_elements(
+    root: MjcfElement, first: int = 1, without: frozenset[str] = frozenset()
+) -> tuple[str, list[MjcfElement]]:
+    """Return the text of a document, one element a line from line ``first`` on, and the elements in order.
+
+    Sections of the document whose tags are in ``without`` become blank lines.
+    """
     lines: list[str] = []
     nodes: list[MjcfElement] = []
+    sections = set(root.children)
     stack: list[MjcfElement | str] = [root]
     while stack:
         part = stack.pop()
         if isinstance(part, str):
             lines[-1] += part
+            continue
+        if part.tag in without and part in sections:
+            hidden = list(part.walk())
+            nodes += hidden
+            lines += [""] * len(hidden)
             continue
         words = [part.tag, *(f"{k}={quoteattr(v, _ESCAPED)}" for k, v in part.attributes.items())]
         nodes.append(part)
