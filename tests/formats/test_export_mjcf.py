@@ -109,6 +109,18 @@ def assert_same_inertia(model: kv.Model, again: kv.Model) -> None:
         )
 
 
+def assert_same_shapes_in_mujoco(model: kv.Model, file: Path, remarks: tuple[str, ...]) -> None:
+    """Compare the numbers of shapes to be touched and to be seen, of bodies none of which is left out."""
+    engine = MujocoReference(file).model
+    touching = engine.geom_contype != 0
+    for name, body in model.bodies.items():
+        if any(f"'{name}' is left out" in r or f"'{name}' are left out" in r for r in remarks):
+            continue
+        geoms = engine.geom_bodyid == engine.body(name).id
+        assert (geoms & touching).sum() == len(body.collisions), name
+        assert (geoms & ~touching).sum() == len(body.visuals), name
+
+
 def turned(body: Body) -> np.ndarray:
     assert body.inertia is not None
     xx, xy, xz, yy, yz, zz = body.inertia.tensor
@@ -133,8 +145,9 @@ def test_shipped_models_are_written_or_refused_by_name(name: str, tmp_path: Path
         assert REFUSED[name] in str(info.value)
         assert not list(tmp_path.iterdir())
         return
-    model.save(file)
+    saved = model.save(file)
     assert_as_in_mujoco(model, file)
+    assert_same_shapes_in_mujoco(model, file, saved.remarks)
     again = kv.load(file)
     assert_same_motion(model, again, tolerance=1e-10 if model.rates.dependent else 1e-12)
     assert model.rates.dependent.keys() == again.rates.dependent.keys()

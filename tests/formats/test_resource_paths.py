@@ -3,12 +3,15 @@
 from __future__ import annotations
 
 import os
+from pathlib import Path
 
 import pytest
 
+import kineverse as kv
 from kineverse.errors import FormatError
 from kineverse.formats import resource_paths
-from kineverse.formats.resource_paths import locate_resource
+from kineverse.formats.reader_warnings import collect_warnings
+from kineverse.formats.resource_paths import locate_mesh, locate_resource
 from kineverse.formats.urdf import read_urdf
 from kineverse.model.body import Mesh
 
@@ -228,3 +231,66 @@ def test_all_meshes_of_large_descriptions_are_found(file, published):
     ]
     assert len(meshes) > 80
     assert all(locate_resource(mesh.uri, mesh.folder).is_file() for mesh in meshes)
+
+
+def robot_beside_meshes(folder: Path, mesh: str) -> Path:
+    """Return a URDF in ``robot/urdf``, beside ``robot/meshes`` and ``robot/secrets``, without a package."""
+    for name in ("urdf", "meshes", "secrets"):
+        (folder / "robot" / name).mkdir(parents=True)
+    for name in ("meshes", "secrets"):
+        (folder / "robot" / name / "a.stl").touch()
+    (folder / "a.stl").touch()
+    path = folder / "robot" / "urdf" / "r.urdf"
+    shape = f'<visual><geometry><mesh filename="{mesh}"/></geometry></visual>'
+    path.write_text(f'<robot name="r"><link name="l">{shape}</link></robot>')
+    return path
+
+
+@pytest.mark.parametrize(
+    "uri", ["../meshes/a.stl", "package://some_robot/meshes/a.stl", "package://robot/meshes/a.stl"]
+)
+def test_meshes_beside_the_folder_of_a_description_are_found(uri: str, tmp_path: Path):
+    path = robot_beside_meshes(tmp_path, uri)
+    with collect_warnings() as said:
+        mesh = kv.load(path).bodies["l"].visuals[0].geometry
+        assert locate_mesh(mesh).samefile(tmp_path / "robot" / "meshes" / "a.stl")
+    expected = (
+        f'there is no package "some_robot"; {tmp_path / "robot"}, which has its files, is taken for it.'
+    )
+    assert said == ([expected] if "some_robot" in uri else [])
+
+
+@pytest.mark.parametrize(
+    "uri",
+    [
+        "../secrets/a.stl",
+        "../../a.stl",
+        "../meshes/../secrets/a.stl",
+        "package://some_robot/secrets/a.stl",
+        "package://x/a.stl",
+    ],
+)
+def test_other_folders_beside_a_description_stay_closed(uri: str, tmp_path: Path):
+    mesh = kv.load(robot_beside_meshes(tmp_path, uri)).bodies["l"].visuals[0].geometry
+    with pytest.raises(FormatError):
+        locate_mesh(mesh)
+
+
+def test_a_link_is_no_folder_of_meshes(tmp_path: Path):
+    path = robot_beside_meshes(tmp_path, "../mesh/a.stl")
+    (tmp_path / "robot" / "mesh").symlink_to(tmp_path / "robot" / "secrets")
+    with pytest.raises(FormatError, match="leads out of the root"):
+        locate_mesh(kv.load(path).bodies["l"].visuals[0].geometry)
+
+
+def test_meshes_of_an_mjcf_may_lie_beside_its_folder(tmp_path: Path):
+    pytest.importorskip("mujoco")
+    path = robot_beside_meshes(tmp_path, "").with_name("r.xml")
+    (tmp_path / "robot" / "meshes" / "a.obj").write_text(
+        "v 0 0 0\nv 1 0 0\nv 0 1 0\nv 0 0 1\nf 1 3 2\nf 1 2 4\nf 1 4 3\nf 2 3 4\n"
+    )
+    path.write_text(
+        '<mujoco><compiler meshdir="../meshes"/><asset><mesh name="m" file="a.obj"/></asset><worldbody>'
+        '<body name="b"><joint/><geom type="mesh" mesh="m"/></body></worldbody></mujoco>'
+    )
+    assert kv.load(path).bodies["b"].inertia.mass == pytest.approx(1000 / 6)

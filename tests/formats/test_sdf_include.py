@@ -7,6 +7,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from test_sdf_pose_graph import at, link, pose, sdf
+from urdf_texts import LIMIT, joint, robot
 
 import kineverse as kv
 from kineverse.formats.sdf import read_sdf
@@ -159,3 +160,86 @@ def test_placement_frames_of_sdformat(models, monkeypatch, published):
         np.testing.assert_allclose(places[f"{name}/L4"], expected, atol=1e-14)
     for name in ("include_with_placement_frame_and_pose_relative_to", "model_with_link_placement_frame"):
         np.testing.assert_allclose(places[f"{name}/L4"], expected, atol=1e-14)
+
+
+BODY = (
+    '<inertial><origin xyz="0.1 0 0" rpy="0 0 0.3"/><mass value="2"/>'
+    '<inertia ixx="1" ixy="0.1" ixz="0" iyy="2" iyz="0" izz="2.5"/></inertial>'
+    '<visual name="seen"><origin xyz="0 0 1" rpy="0.1 0 0"/><geometry><box size="1 2 3"/></geometry>'
+    '<material name="m"><color rgba="0.1 0.2 0.3 1"/></material></visual>'
+    '<collision><geometry><mesh filename="package://robot/a.stl" scale="1 2 3"/></geometry></collision>'
+    '<collision><geometry><cylinder radius="0.5" length="2"/></geometry></collision>'
+)
+
+
+@pytest.mark.parametrize("root", ["base", "world"])
+def test_an_included_urdf_moves_as_the_urdf_itself(tmp_path: Path, root: str):
+    urdf = robot(
+        f'<link name="{root}"/><link name="arm">{BODY}</link><link name="tip"/><link name="grip"/>',
+        joint(
+            "arm",
+            root,
+            "arm",
+            "revolute",
+            '<origin xyz="1 2 3" rpy="0.1 0.2 0.3"/><axis xyz="1 2 3"/>' + LIMIT,
+        ),
+        joint("slide", "arm", "tip", "prismatic", '<axis xyz="0 1 0"/><dynamics damping="3"/>' + LIMIT),
+        joint("follows", "tip", "grip", "continuous", '<mimic joint="arm" multiplier="-2" offset="0.1"/>'),
+    )
+    place = file(tmp_path, sdf(link("l"), include("r.urdf", "<name>r</name>" + pose("0 0 5 0 0 1"))))
+    place.with_name("r.urdf").write_text(urdf)
+    model, alone = kv.load(place), kv.load(place.with_name("r.urdf"), prefix="r")
+    placed = np.eye(4) if root == "base" else kv.translation(0, 0, 5)() @ kv.rotation_z(1.0)()
+    values = {"arm": 0.4, "slide": -0.3}
+    for name in ("r/arm", "r/tip", "r/grip"):
+        there = model.fk(name, relative_to="r/base") if root == "base" else model.fk(name)
+        here = alone.fk(name)
+        names = {s.path: s for s in there.symbols}
+        moved = there(
+            {s: values[path.rpartition("/")[2].removesuffix("_joint")] for path, s in names.items()}
+        )
+        np.testing.assert_allclose(
+            moved, placed @ here({s: values[s.path.rpartition("/")[2]] for s in here.symbols}), atol=1e-14
+        )
+    # A joint cannot have the name of a link in an SDF.
+    assert set(model.articulations) >= {"r/arm_joint", "r/slide", "r/follows"}
+    for ours, known in (("r/arm_joint", "r/arm"), ("r/slide", "r/slide")):
+        assert model.limits(ours) == alone.limits(known)
+        assert (
+            dict(model.articulations[ours].dynamics).items()
+            >= dict(alone.articulations[known].dynamics).items()
+        )
+    assert [s.geometry for s in model.bodies["r/arm"].collisions][1] == alone.bodies["r/arm"].collisions[
+        1
+    ].geometry
+    seen, known = model.bodies["r/arm"].visuals[0], alone.bodies["r/arm"].visuals[0]
+    assert (seen.geometry, seen.color, seen.name) == (known.geometry, known.color, "seen")
+    np.testing.assert_allclose(seen.origin.matrix, known.origin.matrix, atol=1e-15)
+    assert model.bodies["r/arm"].inertia.tensor == alone.bodies["r/arm"].inertia.tensor
+    mesh = model.bodies["r/arm"].collisions[0].geometry
+    assert (mesh.uri, mesh.scale, mesh.folder) == ("package://robot/a.stl", (1, 2, 3), str(place.parent))
+
+
+def test_floating_joints_of_an_included_urdf_leave_the_link_free(tmp_path: Path):
+    urdf = robot(joint("fly", "l0", "l1", "floating", '<origin xyz="1 0 0"/>'), links=2)
+    place = file(tmp_path, sdf(link("l"), include("r.urdf")))
+    place.with_name("r.urdf").write_text(urdf)
+    model = kv.load(place)
+    assert model.articulations["r/l1/free"].kind == "floating"
+    np.testing.assert_allclose(model.fk("r/l1")(model.default_state())[:3, 3], [1, 0, 0])
+    place.with_name("r.urdf").write_text(urdf.replace("floating", "planar"))
+    with pytest.raises(kv.errors.FormatError, match=r'r.urdf, line 4, <joint name="fly">: is planar'):
+        kv.load(place)
+
+
+def test_models_that_include_each_other_without_end_are_refused(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+):
+    monkeypatch.setattr("kineverse.formats.sdf.reader.MAX_INCLUDED", 200)
+    place = file(tmp_path, sdf(link("l"), include("0.sdf")))
+    for k in range(40):
+        both = include(f"{k + 1}.sdf", "<name>a</name>") + include(f"{k + 1}.sdf", "<name>b</name>")
+        place.with_name(f"{k}.sdf").write_text(sdf(link("l"), both))
+    place.with_name("40.sdf").write_text(sdf(link("l")))
+    with pytest.raises(kv.errors.FormatError, match="there are more than 200 elements"):
+        kv.load(place)

@@ -156,6 +156,74 @@ def test_axes_before_version_1_5_are_in_the_model_frame():
         np.testing.assert_allclose(model.jacobian("b")({"j": 0.2})[3:, 0], axis, atol=1e-15)
 
 
+FRAMES = sdf(
+    link("a", pose("1 0 0 0.3 0 0")),
+    link("b", pose("1 0 0 0 0 1.5", 'relative_to="a"') + "<visual name='v'>" + pose("0 0 5 0 0 0", 'relative_to="a"')
+         + "<geometry><sphere><radius>0.1</radius></sphere></geometry></visual>"),
+    link("c", pose("0 2 0 0 0 0", 'relative_to="inner::l"')),
+    '<frame name="f" attached_to="b">' + pose("0 0 1 0.2 0 0") + "</frame>",
+    '<model name="inner" placement_frame="l">'
+    + pose("4 4 4 0 0 0.2", 'relative_to="a"')
+    + link("l", pose("1 0 0 0 0 1"))
+    + "</model>",
+    '<joint name="j" type="revolute">' + pose("0 1 0 0 0 0", 'relative_to="a"') + "<parent>a</parent><child>b</child>"
+    '<axis><xyz expressed_in="f">1 0 0</xyz></axis></joint>',
+)  # fmt: skip
+
+
+@pytest.mark.parametrize("version", ["1.2", "1.4", "1.5", "1.6", "1.7", "1.12"])
+def test_references_to_frames_are_obeyed_in_files_of_every_version(version: str):
+    text = FRAMES.replace('version="1.10"', f'version="{version}"')
+    if version < "1.5" and not version.startswith("1.1"):  # older ones give axes in the frame of the model
+        text = text.replace("</xyz>", "</xyz><use_parent_model_frame>0</use_parent_model_frame>")
+    scene, expected = parse_sdf(text), parse_sdf(FRAMES)
+    for found, wanted in zip(scene.links, expected.links, strict=True):
+        assert (found.name, found.pose, found.body) == (wanted.name, wanted.pose, wanted.body)
+    assert [f.pose for f in scene.frames] == [f.pose for f in expected.frames]
+    assert [(j.pose_in_parent, j.axes) for j in scene.joints] == [
+        (j.pose_in_parent, j.axes) for j in expected.joints
+    ]
+    said = [r for r in scene.remarks if "SDF does not define before 1.7" in r]
+    assert len(said) == (3 if version in ("1.2", "1.4", "1.5", "1.6") else 0)  # once for each attribute
+
+
+def test_a_pose_of_1_6_is_relative_to_its_frame_attribute_first():
+    links = link("a", pose("1 0 0 0 0 0")) + link("b", pose("0 2 0 0 0 0"))
+    for attributes, x in [
+        ('frame="a"', 1),
+        ('frame="a" relative_to="b"', 1),
+        ('frame="" relative_to="a"', 0),
+    ]:
+        scene = parse_sdf(sdf(links, link("c", pose("0 0 0 0 0 0", attributes)), version="1.6"))
+        assert scene.links[2].pose.matrix[:2, 3].tolist() == [x, 0]
+    scene = parse_sdf(sdf(links, link("c", pose("0 0 3 0 0 0", 'frame="a"')), version="1.7"))
+    assert scene.links[2].pose.matrix[:3, 3].tolist() == [0, 0, 3]
+    assert any("has frame, which is relative_to since SDF 1.7" in r for r in scene.remarks)
+
+
+def test_unknown_frames_of_attributes_that_came_with_1_7_are_passed_over_before():
+    joint = '<joint name="j" type="revolute"><parent>a</parent><child>b</child><axis><xyz expressed_in="x">0 1 0</xyz></axis></joint>'
+    text = sdf(link("a"), link("b", pose("0 0 3 0 0 0", 'relative_to="nothing"')), joint, version="1.6")
+    scene = parse_sdf(text)
+    assert scene.links[1].pose.matrix[:3, 3].tolist() == [0, 0, 3]
+    assert scene.joints[0].axes[0].xyz == (0.0, 1.0, 0.0)
+    assert sum("it is passed over" in r for r in scene.remarks) == 2
+    with pytest.raises(kv.errors.FormatError, match='refers to "nothing"'):
+        parse_sdf(text, strict=True)
+
+
+def test_what_a_version_no_longer_has_is_ignored_with_a_remark():
+    joint = '<joint name="j" type="revolute"><parent>a</parent><child>b</child><axis><xyz>1 0 0</xyz>{}</axis></joint>'
+    turned = link("a") + link("b", pose("0 0 0 0 0 1.5707963267948966"))
+    scene = parse_sdf(sdf(turned, joint.format("<use_parent_model_frame>1</use_parent_model_frame>")))
+    assert scene.joints[0].axes[0].xyz == (1.0, 0.0, 0.0)
+    assert any("use_parent_model_frame" in r for r in scene.remarks)
+    inertia = "<inertial>" + pose("1 0 0 0 0 0", 'relative_to="a"') + "<mass>2</mass></inertial>"
+    scene = parse_sdf(sdf(link("a", pose("0 5 0 0 0 0")), link("b", inertia)))
+    assert scene.links[1].body.inertia.origin.matrix[:3, 3].tolist() == [1, 0, 0]
+    assert any("an inertia is always given in its link" in r for r in scene.remarks)
+
+
 NUMBER = st.floats(-2, 2).map(lambda x: round(x, 6))
 POSE = st.tuples(*[NUMBER] * 6)
 

@@ -10,8 +10,18 @@ from hypothesis import given
 from hypothesis import strategies as st
 from urdf_texts import LIMIT, joint, pair, robot
 
+import kineverse as kv
 from kineverse.errors import FormatError
 from kineverse.formats.urdf import UrdfDynamics, UrdfLimits, UrdfMimic, UrdfSafetyController, parse_urdf
+from kineverse.formats.urdf.operations import urdf_operations
+
+
+def model_of(text: str) -> kv.Model:
+    model = kv.Model()
+    with model.edit() as edit:
+        for operation in urdf_operations(parse_urdf(text)):
+            edit.apply(operation)
+    return model
 
 
 def test_defaults_are_those_of_the_specification():
@@ -38,6 +48,72 @@ def test_all_urdf_joint_types_are_read(kind, dof, axis):
     robot = parse_urdf(pair('<axis xyz="0 0 2"/>' + LIMIT, kind))
     assert robot.dof == dof
     assert robot.joints[0].axis == axis
+
+
+INSIDE = (
+    '<axis xyz="0 0 1"/><limit lower="-1" upper="2" effort="10" velocity="3"/>'
+    '<dynamics damping="0.5" friction="0.25"/>'
+    '<safety_controller soft_lower_limit="-0.5" soft_upper_limit="1" k_position="20" k_velocity="30"/>'
+)
+
+
+def test_planar_joints_have_the_limits_of_their_file_in_both_directions():
+    model = model_of(pair(INSIDE, "planar"))
+    assert [model.limits(f"j/{c}") for c in ("x", "y", "angle")] == [(-1, 2), (-1, 2), (-np.inf, np.inf)]
+    names = {"j/x/position", "j/y/position", "j/x/velocity", "j/y/velocity"}
+    assert set(model.constraints) == names
+    assert model.violations(
+        {"j/x": 0.0, "j/y": 2.5, "j/angle": 0.0, "j/x:velocity": 4.0, "j/y:velocity": 0.0}
+    )
+    known = {"effort": 10, "damping": 0.5, "friction": 0.25, "k_position": 20, "k_velocity": 30}
+    assert dict(model.articulations["j"].dynamics) == known
+
+
+@pytest.mark.parametrize("attributes", ["", 'name="r" version="1.2"'])
+def test_a_planar_limit_of_speed_alone_leaves_the_position_free(attributes):
+    robot = parse_urdf(
+        pair('<limit effort="1" velocity="2"/>', "planar", *([attributes] if attributes else []))
+    )
+    assert robot.joints[0].limits == UrdfLimits(velocity=2.0, effort=1.0)
+    assert robot.remarks == ()
+
+
+@pytest.mark.parametrize("kind", ["planar", "floating", "continuous"])
+def test_what_a_joint_does_not_have_is_ignored_with_a_remark(kind):
+    robot = parse_urdf(pair(INSIDE, kind))
+    said = [r for r in robot.remarks if "ignored" in r]
+    assert any("soft limits" in r for r in said)
+    assert any("lower and upper" in r for r in said) == (kind != "planar")
+    assert any("has velocity" in r for r in said) == (kind == "floating")
+    joint = robot.joints[0]
+    assert (joint.limits.effort, joint.dynamics, joint.safety.k_velocity) == (10, UrdfDynamics(0.5, 0.25), 30)
+    assert (joint.limits.velocity, joint.safety.has_limits) == (None if kind == "floating" else 3, False)
+
+
+@pytest.mark.parametrize("kind", ["planar", "floating", "continuous", "prismatic", "revolute"])
+def test_limits_and_dynamics_of_all_joints_are_written_as_they_were_read(kind, tmp_path):
+    model = model_of(pair(INSIDE, kind))
+    model.save(tmp_path / "r.urdf")
+    again = kv.load(tmp_path / "r.urdf")
+    assert dict(again.articulations) == dict(model.articulations)
+    assert again.constraints == model.constraints
+
+
+@pytest.mark.parametrize("kind", ["planar", "floating", "spherical"])
+def test_dynamics_of_joints_with_several_coordinates_are_in_mjcf_or_in_a_remark(kind, tmp_path):
+    mujoco = pytest.importorskip("mujoco")
+    body = '<inertial><mass value="1"/><inertia ixx="1" iyy="1" izz="1" ixy="0" ixz="0" iyz="0"/></inertial>'
+    text = pair('<dynamics damping="0.5" friction="0.25"/>', kind)
+    text = text.replace('<link name="l1"/>', f'<link name="l1">{body}</link>').replace("l0", "world")
+    saved = model_of(text).save(tmp_path / "r.xml")
+    said = any("damping and friction of all is left out" in r for r in saved.remarks)
+    engine = mujoco.MjModel.from_xml_path(str(tmp_path / "r.xml"))
+    assert said == (kind == "planar")
+    if not said:
+        assert set(engine.dof_damping) == {0.5}
+        assert set(engine.dof_frictionloss) == {0.25}
+        read = dict(kv.load(tmp_path / "r.xml").articulations["j"].dynamics)
+        assert (read["damping"], read["friction"]) == (0.5, 0.25)
 
 
 @pytest.mark.parametrize("kind", ["continuous", "fixed", "planar", "floating"])

@@ -203,3 +203,21 @@ def test_chain_of_thirty_thousand_links_is_read():
     assert description.joints[-1].mimic.joint == "j0"
     assert description.joints[-1].mimic.offset == length - 1
     assert description.dof == 1
+
+
+@pytest.mark.parametrize("prefix", [None, "r"])
+def test_a_parent_world_without_a_link_is_the_world(prefix: str | None):
+    text = robot('<link name="base"/>', joint("stand", "world", "base", "fixed", '<origin xyz="1 2 3"/>'))
+    description = parse_urdf(text)
+    assert (description.root, len(description.remarks)) == ("world", 1)
+    assert 'its parent link "world" has no <link> element' in description.remarks[0]
+    model = kv.Model()
+    with model.edit() as edit:
+        for operation in urdf_operations(description, prefix):
+            edit.apply(operation)
+    assert set(model.frames) == ({"base"} if prefix is None else {"r/world", "r/base"})
+    np.testing.assert_array_equal(model.fk("base" if prefix is None else "r/base")()[:3, 3], [1, 2, 3])
+    with pytest.raises(FormatError, match='its parent link "world" does not exist'):
+        parse_urdf(text, strict=True)
+    with pytest.raises(FormatError, match='its child link "world" does not exist'):
+        parse_urdf(robot('<link name="base"/>', joint("stand", "base", "world", "fixed", "")))

@@ -9,7 +9,8 @@ import numpy as np
 import pytest
 
 import kineverse as kv
-from kineverse.model.constraint import as_constraint
+from kineverse.expressions.expression import as_expression
+from kineverse.model.constraint import Constraint, as_constraint
 
 a, b, c, d = (kv.position(n) for n in "abcd")
 INF = math.inf
@@ -387,3 +388,51 @@ def test_home_of_articulations() -> None:
     }
     assert np.isfinite(model.fk("hinge")(state)).all()
     assert state.source == "default"
+
+
+D, V = kv.position("d"), kv.velocity("v")
+NEAR = D < 0.1
+
+
+@pytest.mark.parametrize(
+    "bound",
+    [
+        np.inf * NEAR,
+        NEAR * np.inf,
+        np.inf * (1 - NEAR) + 2,
+        np.inf * (NEAR & (D > 0)),
+        np.inf * D,
+        kv.where(NEAR, np.inf * (D + 1), 3),
+        np.maximum(np.inf * NEAR, 0),
+        1e308 * 10 * NEAR,
+    ],
+    ids=str,
+)
+def test_bounds_that_are_infinity_times_nothing_are_refused_with_what_to_write(bound: kv.Expression) -> None:
+    model = kv.Model()
+    for lower, upper, side in ((-1, bound, "upper"), (-bound, 1, "lower")):
+        with (
+            pytest.raises(
+                kv.errors.InvalidValueError, match=rf"(?s)The {side} bound .* kv\.where\(condition"
+            ) as info,
+            model.edit() as edit,
+        ):
+            edit.constrain("still", lower, V, upper)
+        assert "infinity times something that can be 0" in str(info.value)
+        with pytest.raises(kv.errors.InvalidValueError, match="infinity times"):
+            as_constraint(Constraint(*map(as_expression, (lower, V, upper))))
+        with pytest.raises(kv.errors.InvalidValueError, match="infinity times"):
+            kv.control.Keep(lower, V, upper)
+
+
+def test_a_bound_that_is_infinite_where_a_condition_holds_is_a_number_everywhere() -> None:
+    model = kv.Model()
+    free = kv.where(NEAR, np.inf, 0)  # eq. 10 and 11: v is 0 unless d is small
+    with model.edit() as edit:
+        edit.constrain("still", -free, V, free)
+    assert not model.violations({"d": 0.0, "v:velocity": 7.0})
+    assert [(v.lower, v.upper, v.excess) for v in model.violations({"d": 0.2, "v:velocity": 7.0})] == [
+        (0, 0, 7)
+    ]
+    again = kv.formats.from_bytes(kv.formats.to_bytes(model))
+    assert again.constraints == model.constraints

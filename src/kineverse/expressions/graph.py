@@ -7,6 +7,7 @@ of CasADi only; documents have a format of their own.
 from __future__ import annotations
 
 import hashlib
+import math
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from typing import TYPE_CHECKING, Any
 
@@ -70,6 +71,37 @@ def gradient_keys(expression: Expression, heuristic: bool = True) -> frozenset[S
     ):
         node._keys[heuristic] = node.gradient_keys(heuristic)
     return frozenset(keys.union(*(node._keys[heuristic] for node in nodes)))
+
+
+def has_infinite_product(expression: Expression) -> bool:
+    """Return True if an infinite number is multiplied by an expression."""
+    nodes = topological_order(leaves(expression)[1], lambda n: n.arguments, lambda _: False)
+    return any(
+        _has_infinite_product(part._sx)
+        for part in (expression, *(argument for node in nodes for argument in node.arguments))
+    )
+
+
+_FEW_NODES = 200
+"""Number of nodes up to which the text of a graph is searched before its instructions, which takes longer."""
+
+
+def _has_infinite_product(sx: SX) -> bool:
+    if sx.is_constant() or (ca.n_nodes(sx) < _FEW_NODES and "inf" not in str(sx)):
+        return False
+    f = ca.Function("f", [ca.veccat(*ca.symvar(sx))], [sx])
+    constants: dict[int, float] = {}
+    for k in range(f.n_instructions()):
+        kind, inputs, outputs = f.instruction_id(k), f.instruction_input(k), f.instruction_output(k)
+        if kind == ca.OP_MUL and any(math.isinf(constants.get(i, 0.0)) for i in inputs):
+            return True
+        if kind == ca.OP_OUTPUT:
+            continue
+        for register in outputs:
+            constants.pop(register, None)
+        if kind == ca.OP_CONST:
+            constants[outputs[0]] = f.instruction_constant(k)
+    return False
 
 
 def topological_order(

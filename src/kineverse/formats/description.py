@@ -116,6 +116,8 @@ class LinkDescription:
         Name of the fixed joint to the parent, if nothing moves.
     is_articulation
         True if an articulation of the model has that name.
+    dynamics
+        Dynamics of a planar or floating joint as a whole, by name.
     """
 
     name: str
@@ -125,6 +127,7 @@ class LinkDescription:
     body: Body = NO_BODY
     fixed_joint_name: str = ""
     is_articulation: bool = False
+    dynamics: Mapping[str, Any] = field(default_factory=dict)
 
 
 @dataclass(frozen=True)

@@ -24,6 +24,7 @@ from kineverse.formats.root_folder import (
     declared_roots,
     is_below,
     is_common,
+    mesh_folders,
     outside_root_error,
     split_path_variable,
 )
@@ -67,14 +68,16 @@ def locate_resource(
        models of ``GZ_SIM_RESOURCE_PATH``, ``IGN_GAZEBO_RESOURCE_PATH``, ``GAZEBO_MODEL_PATH``, ``SDF_PATH``;
     4. ``folder`` and its parents: each is the package, or contains it;
     5. packages of robots that are installed for this Python (example-robot-data, the cache of
-       robot_descriptions).
+       robot_descriptions);
+    6. ``folder`` and its parents, whatever their names, where the file may be opened; a warning names the
+       folder.
 
     A folder is the package ``name`` if that is its name or the name in its ``package.xml``. Other paths are
     relative to ``folder``, then to the folders of ``search``.
 
-    With a root, paths have to lie below it, below ``search``, or below a folder in one of these variables or
-    ``KINEVERSE_ROOT``. Parents of a description's folder that lie outside of the root count if they have a
-    manifest, or if they are neither the home folder nor above it.
+    With a root, paths have to lie below it, below ``../meshes`` of ``folder``, below ``search``, or below a
+    folder in one of these variables or ``KINEVERSE_ROOT``. Parents of a description's folder that lie outside
+    of the root count if they have a manifest, or if they are neither the home folder nor above it.
 
     Parameters
     ----------
@@ -105,6 +108,41 @@ def locate_resource(
     raise FormatError(
         f"{quote(uri)}: {scheme}:// is not fetched. Download the file and name it by package:// or a path."
     )
+
+
+def find_package(name: str, folder: Folder, root: str, inside: str = "") -> tuple[Path, bool]:
+    """Return the folder of a package, searched as for ``package://``, and whether it is a substitute.
+
+    Without such a package, the nearest folder above ``folder`` that has ``inside`` is the substitute, else
+    the parent of ``folder``.
+
+    Raises
+    ------
+    FormatError
+        If there is none, or it may not be opened.
+    """
+    if not name or name in (".", "..") or "/" in name or "\\" in name:
+        raise FormatError(f"{quote(name)} is no name of a package.")
+    log = _SearchLog()
+    for package in _folders_of(name, Path(folder), (), log, root):
+        if log.trusted or _may_open(package, root, package):
+            return package, False
+    here = Path(folder).absolute()
+    for place in (here, *here.parents) if inside and not log.outside else ():
+        if is_common(os.path.realpath(place)) or not may_open(place / inside, root, folder):
+            continue
+        if os.path.exists(place / inside):
+            return place, True
+    if not log.outside and may_open(here.parent, root, folder):
+        return here.parent, True
+    if log.outside:
+        raise outside_root_error(name, root)
+    raise FormatError(_not_found_message(f"$(find {name})", name, "", log))
+
+
+def may_open(path: Folder, root: str, folder: Folder) -> bool:
+    """Return True if a description in a folder, with a root, may open a path."""
+    return _may_open(path, root, folder=folder)
 
 
 def model_paths() -> Iterator[tuple[str, Path]]:
@@ -157,23 +195,52 @@ def _locate_packaged(uri: str, rest: str, folder: Folder, search: Sequence[Folde
                     return path
                 raise outside_root_error(uri, root)
             log.without_file.append(package)
+    if not log.without_file and not log.outside:
+        substitute = _find_substitute(name, insides, Path(folder), root)
+        if substitute is not None:
+            return substitute
     if log.outside and root is not None and not log.without_file:
         raise outside_root_error(uri, root)
     raise FormatError(_not_found_message(uri, name, inside, log))
 
 
-def _may_open(path: Folder, root: str, package: Path | None = None) -> bool:
-    """Return True if a path leads into the root, into its package, or into a folder of a variable."""
+_said: set[tuple[str, str]] = set()
+
+
+def _find_substitute(name: str, insides: list[list[str]], folder: Path, root: str | None) -> Path | None:
+    """Return a file of a package that is not there, below the folder of the description or one above it."""
+    if not os.fspath(folder) or root == NOWHERE:
+        return None
+    here = folder.absolute()
+    for place in (here, *here.parents):
+        if is_common(os.path.realpath(place)):
+            break
+        for parts in insides:
+            path = place.joinpath(*parts)
+            if parts and os.path.isfile(path) and (root is None or _may_open(path, root, folder=folder)):
+                if (name, str(place)) not in _said:
+                    _said.add((name, str(place)))
+                    warn(
+                        [f"there is no package {quote(name)}; {place}, which has its files, is taken for it."]
+                    )
+                return path
+    return None
+
+
+def _may_open(path: Folder, root: str, package: Path | None = None, folder: Folder = "") -> bool:
+    """Return True if a path leads into the root, its package, ``../meshes``, or a folder of a variable."""
     real = os.path.realpath(path)
-    return any(is_below(real, folder) for folder in _allowed_folders(root, package))
+    return any(is_below(real, allowed) for allowed in _allowed_folders(root, package, folder))
 
 
-def _allowed_folders(root: str, package: Path | None) -> Iterator[str]:
+def _allowed_folders(root: str, package: Path | None, folder: Folder) -> Iterator[str]:
     """Yield the real paths of the folders in which files may be opened."""
     # Most meshes lie below the root, and each further real path costs system calls.
     yield root
     if package is not None:
         yield os.path.realpath(package)
+    if root != NOWHERE:
+        yield from mesh_folders(folder)
     yield from declared_roots()
     yield from declared_folders()
 
@@ -192,7 +259,7 @@ def find_root_violation(uri: str, folder: Folder, root: str | None) -> FormatErr
         if colon
         else Path(folder).absolute() / uri
     )
-    return None if "\0" in uri or _may_open(path, root) else outside_root_error(uri, root)
+    return None if "\0" in uri or _may_open(path, root, folder=folder) else outside_root_error(uri, root)
 
 
 def _outside_package(uri: str, folder: Folder, root: str) -> FormatError | None:
@@ -390,7 +457,8 @@ def _locate_plain(uri: str, text: str, folder: Folder, search: Sequence[Folder],
     left = False
     for candidate in tried:
         # No file outside is touched, not even to see if it exists.
-        if root is not None and candidate is tried[0] and "\0" not in text and not _may_open(candidate, root):
+        restricted = root if candidate is tried[0] and "\0" not in text else None
+        if restricted is not None and not _may_open(candidate, restricted, folder=folder):
             left = True
         elif os.path.isfile(candidate):  # False, and no error, for a name that is too long
             return candidate

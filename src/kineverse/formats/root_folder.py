@@ -19,6 +19,9 @@ Folder: TypeAlias = "str | os.PathLike[str]"
 ROOT = "KINEVERSE_ROOT"
 """Environment variable with folders whose files any description may open."""
 
+MESH_FOLDERS = ("meshes", "mesh", "assets")
+"""Names of the folders of meshes that may lie beside the folder of a description."""
+
 NOWHERE = ""
 """Root of a text without a folder; no path lies below it."""
 
@@ -71,6 +74,20 @@ def declared_roots() -> Iterator[str]:
     """Yield the real paths of the folders of ``KINEVERSE_ROOT``."""
     for place in split_path_variable(ROOT):
         yield os.path.realpath(os.path.expanduser(place))
+
+
+def mesh_folders(folder: Folder) -> Iterator[str]:
+    """Yield the folders of meshes beside the folder of a description: ``../meshes``, whatever the root.
+
+    Robots that are no package have them there, as those of ROS: ``robot/urdf`` beside ``robot/meshes``. A
+    link to another place is no such folder.
+    """
+    if os.fspath(folder):
+        beside = os.path.dirname(os.path.realpath(folder))
+        for name in MESH_FOLDERS:
+            path = os.path.join(beside, name)
+            if os.path.realpath(path) == path and os.path.isdir(path):
+                yield path
 
 
 def split_path_variable(variable: str) -> Iterator[str]:

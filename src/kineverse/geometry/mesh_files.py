@@ -23,6 +23,8 @@ from kineverse.formats.resource_paths import locate_mesh
 from kineverse.formats.root_folder import is_below
 from kineverse.model.body import Mesh
 
+from .mesh_expansion import expanded_size
+
 Floats: TypeAlias = npt.NDArray[np.float64]
 Integers: TypeAlias = npt.NDArray[np.int64]
 
@@ -136,6 +138,7 @@ def load_mesh_parts(file: MeshFile) -> list[Any]:
             f"reading meshes needs trimesh: {install_command('geometry')}"
         ) from error
     _check_packing(file)
+    _check_expansion(file)
     with _without_logging("trimesh"):
         scene = trimesh.load_scene(file.path, process=False, resolver=_FolderFiles(file.path.parent))
         found = [g for g in scene.dump() if isinstance(g, trimesh.Trimesh) and len(g.faces)]
@@ -154,6 +157,19 @@ def _check_packing(file: MeshFile) -> None:
         if size > LARGEST_FILE:
             most = f"the {LARGEST_FILE / 2**20:.0f} MiB read here"
             raise OSError(f"{file.path} unpacks to {size / 2**20:.0f} MiB, more than {most}")
+
+
+def _check_expansion(file: MeshFile) -> None:
+    """Raise OSError for meshes that draw so much, so often, that it would be larger than what is read."""
+    try:
+        size = expanded_size(file.path, LARGEST_FILE)
+    except ValueError as error:
+        raise OSError(f"{file.path} is not read: {error}") from None
+    if size > LARGEST_FILE:
+        raise OSError(
+            f"{file.path} draws its parts so often that all of them would be {size / 2**20:.3g} MiB, more "
+            f"than the {LARGEST_FILE / 2**20:.0f} MiB read here"
+        )
 
 
 class _FolderFiles(Mapping[str, bytes]):

@@ -10,7 +10,7 @@ from typing import TypeAlias
 
 from kineverse.errors import InvalidValueError, ShapeError
 from kineverse.expressions.expression import Expression, ExpressionLike, access_listener, as_expression
-from kineverse.expressions.graph import gradient_keys
+from kineverse.expressions.graph import gradient_keys, has_infinite_product
 from kineverse.symbols import Symbol
 
 ConstraintLike: TypeAlias = "Constraint | Sequence[ExpressionLike]"
@@ -38,7 +38,8 @@ class Constraint:
         ShapeError
             If one of the three is not a scalar.
         InvalidValueError
-            If the expression is constant, or constant bounds leave nothing between them, or one is NaN.
+            If the expression is constant, or constant bounds leave nothing between them, or one is NaN; also
+            for a bound with a product of infinity and an expression, which is NaN where that is 0.
         """
         low, middle, high = as_expression(lower), as_expression(expression), as_expression(upper)
         if low.shape or middle.shape or high.shape:
@@ -52,6 +53,8 @@ class Constraint:
                 f"The constrained expression ({middle!r}) depends on no symbol. "
                 "The order is lower, expression, upper."
             )
+        check_bound(low, "lower bound")
+        check_bound(high, "upper bound")
         if not low.symbols and not high.symbols:
             a, b = float(low), float(high)
             if a > b or a == math.inf or b == -math.inf:
@@ -91,10 +94,32 @@ class Constraint:
         return max(s.order for s in self.expression.symbols)
 
 
+def check_bound(bound: Expression, name: str) -> None:
+    """Check that a bound has no product of infinity and an expression.
+
+    In the papers, eq. 10 and 11, such a product with a condition means 0 where the condition is false; as a
+    product of floating-point numbers it is NaN there.
+
+    Raises
+    ------
+    InvalidValueError
+        If it has one.
+    """
+    if bound.symbols and has_infinite_product(bound):
+        raise InvalidValueError(
+            f"The {name} {bound!r} of a constraint is infinity times something that can be 0, where it would "
+            "be NaN. For no bound where a condition holds, and 0 elsewhere, write "
+            "kv.where(condition, np.inf, 0), or kv.where(condition, -np.inf, 0) as the lower bound."
+        )
+
+
 def as_constraint(value: ConstraintLike) -> Constraint:
     """Convert a constraint, or a triple (lower, expression, upper), to a constraint."""
     if isinstance(value, Constraint):
         if all(isinstance(part, Expression) for part in (value.lower, value.expression, value.upper)):
+            for bound, name in ((value.lower, "lower bound"), (value.upper, "upper bound")):
+                if access_listener(bound) is None:
+                    check_bound(bound, name)
             return value
         return Constraint.from_expressions(value.lower, value.expression, value.upper)
     if isinstance(value, Expression) or not isinstance(value, Sequence) or len(value) != 3:

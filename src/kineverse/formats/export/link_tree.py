@@ -397,7 +397,14 @@ class LinkTreeBuilder:
         body = self.model.bodies.get(name, NO_BODY)
         fixed = "" if made else joints.take(label, name, f"{name}/fixed")
         return LinkDescription(
-            name, self.model.frames[name].parent, found.pose, made, body, fixed, record is not None
+            name,
+            self.model.frames[name].parent,
+            found.pose,
+            made,
+            body,
+            fixed,
+            record is not None,
+            _joint_dynamics(record),
         )
 
     def _dynamics_of(
@@ -501,3 +508,10 @@ def _quaternion_coordinates(found: MotionChain) -> Iterator[Symbol]:
 def _negative(axis: tuple[float, float, float]) -> tuple[float, float, float]:
     x, y, z = axis
     return 0.0 - x, 0.0 - y, 0.0 - z
+
+
+def _joint_dynamics(record: Articulation | None) -> dict[str, object]:
+    """Return the dynamics of a planar or floating joint as a whole; those of its coordinates have a slash."""
+    if record is None or record.kind not in ("planar", "floating"):
+        return {}
+    return {key: value for key, value in record.dynamics if "/" not in key}

@@ -33,7 +33,6 @@ _CHECKED_ARRAYS = (
     "site_quat",
     "eq_data",
 )
-_SHAPELESS = {"mjGEOM_HFIELD": "a height field is no shape here", "mjGEOM_SDF": "its shape is a plugin's"}
 
 
 @dataclass(frozen=True, slots=True)
@@ -123,13 +122,14 @@ def _try_compile(
 ) -> CompiledMjcf:
     """Compile a document with or without the mesh files that inertia and sizes depend on."""
     spec = mujoco_api.parse_spec(prepared, source)
-    shapeless = _replace_shapeless(spec)
+    strength, home = joint_efforts(spec), _home(spec)
+    if spec.actuators or spec.keys:
+        # Muscles slow down compilation, and keys fail if joints are left out. To delete them one by one takes
+        # time in the square of their number.
+        spec = mujoco_api.parse_spec(prepared, source, passive=True)
+    height_fields = _prepare_shapes(spec)
     replacement = MeshReplacement(spec, prepared, folder, root, remark)
     files = replacement.read_files(with_files)
-    strength, home = joint_efforts(spec), _home(spec)
-    # Actuators and keys have been read: muscles slow down compilation, and keys fail if joints are left out.
-    for part in (*spec.actuators, *spec.keys):
-        spec.delete(part)
     try:
         model = mujoco_api.compile_spec(spec, prepared, source)
     except FormatError as error:
@@ -137,22 +137,22 @@ def _try_compile(
             raise _MeshError(str(error)) from None
         raise
     meshes = replacement.meshes
-    shapeless += [(geom, "its size is that of a mesh that is not there") for geom in meshes.unknown_size]
-    left_out = {geom.id: f"is left out: {reason}." for geom, reason in shapeless}
+    left_out = {geom.id: "is left out: a height field is no shape here." for geom in height_fields}
+    for geom in meshes.unknown_size:
+        left_out[geom.id] = "is left out: its size is that of a mesh that is not there."
     unknown_inertia = frozenset(body.id for body in meshes.unknown_inertia)
     return CompiledMjcf(spec, model, prepared, meshes.assets, left_out, unknown_inertia, strength, home)
 
 
-def _replace_shapeless(spec: Any) -> list[tuple[Any, str]]:
-    """Replace geoms that need files or plugins by spheres; return these, each with the reason."""
+def _prepare_shapes(spec: Any) -> list[Any]:
+    """Make signed distance fields the meshes that they have the mass of; return the height fields."""
     kinds = mujoco_api.mujoco().mjtGeom
-    found: list[tuple[Any, str]] = []
+    found = []
     for geom in spec.geoms:
-        for kind, reason in _SHAPELESS.items():
-            if geom.type == getattr(kinds, kind):
-                geom.type, geom.size = kinds.mjGEOM_SPHERE, [1.0] * 3
-                geom.hfieldname = geom.meshname = ""
-                found.append((geom, reason))
+        if geom.type == kinds.mjGEOM_SDF:
+            geom.type = kinds.mjGEOM_MESH
+        elif geom.type == kinds.mjGEOM_HFIELD:
+            found.append(geom)
     return found
 
 

@@ -16,7 +16,7 @@ from xml.sax.saxutils import quoteattr
 
 from kineverse.errors import FormatError
 from kineverse.formats.files import read_file
-from kineverse.formats.root_folder import declared_roots, is_below, outside_root_error
+from kineverse.formats.root_folder import declared_roots, is_below, mesh_folders, outside_root_error
 from kineverse.formats.xml_reader import Element, label, parse_xml, quote
 
 MAX_ELEMENT_DEPTH = 450
@@ -147,7 +147,7 @@ def find_below_root(node: MjcfElement, name: str, root: str, *places: str) -> Pa
         node.refuse(f"names the file {quote(name)}, and the text has no folder. Load it from its file.")
     if not name or "\0" in name:
         node.refuse("names no file.")
-    allowed = [root, *declared_roots()]
+    allowed = [root, *declared_roots(), *(m for place in places if root for m in mesh_folders(place))]
     outside = False
     for place in dict.fromkeys(places):
         path = os.path.realpath(os.path.join(place, name))
@@ -178,15 +178,26 @@ def _check_root(root: Element, source: str) -> None:
 _ESCAPED = {"\n": "&#10;", "\r": "&#13;", "\t": "&#9;"}
 
 
-def serialize_elements(root: MjcfElement, first: int = 1) -> tuple[str, list[MjcfElement]]:
-    """Return the text of a document, one element a line from line ``first`` on, and the elements in order."""
+def serialize_elements(
+    root: MjcfElement, first: int = 1, without: frozenset[str] = frozenset()
+) -> tuple[str, list[MjcfElement]]:
+    """Return the text of a document, one element a line from line ``first`` on, and the elements in order.
+
+    Sections of the document whose tags are in ``without`` become blank lines.
+    """
     lines: list[str] = []
     nodes: list[MjcfElement] = []
+    sections = set(root.children)
     stack: list[MjcfElement | str] = [root]
     while stack:
         part = stack.pop()
         if isinstance(part, str):
             lines[-1] += part
+            continue
+        if part.tag in without and part in sections:
+            hidden = list(part.walk())
+            nodes += hidden
+            lines += [""] * len(hidden)
             continue
         words = [part.tag, *(f"{k}={quoteattr(v, _ESCAPED)}" for k, v in part.attributes.items())]
         nodes.append(part)

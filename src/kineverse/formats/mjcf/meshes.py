@@ -24,7 +24,8 @@ from kineverse.model.body import Mesh, Pose
 
 from .elements import MjcfElement, find_below_root
 from .mujoco_api import mujoco
-from .preprocess import PreprocessedMjcf
+from .plugin_meshes import Triangles, make_plugin_meshes
+from .preprocess import MeshReference, PreprocessedMjcf
 
 _FORMATS = (".stl", ".obj", ".msh")
 _DIAGONAL = 1e-9
@@ -69,6 +70,7 @@ class MeshReplacement:
         self._spec, self._prepared, self._remark = spec, prepared, remark
         self._folder, self._root = folder, root
         self.meshes = MjcfMeshes()
+        self._made: dict[MeshReference, Triangles | str] = {}
         self._nodes: dict[str, MjcfElement] = {}
         self._boxes: dict[str, tuple[Any, list[float], list[int]]] = {}
         for mesh in spec.meshes:
@@ -92,12 +94,14 @@ class MeshReplacement:
         ]
         contents: dict[str, bytes] = {}
         missing: dict[str, bool] = {}
+        if wanted:
+            self._make({geom.meshname for geom, _ in needed})
         for geom, body in needed:
             name = geom.meshname
             if name not in missing:
                 content = self._content(name) if wanted else None
                 missing[name] = content is None
-                self._set_file(name, content, contents)
+                self._set_content(name, content, contents)
             if missing[name]:
                 if geom.type != mujoco().mjtGeom.mjGEOM_MESH:
                     self.meshes.unknown_size.append(geom)
@@ -106,7 +110,7 @@ class MeshReplacement:
         self._spec.assets = contents
         for body in self.meshes.unknown_inertia:
             self._keep_frame(body)
-        return bool(contents)
+        return any(not is_missing for is_missing in missing.values())
 
     def _keep_frame(self, body: Any) -> None:
         """Keep the frame of a free body of unknown inertia, with which MuJoCo would align it."""
@@ -137,10 +141,29 @@ class MeshReplacement:
             return not body.explicitinertial
         return bool(rule == kinds.mjINERTIAFROMGEOM_TRUE)
 
-    def _content(self, name: str) -> bytes | None:
-        """Return the content of a mesh file; None, with a remark, if it cannot be read."""
-        node, uri = self._nodes[name], self.meshes.assets[name].uri
+    def _make(self, names: set[str]) -> None:
+        """Make the meshes of these names that plugins make."""
+        found = [self._prepared.files[self._nodes[name]] for name in sorted(names)]
+        plugins = [reference for reference in dict.fromkeys(found) if reference.plugin]
+        if plugins:
+            self._made = make_plugin_meshes(plugins)
+
+    def _content(self, name: str) -> bytes | Triangles | None:
+        """Return the content of a mesh file, or the triangles that a plugin makes.
+
+        None, with a remark, if the file cannot be read or the plugin makes none.
+        """
+        node = self._nodes[name]
+        reference = self._prepared.files[node]
+        uri = reference.uri
+        if reference.plugin:
+            made = self._made[reference]
+            if not isinstance(made, str):
+                return made
+            self._remark(node, f"is a mesh of {quote(reference.plugin)}, and has no inertia here: {made}.")
+            return None
         if not uri:
+            self._remark(node, "is not made by MuJoCo here, and has no inertia: it has too many triangles.")
             return None
         try:
             if Path(uri).suffix.lower() not in _FORMATS:
@@ -151,17 +174,20 @@ class MeshReplacement:
             self._remark(node, f"is not read, where its triangles decide an inertia or a size: {reason}")
             return None
 
-    def _set_file(self, name: str, content: bytes | None, contents: dict[str, bytes]) -> None:
-        """Set a mesh to the content of its file, or to its box if there is none."""
+    def _set_content(self, name: str, content: bytes | Triangles | None, contents: dict[str, bytes]) -> None:
+        """Set a mesh to a file of some content, to triangles, or to its box if there is neither."""
         asset = self.meshes.assets[name]
         mesh, *box = self._boxes[name]
         if content is None:
             mesh.file, (mesh.uservert, mesh.userface) = "", box
             mesh.scale, mesh.refpos, mesh.refquat = _IDENTITY_PLACEMENT
             return
-        mesh.file = f"{len(contents)}{Path(asset.uri).suffix.lower()}"
-        contents[mesh.file] = content
-        mesh.uservert, mesh.userface = [], []
+        if isinstance(content, bytes):
+            mesh.file = f"{len(contents)}{Path(asset.uri).suffix.lower()}"
+            contents[mesh.file] = content
+            mesh.uservert, mesh.userface = [], []
+        else:
+            mesh.uservert, mesh.userface = content
         mesh.scale, mesh.refpos, mesh.refquat = asset.scale, asset.position, asset.quaternion
 
 

@@ -55,8 +55,8 @@ def capture_mujoco_warnings() -> Iterator[list[str]]:
             captured += [str(warning.message) for warning in warned]
 
 
-def parse_spec(prepared: PreprocessedMjcf, source: str) -> Any:
-    """Parse a document to an ``MjSpec``.
+def parse_spec(prepared: PreprocessedMjcf, source: str, passive: bool = False) -> Any:
+    """Parse a document to an ``MjSpec``, without actuators and keys if it is ``passive``.
 
     Raises
     ------
@@ -65,6 +65,8 @@ def parse_spec(prepared: PreprocessedMjcf, source: str) -> Any:
     """
     engine = mujoco()
     try:
+        if passive:
+            return engine.MjSpec.from_string(prepared.passive_text, include=prepared.passive_models)
         return engine.MjSpec.from_string(prepared.text, include=prepared.models)
     except (ValueError, RuntimeError, engine.FatalError, engine.UnexpectedError) as error:
         raise mujoco_error(error, prepared, source) from None

@@ -1,6 +1,7 @@
 """Preprocessing of MJCF: attached models gathered, files, plugins and unsupported elements removed.
 
-None of these affects the poses of bodies. Mesh files are replaced by boxes, see :mod:`.meshes`.
+None of these affects the poses of bodies. Meshes of files and of plugins are replaced by boxes, see
+:mod:`.meshes`, and height fields by flat ones, which have the same mass.
 """
 
 from __future__ import annotations
@@ -10,7 +11,7 @@ import os
 import posixpath
 import re
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 from kineverse.formats.files import read_file
@@ -32,7 +33,7 @@ BOX_MESH = {
 _SECTIONS = frozenset(
     ("size", "visual", "statistic", "custom", "sensor", "extension", "contact", "deformable")
 )
-_ELEMENTS = frozenset(("plugin", "flexcomp", "skin", "texture", "hfield", "light", "camera", "layer"))
+_ELEMENTS = frozenset(("plugin", "flexcomp", "skin", "texture", "light", "camera", "layer"))
 _FLEXIBLE = frozenset(("flex", "flexvert", "flexstrain"))
 _REMARKS = {
     "deformable": "is left out: what bends has no frames here.",
@@ -47,8 +48,13 @@ _ATTRIBUTES = {
     "compiler": ("meshdir", "texturedir", "assetdir", "strippath", "fusestatic", "discardvisual"),
     "material": ("texture",),
     "body": ("fuse",),
-    "mesh": ("file", "builtin", "params", "content_type"),
+    "mesh": ("file", "content_type"),
+    "hfield": ("file", "content_type", "elevation"),
 }
+_CONTROL = frozenset(("actuator", "keyframe"))
+_MAX_RESOLUTION = 200
+"""Largest parameter of a mesh that MuJoCo generates, whose number of triangles grows with its square."""
+
 _INLINE = ("vertex", "normal", "texcoord", "face")
 _NAMES = frozenset(
     (
@@ -75,9 +81,11 @@ _LARGE = re.compile(r"e\+?\d\d|\d{40}|0x|inf", re.IGNORECASE)
 
 @dataclass(frozen=True, slots=True)
 class MeshReference:
-    """Reference of a mesh to its file; empty for shapes that MuJoCo generates."""
+    """Reference of a mesh to its file, or to the plugin that makes it: its name and its settings."""
 
-    uri: str
+    uri: str = ""
+    plugin: str = ""
+    settings: tuple[tuple[str, str], ...] = ()
 
 
 def remove_unsupported(
@@ -91,15 +99,20 @@ def remove_unsupported(
         For numbers that are not finite or too large, and for models without file.
     """
     meshdir, strip_paths = _mesh_directory(root)
+    plugins = _plugin_instances(root)
     root.children = [child for child in root.children if not _is_removed(child, _SECTIONS, remark)]
     files: dict[MjcfElement, MeshReference] = {}
     for node in root.walk():
+        if node.tag == "mesh":
+            _replace_mesh(node, meshdir, strip_paths, plugins, files)
+        elif node.tag == "hfield":
+            _flatten(node)
         unwanted = _ELEMENTS | _FLEXIBLE if node.tag == "equality" else _ELEMENTS
+        if node.tag in ("mesh", "geom"):  # what a plugin makes of these is in the files of the meshes
+            node.children = [child for child in node.children if child.tag != "plugin"]
         node.children = [child for child in node.children if not _is_removed(child, unwanted, remark)]
         if node.tag == "model" and not node.attributes.get("file"):
             node.refuse("names no file.")
-        if node.tag == "mesh" and ("file" in node.attributes or "builtin" in node.attributes):
-            files[node] = _replace_file(node, meshdir, strip_paths)
         for key in _ATTRIBUTES.get(node.tag, ()):
             node.attributes.pop(key, None)
         for key, value in node.attributes.items():
@@ -158,17 +171,66 @@ def _mesh_directory(root: MjcfElement) -> tuple[str, bool]:
     return meshdir, strip_paths
 
 
-def _replace_file(node: MjcfElement, meshdir: str, strip_paths: bool) -> MeshReference:
-    """Replace the file of a mesh by a box under the same name; return the file."""
+def _plugin_instances(root: MjcfElement) -> dict[str, MeshReference]:
+    """Return the plugins that a document names, by the names of their instances."""
+    found: dict[str, MeshReference] = {}
+    for section in root.children:
+        if section.tag != "extension":
+            continue
+        for plugin in section.children:
+            for instance in plugin.children:
+                name = instance.attributes.get("name", "")
+                found[name] = _plugin_reference(plugin.attributes.get("plugin", ""), instance)
+    return found
+
+
+def _plugin_reference(plugin: str, owner: MjcfElement) -> MeshReference:
+    """Return a plugin with the settings in an element."""
+    settings = [(c.attributes.get("key", ""), c.attributes.get("value", "")) for c in owner.children]
+    return MeshReference("", plugin, tuple(settings))
+
+
+def _replace_mesh(
+    node: MjcfElement,
+    meshdir: str,
+    strip_paths: bool,
+    plugins: Mapping[str, MeshReference],
+    files: dict[MjcfElement, MeshReference],
+) -> None:
+    """Replace a mesh by a box under the same name if it is in a file or made by a plugin."""
     file = node.attributes.get("file", "")
-    if strip_paths:
-        file = posixpath.basename(file)
-    if not node.attributes.get("name") and file:
-        node.attributes["name"] = posixpath.splitext(posixpath.basename(file))[0]
-    for key in _INLINE:
+    made_by = next((child for child in node.children if child.tag == "plugin"), None)
+    if file:
+        if strip_paths:
+            file = posixpath.basename(file)
+        if not node.attributes.get("name"):
+            node.attributes["name"] = posixpath.splitext(posixpath.basename(file))[0]
+        files[node] = MeshReference(posixpath.join(meshdir, file))
+    elif made_by is not None:
+        plugin = _plugin_reference(made_by.attributes.get("plugin", ""), made_by)
+        files[node] = plugins.get(made_by.attributes.get("instance", ""), plugin)
+    elif "builtin" not in node.attributes or _is_small(node.attributes.get("params", "")):
+        return
+    else:
+        files[node] = MeshReference()
+    for key in (*_INLINE, "builtin", "params"):
         node.attributes.pop(key, None)
     node.attributes |= BOX_MESH
-    return MeshReference(posixpath.join(meshdir, file) if file else "")
+
+
+def _is_small(params: str) -> bool:
+    """Return True if a mesh of these parameters has few enough triangles to be generated."""
+    try:
+        return all(float(word) <= _MAX_RESOLUTION for word in params.split())
+    except ValueError:  # MuJoCo reports it
+        return True
+
+
+def _flatten(node: MjcfElement) -> None:
+    """Replace the heights of a height field, which do not affect its mass, by zeros."""
+    if not node.attributes.get("name") and node.attributes.get("file"):
+        node.attributes["name"] = posixpath.splitext(posixpath.basename(node.attributes["file"]))[0]
+    node.attributes |= {"nrow": "2", "ncol": "2"}
 
 
 def check_element_count(root: MjcfElement, attached: Mapping[str, int]) -> int:
@@ -224,6 +286,8 @@ class PreprocessedMjcf:
         Text of the document.
     models
         Texts of the attached models, by the names with which they are referenced.
+    passive_text, passive_models
+        The same without actuators and keys, with all elements on the same lines.
     nodes
         Elements by line: ``nodes[n - 1]`` is on line n, over all of these texts.
     files
@@ -234,6 +298,8 @@ class PreprocessedMjcf:
 
     text: str = ""
     models: dict[str, bytes] = field(default_factory=dict)
+    passive_text: str = ""
+    passive_models: dict[str, bytes] = field(default_factory=dict)
     nodes: list[MjcfElement] = field(default_factory=list)
     files: dict[MjcfElement, MeshReference] = field(default_factory=dict)
     custom: CustomElements = field(default_factory=CustomElements)
@@ -279,11 +345,11 @@ class MjcfPreprocessor:
         """
         root = self._read(data, source, self._top)
         self.prepared.custom = read_custom_elements(root, self._remark)
-        self.prepared.text = self._preprocess(root, self._top)[0]
+        self.prepared.text, self.prepared.passive_text, _ = self._preprocess(root, self._top)
         return self.prepared
 
-    def _preprocess(self, root: MjcfElement, folder: str) -> tuple[str, _AttachedModel]:
-        """Return the text of a document for MuJoCo, and its size; attached models come first."""
+    def _preprocess(self, root: MjcfElement, folder: str) -> tuple[str, str, _AttachedModel]:
+        """Return the texts of a document for MuJoCo, and its size; attached models come first."""
         models: dict[str, int] = {}
         for node in root.walk():
             if node.tag == "model" and "file" in node.attributes:
@@ -294,11 +360,13 @@ class MjcfPreprocessor:
         files = remove_unsupported(root, self._remark)
         for node, file in files.items():
             below = Path(os.path.relpath(folder, self._top)) if folder != self._top else Path()
-            self.prepared.files[node] = MeshReference((below / file.uri).as_posix() if file.uri else "")
+            self.prepared.files[node] = replace(file, uri=(below / file.uri).as_posix() if file.uri else "")
         size = check_element_count(root, models)
-        text, nodes = serialize_elements(root, len(self.prepared.nodes) + 1)
+        first = len(self.prepared.nodes) + 1
+        text, nodes = serialize_elements(root, first)
+        passive_text, _ = serialize_elements(root, first, _CONTROL)
         self.prepared.nodes += nodes
-        return text, _AttachedModel("", root.attributes.get("model", ""), size)
+        return text, passive_text, _AttachedModel("", root.attributes.get("model", ""), size)
 
     def _read(self, data: str | bytes, source: str, folder: str) -> MjcfElement:
         """Return the element tree of a document."""
@@ -312,9 +380,11 @@ class MjcfPreprocessor:
         if path not in self._models:
             self._open_files.append(path)
             folder = str(path.parent)
-            text, model = self._preprocess(self._read(read_file(path), path.name, folder), folder)
+            tree = self._read(read_file(path), path.name, folder)
+            text, passive_text, model = self._preprocess(tree, folder)
             self._open_files.pop()
             model.name = f"{len(self._models)}.xml"
             self._models[path] = model
             self.prepared.models[model.name] = text.encode()
+            self.prepared.passive_models[model.name] = passive_text.encode()
         return self._models[path]

@@ -11,6 +11,7 @@ import math
 from collections.abc import Collection, Iterable, Mapping
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -200,6 +201,11 @@ class MjcfWriter:
     def _link(self, link: LinkDescription) -> None:
         """Add the body of a link, and intermediate bodies if it has more joints than a body may have."""
         check_rotation(link, self._unsupported)
+        if link.dynamics and self._freejoint_name(link) is None:
+            self._description.remarks.append(
+                f"'{link.name}' is moved by several joints in MJCF: "
+                f"the {' and '.join(link.dynamics)} of all is left out"
+            )
         body = self._bodies_by_name[link.parent]
         groups = _group_joints(link.joints)
         for k, joints in enumerate(groups):
@@ -219,14 +225,18 @@ class MjcfWriter:
         """Add joints to a body, and their home position to the key."""
         free = self._freejoint_name(link)
         if free is not None:
-            body.add("freejoint", name=free)
+            if link.dynamics:
+                self._dynamics(body.add("joint", name=free, type="free"), free, link.dynamics)
+            else:
+                body.add("freejoint", name=free)
             self._joint_names.add(free)
             self._append_free_home(link, free)
         else:
             for joint in joints:
                 self._joint_names.add(joint.name)
                 if isinstance(joint, BallJointDescription):
-                    body.add("joint", name=joint.name, type="ball", pos=_unless_zero(joint.point))
+                    element = body.add("joint", name=joint.name, type="ball", pos=_unless_zero(joint.point))
+                    self._dynamics(element, joint.name, joint.dynamics)
                     w, x, y, z = (self._home.get(f"{joint.name}/q{c}", 0.0) for c in "wxyz")
                     self._qpos += [w, x, y, z]
                 else:
@@ -276,16 +286,20 @@ class MjcfWriter:
             self._description.remarks.append(f"the soft limits of '{joint.name}' are written as its limits")
         if (lower, upper) != (-math.inf, math.inf):
             element.attributes["range"] = _range(lower, upper)
-        known = joint.dynamics
+        self._dynamics(element, joint.name, joint.dynamics)
+
+    def _dynamics(self, element: Tag, name: str, known: Mapping[str, Any]) -> None:
+        """Add the dynamics of a joint that MJCF can represent."""
         for key, attribute in _DYNAMICS.items():
             if isinstance(known.get(key), (int, float)) and known[key]:
                 element.give(attribute, float(known[key]))
         effort = known.get("effort")
-        if isinstance(effort, (int, float)) and 0 < effort < math.inf:
+        has_effort = element.attributes["type"] in ("hinge", "slide")
+        if has_effort and isinstance(effort, (int, float)) and 0 < effort < math.inf:
             element.give("actuatorfrcrange", (-float(effort), float(effort)))
         for key, value in known.items():
-            if key not in _DYNAMICS and (key != "effort" or not value) and value:
-                self._description.remarks.append(f"MJCF has no {key}: that of '{joint.name}' is left out")
+            if value and key not in _DYNAMICS and not (key == "effort" and has_effort):
+                self._description.remarks.append(f"MJCF has no {key} here: that of '{name}' is left out")
 
     def _home_position(self, joint: JointDescription) -> float:
         """Return the home position of a joint."""

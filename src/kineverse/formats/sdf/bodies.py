@@ -35,7 +35,7 @@ from kineverse.model.body import (
     Sphere,
 )
 
-from .pose_graph import PoseNode, pose_between
+from .pose_graph import PoseNode, find_pose_reference, pose_between
 
 _ROUND: dict[str, Callable[[float, float], Geometry]] = {
     "cylinder": Cylinder,
@@ -81,10 +81,9 @@ def _shape(element: Element, link: PoseNode) -> Shape | None:
     pose = find_child(element, "pose")
     if pose is not None:
         link_T_shape = read_element_pose(pose, link.document.remarks)
-        reference = pose[1].get(link.document.reference_key, "")
-        if reference:
-            link_T_reference = pose_between(link, link.scope.find(reference, pose, element))
-            link_T_shape = compose_poses(link_T_reference, link_T_shape)
+        reference = find_pose_reference(pose, link.scope, element)
+        if reference is not None:
+            link_T_shape = compose_poses(pose_between(link, reference), link_T_shape)
     color = _color(element, link) if element[0] == "visual" else None
     return Shape(form, link_T_shape, element[1].get("name", ""), color)
 
@@ -170,6 +169,11 @@ def _inertia(inertial: Element, link: PoseNode) -> Inertia | None:
     mass = read_child_number(inertial, "mass", 1.0)
     pose, tensor = find_child(inertial, "pose"), find_child(inertial, "inertia")
     origin = IDENTITY if pose is None else read_element_pose(pose, link.document.remarks)
+    frame = "" if pose is None else pose[1].get("relative_to", "")
+    if pose is not None and frame not in ("", link.element[1].get("name", "")):
+        link.document.remarks.add(
+            pose, "has relative_to, but an inertia is always given in its link; it is ignored.", link.element
+        )
     if tensor is None:
         return Inertia(mass, (1.0, 0.0, 0.0, 1.0, 0.0, 1.0), origin)
     ixx, ixy, ixz, iyy, iyz, izz = (

@@ -22,7 +22,7 @@ from kineverse.formats.xml_values import (
 from kineverse.model.body import Vector3
 
 from .description import AXIS_COUNT, SdfAxis, SdfJoint, SdfJointType
-from .pose_graph import MODEL_FRAME, PoseNode, find_joint_end, pose_between
+from .pose_graph import PoseNode, find_early, find_joint_end, pose_between
 
 _SUFFIXES = {1: ("",), 2: ("/first", "/second")}
 _DYNAMICS = ("damping", "friction", "spring_reference", "spring_stiffness")
@@ -158,18 +158,23 @@ def _dynamics_value(dynamics: Element, key: str, node: PoseNode) -> float:
 
 def _direction(node: PoseNode, axis: Element) -> Vector3:
     """Return the direction of an axis in the joint's frame."""
-    xyz, version = read_axis_direction(axis), node.document.version
+    xyz, document = read_axis_direction(axis), node.document
     part = find_child(axis, "xyz")
-    frame = ""
-    if version >= (1, 7):
-        frame = "" if part is None else part[1].get("expressed_in", "")
-    elif read_child_bool(axis, "use_parent_model_frame", default=version < (1, 5)):
-        frame = MODEL_FRAME if node.scope.model.kind != "world" else ""
-    if not frame:
-        return xyz
-    assert part is not None or frame == MODEL_FRAME
-    reference = node.scope.find(frame, part or axis, node.element)
-    return rotate_direction(pose_between(node, reference), xyz)
+    reference = None
+    if part is not None:
+        name = document.early_attribute(part, "expressed_in")
+        reference = find_early(name, part, node.scope, node.element)
+    if document.version < (1, 7):
+        # In files without one, libsdformat adds the frame of the model up to 1.4; it replaces expressed_in.
+        if read_child_bool(axis, "use_parent_model_frame", default=document.version < (1, 5)):
+            reference = node.scope.model if node.scope.model.kind != "world" else None
+    elif find_child(axis, "use_parent_model_frame") is not None:
+        document.remarks.add(
+            axis,
+            "has use_parent_model_frame, which is expressed_in since SDF 1.7; it is ignored.",
+            node.element,
+        )
+    return xyz if reference is None else rotate_direction(pose_between(node, reference), xyz)
 
 
 def _mimic(node: PoseNode, axis: Element) -> MimicRelation[str] | None:

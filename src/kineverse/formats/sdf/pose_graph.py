@@ -42,11 +42,22 @@ class SdfDocument:
     version: SdfVersion
     remarks: ReaderWarnings
     root: str = NOWHERE
+    _early: set[str] = field(default_factory=set)
 
-    @property
-    def reference_key(self) -> str:
-        """Attribute of a ``<pose>`` that names the frame it is relative to."""
-        return "frame" if self.version < (1, 7) else "relative_to"
+    def early_attribute(self, element: Element, key: str) -> str:
+        """Return an attribute of SDF 1.7, with a remark on the first one in a file of an earlier version.
+
+        libsdformat converts such files to its own version first, and obeys it.
+        """
+        value = element[1].get(key, "")
+        if value and self.version < (1, 7) and key not in self._early:
+            self._early.add(key)
+            self.remarks.add(
+                element,
+                f"has {key}, which SDF does not define before 1.7; it is obeyed in this file, "
+                "as libsdformat does.",
+            )
+        return value
 
     @contextmanager
     def locate_errors(self, owner: Element) -> Iterator[None]:
@@ -155,6 +166,10 @@ class SdfScope:
                 )
         return found
 
+    def has(self, name: str) -> bool:
+        """Return True if a name exists in this scope."""
+        return self._find(name) is not None
+
     def _find(self, name: str) -> PoseNode | None:
         """Return the node of a name, or of a path ``a::b``; None if there is none."""
         if name == MODEL_FRAME:
@@ -191,6 +206,37 @@ class PoseGraph:
     def by_kind(self, kind: str) -> Iterator[PoseNode]:
         """Yield the nodes of one kind."""
         return (node for node in self.nodes if node.kind == kind)
+
+
+def find_pose_reference(pose: Element, scope: SdfScope, owner: Element) -> PoseNode | None:
+    """Return the node that a ``<pose>`` says it is relative to; None if it says nothing.
+
+    Before SDF 1.7 the attribute was ``frame``, which libsdformat renames to ``relative_to``.
+    """
+    document = scope.document
+    name = document.early_attribute(pose, "relative_to")
+    if "frame" in pose[1]:
+        if document.version < (1, 7):
+            name = pose[1]["frame"]
+            return scope.find(name, pose, owner) if name else None
+        document.remarks.add(pose, "has frame, which is relative_to since SDF 1.7; it is ignored.", owner)
+    return find_early(name, pose, scope, owner)
+
+
+def find_early(name: str, element: Element, scope: SdfScope, owner: Element) -> PoseNode | None:
+    """Return the node that an attribute of SDF 1.7 names; None for no name.
+
+    In files of earlier versions, which do not define it, an unknown name is passed over with a remark.
+    """
+    if not name:
+        return None
+    document = scope.document
+    if document.version < (1, 7) and not scope.has(name):
+        with document.locate_errors(owner):
+            mistake = ElementError(element, f"refers to {quote(name)}, which does not exist in this scope.")
+            document.remarks.mend(mistake, "it is passed over", owner)
+        return None
+    return scope.find(name, element, owner)
 
 
 def check_sdf_name(name: str, element: Element, version: SdfVersion) -> None:
@@ -261,7 +307,7 @@ def _attach(node: PoseNode) -> None:
     if node.kind == "joint":
         node.attached_to = find_joint_end(node, "child")
     elif node.kind == "frame" and node.is_named_frame:
-        name = node.element[1].get("attached_to", "")
+        name = node.document.early_attribute(node.element, "attached_to")
         target = node.scope.find(name, node.element, node.element) if name else node.scope.model
         node.attached_to = target
         node.relative_to = target
@@ -293,9 +339,9 @@ def _relate(node: PoseNode) -> None:
         return
     with scope.document.locate_errors(node.element):
         node.pose = read_element_pose(element, scope.document.remarks)
-    name = element[1].get(scope.document.reference_key, "")
-    if name:
-        node.relative_to = scope.find(name, element, node.element)
+    reference = find_pose_reference(element, scope, node.element)
+    if reference is not None:
+        node.relative_to = reference
 
 
 def check_cycles(nodes: Iterable[PoseNode]) -> None:

@@ -14,7 +14,7 @@ from pathlib import Path
 from typing import NoReturn
 
 from kineverse.errors import FormatError
-from kineverse.formats.files import read_file
+from kineverse.formats.files import MAX_BYTES, read_file
 from kineverse.formats.mimic import MimicRelation, resolve_mimic_chains
 from kineverse.formats.reader_warnings import ReaderWarnings
 from kineverse.formats.root_folder import find_text_root
@@ -38,8 +38,12 @@ from .pose_graph import (
     resolve_pose_graph,
 )
 from .tree import build_spanning_tree
+from .urdf_include import read_urdf_as_sdf
 
 _MAX_DEPTH = 100
+MAX_INCLUDED = 100_000
+"""Largest number of links, joints, frames and models with those of included files."""
+
 _OLDEST, _LATEST = (1, 2), (1, 12)
 _IGNORED = ("actor", "population", "road", "plugin")
 
@@ -115,6 +119,7 @@ class SdfModelReader:
         self._remarks = remarks
         self._root, self._strict = root, strict
         self._open_files: list[Path] = []
+        self._included_bytes = 0
 
     def read_world(self, element: Element, scope: SdfScope) -> None:
         """Read the elements of a world."""
@@ -218,6 +223,10 @@ class SdfModelReader:
 
     def _add(self, kind: NodeKind, element: Element, scope: SdfScope, name: str) -> PoseNode:
         """Add a node under its name; up to version 1.6, a repeated name of another kind is replaced."""
+        if self._open_files and len(self._graph.nodes) >= MAX_INCLUDED:
+            scope.document.refuse(
+                element, f"with the models that are included, there are more than {MAX_INCLUDED} elements."
+            )
         other = scope.names.get(name)
         if other is not None:
             again = f"has the name of the <{other.element[0]}> on line {other.element[3]} again"
@@ -250,10 +259,16 @@ class SdfModelReader:
                 raise ElementError(
                     part, f"{quote(read_text(part))} includes itself, directly or through others."
                 )
-            if path.suffix == ".urdf":
-                raise ElementError(part, f"{quote(read_text(part))} is a URDF; load it by itself.")
         content, folder = read_file(path), str(path.parent)
-        inner, root = open_document(content, path.name, folder, self._remarks, self._root, self._strict)
+        self._included_bytes += len(content)
+        if self._included_bytes > MAX_BYTES:
+            document.refuse(
+                include, f"with it, more than {MAX_BYTES} bytes are included, the most that is read."
+            )
+        if path.suffix == ".urdf":
+            inner, root = self._open_urdf(content, path.name, folder)
+        else:
+            inner, root = open_document(content, path.name, folder, self._remarks, self._root, self._strict)
         models = [element for element in root[2] if element[0] == "model"]
         if len(models) != 1 and not models:
             others = [element for element in root[2] if element[0] in ("light", "actor")]
@@ -284,6 +299,12 @@ class SdfModelReader:
         else:
             self._model(models[0], scope, inner, name, include=include)
         self._open_files.pop()
+
+    def _open_urdf(self, content: bytes, source: str, folder: str) -> tuple[SdfDocument, Element]:
+        """Return a URDF as a document of SDF, and its root element."""
+        warnings = ReaderWarnings(source, self._remarks, self._strict)
+        model = read_urdf_as_sdf(content, source, folder, self._root, self._strict)
+        return SdfDocument(source, folder, _LATEST, warnings, self._root), ("sdf", {}, [model], 1)
 
 
 def make_root_scope(document: SdfDocument, element: Element) -> SdfScope:

@@ -109,8 +109,9 @@ class UrdfJoint:
 
     ``origin`` is parent_T_joint, the pose of the child link in the parent link at position zero. ``axis`` is
     a unit vector in the joint's frame: the axis of rotation, the direction of translation, or the normal of
-    the plane; None for joints without axis. ``limits``, ``safety``, ``mimic`` and ``dynamics`` are defined
-    for joints of one DoF only.
+    the plane; None for joints without axis. The ``limits`` of a planar joint hold for both directions in the
+    plane; those of a floating joint are an effort only. ``mimic`` and soft limits are defined for joints of
+    one DoF.
     """
 
     name: str

@@ -1,14 +1,15 @@
 """URDF joint elements as checked joints.
 
-Specification: http://wiki.ros.org/urdf/XML/joint, and urdf.xsd of ros/urdfdom for defaults. Only the elements
-that apply to the type of a joint are read: the limits of a fixed joint are ignored. Mistakes that other
-parsers accept are read as they do, with a remark, unless the document is read strictly.
+Specification: http://wiki.ros.org/urdf/XML/joint, and urdf.xsd of ros/urdfdom for defaults. The limits of a
+fixed joint, which does not move, are ignored; what a joint that moves does not have is, with a remark.
+Mistakes that other parsers accept are read as they do, with a remark, unless the document is read strictly.
 """
 
 from __future__ import annotations
 
 import math
 import sys
+from dataclasses import replace
 
 from kineverse.errors import suggest
 from kineverse.formats.reader_warnings import ReaderWarnings
@@ -39,6 +40,7 @@ from kineverse.model.body import Vector3
 _X = (1.0, 0.0, 0.0)
 _Z = (0.0, 0.0, 1.0)
 _MIN_AXIS_LENGTH = 1e-9
+_ZEROS = ("0", "0.0", "0.", "-0", "-0.0")
 _PARTS = frozenset(
     ("origin", "parent", "child", "axis", "limit", "safety_controller", "mimic", "dynamics", "calibration")
 )
@@ -59,21 +61,29 @@ def read_urdf_joint(element: Element, version: tuple[int, int], remarks: ReaderW
     name = name or f"{parent}_{child}"
     origin = read_origin(parts.get("origin"), element, version, remarks)
     line = element[3]
-    if kind in ("fixed", "floating", "planar", "spherical"):
-        if "mimic" in parts and kind != "fixed":
-            mistake = ElementError(
-                parts["mimic"], f"cannot drive a {kind} joint: only a joint of one DoF can mimic."
-            )
-            remarks.mend(mistake, "it moves by itself", element)
-        axis = None
-        if kind == "planar":
-            axis = _axis(parts.get("axis"), element, remarks, "the plane is that of x and y") or _Z
-        return UrdfJoint(name, kind, parent, child, origin, axis, line=line)
-    axis = _axis(parts.get("axis"), element, remarks, "the joint does not move, it is fixed")
-    if axis is None:
-        return UrdfJoint(name, "fixed", parent, child, origin, line=line)
+    if kind == "fixed":
+        return UrdfJoint(name, kind, parent, child, origin, line=line)
+    has_one_dof = DOF_BY_TYPE[kind] == 1
+    axis = None
+    if has_one_dof:
+        axis = _axis(parts.get("axis"), element, remarks, "the joint does not move, it is fixed")
+        if axis is None:
+            return UrdfJoint(name, "fixed", parent, child, origin, line=line)
+    elif kind == "planar":
+        axis = _axis(parts.get("axis"), element, remarks, "the plane is that of x and y") or _Z
     limit, safety, mimic, dynamics = map(parts.get, ("limit", "safety_controller", "mimic", "dynamics"))
+    if mimic is not None and not has_one_dof:
+        mistake = ElementError(mimic, f"cannot drive a {kind} joint: only a joint of one DoF can mimic.")
+        remarks.mend(mistake, "it moves by itself", element)
+        mimic = None
     limits = _limits(limit, kind, element, version, remarks)
+    controller = read_or_default(lambda: _safety(safety, limits), None, "it is left out", remarks, element)
+    if safety is not None and controller is not None and controller.has_limits:
+        if not has_one_dof or kind == "continuous":
+            remarks.add(
+                safety, f"has soft limits, which a {kind} joint has none of here; they are ignored.", element
+            )
+            controller = replace(controller, soft_lower=0.0, soft_upper=0.0)
     return UrdfJoint(
         name,
         kind,
@@ -82,7 +92,7 @@ def read_urdf_joint(element: Element, version: tuple[int, int], remarks: ReaderW
         origin,
         axis,
         limits,
-        read_or_default(lambda: _safety(safety, limits), None, "it is left out", remarks, element),
+        controller,
         None if mimic is None else _mimic(mimic),
         read_or_default(lambda: _dynamics(dynamics), FRICTIONLESS, "it is left out", remarks, element),
         line,
@@ -166,7 +176,7 @@ def _limits(
 ) -> UrdfLimits:
     """Return the limits of a joint; none, with a remark, if a required ``<limit>`` is missing."""
     if limit is None:
-        if kind != "continuous":
+        if kind in ("revolute", "prismatic"):
             mistake = ElementError(
                 joint,
                 f"is {kind} but has no <limit>; the specification requires "
@@ -176,13 +186,23 @@ def _limits(
             remarks.mend(mistake, "it has no limits")
         return UNLIMITED
     newer = version >= (1, 2)
-    lower, upper = (None, None) if kind == "continuous" else _range(limit, joint, newer, remarks)
+    lower = upper = None
+    has_range = "lower" in limit[1] or "upper" in limit[1]
+    if kind in ("revolute", "prismatic") or (kind == "planar" and has_range):
+        lower, upper = _range(limit, joint, newer, remarks)
+    elif has_range and any(limit[1].get(key, "0").strip() not in _ZEROS for key in ("lower", "upper")):
+        remarks.add(limit, f"has lower and upper, which a {kind} joint has not; they are ignored.", joint)
     values = {key: _magnitude(limit, key, joint, newer, remarks) for key in ("effort", "velocity")}
     for key in ("acceleration", "deceleration", "jerk"):
         if newer:
             values[key] = _magnitude(limit, key, joint, newer, remarks)
         elif key in limit[1]:
             remarks.add(limit, f"has {key}, which is ignored: it came with URDF 1.2.", joint)
+    if kind in ("floating", "spherical"):
+        for key in ("velocity", "acceleration", "deceleration", "jerk"):
+            if values.pop(key, None) is not None:
+                remarks.add(limit, f"has {key}, which a {kind} joint has not here; it is ignored.", joint)
+        return UrdfLimits(effort=_bound(values["effort"]))
     if values.get("deceleration") is None and "deceleration" not in limit[1]:
         values["deceleration"] = values.get("acceleration")
     return UrdfLimits(_bound(lower), _bound(upper), **{key: _bound(value) for key, value in values.items()})

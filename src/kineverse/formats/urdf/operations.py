@@ -132,6 +132,7 @@ def _joint_operations(
         "parent": frame_name(joint.parent),
         "child": frame_name(joint.child),
         "origin": joint.origin,
+        "dynamics": _dynamics(joint),
     }
     if joint.kind == "fixed":
         yield Fixed(**common)
@@ -141,12 +142,15 @@ def _joint_operations(
         yield Ball(**common)
     elif joint.kind == "planar":
         assert joint.axis is not None
-        yield Planar(**common, axis=joint.axis)
+        limits = joint.limits
+        yield Planar(
+            **common, axis=joint.axis, lower=limits.lower, upper=limits.upper, velocity=limits.velocity
+        )
     else:
         mimic_position = _mimic_position(joint, joint_name)
         yield _axis_joint(joint, common, mimic_position)
         safety = joint.safety
-        if safety is not None and safety.has_limits and joint.kind != "continuous":
+        if safety is not None and safety.has_limits:
             q = position(name) if mimic_position is None else mimic_position
             yield SoftLimits(name, q, safety.soft_lower, safety.soft_upper)
 
@@ -163,7 +167,6 @@ def _axis_joint(
         upper=joint.limits.upper,
         velocity=joint.limits.velocity,
         position=mimic_position,
-        dynamics=_dynamics(joint),
     )
 
 

@@ -11,6 +11,7 @@ from kineverse.errors import FormatError, suggest
 from kineverse.formats.reader_warnings import ReaderWarnings
 from kineverse.formats.urdf.description import UrdfJoint, UrdfLink
 from kineverse.formats.xml_reader import quote
+from kineverse.model.frame import WORLD
 
 _SHOWN = 8
 
@@ -66,6 +67,7 @@ def order_from_root(
         roots and for cycles.
     """
     source = remarks.source
+    links = _with_world(links, joints, remarks)
     lines = {link.name: link.line for link in links}
     joints_below: dict[str, list[UrdfJoint]] = {}
     joint_above: dict[str, UrdfJoint] = {}
@@ -110,6 +112,21 @@ def order_from_root(
             loop[0].line, f"{where}: {text.rstrip('.')}; {left} links that no root holds are left out."
         )
     return tuple(root.name for root in roots), tuple(ordered), [k for k in links if k.name in reached]
+
+
+def _with_world(
+    links: Sequence[UrdfLink], joints: Sequence[UrdfJoint], remarks: ReaderWarnings
+) -> Sequence[UrdfLink]:
+    """Return the links, with the world if it is a parent without a link of its own, as in Drake."""
+    joint = next((joint for joint in joints if joint.parent == WORLD), None)
+    if joint is None or remarks.strict or any(link.name == WORLD for link in links):
+        return links
+    remarks.fault(
+        joint.line,
+        f"<joint name={quote(joint.name)}>: its parent link {quote(WORLD)} has no <link> element of its own; "
+        "it is the world.",
+    )
+    return [UrdfLink(WORLD, line=joint.line), *links]
 
 
 def _outwards(root: str, joints_below: dict[str, list[UrdfJoint]]) -> list[UrdfJoint]:

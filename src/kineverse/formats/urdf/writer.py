@@ -10,9 +10,10 @@ from __future__ import annotations
 import math
 import os
 import sys
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -23,6 +24,7 @@ from kineverse.formats.description import (
     IDENTITY_COEFFICIENTS,
     NO_BODY,
     BallJointDescription,
+    JointBounds,
     JointDescription,
     LinkDescription,
     Matrix,
@@ -248,8 +250,6 @@ class UrdfWriter:
             Naming all features that URDF cannot represent.
         """
         links = self._description.links
-        if any(key in joint.dynamics for joint in self._description.joints for key in _NEWER):
-            self._root.give("version", "1.2")
         root = self._root_link()
         if root is None:
             self._bodies.write(self._root.add("link", name=WORLD), self._description.world_body)
@@ -257,7 +257,24 @@ class UrdfWriter:
             self._link(link, link is root)
         self._unsupported.check(self._path.name)
         self._description.remarks += self._unsupported.remarks
+        self._root.give("version", self._version())
         return format_xml(self._root, [*self._description.remarks, *self._description.error_lines])
+
+    def _version(self) -> str | None:
+        """Return the version of URDF that the file needs; None for the first, which all parsers read."""
+        tags = list(self._root.inside)
+        for tag in tags:
+            tags += tag.inside
+        limits = [tag.attributes for tag in tags if tag.name == "limit"]
+        if any(key in attributes for attributes in limits for key in _NEWER):
+            return "1.2"
+        if any(tag.name == "capsule" for tag in tags):
+            # urdfdom passes over all shapes of a link with a capsule in a file of version 1.0.
+            self._description.remarks.append(
+                "the capsules need version 1.1 of URDF, which urdfdom reads since 5.1 only"
+            )
+            return "1.1"
+        return None
 
     def _root_link(self) -> LinkDescription | None:
         """Return the link that is fixed at the world's origin and carries all others; None without one."""
@@ -279,8 +296,18 @@ class UrdfWriter:
         if compound is not None:
             name, kind, axis = compound
             self._bodies.write(self._root.add("link", name=link.name), link.body)
-            self._joint(name, kind, parent, link.name, pose, axis)
+            element = self._joint(name, kind, parent, link.name, pose, axis)
+            bounds = JointBounds()
+            if isinstance(link.joints[0], JointDescription):
+                bounds = link.joints[0].bounds
+            self._limit(element, name, kind, bounds, link.dynamics)
+            self._dynamics(element, name, link.dynamics)
             return
+        if link.dynamics:
+            self._description.remarks.append(
+                f"'{link.name}' is moved by several joints in URDF: "
+                f"the {' and '.join(link.dynamics)} of all is left out"
+            )
         offset = np.zeros(3)
         for k, joint in enumerate(link.joints):
             if isinstance(joint, BallJointDescription):
@@ -306,14 +333,18 @@ class UrdfWriter:
         if len(link.joints) not in (3, 4):
             return None
         axes = [j for j in link.joints if isinstance(j, JointDescription)]
-        if any(not j.is_independent or not _is_plain(j) for j in axes):
+        if any(not j.is_independent or j.dynamics or j.bounds.soft is not None for j in axes):
             return None
-        names = [j.name for j in axes]
+        names, bounds = [j.name for j in axes], [j.bounds for j in axes]
         ball = link.joints[-1]
         if isinstance(ball, BallJointDescription) and len(axes) == 3 and not any(ball.point):
             free = [(f"{ball.name}/{c}", False, axis) for c, axis in _SPACE]
+            if bounds != [JointBounds()] * 3 or ball.dynamics:
+                return None
             return (ball.name, "floating", None) if free == [_axis_key(j) for j in axes] else None
         if len(axes) != 3 or len(link.joints) != 3:
+            return None
+        if bounds[0] != bounds[1] or bounds[2] != JointBounds() or not bounds[0].max_velocity > 0:
             return None
         name, n = names[2].removesuffix("/angle"), axes[2].axis
         rotation = rotation_from_z(n)
@@ -335,21 +366,30 @@ class UrdfWriter:
             else "revolute"
         )
         element = self._joint(joint.name, kind, parent, child, pose, joint.axis)
-        self._limit(element, joint, kind)
+        self._limit(element, joint.name, kind, joint.bounds, joint.dynamics)
         if joint.coefficients != IDENTITY_COEFFICIENTS or not joint.is_independent:
             offset, factor = (*joint.coefficients, 0.0)[:2]
             element.add(
                 "mimic", joint=joint.symbol.path, multiplier=factor, offset=offset if offset else None
             )
-        known = joint.dynamics
-        if known.get("damping") or known.get("friction"):
-            element.add("dynamics", damping=_number(known, "damping"), friction=_number(known, "friction"))
         soft = joint.bounds.soft
         if soft is not None and kind == "continuous":
             self._unsupported.leave_out(
                 f"{joint.name}/soft_limits", "are soft limits of a joint that has no others"
             )
             soft = None
+        self._dynamics(element, joint.name, joint.dynamics, soft)
+
+    def _dynamics(
+        self,
+        element: Tag,
+        name: str,
+        known: Mapping[str, Any],
+        soft: tuple[float, float] | None = None,
+    ) -> None:
+        """Add the ``<dynamics>`` and the ``<safety_controller>`` of a joint."""
+        if known.get("damping") or known.get("friction"):
+            element.add("dynamics", damping=_number(known, "damping"), friction=_number(known, "friction"))
         if soft is not None or "k_velocity" in known:
             lower, upper = soft or (None, None)
             element.add(
@@ -361,19 +401,21 @@ class UrdfWriter:
             )
         for key in known:
             if key not in _KNOWN:
-                self._description.remarks.append(f"URDF has no {key}: that of '{joint.name}' is left out")
+                self._description.remarks.append(f"URDF has no {key}: that of '{name}' is left out")
 
-    def _limit(self, element: Tag, joint: JointDescription, kind: str) -> None:
-        """Add the ``<limit>`` of a joint, unless a continuous joint has none."""
-        bounds, known = joint.bounds, joint.dynamics
+    def _limit(
+        self, element: Tag, name: str, kind: str, bounds: JointBounds, known: Mapping[str, Any]
+    ) -> None:
+        """Add the ``<limit>`` of a joint, unless it has none and its kind requires none."""
         effort, max_velocity = _number(known, "effort"), bounds.max_velocity
         newer = {key: _number(known, key) for key in _NEWER}
-        if kind == "continuous" and effort is None and max_velocity == math.inf and not any(newer.values()):
+        has_range = kind in ("revolute", "prismatic") or not bounds.is_unbounded
+        if not has_range and effort is None and max_velocity == math.inf and not any(newer.values()):
             return
         if not max_velocity > 0:
-            self._unsupported.refuse(joint.name, "may not move at all, by a limit of its speed that is 0")
+            self._unsupported.refuse(name, "may not move at all, by a limit of its speed that is 0")
         limit = element.add("limit")
-        if kind != "continuous":
+        if has_range:
             limit.give("lower", max(bounds.lower, -LARGEST_FLOAT))
             limit.give("upper", min(bounds.upper, LARGEST_FLOAT))
         limit.give("effort", LARGEST_FLOAT if effort is None else min(effort, LARGEST_FLOAT))
@@ -405,14 +447,6 @@ class UrdfWriter:
 def _axis_key(joint: JointDescription) -> tuple[str, bool, tuple[float, ...]]:
     """Return name, kind and axis of a joint for comparison."""
     return joint.name, joint.is_rotation, joint.axis
-
-
-def _is_plain(joint: JointDescription) -> bool:
-    """Return True if a joint has neither limits nor dynamics, which URDF has for joints of one DoF only."""
-    bounds = joint.bounds
-    return (
-        bounds.is_unbounded and bounds.soft is None and bounds.max_velocity == math.inf and not joint.dynamics
-    )
 
 
 def _number(dynamics: object, key: str) -> float | None:
