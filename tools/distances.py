@@ -47,9 +47,9 @@ CASES = (*HULLS, "small", "far", "touching", "deep", "planar", "aligned")
 """In ``planar`` the bodies turn about y and move in the plane of x and z; in ``aligned`` their axes are parallel,
 and many of their sizes and places are the same."""
 
-STEP = 2e-5
+STEP = 1e-4
 """Length of a motion for a difference quotient [m], [rad]."""
-SLOPE_LIMIT = 0.02
+SLOPE_LIMIT = 0.05
 """No slope is further off than this, for points about 1 m from the centre of the motion."""
 
 Measure = Callable[[list[Solid], Floats], tuple[float, Floats]]
@@ -173,7 +173,8 @@ def slope_error(measure: Measure, solids: list[Solid], poses: Floats, witness: F
     """Return by how much the change of a distance differs from what its expression says.
 
     Either body moves along and turns about each axis, one way and the other. Where these differ, as at
-    parallel faces, any slope between them is right.
+    parallel faces, any slope between them is right. Motions after which another way out is the shortest are
+    left out.
     """
     *points, normal = witness
     start, worst = measure(solids, poses)[0], 0.0
@@ -189,9 +190,12 @@ def slope_error(measure: Measure, solids: list[Solid], poses: Floats, witness: F
                     turn = Rotation.from_rotvec(step * np.eye(3)[axis - 3]).as_matrix()
                     moved[k, :, :3] = turn @ poses[k, :, :3]
                     direction = np.cross(np.eye(3)[axis - 3], points[k] - poses[k, :, 3])
-                slopes.append((measure(solids, moved)[0] - start) / step)
+                distance, (_, _, way) = measure(solids, moved)
+                if normal @ way > 0.99:
+                    slopes.append((distance - start) / step)
             said = sign * float(normal @ direction)
-            worst = max(worst, min(slopes) - said, said - max(slopes))
+            if len(slopes) == 2:
+                worst = max(worst, min(slopes) - said, said - max(slopes))
     return worst
 
 
