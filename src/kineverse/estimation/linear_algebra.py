@@ -10,12 +10,27 @@ from kineverse.errors import InvalidValueError
 from kineverse.lie import Array
 
 
+_SINGULAR = (
+    "Some directions are known so much better than others that floating point cannot hold both: a covariance "
+    "that was handed in is far too small, or an uncertainty far too large."
+)
+
+
 def invert_matrices(matrices: Array) -> Array:
-    """Invert a stack of positive definite matrices."""
+    """Invert a stack of positive definite matrices.
+
+    Raises
+    ------
+    InvalidValueError
+        If one is numerically singular.
+    """
     size = matrices.shape[-1]
     if size == 1:
         return 1.0 / matrices
-    return np.asarray(np.linalg.inv(matrices), dtype=np.float64)
+    try:
+        return np.asarray(np.linalg.inv(matrices), dtype=np.float64)
+    except np.linalg.LinAlgError:
+        raise InvalidValueError(_SINGULAR) from None
 
 
 def transposed(matrices: Array) -> Array:
@@ -59,14 +74,20 @@ def inverse_spd(matrix: Array) -> Array:
         np.linalg.cholesky(matrix)
         return symmetric(np.asarray(np.linalg.inv(matrix), dtype=np.float64))
     except np.linalg.LinAlgError:
-        raise InvalidValueError(
-            "Some directions are known so much better than others that floating point cannot hold both: a "
-            "covariance that was handed in is far too small, or an uncertainty far too large."
-        ) from None
+        raise InvalidValueError(_SINGULAR) from None
 
 
 def squared_errors(errors: Array, covariances: Array) -> Array:
-    """Return the squared Mahalanobis norms eᵀ S⁻¹ e, (N,), of errors (N, m) with covariances S (N, m, m)."""
-    weighted = np.linalg.solve(covariances, errors[:, :, None])[:, :, 0]
+    """Return the squared Mahalanobis norms eᵀ S⁻¹ e, (N,), of errors (N, m) with covariances S (N, m, m).
+
+    Raises
+    ------
+    InvalidValueError
+        If a covariance is numerically singular.
+    """
+    try:
+        weighted = np.linalg.solve(covariances, errors[:, :, None])[:, :, 0]
+    except np.linalg.LinAlgError:
+        raise InvalidValueError(_SINGULAR) from None
     squares: Array = np.sum(errors * weighted, axis=1)
     return squares
