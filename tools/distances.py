@@ -44,8 +44,8 @@ HULLS: dict[str, Scales] = {
     "sliver": lambda rng: np.array([0.5, *10.0 ** rng.uniform(-4, -2, 2)]),
 }
 CASES = (*HULLS, "small", "far", "touching", "deep", "planar", "aligned")
-"""In ``planar`` the bodies turn about y and move in the plane of x and z; in ``aligned`` their axes are parallel,
-and many of their sizes and places are the same."""
+"""In ``planar`` the bodies turn about y and move in the plane of x and z; in ``aligned`` their axes are
+parallel, and many of their sizes and places are the same."""
 
 STEP = 1e-4
 """Length of a motion for a difference quotient [m], [rad]."""
@@ -145,7 +145,9 @@ def outside(solid: Solid, pose: Floats, point: Floats) -> float:
         return max(0.0, abs(z) - shape.length / 2, across - shape.radius)
     if isinstance(shape, Ellipsoid):
         level = float(np.linalg.norm(own / shape.radii))
-        return max(0.0, (level - 1.0) * level / max(1e-9, float(np.linalg.norm(own / np.square(shape.radii)))))
+        return max(
+            0.0, (level - 1.0) * level / max(1e-9, float(np.linalg.norm(own / np.square(shape.radii))))
+        )
     assert isinstance(shape, Cone)
     slope = shape.radius / shape.length
     side = (across - slope * (shape.length / 2 - z)) / np.hypot(1.0, slope)
@@ -199,9 +201,7 @@ def slope_error(measure: Measure, solids: list[Solid], poses: Floats, witness: F
     return worst
 
 
-def check(
-    kinds: tuple[str, str], case: str, pairs: int, seed: int, slopes: bool = False
-) -> dict[str, Count]:
+def check(kinds: tuple[str, str], case: str, pairs: int, seed: int, slopes: bool = False) -> dict[str, Count]:
     """Measure pairs, and count what is off."""
     rng = np.random.default_rng([seed, *map(KINDS.index, kinds), CASES.index(case)])
     counts = {"C": Count(), "coal": Count()}
@@ -253,7 +253,8 @@ def main() -> int:
     chosen = [tuple(given.kinds)] if given.kinds else list(itertools.combinations_with_replacement(KINDS, 2))
     off = 0
     print(
-        f"{'pair':24}{'case':10}{'by':6}{'apart':>8}{'inside':>8}{'unsolved':>9}{'off':>6}{'worst [m]':>11}{'slopes':>9}"
+        f"{'pair':24}{'case':10}{'by':6}{'apart':>8}{'inside':>8}{'unsolved':>9}{'off':>6}{'worst [m]':>11}"
+        f"{'slopes':>9}"
     )
     for case in given.case or ["any"]:
         for one, other in chosen:

@@ -318,5 +318,5 @@ def test_witness_error_sees_points_beside_their_body():
     poses[0, :, 3] = [0.03, 0.0, 0.1]
     witness = np.array([[0.0, 0.0, 0.1], [0.03, 0.0, 0.1], [-1.0, 0.0, 0.0]])
     assert distances.witness_error([ball, box], poses, -0.03, witness) < 1e-12
-    beside = witness + [[0.0, 0.0, 0.02], [0.0, 0.0, 0.02], [0.0, 0.0, 0.0]]
+    beside = witness + np.array([[0.0, 0.0, 0.02], [0.0, 0.0, 0.02], [0.0, 0.0, 0.0]])
     assert distances.witness_error([ball, box], poses, -0.03, beside) > 5e-3

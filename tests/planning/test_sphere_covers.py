@@ -11,7 +11,13 @@ from hypothesis import strategies as st
 from kineverse.errors import InvalidValueError, ShapeError
 from kineverse.geometry.shapes import Solid, scale_solid, solid_from_geometry, solid_from_points
 from kineverse.model.body import Box, Capsule, Cone, Cylinder, Ellipsoid, Sphere
-from kineverse.planning.spheres import cover_objects, cover_solid, cover_solids, default_protrusion, measure_cover
+from kineverse.planning.spheres import (
+    cover_objects,
+    cover_solid,
+    cover_solids,
+    default_protrusion,
+    measure_cover,
+)
 from kineverse.planning.spheres.certificate import find_uncovered
 from kineverse.planning.spheres.polytope import CoverRegion, bound_solid
 from kineverse.planning.spheres.union_volume import union_volume

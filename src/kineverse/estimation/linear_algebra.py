@@ -3,17 +3,27 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Iterator
+from contextlib import contextmanager
 
 import numpy as np
 
 from kineverse.errors import InvalidValueError
 from kineverse.lie import Array
 
-
 _SINGULAR = (
     "Some directions are known so much better than others that floating point cannot hold both: a covariance "
     "that was handed in is far too small, or an uncertainty far too large."
 )
+
+
+@contextmanager
+def singularity_named() -> Iterator[None]:
+    """Raise an InvalidValueError where numpy finds a matrix singular; also a decorator of functions."""
+    try:
+        yield
+    except np.linalg.LinAlgError:
+        raise InvalidValueError(_SINGULAR) from None
 
 
 def invert_matrices(matrices: Array) -> Array:
@@ -27,10 +37,8 @@ def invert_matrices(matrices: Array) -> Array:
     size = matrices.shape[-1]
     if size == 1:
         return 1.0 / matrices
-    try:
+    with singularity_named():
         return np.asarray(np.linalg.inv(matrices), dtype=np.float64)
-    except np.linalg.LinAlgError:
-        raise InvalidValueError(_SINGULAR) from None
 
 
 def transposed(matrices: Array) -> Array:

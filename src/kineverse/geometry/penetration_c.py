@@ -153,8 +153,8 @@ static Part on_facet(const Polytope *p, const Facet *facet, Vector v, Simplex *s
   return edge.square < part.square ? edge : part;
 }
 
-/* Point a that the foot of the origin on a facet's plane comes from. The foot is on the surface of {b - a}, but
-   where triangles share a plane, or nearly, it may be in another one than that which was found. */
+/* Point a that the foot of the origin on a facet's plane comes from. The foot is on the surface of {b - a},
+   but where triangles share a plane, or nearly, it may be in another one than that which was found. */
 static Vector point_below(const Polytope *p, const Facet *facet) {
   const Vector foot = plus((Vector){{0.0, 0.0, 0.0}}, facet->height, facet->normal);
   Simplex s, other;

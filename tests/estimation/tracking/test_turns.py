@@ -90,7 +90,7 @@ def test_late_measurements_and_copies_keep_the_turn():
     tracker = Tracker(MODEL, ["pinion"], lag=0.5, process="velocity")
     observer = NoisyObserver(MODEL, ["pinion"])
     for k in range(150):
-        for step in ((k + 1, k) if k % 2 else ()):
+        for step in (k + 1, k) if k % 2 else ():
             tracker.update(observer({"q": 0.1 * step}), at=DT * step)
     estimate = tracker.copy().update(observer({"q": 15.1}), at=DT * 151)
     assert estimate.state["q"] == pytest.approx(15.1, abs=0.2)

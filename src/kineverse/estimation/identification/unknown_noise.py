@@ -29,8 +29,8 @@ from .solver import solver
 UNKNOWN_NOISE = (0.005, math.radians(1.0))
 """Medians of the unknown standard deviations of positions [m] and orientations [rad].
 
-That of positions is a thousandth of the length scale of the data, see :mod:`.scale`, where that is more: of what
-moves over 20 m, or is in millimetres.
+That of positions is a thousandth of the length scale of the data, see :mod:`.scale`, where that is more: of
+cranes, and in millimetres.
 """
 
 _SHARE = 1e-3

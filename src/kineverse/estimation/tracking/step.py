@@ -189,7 +189,7 @@ class UpdateStep:
     ) -> list[Candidate]:
         """Return candidates on other turns of counted coordinates.
 
-        The orientation of a pinion has a minimum on each turn; the place of its rack tells which is the least.
+        The orientation of a pinion has a minimum on each turn. The place of its rack tells which is least.
         """
         candidates = []
         for x in self.counted:

@@ -222,8 +222,8 @@ class Tracker:
     def rebuild(self, model: ModelView | None = None) -> Tracker:
         """Return a tracker of an edited model with the same observations and options.
 
-        It starts anew, and repeats the recent updates in the order of their times, without commands. Turns are
-        those of this tracker.
+        It starts anew, and repeats the recent updates in the order of their times, without commands. Turns
+        are those of this tracker.
 
         Parameters
         ----------

@@ -114,7 +114,7 @@ def fit_spheres(region: CoverRegion, protrusion: float, most: int) -> FittedSphe
 def _least_protrusion(region: CoverRegion, most: int) -> float:
     """Return a protrusion that no cover by so many spheres is below.
 
-    The part of a convex surface in a sphere is no larger than the sphere, and it sticks out by its radius less
+    The part of a convex surface in a sphere is no larger than the sphere, which sticks out by its radius less
     a depth.
     """
     a, b, c = np.moveaxis(region.corners[region.faces], 1, 0)
