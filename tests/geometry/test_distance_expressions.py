@@ -8,7 +8,8 @@ from scene_models import arm_among_boxes, body, random_state
 
 import kineverse as kv
 from kineverse.geometry import Scene
-from kineverse.model.body import Box, Capsule, Cylinder, Ellipsoid, Sphere
+from kineverse.geometry.bindings import collision_library
+from kineverse.model.body import Box, Capsule, Cone, Cylinder, Ellipsoid, Sphere
 
 
 def slopes(scene, state, pair, symbols, step=1e-5):
@@ -72,6 +73,48 @@ def test_distance_expression_is_signed_and_finite_across_contact(geometry):
         assert slope[0] == pytest.approx(1, abs=1e-4)
         turning = slope[1] if turning is None else turning
         assert slope[1] == pytest.approx(turning, abs=2e-3)
+
+
+def between(low, value, high, tolerance):
+    """Return whether values are between one-sided slopes, in either order."""
+    low, high = np.minimum(low, high), np.maximum(low, high)
+    return ((low - tolerance <= value) & (value <= high + tolerance)).all()
+
+
+@pytest.mark.compiler
+@pytest.mark.parametrize("fixed", ["rod", "other"])
+@pytest.mark.parametrize("geometry", [Sphere(0.03), Box((0.05, 0.06, 0.04)), Capsule(0.03, 0.08), Cylinder(0.03, 0.06),
+                                      Cone(0.03, 0.06), Ellipsoid((0.02, 0.03, 0.04))])  # fmt: skip
+def test_gradient_in_a_plane_is_between_the_one_sided_slopes_whichever_body_is_fixed(geometry, fixed):
+    """In a plane the faces of a box are seen edge on, and the nearest ones share planes."""
+    assert collision_library.prepare(wait=True)
+    model, symbols = kv.Model(), [kv.position(name) for name in ("x", "z", "turn")]
+    x, z, turn = symbols
+    moving = kv.translation(x, 0, z) @ kv.rotation_y(turn)
+    rod, other = body(Box((0.06, 0.06, 0.3))), body(geometry)
+    with model.edit() as edit:
+        edit.add_frame("rod", "world", np.eye(4) if fixed == "rod" else moving, rod)
+        edit.add_frame("other", "world", np.eye(4) if fixed == "other" else moving, other)
+    scene, rng, step, inside = Scene(model), np.random.default_rng(2), 1e-6, 0
+    scene.update(dict.fromkeys(symbols, 0.0))
+    distance = scene.expression("rod", "other")
+    f = kv.compile([distance.expression, distance.expression.jacobian(symbols)])
+    for _ in range(60):
+        state = dict(zip(symbols, rng.uniform([-0.08, -0.2, -np.pi], [0.08, 0.2, np.pi]), strict=True))
+        scene.update(state)
+        found = scene.distance("rod", "other")
+        value, slope = f({**state, **scene.expression_values(distance)})
+        assert value == pytest.approx(found.distance, abs=1e-9)
+        one_sided = []
+        for sign in (step, -step):
+            ends = []
+            for symbol in symbols:
+                scene.update({**state, symbol: state[symbol] + sign})
+                ends.append((scene.distance("rod", "other").distance - found.distance) / sign)
+            one_sided.append(np.array(ends))
+        inside += found.distance < 0.0
+        assert between(one_sided[0], slope, one_sided[1], 5e-3)
+    assert inside > 10
 
 
 def test_distance_expression_as_constraint_survives_a_document(tmp_path):

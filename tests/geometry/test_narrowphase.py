@@ -280,7 +280,7 @@ def test_wrong_distances_of_coal_are_corrected(kind, seed):
             assert np.linalg.norm(normal) == pytest.approx(1.0, abs=1e-6)
 
 
-CASES = ("any", "flat", "sliver", "small", "far", "touching", "deep")
+CASES = ("any", "flat", "sliver", "small", "far", "touching", "deep", "planar", "aligned")
 
 
 @pytest.mark.compiler
@@ -294,6 +294,29 @@ def test_distances_tool_finds_no_errors(kind, case):
         assert count.apart + count.inside + count.unsolved > 0
 
 
+@pytest.mark.compiler
+@pytest.mark.parametrize("case", ["any", "planar", "aligned"])
+@pytest.mark.parametrize("swapped", [False, True])
+@pytest.mark.sampled(2)
+def test_points_are_on_their_bodies_and_slopes_are_theirs(case, swapped):
+    assert collision_library.prepare(wait=True)
+    for pair in itertools.combinations_with_replacement(KINDS, 2):
+        for count in distances.check(pair[::-1] if swapped else pair, case, 3, seed=2, slopes=True).values():
+            assert count.off == 0
+
+
 def test_distances_tool_reports_errors(monkeypatch):
-    monkeypatch.setattr(distances, "by_c", lambda solids, poses: (0.5, np.array([0.0, 0.0, 1.0])))
+    witness = np.array([[0.0, 0.0, 0.0], [0.0, 0.0, 0.5], [0.0, 0.0, 1.0]])
+    monkeypatch.setattr(distances, "by_c", lambda solids, poses: (0.5, witness))
     assert distances.check(("cone", "hull"), "far", 3, seed=1)["C"].off == 3
+
+
+def test_witness_error_sees_points_beside_their_body():
+    """A gap along the normal alone cannot see it."""
+    ball, box = solid_from_geometry(Sphere(0.03)), solid_from_geometry(Box((0.06, 0.06, 0.3)))
+    poses = np.stack([np.eye(4)[:3]] * 2)
+    poses[0, :, 3] = [0.03, 0.0, 0.1]
+    witness = np.array([[0.0, 0.0, 0.1], [0.03, 0.0, 0.1], [-1.0, 0.0, 0.0]])
+    assert distances.witness_error([ball, box], poses, -0.03, witness) < 1e-12
+    beside = witness + np.array([[0.0, 0.0, 0.02], [0.0, 0.0, 0.02], [0.0, 0.0, 0.0]])
+    assert distances.witness_error([ball, box], poses, -0.03, beside) > 5e-3

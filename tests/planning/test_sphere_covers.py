@@ -11,7 +11,13 @@ from hypothesis import strategies as st
 from kineverse.errors import InvalidValueError, ShapeError
 from kineverse.geometry.shapes import Solid, scale_solid, solid_from_geometry, solid_from_points
 from kineverse.model.body import Box, Capsule, Cone, Cylinder, Ellipsoid, Sphere
-from kineverse.planning.spheres import cover_solid, cover_solids, default_protrusion, measure_cover
+from kineverse.planning.spheres import (
+    cover_objects,
+    cover_solid,
+    cover_solids,
+    default_protrusion,
+    measure_cover,
+)
 from kineverse.planning.spheres.certificate import find_uncovered
 from kineverse.planning.spheres.polytope import CoverRegion, bound_solid
 from kineverse.planning.spheres.union_volume import union_volume
@@ -248,3 +254,39 @@ def test_union_volume_of_two_spheres_is_that_of_the_lens_formula(apart):
     expected = 8 / 3 * np.pi - lens
     found = union_volume(np.array([[0, 0, 0], [0.6 * apart, 0, 0.8 * apart]]), np.ones(2))
     assert found == pytest.approx(expected, rel=4e-3)
+
+
+EXTREME = [
+    Cylinder(1.0, 1e-6), Cylinder(1e-6, 1.0), Cylinder(1e6, 1e-7), Cylinder(1e-7, 1e6),
+    Cone(1.0, 1e-6), Cone(1e-6, 1.0), Box((1.0, 1.0, 1e-7)), Box((1.0, 1e-7, 1e-7)), Box((1e6, 1e-7, 1.0)),
+    Box((1e-7, 1e-7, 1e-7)), Box((1e6, 1e6, 1e6)), Capsule(1e-7, 1.0), Capsule(1e-6, 1e6),
+    Ellipsoid((1.0, 1.0, 1e-6)), Ellipsoid((1.0, 1e-6, 1e-6)), Sphere(1e6), Sphere(1e-7),
+]  # fmt: skip
+
+
+@pytest.mark.parametrize("geometry", EXTREME, ids=str)
+def test_covers_of_plates_needles_and_extreme_sizes_contain_them(geometry):
+    solid = solid_from_geometry(geometry)
+    cover = cover_solid(solid, most=6)
+    size = solid.radius
+    assert 1 <= len(cover) <= 6
+    assert distances_outside(cover.centres, cover.radii, sample(solid, 200)).max() < 1e-7 * size
+    # Centres are inside, so that none sticks out by more than its radius.
+    assert cover.protrusion <= cover.radii.max() * (1 + 1e-6) + 3e-4 * size
+    assert cover.protrusion <= 1.01 * size
+
+
+def test_cover_of_a_needle_beside_a_plate_contains_both():
+    needle, plate = (solid_from_geometry(g) for g in (Cylinder(1e-6, 1.0), Box((1.0, 1.0, 1e-6))))
+    pose = np.eye(4)
+    pose[2, 3] = 0.5
+    cover = cover_solids([(plate, np.eye(4)), (needle, pose)], most=12)
+    points = np.concatenate([sample(plate, 200), sample(needle, 200) + pose[:3, 3]])
+    assert distances_outside(cover.centres, cover.radii, points).max() < 1e-9
+
+
+def test_cover_of_nothing_is_refused():
+    with pytest.raises(InvalidValueError, match="no solid"):
+        cover_solids([])
+    with pytest.raises(InvalidValueError, match="no shape"):
+        cover_objects([])

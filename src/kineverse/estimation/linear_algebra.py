@@ -3,19 +3,42 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Iterator
+from contextlib import contextmanager
 
 import numpy as np
 
 from kineverse.errors import InvalidValueError
 from kineverse.lie import Array
 
+_SINGULAR = (
+    "Some directions are known so much better than others that floating point cannot hold both: a covariance "
+    "that was handed in is far too small, or an uncertainty far too large."
+)
+
+
+@contextmanager
+def singularity_named() -> Iterator[None]:
+    """Raise an InvalidValueError where numpy finds a matrix singular; also a decorator of functions."""
+    try:
+        yield
+    except np.linalg.LinAlgError:
+        raise InvalidValueError(_SINGULAR) from None
+
 
 def invert_matrices(matrices: Array) -> Array:
-    """Invert a stack of positive definite matrices."""
+    """Invert a stack of positive definite matrices.
+
+    Raises
+    ------
+    InvalidValueError
+        If one is numerically singular.
+    """
     size = matrices.shape[-1]
     if size == 1:
         return 1.0 / matrices
-    return np.asarray(np.linalg.inv(matrices), dtype=np.float64)
+    with singularity_named():
+        return np.asarray(np.linalg.inv(matrices), dtype=np.float64)
 
 
 def transposed(matrices: Array) -> Array:
@@ -59,14 +82,20 @@ def inverse_spd(matrix: Array) -> Array:
         np.linalg.cholesky(matrix)
         return symmetric(np.asarray(np.linalg.inv(matrix), dtype=np.float64))
     except np.linalg.LinAlgError:
-        raise InvalidValueError(
-            "Some directions are known so much better than others that floating point cannot hold both: a "
-            "covariance that was handed in is far too small, or an uncertainty far too large."
-        ) from None
+        raise InvalidValueError(_SINGULAR) from None
 
 
 def squared_errors(errors: Array, covariances: Array) -> Array:
-    """Return the squared Mahalanobis norms eᵀ S⁻¹ e, (N,), of errors (N, m) with covariances S (N, m, m)."""
-    weighted = np.linalg.solve(covariances, errors[:, :, None])[:, :, 0]
+    """Return the squared Mahalanobis norms eᵀ S⁻¹ e, (N,), of errors (N, m) with covariances S (N, m, m).
+
+    Raises
+    ------
+    InvalidValueError
+        If a covariance is numerically singular.
+    """
+    try:
+        weighted = np.linalg.solve(covariances, errors[:, :, None])[:, :, 0]
+    except np.linalg.LinAlgError:
+        raise InvalidValueError(_SINGULAR) from None
     squares: Array = np.sum(errors * weighted, axis=1)
     return squares

@@ -40,6 +40,8 @@ _TOUCH = 1e-6
 _GAP_TOLERANCE = 3 * DEPTH_TOLERANCE
 # Translation that separates touching solids to find their normal [m], and its largest part of their radius.
 _SHIFT, _SHIFT_OF_RADIUS = 1e-5, 1e-3
+# Part of the smaller radius by which solids are moved apart to find where they face each other.
+_APART_OF_RADIUS = 0.1
 # Solids below the first radius are enlarged to the second, up to the third: the tolerances inside of coal
 # suit decimetres [m].
 _SMALL, _ENLARGED, _LARGEST = 5e-3, 0.1, 1e3
@@ -186,10 +188,16 @@ class Narrowphase:
         return bool(abs(x * x + y * y + z * z - 1.0) < 1e-6)
 
     def _normal_confirms(self, i: int, j: int, distance: float) -> bool:
-        """Return True if the gap along the normal equals the distance of two convex solids."""
-        a, b = self._pair(i, j)
-        gap = float(directional_gaps(*self._placed_solids(i, j), self.witness()[2][None])[0])
-        return abs(distance - gap) <= _GAP_TOLERANCE * max(1.0, distance, a.radius, b.radius)
+        """Return True if the gap along the normal equals the distance of two convex solids.
+
+        Nor may it be wider along the axes of the solids, or the other way: coal sometimes takes solids that
+        touch for deep in each other.
+        """
+        (a, rotation, _), (b, other, _) = placed = self._placed_solids(i, j)
+        axes = np.concatenate([self.witness()[2][None], rotation.T, other.T])
+        gaps = directional_gaps(*placed, np.concatenate([axes, -axes]))
+        tolerance = _GAP_TOLERANCE * max(1.0, distance, a.radius, b.radius)
+        return bool(abs(distance - gaps[0]) <= tolerance and gaps.max() <= gaps[0] + tolerance)
 
     def _solve(self, i: int, j: int) -> float:
         """Measure two separated convex solids by GJK, without coal."""
@@ -270,7 +278,13 @@ class Narrowphase:
         a, b = self._placed_solids(i, j)
         start, end = self._centres(i, j)
         distance, normal = find_widest_gap(a, b, _unit(end - start)[None])
-        self._witness = smoothed_support(a, normal), smoothed_support(b, -normal), normal
+        # Moved apart along the normal, they have their nearest points where they face each other.
+        solid, rotation, position = b
+        moved = position + (_APART_OF_RADIUS * min(a[0].radius, solid.radius) - distance) * normal
+        if (found := gjk_distance(a, (solid, rotation, moved))) is not None:
+            self._witness = found[1], found[1] + distance * normal, normal
+        else:
+            self._witness = smoothed_support(a, normal), smoothed_support(b, -normal), normal
         return distance
 
     def _placed_solids(self, i: int, j: int) -> tuple[PlacedSolid, PlacedSolid]:

@@ -142,6 +142,34 @@ static int grow(Polytope *p, int from, Vector w, Vector a, double flat) {
   return edges >= 3;
 }
 
+/* Point of a triangle nearest to another point. */
+static Part on_facet(const Polytope *p, const Facet *facet, Vector v, Simplex *s) {
+  s->n = 3;
+  for (int k = 0; k < 3; k++) {
+    s->w[k] = plus(p->w[facet->corner[k]], -1.0, v);
+    s->a[k] = p->a[facet->corner[k]];
+  }
+  const Part part = on_triangle(s, 0, 1, 2), edge = on_segment(s, 0, 1);
+  return edge.square < part.square ? edge : part;
+}
+
+/* Point a that the foot of the origin on a facet's plane comes from. The foot is on the surface of {b - a},
+   but where triangles share a plane, or nearly, it may be in another one than that which was found. */
+static Vector point_below(const Polytope *p, const Facet *facet) {
+  const Vector foot = plus((Vector){{0.0, 0.0, 0.0}}, facet->height, facet->normal);
+  Simplex s, other;
+  Part part = on_facet(p, facet, foot, &s);
+  if (part.square > square(DEEP_MET))
+    for (int f = 0; f < p->faces; f++) {
+      if (!(p->face[f].height <= facet->height + DEEP_STUCK)) continue;
+      const Part one = on_facet(p, p->face + f, foot, &other);
+      if (one.square < part.square) part = one, s = other;
+    }
+  Vector a = {{0.0, 0.0, 0.0}};
+  for (int k = 0; k < part.n; k++) a = plus(a, part.weight[k], s.a[part.which[k]]);
+  return a;
+}
+
 /* Returns the depth of two cores, the deepest point a of the first and the normal from there to the second,
    in the frame of the first; NaN if the bounds do not meet, or the cores do not overlap. A simplex of four
    points is the initial polytope. */
@@ -167,13 +195,8 @@ static double depth_of(const Pair *pair, const Simplex *s, double size, Vector *
     if (reach - low <= DEEP_MET || !grow(&p, nearest, w, from, FLAT * size)) break;
   }
   if (!(high - low <= DEEP_STUCK && best.height >= -LEAST)) return NAN;
-  const int *c = best.corner;
-  const Vector n = best.normal, x = p.w[c[0]], y = p.w[c[1]], z = p.w[c[2]];
-  double weight[3] = {dot(n, cross(y, z)), dot(n, cross(z, x)), dot(n, cross(x, y))}, sum = 0.0;
-  for (int k = 0; k < 3; k++) sum += weight[k] = larger(weight[k], 0.0);
-  if (!(sum > 0.0)) return NAN;
-  *a = (Vector){{0.0, 0.0, 0.0}};
-  for (int k = 0; k < 3; k++) *a = plus(*a, weight[k] / sum, p.a[c[k]]);
+  const Vector n = best.normal;
+  *a = point_below(&p, &best);
   *normal = (Vector){{-n.x[0], -n.x[1], -n.x[2]}};
   return best.height;
 }

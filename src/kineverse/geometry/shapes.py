@@ -6,6 +6,7 @@ import hashlib
 import logging
 import math
 import threading
+from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from functools import lru_cache, partial
 from typing import Any, TypeAlias
@@ -75,7 +76,9 @@ def thicken_flat(points: Floats) -> Floats:
     size, width, thickness = np.ptp(centred @ axes.T, axis=0).tolist() if len(axes) == 3 else (0.0, 0.0, 0.0)
     least = max(THICKNESS, 1e-5 * size)
     if len(unique) < 3 or width < least:
-        raise InvalidValueError("all its points lie on a line, so that there is nothing to touch.")
+        raise InvalidValueError(
+            f"all its points lie on a line, or within {least:g} m of one, so that there is nothing to touch."
+        )
     if thickness >= least:
         return unique
     normal = axes[2] * (least / 2)
@@ -247,6 +250,20 @@ def scale_solid(solid: Solid, factor: float) -> Solid:
     return replace(made, radius=factor * solid.radius)
 
 
+def thicken_primitive(solid: Solid, ratio: float) -> tuple[Solid, float]:
+    """Return a primitive that contains another one, with no size below a part of the largest one.
+
+    Further, by how much it has grown at most [m].
+    """
+    assert not isinstance(solid.surface, Hull | Faces)
+    sizes = _sizes(solid.surface)
+    least = ratio * max(sizes)
+    grown = [max(size, least) for size in sizes]
+    if tuple(grown) == sizes:
+        return solid, 0.0
+    return _of_primitive(_resize_primitive(solid.surface, grown)), least * math.sqrt(len(sizes))
+
+
 def import_coal() -> Any:
     """Import coal and return it.
 
@@ -396,7 +413,10 @@ SMALLEST_SIZE, LARGEST_SIZE = 1e-7, 1e6
 
 
 def _scale_primitive(geometry: Primitive, factor: float) -> Primitive:
-    sizes = [factor * size for size in _sizes(geometry)]
+    return _resize_primitive(geometry, [factor * size for size in _sizes(geometry)])
+
+
+def _resize_primitive(geometry: Primitive, sizes: Sequence[float]) -> Primitive:
     if isinstance(geometry, Box | Ellipsoid):
         x, y, z = sizes
         return type(geometry)((x, y, z))

@@ -6,6 +6,7 @@ import math
 
 import numpy as np
 import pytest
+from scipy.spatial.transform import Rotation
 from synthetic_recordings import JOINTS, Recording, noisy, recording
 
 import kineverse as kv
@@ -100,3 +101,49 @@ def test_a_custom_family_keeps_its_metres() -> None:
     assert found.best.family == "gate"
     assert found.best.parameters["length"] == pytest.approx(17.0, abs=4 * found.best.deviation("length"))
     np.testing.assert_allclose(found.best.poses, true, atol=0.2)
+
+
+def exact_poses(kind: str, scale: float, far: float, count: int, seed: int) -> np.ndarray:
+    """Return exact poses (count, 4, 4) of a joint whose lengths are of a scale, at a place as far as given."""
+    rng = np.random.default_rng(seed)
+
+    def pose(rotation: Rotation, place: np.ndarray) -> np.ndarray:
+        result = np.eye(4)
+        result[:3, :3], result[:3, 3] = rotation.as_matrix(), place
+        return result
+
+    left = pose(Rotation.random(random_state=rng), far * rng.normal(size=3))
+    right = pose(Rotation.random(random_state=rng), scale * rng.normal(size=3))
+    poses = []
+    for q in rng.uniform(-1.5, 1.5, count):
+        turn = Rotation.from_rotvec([0.0, 0.0, q])
+        free = scale * rng.uniform(-1.0, 1.0, 3)
+        moved = {
+            "rigid": pose(Rotation.identity(), np.zeros(3)),
+            "prismatic": pose(Rotation.identity(), [0.0, 0.0, scale * q]),
+            "revolute": pose(turn, np.zeros(3)),
+            "screw": pose(turn, [0.0, 0.0, 0.3 * scale * q]),
+            "spherical": pose(Rotation.random(random_state=rng), np.zeros(3)),
+            "planar": pose(turn, [*free[:2], 0.0]),
+        }[kind]
+        poses.append(left @ moved @ right)
+    return np.array(poses)
+
+
+@pytest.mark.parametrize("kind", ["rigid", "prismatic", "revolute", "screw", "spherical", "planar"])
+@pytest.mark.parametrize("scale", [1.0, 3000.0, pytest.param(1e5, marks=pytest.mark.long)])
+@pytest.mark.parametrize("count", [10, pytest.param(80, marks=pytest.mark.long)])
+def test_family_of_exact_poses_is_found_in_any_unit(kind: str, scale: float, count: int) -> None:
+    """Millimetres, and a frame far away. The noise is none, and may not be taken for less than rounding."""
+    poses = exact_poses(kind, scale, 10.0 * scale, count, seed=count)
+    result = identify(None, poses)
+    assert result.best.family == kind
+    assert result.noise is not None
+    assert result.noise.position < 2e-3 * max(scale, 5.0)
+
+
+def test_noise_beyond_what_numbers_hold_is_no_bare_error() -> None:
+    poses = exact_poses("revolute", 1e5, 1e6, 20, seed=1)
+    for position in (1e-6, 1.0):
+        assert identify(None, poses, noise=pose_covariance(position, 1e-6)).best.family == "revolute"
+    assert identify(None, poses[:, :3, 3]).best.family in ("revolute", "spherical", "planar")

@@ -107,7 +107,7 @@ def test_speeds_of_a_base_and_of_a_free_body_are_consistent(wheels):
     assert 0.7 < np.mean(squares) < 1.35
 
 
-def test_speed_of_a_periodic_angle_does_not_jump_where_the_angle_wraps():
+def test_speed_of_a_periodic_angle_does_not_jump_after_a_turn():
     model = kv.Model()
     with model.edit() as edit:
         edit.apply(kv.Continuous(name="q", parent="world", child="part"))
@@ -115,7 +115,7 @@ def test_speed_of_a_periodic_angle_does_not_jump_where_the_angle_wraps():
     found = [tracker.update(observer({"q": 2.0 * 0.05 * k}), at=0.05 * k).speeds for k in range(100)]
     speeds = np.array([next(iter(one.values())) for one in found])
     np.testing.assert_allclose(speeds[20:], 2.0, atol=0.5)
-    assert abs(tracker.estimate.state["q"]) < np.pi
+    assert tracker.estimate.state["q"] == pytest.approx(9.9, abs=0.1)
 
 
 def test_commanded_and_locked_speeds_are_known():

@@ -30,6 +30,7 @@ from .unknown_noise import (
     NoisePosterior,
     NoiseSolution,
     adapt_noise,
+    median_factor,
     scale_noise,
     solve_unknown_noise,
     weigh_observations,
@@ -118,6 +119,8 @@ def prepare_data(
     if outliers is not None and outliers != Outliers():
         outliers = replace(outliers, reach=outliers.reach / unit)
     scaled = convert_to_unit(observations, unit)
+    if not stated:
+        scaled = scale_noise(scaled, np.array([median_factor(unit), 1.0]))
     return IdentificationData(
         scaled, unit, stated, outliers, sequential, observation_weight=observation_weight
     )
@@ -295,7 +298,7 @@ def weigh_families(
     ]
     best = list(solutions.values())[int(np.argmax(total))]
     return IdentificationResult(
-        tuple(sorted(lazy_fits, key=lambda lazy_fit: -lazy_fit.probability)), best.noise.deviations
+        tuple(sorted(lazy_fits, key=lambda lazy_fit: -lazy_fit.probability)), best.noise.deviations(data.unit)
     )
 
 

@@ -11,6 +11,7 @@ import numpy as np
 import numpy.typing as npt
 
 from kineverse.errors import InvalidValueError, UnknownNameError, suggest
+from kineverse.estimation.linear_algebra import singularity_named
 from kineverse.estimation.noise import pose_covariance
 from kineverse.estimation.robust import Outliers, as_outliers
 
@@ -42,6 +43,7 @@ WEIGHTS: Mapping[str, float] = MappingProxyType(
 special cases and is rarer, and so is a curve; a free joint is rarer still."""
 
 
+@singularity_named()
 def identify(
     parent_poses: npt.ArrayLike | None,
     child_poses: npt.ArrayLike,

@@ -12,7 +12,7 @@ import numpy as np
 import numpy.typing as npt
 
 from kineverse.errors import InvalidValueError, ShapeError
-from kineverse.estimation.linear_algebra import squared_errors
+from kineverse.estimation.linear_algebra import singularity_named, squared_errors
 from kineverse.estimation.robust import Outliers, as_outliers
 from kineverse.lie import Array
 
@@ -286,6 +286,7 @@ class Identifier:
             self._result = self._identify()
         return self._result
 
+    @singularity_named()
     def _identify(self) -> IdentificationResult:
         observations = self._buffer.all
         if not self._joint_weights:

@@ -11,6 +11,7 @@ import numpy as np
 import numpy.typing as npt
 
 from kineverse.errors import InvalidValueError, UnknownNameError, suggest
+from kineverse.estimation.linear_algebra import singularity_named
 from kineverse.lie import Array
 from kineverse.model.operation import Operation
 
@@ -290,6 +291,7 @@ class IdentificationResult:
         words = "cannot tell: " + " or ".join(f"{name} ({p:.0%})" for name, p in likely.items())
         return f"{words}, but {self.reason}" if self.reason else words
 
+    @singularity_named()
     def _fit(self, k: int) -> Fit:
         if k not in self._computed:
             self._computed[k] = self.lazy_fits[k].compute()

@@ -22,6 +22,9 @@ from .result import Fit
 
 # For rotations of 15° or more, the lever is within four times the median distance from the middle.
 _TIMES = 4.0
+# Standard deviation, in units of length, that is added to all stated ones: floating point cannot hold a noise
+# that is smaller beside motions of the size of the unit.
+_ROUNDING = 1e-7
 
 
 def length_scale(observations: Observations) -> float:
@@ -37,8 +40,11 @@ def convert_to_unit(observations: Observations, unit: float) -> Observations:
         return observations
     scale = np.array([1.0 / unit] * 3 + [1.0] * 3)
     by = np.outer(scale, scale)
-    of_parent = None if observations.parent_covariance is None else observations.parent_covariance * by
-    of_child = observations.child_covariance * by[: observations.rows, : observations.rows]
+    rounding = np.diag([_ROUNDING**2] * 3 + [0.0] * 3)
+    of_parent = observations.parent_covariance
+    of_parent = None if of_parent is None else of_parent * by + rounding
+    rows = observations.rows
+    of_child = observations.child_covariance * by[:rows, :rows] + rounding[:rows, :rows]
     return Observations(
         _scale_positions(observations.parent, 1.0 / unit),
         _scale_positions(observations.child, 1.0 / unit),

@@ -27,7 +27,13 @@ from .result import NoiseDeviations
 from .solver import solver
 
 UNKNOWN_NOISE = (0.005, math.radians(1.0))
-"""Medians of the unknown standard deviations of positions [m] and orientations [rad]."""
+"""Medians of the unknown standard deviations of positions [m] and orientations [rad].
+
+That of positions is a thousandth of the length scale of the data, see :mod:`.scale`, where that is more: of
+cranes, and in millimetres.
+"""
+
+_SHARE = 1e-3
 
 _SPREAD = math.log(5.0)
 """Standard deviation of their logarithms: a factor of 5."""
@@ -47,6 +53,11 @@ _SOLUTIONS, _SETTLED = 3, 0.3
 # Least and largest curvature over the stencil, relative to that of a Gaussian, at which the step is right.
 _FLAT, _SHARP = 0.3, 3.0
 _NODES, _NODE_WEIGHTS = np.polynomial.hermite_e.hermegauss(7)
+
+
+def median_factor(unit: float) -> float:
+    """Return the factor on the median of position noise for a length scale [m]."""
+    return max(1.0, _SHARE * unit / UNKNOWN_NOISE[0])
 
 
 class NoisePosterior(NamedTuple):
@@ -73,12 +84,18 @@ class NoisePosterior(NamedTuple):
         factors: Array = _factors(self.logs[None])[0]
         return factors
 
-    @property
-    def deviations(self) -> NoiseDeviations | None:
-        """Most probable standard deviations; None if the noise is stated."""
+    def deviations(self, unit: float) -> NoiseDeviations | None:
+        """Return the most probable standard deviations [m], [rad]; None if the noise is stated.
+
+        Parameters
+        ----------
+        unit
+            Length scale of the data [m].
+        """
         if not len(self.logs):
             return None
-        position, orientation = np.multiply(self.factors, UNKNOWN_NOISE).tolist()
+        medians = np.array([UNKNOWN_NOISE[0] * median_factor(unit), UNKNOWN_NOISE[1]])
+        position, orientation = (self.factors * medians).tolist()
         return NoiseDeviations(position, orientation if len(self.logs) == 2 else math.nan)
 
 

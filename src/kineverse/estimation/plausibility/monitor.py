@@ -21,6 +21,7 @@ from kineverse.estimation.identification.observations import (
     exact_track,
     pair_tracks,
 )
+from kineverse.estimation.linear_algebra import singularity_named
 from kineverse.estimation.robust import Outliers, as_outliers
 from kineverse.lie import Array
 from kineverse.model.frame import WORLD
@@ -127,6 +128,7 @@ class PlausibilityMonitor:
                 result[monitored.joint.tag] = min(number, result.get(monitored.joint.tag, number))
         return result
 
+    @singularity_named()
     def update(self, observations: Mapping[str, PosesLike], at: float | None = None) -> tuple[str, ...]:
         """Add one observation; return the tags of newly rejected joints.
 
@@ -163,6 +165,7 @@ class PlausibilityMonitor:
         self.count += 1
         return tuple(tag for tag in self.implausible_since if tag not in before)
 
+    @singularity_named()
     def report(self) -> Plausibility:
         """Return the verdicts on all joints from the recent observations."""
         if self.model.version != self._version:

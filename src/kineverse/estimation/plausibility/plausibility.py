@@ -12,6 +12,7 @@ import numpy.typing as npt
 from kineverse.errors import InvalidValueError, KineverseError, ShapeError
 from kineverse.estimation.identification.kinematic_graph.pairwise import FamilyChoice
 from kineverse.estimation.identification.observations import PosesLike, check_tracks, exact_track, pair_tracks
+from kineverse.estimation.linear_algebra import singularity_named
 from kineverse.estimation.robust import Outliers, as_outliers
 from kineverse.estimation.tracking import Tracker
 from kineverse.lie import Array
@@ -32,6 +33,7 @@ FALSE_ALARMS = 1e-3
 """Default probability of rejecting a joint that is as served."""
 
 
+@singularity_named()
 def check_plausibility(
     model: Model | Snapshot | Tracker,
     observations: Mapping[str, PosesLike] | None = None,

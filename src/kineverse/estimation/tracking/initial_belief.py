@@ -18,7 +18,7 @@ from .bounds import initial_deviations, initial_point
 from .gaussian import InformationState
 from .gaussian_sum import GaussianSum
 from .measurements import require_mapping, require_positive
-from .multi_start import find_periodic_coordinates, spread_starts
+from .multi_start import find_turning_coordinates, spread_starts
 from .step import UpdateStep
 
 if TYPE_CHECKING:
@@ -186,7 +186,7 @@ def make_initial_belief(
     """
     tangent_space, limits = update_step.layout.tangent_space, update_step.limits
     x = initial_point(model, tangent_space, limits, values.coordinates)
-    update_step.periodic = find_periodic_coordinates(update_step, x, inputs)
+    update_step.periodic, update_step.counted = find_turning_coordinates(update_step, x, inputs)
     usual = initial_deviations(tangent_space, limits, update_step.periodic)
     belief = InitialBelief(x, usual).with_values(update_step, values)
     update_step.unobservable.deviations = belief.deviations

@@ -7,6 +7,7 @@ import math
 from collections.abc import Iterable
 
 import numpy as np
+import numpy.typing as npt
 
 from kineverse.errors import KineverseError
 from kineverse.lie import Array
@@ -28,12 +29,16 @@ _SAME = 1e-9
 _SAMPLES = (0.125, 0.375, 0.625, 0.875)
 
 
-def find_periodic_coordinates(update_step: UpdateStep, x: Array, inputs: Array) -> frozenset[Symbol]:
-    """Return the coordinates without limits whose full turn changes no prediction."""
-    tangent_space, limits = update_step.layout.tangent_space, update_step.limits
-    free = np.flatnonzero(np.isinf(limits.lower) & np.isinf(limits.upper))
-    result = []
-    for i in free.tolist():
+def find_turning_coordinates(
+    update_step: UpdateStep, x: Array, inputs: Array
+) -> tuple[frozenset[Symbol], frozenset[Symbol]]:
+    """Return the coordinates without limits whose full turn changes no predicted observation, or only some.
+
+    The latter are angles whose turn is observed elsewhere, such as that of a pinion by the place of its rack.
+    """
+    layout, limits = update_step.layout, update_step.limits
+    periodic, counted = [], []
+    for i in np.flatnonzero(np.isinf(limits.lower) & np.isinf(limits.upper)).tolist():
         there = x.copy()
         there[i] += 2 * math.pi
         try:
@@ -41,11 +46,13 @@ def find_periodic_coordinates(update_step: UpdateStep, x: Array, inputs: Array) 
         except KineverseError:  # the loop does not close there
             continue
         with np.errstate(invalid="ignore"):  # where the model is not finite
-            change = np.abs(_difference(update_step.layout, before, after)).max()
-        should_merge = change < _SAME * (1 + np.abs(x).max())
-        if should_merge and tangent_space.coordinates[i] not in tangent_space.by_speeds:
-            result.append(tangent_space.coordinates[i])
-    return frozenset(result)
+            is_same = np.abs(_difference(layout, before, after)) < _SAME * (1 + np.abs(x).max())
+        coordinate = layout.tangent_space.coordinates[i]
+        if is_same.all():
+            periodic.append(coordinate)
+        elif coordinate not in layout.tangent_space.by_speeds and _turns_some(layout, i, before, is_same):
+            counted.append(coordinate)
+    return frozenset(periodic), frozenset(counted)
 
 
 def _difference(layout: Layout, before: Array, after: Array) -> Array:
@@ -54,6 +61,19 @@ def _difference(layout: Layout, before: Array, after: Array) -> Array:
     for one, where in zip(layout.observations, layout.value_slices, strict=True):
         result[where] = wrap_difference(result[where], one.period)
     return result
+
+
+def _turns_some(layout: Layout, i: int, predicted: Array, is_same: npt.NDArray[np.bool_]) -> bool:
+    """Return True if an observation that moves with a coordinate is the same after a full turn."""
+    number, group = next((n, g) for n, g in enumerate(layout.groups) if i in g.x)
+    column = group.tangent_index(group.x.tolist().index(i))
+    for k, (one, value, jacobian) in enumerate(
+        zip(layout.observations, layout.value_slices, layout.jacobian_slices, strict=True)
+    ):
+        if layout.group_of[k] == number and is_same[value].all() and is_same[jacobian].all():
+            if predicted[jacobian].reshape(one.size, -1)[:, column].any():
+                return True
+    return False
 
 
 def spread_starts(update_step: UpdateStep, first: InformationState, inputs: Array) -> GaussianSum:

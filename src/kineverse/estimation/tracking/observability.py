@@ -17,7 +17,7 @@ from kineverse.lie import Array
 
 from .bounds import GroupBounds
 from .gaussian import InformationState
-from .layout import Layout
+from .layout import CoordinateGroup, Layout
 from .map_update import MapResult
 from .process_model import ProcessModel
 
@@ -70,6 +70,28 @@ _EXPLAINED = 3.0
 _MOST_DIRECTIONS = 2
 
 
+def find_unexplained(result: MapResult) -> list[int]:
+    """Return the groups whose residuals exceed the noise."""
+    beyond = result.nis > result.dof + _EXPLAINED * np.sqrt(2 * result.dof)
+    return [int(n) for n in np.flatnonzero(beyond)] if beyond.any() else []
+
+
+def move_origin(
+    belief: InformationState,
+    number: int,
+    group: CoordinateGroup,
+    there: Array,
+    step: Array,
+    transport: Array | None,
+) -> None:
+    """Write the same belief of a group about other coordinates, at the end of a tangent step; in place."""
+    belief.x[group.x] = there
+    belief.set_group_cost(group.t, belief.group_cost(group.t).transported(step, transport))
+    record = belief.records[number]
+    if record is not None:
+        belief.records[number] = replace(record, prior=record.prior.transported(step, transport))
+
+
 class StationaryPoints:
     """Detection of states where the measurement Jacobian vanishes, and restarts beside them.
 
@@ -95,10 +117,7 @@ class StationaryPoints:
 
     def unexplained(self, before: InformationState, result: MapResult) -> list[int]:
         """Return the groups whose residuals exceed the noise and that have unobservable directions."""
-        beyond = result.nis > result.dof + _EXPLAINED * np.sqrt(2 * result.dof)
-        if not beyond.any():
-            return []
-        return [n for n in np.flatnonzero(beyond).tolist() if self._may_have_moved(n, before, result.belief)]
+        return [n for n in find_unexplained(result) if self._may_have_moved(n, before, result.belief)]
 
     def _may_have_moved(self, number: int, before: InformationState, after: InformationState) -> bool:
         t = self._layout.groups[number].t
@@ -134,14 +153,7 @@ class StationaryPoints:
                     continue
                 if index == len(beliefs):
                     beliefs.append(before.copy())
-                beliefs[index].x[group.x] = there
-                beliefs[index].set_group_cost(
-                    group.t, before.group_cost(group.t).transported(step, transport)
-                )
-                record = before.records[number]
-                if record is not None:
-                    prior = record.prior.transported(step, transport)
-                    beliefs[index].records[number] = replace(record, prior=prior)
+                move_origin(beliefs[index], number, group, there, step, transport)
                 index += 1
         return beliefs
 

@@ -23,7 +23,7 @@ from .gaussian import InformationState
 from .gaussian_sum import Candidate, GaussianSum, MergeCriterion
 from .layout import Layout
 from .map_update import MapResult, MapSolver
-from .observability import StationaryPoints, UnobservableDirections
+from .observability import StationaryPoints, UnobservableDirections, find_unexplained, move_origin
 from .process_model import ProcessModel
 from .residuals import MeasurementReader, Measurements, Residuals
 from .static_batch import StaticBatch
@@ -73,7 +73,9 @@ class UpdateStep:
     Attributes
     ----------
     periodic
-        Periodic coordinates.
+        Periodic coordinates: no observation tells their turn, so they keep the one nearest to the prediction.
+    counted
+        Coordinates whose turn is observed by some observations and not by others.
     velocity
         Prediction of states and speeds; None if no speeds are estimated.
     """
@@ -108,6 +110,7 @@ class UpdateStep:
             NativeInlierSolver(layout, self.native, outliers) if self.native and outliers else None
         )
         self.periodic: frozenset[Symbol] = frozenset()
+        self.counted: frozenset[Symbol] = frozenset()
         if self.native:
             native_library.prepare()
 
@@ -118,16 +121,24 @@ class UpdateStep:
 
     def update(self, mixture: GaussianSum, reading: Measurements, inputs: Array) -> StepResult:
         """Update all components with a reading; see :meth:`.map_update.MapSolver.update`."""
+        result = self._update(mixture, reading, inputs)
+        self._keep_turns(result.mixture, mixture.best.x)
+        return result
+
+    def _update(self, mixture: GaussianSum, reading: Measurements, inputs: Array) -> StepResult:
         mixture = self._forget_other_inputs(mixture, inputs)
         if not mixture.is_single or self.outliers is not None:
             return self._update_mixture(mixture, reading, inputs)
         before = mixture.best
         result = self._map_update(before, reading, inputs)
         self.static_batch.relinearise(before, result, reading, inputs)
-        self._wrap_angles(result.belief)
+        _require_finite(result.belief.numbers)
         after = GaussianSum(self.layout, [result.belief], mixture.alive)
         unexplained = self.stationary_points.unexplained(before, result)
         candidates = self._restart(before, result, reading, inputs, unexplained) if unexplained else []
+        if self.counted and (turned := find_unexplained(result)):
+            candidates += self._try_other_turns(before, result, reading, inputs, turned)
+            unexplained = sorted({*unexplained, *turned})
         if not candidates:
             return StepResult(after, result.nis, result.dof, (), result.rounds)
         first = self._candidate(result.belief, None, result.nis, result.dof, unexplained, inputs)
@@ -168,6 +179,45 @@ class UpdateStep:
                 continue
         return candidates
 
+    def _try_other_turns(
+        self,
+        before: InformationState,
+        result: MapResult,
+        reading: Measurements,
+        inputs: Array,
+        groups: list[int],
+    ) -> list[Candidate]:
+        """Return candidates on other turns of counted coordinates.
+
+        The orientation of a pinion has a minimum on each turn. The place of its rack tells which is least.
+        """
+        candidates = []
+        for x in self.counted:
+            i = self.layout.tangent_space.coordinates.index(x)
+            number = next(n for n, group in enumerate(self.layout.groups) if i in group.x)
+            group = self.layout.groups[number]
+            if number not in groups or group.by_speeds:
+                continue
+            place, off = result.belief.x.copy(), []
+            for turn in (0.0, math.tau):
+                place[i] = result.belief.x[i] + turn
+                errors = self.residuals.errors(
+                    self.residuals.evaluate(place, inputs), reading, group.observation_indices
+                )
+                off.append(np.concatenate([error for error, _ in errors.values()]))
+            change = off[1] - off[0]
+            turns = round(-float(off[0] @ change) / max(float(change @ change), np.finfo(float).tiny))
+            if turns:
+                place[i] = result.belief.x[i] + turns * math.tau
+                start = before.copy()
+                there = place[group.x]
+                move_origin(start, number, group, there, there - before.x[group.x], None)
+                try:
+                    candidates.append(self._update_from(start, reading, inputs, [number]))
+                except KineverseError:  # the restart fails
+                    continue
+        return candidates
+
     def _update_from(
         self, start: InformationState, reading: Measurements, inputs: Array, groups: list[int]
     ) -> Candidate:
@@ -197,7 +247,7 @@ class UpdateStep:
         groups: list[int],
     ) -> Candidate:
         self.static_batch.relinearise(before, result, reading, inputs, groups)
-        self._wrap_angles(result.belief)
+        _require_finite(result.belief.numbers)
         return self._candidate(result.belief, result.weights, result.nis, result.dof, groups, inputs)
 
     def _forget_other_inputs(self, mixture: GaussianSum, inputs: Array) -> GaussianSum:
@@ -250,7 +300,7 @@ class UpdateStep:
             moments = [m for one in result.speeds if one for m in (one.mean, one.gain, one.covariance)]
             _require_finite(result.numbers, *moments)
             result = self._constrained(result, inputs)
-            self._wrap_angles(result)
+            _require_finite(result.numbers)
             return result
         moving = self.process_model.find_moving_groups(speeds, noise)
         noise_only = [
@@ -277,7 +327,7 @@ class UpdateStep:
             group = self.layout.groups[number]
             added_variance = np.array([noise.get(v, 0.0) for v in group.tangent]) * dt
             self.static_batch.add_noise(number, belief, result, added_variance)
-        self._wrap_angles(result)
+        _require_finite(result.numbers)
         return result
 
     def _constrained(self, belief: InformationState, inputs: Array) -> InformationState:
@@ -321,18 +371,15 @@ class UpdateStep:
             if reading.mask[list(group.observation_indices)].any()
         ]
 
-    def _wrap_angles(self, belief: InformationState) -> None:
-        """Wrap periodic coordinates to half a turn.
+    def _keep_turns(self, mixture: GaussianSum, predicted: Array) -> None:
+        """Take periodic coordinates to the turn nearest to their prediction (n,); in place.
 
-        Raises
-        ------
-        InvalidValueError
-            If the belief is not finite. Non-finite results are never returned.
+        Integrators, controllers and gears count turns, though nothing that is observed tells them.
         """
-        _require_finite(belief.numbers)
         for x in self.periodic:
             i = self.layout.tangent_space.coordinates.index(x)
-            belief.x[i] = math.remainder(belief.x[i], 2 * math.pi)
+            for belief in mixture.beliefs:
+                belief.x[i] -= math.tau * round((belief.x[i] - predicted[i]) / math.tau)
 
     def _update_mixture(self, mixture: GaussianSum, reading: Measurements, inputs: Array) -> StepResult:
         """Update all components and keep the best candidates."""
@@ -401,7 +448,9 @@ class UpdateStep:
             return result
 
         start = before.replace_groups(initial.map(with_evidence), groups)
-        return self.update(start, reading._replace(mask=mask), inputs)
+        result = self.update(start, reading._replace(mask=mask), inputs)
+        self._keep_turns(result.mixture, before.best.x)
+        return result
 
     def find_accepted(
         self, mixture: GaussianSum, reading: Measurements, inputs: Array
@@ -433,7 +482,7 @@ class UpdateStep:
         for candidate in result:
             as_found = MapResult(candidate.belief, candidate.nis, candidate.dof, rounds, candidate.weights)
             self.static_batch.relinearise(mixture.best, as_found, reading, inputs, candidate.groups)
-            self._wrap_angles(candidate.belief)
+            _require_finite(candidate.belief.numbers)
         return result, rounds
 
     def _explain(
@@ -445,6 +494,9 @@ class UpdateStep:
             candidates = [self._relinearised(belief, result, reading, inputs, groups)]
             if is_best and (unexplained := self._unexplained(belief, result, reading, groups)):
                 candidates += self._restart(belief, result, reading, inputs, unexplained)
+            if is_best and self.counted:
+                turned = find_unexplained(result)
+                candidates += self._try_other_turns(belief, result, reading, inputs, turned)
             return candidates, result.rounds
         robust_start = self.solver.find_robust_start(belief, reading, inputs, groups)
         candidates, rounds = [], 0
@@ -454,6 +506,9 @@ class UpdateStep:
             rounds = max(rounds, result.rounds)
         if is_best and (unexplained := self._unexplained(belief, result, reading, groups)):
             candidates += self._restart(belief, result, reading, inputs, unexplained)
+        if is_best and self.counted:
+            turned = self._with_rejected(result, reading, groups)
+            candidates += self._try_other_turns(belief, result, reading, inputs, turned)
         all_outliers = belief.copy()
         none = np.zeros(len(self.layout.groups))
         for number in groups:
@@ -471,13 +526,18 @@ class UpdateStep:
         self, belief: InformationState, result: MapResult, reading: Measurements, groups: list[int]
     ) -> list[int]:
         """Return the groups with unexplained residuals or outliers."""
-        unexplained = set(self.stationary_points.unexplained(belief, result))
-        if result.weights is not None:
-            rejected = reading.mask & (result.weights < 0.5)
-            unexplained |= {
-                n for n in groups if rejected[list(self.layout.groups[n].observation_indices)].any()
-            }
+        unexplained = {
+            *self.stationary_points.unexplained(belief, result),
+            *self._with_rejected(result, reading, groups),
+        }
         return [n for n in groups if n in unexplained]
+
+    def _with_rejected(self, result: MapResult, reading: Measurements, groups: list[int]) -> list[int]:
+        """Return the groups of which an observation is rejected as an outlier."""
+        if result.weights is None:
+            return []
+        rejected = reading.mask & (result.weights < 0.5)
+        return [n for n in groups if rejected[list(self.layout.groups[n].observation_indices)].any()]
 
     def _candidate(
         self,

@@ -24,6 +24,7 @@ from .bindings import native_library
 from .bounds import SpeedLocks, arrange_state
 from .estimate import Estimate, TrackerState
 from .fixed_lag import FixedLag, Step
+from .gaussian import InformationState
 from .initial_belief import GivenValues, make_initial_belief
 from .measurements import (
     ObservedLike,
@@ -179,7 +180,7 @@ class Tracker:
 
     @property
     def periodic(self) -> frozenset[Symbol]:
-        """Periodic coordinates; their values stay within half a turn."""
+        """Coordinates whose turn no observation tells; it is the one nearest to the prediction."""
         return self._update_step.periodic
 
     @property
@@ -221,7 +222,8 @@ class Tracker:
     def rebuild(self, model: ModelView | None = None) -> Tracker:
         """Return a tracker of an edited model with the same observations and options.
 
-        It starts anew, and repeats the recent updates in the order of their times, without commands.
+        It starts anew, and repeats the recent updates in the order of their times, without commands. Turns
+        are those of this tracker.
 
         Parameters
         ----------
@@ -234,14 +236,41 @@ class Tracker:
             If an observed frame is not in the model.
         """
         other = Tracker(self.model if model is None else model, self._observed, **self._options)
-        inputs = {str(s): k for k, s in enumerate(self._layout.inputs)}
-        recent = list(self._recent)
+        start = other._now
+        other._repeat(self)
+        turns = other._turns_from(self)
+        if turns.any():
+
+            def turned(belief: InformationState) -> InformationState:
+                result = belief.copy()
+                result.x += turns
+                return result
+
+            other._now = replace(start, mixture=start.mixture.map(turned))
+            other._buffer.clear()
+            other._recent.clear()
+            other._repeat(self)
+        return other
+
+    def _repeat(self, other: Tracker) -> None:
+        """Update with what another tracker has seen."""
+        inputs = {str(s): k for k, s in enumerate(other._layout.inputs)}
+        recent = list(other._recent)
         if all(stamp is not None for stamp, _, _ in recent):
             recent.sort(key=lambda one: one[0] or 0.0)
         for stamp, reading, values in recent:
-            known = {s: values[inputs[str(s)]] for s in other._layout.inputs if str(s) in inputs}
-            other._update(reading, stamp, None, State(known))
-        return other
+            known = {s: values[inputs[str(s)]] for s in self._layout.inputs if str(s) in inputs}
+            self._update(reading, stamp, None, State(known))
+
+    def _turns_from(self, other: Tracker) -> Array:
+        """Return the whole turns of periodic coordinates to those of another tracker (n,) [rad]."""
+        theirs, mine = other.estimate.state, self._now.mixture.best.x
+        return np.array(
+            [
+                math.tau * round((theirs[x] - at) / math.tau) if x in self.periodic and x in theirs else 0.0
+                for x, at in zip(self.symbols, mine.tolist(), strict=True)
+            ]
+        )
 
     def reset(
         self,

@@ -93,6 +93,7 @@ def fit_spheres(region: CoverRegion, protrusion: float, most: int) -> FittedSphe
     most
         Largest number of spheres.
     """
+    protrusion = max(protrusion, _least_protrusion(region, most))
     problem = _Problem(region, protrusion)
     aim = protrusion / _ALLOWANCE
     for _ in range(_ATTEMPTS):
@@ -108,6 +109,18 @@ def fit_spheres(region: CoverRegion, protrusion: float, most: int) -> FittedSphe
             break
         aim *= 0.99 * protrusion / proved.protrusion
     return proved
+
+
+def _least_protrusion(region: CoverRegion, most: int) -> float:
+    """Return a protrusion that no cover by so many spheres is below.
+
+    The part of a convex surface in a sphere is no larger than the sphere, which sticks out by its radius less
+    a depth.
+    """
+    a, b, c = np.moveaxis(region.corners[region.faces], 1, 0)
+    areas = np.bincount(region.owners, np.linalg.norm(np.cross(b - a, c - a), axis=1) / 2)
+    radius = math.sqrt(float(areas.max()) / (4.0 * math.pi * most))
+    return radius - float(region.depths(region.middles).max())
 
 
 def _fit_to_points(problem: _Problem, aim: float, most: int) -> FittedSpheres:

@@ -55,6 +55,8 @@ def _request(
 ) -> tuple[list[tuple[Solid, Floats]], str]:
     """Return the solids of objects with their poses, and the key of their cover."""
     check_cover_settings(protrusion, most)
+    if not items:
+        raise InvalidValueError("There is no shape to cover.")
     base = np.linalg.inv(items[0].shape.origin.matrix)
     solids: list[tuple[Solid, Floats]] = []
     for item in items:

@@ -31,7 +31,7 @@ TREES = ContentCache(_OPEN, ".tree", 64 * 2**20, _LOG, "The sphere tree %s %s an
 """Covers and trees on the disk."""
 
 # Raise the number when the covers or trees of equal solids and settings change.
-_VERSION = 4
+_VERSION = 5
 _MOST_IN_MEMORY = 4096
 
 _in_memory: OrderedDict[str, SphereCover | SphereTree] = OrderedDict()

@@ -9,12 +9,12 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from kineverse.errors import InvalidValueError
-from kineverse.geometry.mesh_files import Floats
-from kineverse.geometry.shapes import Solid
+from kineverse.geometry.mesh_files import Faces, Floats
+from kineverse.geometry.shapes import Hull, Solid, scale_solid, thicken_primitive
 from kineverse.model.body import Capsule, Sphere
 
 from .cover_fit import FittedSpheres, fit_spheres
-from .polytope import CoverRegion, bound_solid, solid_volume
+from .polytope import CoverPolytope, CoverRegion, bound_solid, solid_volume
 from .union_volume import union_volume
 
 MOST = 48
@@ -24,6 +24,11 @@ PROTRUSION_OF_SIZE, LEAST_PROTRUSION, LARGEST_PROTRUSION = 0.1, 5e-3, 25e-3
 """Default protrusion, as a fraction of the edge of a cube with the volume of the solid; its bounds [m]."""
 
 _MOST_OF_ALL = 1024
+
+_NEEDLE, _LEAST_RATIO = 1e-3, 1e-4
+"""Thickness of a needle beside its length, and the least one beside the largest size of what is fitted."""
+_SMALL, _LARGE = 1e-4, 1e4
+"""Radii between which a solid is bounded as it is [m]."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -82,10 +87,12 @@ def cover_solids(
     Raises
     ------
     InvalidValueError
-        For a triangle mesh, which has no inside; or if the protrusion is not a positive length, or ``most``
-        not between 1 and 1024.
+        For a triangle mesh, which has no inside; or if there is no solid, the protrusion is not a positive
+        length, or ``most`` not between 1 and 1024.
     """
     check_cover_settings(protrusion, most)
+    if not solids:
+        raise InvalidValueError("There is no solid to cover.")
     spheres = [(pose, solid.surface) for solid, pose in solids if isinstance(solid.surface, Sphere)]
     if len(spheres) == len(solids) <= most:
         places = np.array([pose[:3, 3] for pose, _ in spheres])
@@ -99,7 +106,10 @@ def cover_solids(
     if isinstance(first.surface, Capsule) and not others:
         centres, radii, reached = _capsule_chain(first.surface, protrusion, most)
         return _make_cover(centres, radii, reached, _volume(solids)).move(pose)
-    parts = [bound_solid(solid, protrusion).move(pose) for solid, pose in solids]
+    if _is_needle(first) and not others:
+        centres, reached = _needle_chain(first, protrusion, most)
+        return _make_cover(centres, np.full(len(centres), reached), reached, _volume(solids)).move(pose)
+    parts, growth = _bound_solids(solids, protrusion)
     corners = np.concatenate([part.corners for part in parts])
     low, high = corners.min(axis=0), corners.max(axis=0)
     origin, unit = (low + high) / 2, float(np.linalg.norm(high - low)) / 2
@@ -107,8 +117,9 @@ def cover_solids(
     shift[:3, 3] = -origin
     region = CoverRegion([part.move(shift, 1.0 / unit) for part in parts])
     fitted: FittedSpheres = fit_spheres(region, protrusion / unit, most)
-    volume = region.measure_volume() * unit**3
-    return _make_cover(fitted.centres * unit + origin, fitted.radii * unit, fitted.protrusion * unit, volume)
+    volume = solid_volume(first) if not others else region.measure_volume() * unit**3
+    reached = fitted.protrusion * unit + growth
+    return _make_cover(fitted.centres * unit + origin, fitted.radii * unit, reached, volume)
 
 
 def default_protrusion(solids: Sequence[tuple[Solid, Floats]]) -> float:
@@ -131,8 +142,51 @@ def check_cover_settings(protrusion: float | None, most: int) -> None:
 def _volume(solids: Sequence[tuple[Solid, Floats]]) -> float:
     if len(solids) == 1:
         return solid_volume(solids[0][0])
-    parts = [bound_solid(solid, 0.1 * solid.radius).move(pose) for solid, pose in solids]
+    parts, _ = _bound_solids(solids, 0.1 * min(solid.radius for solid, _ in solids))
     return CoverRegion(parts).measure_volume()
+
+
+def _bound_solids(
+    solids: Sequence[tuple[Solid, Floats]], protrusion: float
+) -> tuple[list[CoverPolytope], float]:
+    """Return polytopes around solids at poses, and by how much solids have grown at most [m].
+
+    Plates and needles are thickened, and what is very large or small is bounded at a size of 1 m, since hulls
+    need a volume and a size.
+    """
+    parts, most = [], 0.0
+    for solid, pose in solids:
+        if isinstance(solid.surface, Hull | Faces):
+            parts.append(bound_solid(solid, protrusion).move(pose))
+            continue
+        solid, growth = thicken_primitive(solid, _LEAST_RATIO)
+        most = max(most, growth)
+        size = solid.radius if not _SMALL < solid.radius < _LARGE else 1.0
+        part = bound_solid(solid if size == 1.0 else scale_solid(solid, 1.0 / size), protrusion / size)
+        parts.append(part.move(np.eye(4), size).move(pose))
+    return parts, most
+
+
+def _is_needle(solid: Solid) -> bool:
+    """Return True for a primitive that is a thousand times as long as it is thick."""
+    _, width, length = np.sort(solid.half).tolist()
+    return not isinstance(solid.surface, Hull | Faces) and width <= _NEEDLE * length
+
+
+def _needle_chain(solid: Solid, protrusion: float, most: int) -> tuple[Floats, float]:
+    """Return the centres of equal spheres along the axis of a needle, and their radius [m].
+
+    The axis lies inside, so that none sticks out by more than its radius.
+    """
+    *_, axis = np.argsort(solid.half, kind="stable").tolist()
+    half = float(solid.half[axis])
+    aside = float(np.linalg.norm(np.delete(solid.half, axis)))
+    # Spheres reach this far along the axis where they contain the needle.
+    reach = math.sqrt(max(protrusion**2 - aside**2, (half / most) ** 2))
+    count = min(max(math.ceil(half / reach), 1), most)
+    centres = np.zeros((count, 3))
+    centres[:, axis] = half * ((2.0 * np.arange(count) + 1.0) / count - 1.0)
+    return solid.centre + centres, math.hypot(half / count, aside) * (1.0 + 1e-9)
 
 
 def _make_cover(centres: Floats, radii: Floats, protrusion: float, volume: float) -> SphereCover:

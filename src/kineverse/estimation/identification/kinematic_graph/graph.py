@@ -21,6 +21,7 @@ from kineverse.errors import DuplicateNameError, InvalidValueError, ModelError
 from kineverse.estimation.identification.found_operations import rigid_pose
 from kineverse.estimation.identification.observations import PosesLike, PoseTrack, check_tracks, exact_track
 from kineverse.estimation.identification.result import SURE, Fit, IdentificationResult
+from kineverse.estimation.linear_algebra import singularity_named
 from kineverse.lie import Array, inverse
 from kineverse.model.frame import WORLD
 from kineverse.model.model import Model
@@ -248,6 +249,7 @@ class KinematicGraph:
         return "\n".join(lines)
 
 
+@singularity_named()
 def identify_graph(
     poses: Mapping[str, PosesLike],
     *,
