@@ -37,8 +37,8 @@ EXPORTED int kineverse_batch(const double *in, double *const *out, long long row
   const int left = (int)(rows - full);
   for (long long row = 0; row < rows; row += W) {
     const double *from = in + row * INPUTS;
-    /* Vectors of the last row of a block reach beyond it, and behind the last row of all may be nothing: where they
-       would, the block is read from a copy. */
+    /* Vectors of the last row of a block reach beyond it. Behind the last row of all may be nothing: blocks
+       whose vectors reach there are read from a copy. */
     if ((rows - row - W) * INPUTS < PADDED(INPUTS) - INPUTS) {
       const int there = row == full ? left : W;
       for (int i = 0; i < W; i++)

@@ -13,6 +13,7 @@ from weakref import WeakMethod
 
 from .build_queue import BuildJob, request
 from .cache import library_cache
+from .interruption import watch_signals
 from .parallel import cores
 from .program import Program
 from .toolchain import FLOATING_POINT_FLAGS, NO_UNDEFINED_FLAGS, Toolchain, optimisation_level, toolchain
@@ -186,6 +187,7 @@ class SourceLibrary:
 
     def _load(self, path: str) -> Any:
         code = ctypes.CDLL(path)
+        watch_signals(code)
         self._declare(code)
         return code
 
