@@ -46,7 +46,9 @@ def find_libraries() -> list[str] | None:
         return None
     found = []
     for name in ("libasan.so", "libubsan.so"):
-        path = subprocess.run(["gcc", f"-print-file-name={name}"], capture_output=True, text=True).stdout.strip()
+        path = subprocess.run(
+            ["gcc", f"-print-file-name={name}"], capture_output=True, text=True
+        ).stdout.strip()
         if not os.path.isabs(path):
             return None
         found.append(path)
@@ -67,7 +69,7 @@ def environment(folder: Path, libraries: list[str]) -> dict[str, str]:
         "CC": str(compiler),
         "KINEVERSE_CACHE_DIR": str(folder / "cache"),
         "LD_PRELOAD": ":".join([str(preloaded), *libraries]),
-        # Python keeps memory until it ends; "link order" is about preloaded.so, which is no part of the program.
+        # Python keeps memory until it ends, and preloaded.so comes before the sanitizer.
         "ASAN_OPTIONS": "detect_leaks=0:verify_asan_link_order=0:allocator_may_return_null=1",
         "UBSAN_OPTIONS": "print_stacktrace=1",
         # Arrays have an end of their own each.
@@ -123,7 +125,9 @@ def run_short() -> None:
         pose = kv.translation(x, y, 0)
         edit.add_frame("hand", "world", pose, Body(collisions=tuple(map(Shape, shapes))))
         for k in range(9):
-            edit.add_frame(f"post{k}", "world", kv.translation(0, k - 4, 0), Body(collisions=(Shape(shapes[k % 3]),)))
+            edit.add_frame(
+                f"post{k}", "world", kv.translation(0, k - 4, 0), Body(collisions=(Shape(shapes[k % 3]),))
+            )
         edit.constrain("x", -2, x, 2)
         edit.constrain("y", -5, y, 5)
     scene = kv.geometry.Scene(model)
@@ -150,7 +154,9 @@ def main(arguments: list[str]) -> int:
     """Run the command line and return its status."""
     libraries = find_libraries()
     if libraries is None:
-        print("Sanitizers need gcc with libasan and libubsan, on Linux: install gcc, or the package libgcc-dev.")
+        print(
+            "Sanitizers need gcc with libasan and libubsan, on Linux: install gcc, or the package libgcc-dev."
+        )
         return 2
     reports = [] if arguments == ["--short"] else find_warnings()
     print(*reports, sep="\n", end="")
