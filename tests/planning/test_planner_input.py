@@ -13,7 +13,7 @@ from planning_models import body
 
 import kineverse as kv
 from kineverse.errors import CompileError, InvalidValueError, KineverseError, ShapeError, UnknownNameError
-from kineverse.model.body import Box, Sphere
+from kineverse.model.body import Box, Capsule, Cone, Cylinder, Sphere
 from kineverse.planning import Mode, Planner, bindings
 from kineverse.planning.checker import CollisionChecker
 from kineverse.planning.search import RrtConnect
@@ -307,3 +307,27 @@ def test_coordinates_that_move_no_shape_are_planned_within_limits_and_locks(meth
     assert planner.valid(np.vstack([path.at(t).vector([x, y]) for t in np.linspace(0, 1, 200)])).all()
     assert np.isinf(path.clearance())
     assert "range is -1 to 1" in planner.plan([-0.5, 0.0], [2.0, 0.0], method=method).why
+
+
+@pytest.mark.parametrize(
+    "solid",
+    [
+        Cylinder(1, 1e-6),
+        Capsule(1e-6, 100),
+        *(pytest.param(solid, marks=pytest.mark.long) for solid in (Cone(1, 1e-6), Cylinder(1e3, 1e-3))),
+    ],
+)
+def test_plates_and_needles_are_planned_with(solid):
+    model = points(2)
+    with model.edit() as edit:
+        edit.add_frame("plate", "ball", kv.rotation_x(0.3), body(solid))
+        edit.add_frame("post", "world", kv.translation(0, 0, 3000), body(Sphere(0.1)))
+    assert Planner(model).plan([0, 0], [1, 0.5], seconds=30.0)
+
+
+def test_body_without_a_cover_is_named():
+    model = points(2)
+    with model.edit() as edit:
+        edit.add_frame("needle", "ball", np.eye(4), body(Cylinder(1e-6, 1)))
+    with pytest.raises(InvalidValueError, match=r"'needle'.*leave_out"):
+        Planner(model)
