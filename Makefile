@@ -13,12 +13,13 @@ INSTALL_FILES = printf '%s\n' $(filter %.txt,$^) | xargs -P $(JOBS) -I {} $(INST
 # What the demo and every command in the README need.
 DEMO := $(patsubst %,requirements/%.txt,geometry core view figures build control recording)
 
-.PHONY: help demo test fuzz format clean
+.PHONY: help demo test sanitize fuzz format clean
 .NOTPARALLEL:
 
 help:
 	@echo "make demo    a robot opens and closes a kitchen in the browser (ARGS=--headless: a table, a picture, and end)"
 	@echo "make test    formatter, linter, types, layers, tests"
+	@echo "make sanitize  all C with sanitizers, and the tests that use it (ARGS=--short: a little of each)"
 	@echo "make fuzz    look for inputs that break a reader (ARGS='--target sdf --minutes 60')"
 	@echo "make format  format the code and mend what the linter can mend"
 	@echo "make clean   remove the environment and what the tools left"
@@ -37,6 +38,9 @@ test: $(VENV)/test.installed
 	@# The tests of a file share what takes long to make, so that they stay in one process.
 	$(BIN)/python -m pytest -q -n $(JOBS) --dist loadfile --no-loadscope-reorder --assert=plain $(ARGS) || \
 	    { $(BIN)/python -m pytest -q --last-failed --last-failed-no-failures=none $(ARGS); exit 1; }
+
+sanitize: $(VENV)/test.installed
+	$(BIN)/python tools/sanitize.py $(ARGS)
 
 fuzz: $(VENV)/fuzz.installed
 	PYTHONPATH=tools $(BIN)/python -m fuzz $(ARGS)

@@ -2,7 +2,10 @@
 
 from __future__ import annotations
 
+import ctypes
 import gc
+import mmap
+import sys
 import threading
 
 import numpy as np
@@ -55,6 +58,41 @@ def test_any_number_of_rows(function: kv.CompiledFunction, count: int) -> None:
     results = function.batch(x)
     assert all(close(v, w) for v, w in zip(results, one_by_one(function, x), strict=True))
     assert all(v.flags.c_contiguous and v.flags.writeable for v in results)
+
+
+def last_of_a_page(count: int) -> np.ndarray:
+    """Return doubles behind which there is memory that cannot be touched."""
+    size = -(-8 * count // mmap.PAGESIZE) * mmap.PAGESIZE
+    pages = mmap.mmap(-1, size + mmap.PAGESIZE)
+    start = ctypes.addressof(ctypes.c_char.from_buffer(pages))
+    assert ctypes.CDLL(None).mprotect(ctypes.c_void_p(start + size), mmap.PAGESIZE, 0) == 0
+    return np.frombuffer(pages, count=size // 8)[size // 8 - count :]
+
+
+@pytest.mark.compiler
+@pytest.mark.skipif(not sys.platform.startswith("linux"), reason="uses mprotect")
+@pytest.mark.parametrize("inputs", [1, 2, 3, 5, 7, 8, 9])
+def test_nothing_behind_points_and_results_is_touched(inputs: int) -> None:
+    x = [kv.position(f"x{k}") for k in range(inputs)]
+    total = sum(x, kv.expressions.array(0.0))
+    f = kv.compile([kv.expressions.array([total] * outputs) for outputs in (1, 3, 9)], x, tier="c")
+    for rows in (*range(1, 4), *range(7, 26)):
+        points = last_of_a_page(rows * inputs).reshape(rows, inputs)
+        points[:] = np.arange(points.size).reshape(points.shape)
+        out = [last_of_a_page(rows * outputs).reshape(rows, outputs) for outputs in (1, 3, 9)]
+        f.batch(points, out=out)
+        for result in out:
+            assert (result == points.sum(axis=1)[:, None]).all()
+
+
+@pytest.mark.compiler
+def test_functions_without_inputs_have_batches_of_any_number_of_rows() -> None:
+    f = kv.compile([np.eye(2), np.array(3.0)], [], tier="c")
+    for rows in (0, 1, 7, 8, 20):
+        first, second = f.batch(np.zeros((rows, 0)))
+        assert first.shape == (rows, 2, 2)
+        assert (first == np.eye(2)).all()
+        assert (second == np.full(rows, 3.0)).all()
 
 
 @pytest.mark.parametrize("offset", [0, 1, 2, 5])

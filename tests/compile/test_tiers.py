@@ -58,6 +58,37 @@ def test_tiers_agree_to_the_bit_on_random_programs(program) -> None:
     agree(slow, fast, points(300, 5))
 
 
+EXTREMES = (*(np.nan, -np.nan, 0.0, -0.0, np.inf, -np.inf, 5e-324, -5e-324, 1e-310, -2.2e-308), *(1.0, -1.0, 0.5),
+            *(-2.0, 3.0, 1e300, -1e300, np.pi, 1e5, -1e6, 1e22, 709.0, -745.0, 20.0, 1e-8))  # fmt: skip
+
+
+@pytest.mark.compiler
+def test_signs_zeros_and_nan_are_the_same_in_all_tiers() -> None:
+    unary = (
+        "sin cos tan arcsin arccos arctan exp expm1 log log1p log2 log10 tanh sinh cosh arcsinh arccosh arctanh sqrt "
+        "cbrt abs sign floor ceil rint trunc square negative reciprocal exp2"
+    )
+    binary = "add subtract multiply divide arctan2 power fmod mod hypot copysign minimum maximum fmin fmax floor_divide"
+    outputs = [getattr(np, name)(a) for name in unary.split()]
+    outputs += [getattr(np, name)(a, b) for name in binary.split()]
+    # The sign of a NaN that is computed differs between scalar and vector instructions.
+    outputs += [
+        np.copysign(a, getattr(np, name)(b)) for name in ("log", "sqrt", "arccos", "arcsin", "arccosh")
+    ]
+    slow, fast = (kv.compile(outputs, [a, b], tier=tier, wait=True) for tier in ("interpreter", "c"))
+    x = np.array([(one, other) for one in EXTREMES for other in EXTREMES])
+    agree(slow, fast, x)
+    batches = fast.batch(x), slow.batch(x)
+    single = [np.array(column) for column in zip(*map(fast, x), strict=True)]
+    for k, (by_c, by_interpreter, exact) in enumerate(zip(*batches, single, strict=True)):
+        assert same_bits(by_interpreter, exact), k
+        assert (np.isnan(by_c) == np.isnan(exact)).all(), k
+        number = ~np.isnan(exact)
+        assert (np.signbit(by_c) == np.signbit(exact))[number].all(), k
+        assert ((by_c == 0) == (exact == 0))[number].all(), k
+        assert (np.isinf(by_c) == np.isinf(exact)).all(), k
+
+
 @pytest.mark.compiler
 def test_calls_through_casadi_and_through_the_extension_agree(monkeypatch: pytest.MonkeyPatch) -> None:
     mechanism = arm()

@@ -207,3 +207,33 @@ def test_edits_of_the_model_are_followed():
         edit.add_frame("box", "world", kv.translation(1.0, 0, 0), body(Box((0.1, 0.1, 0.1))))
     assert planner.valid([[0.5], [1.0], [-1.0]]).tolist() == [False, False, True]
     assert Scene(model).bodies == planner.scene.bodies
+
+
+@pytest.fixture(scope="module")
+def turnstile():
+    """An arm that turns fully, up and down a little, and a wall on one side of it."""
+    turn, lift = kv.position("turn"), kv.position("lift")
+    model = kv.Model()
+    with model.edit() as edit:
+        edit.add_frame("arm", "world", kv.rotation_z(turn) @ kv.translation(0.5, 0, lift), body(Sphere(0.1)))
+        edit.add_frame(
+            "wall", "world", kv.rotation_z(0.8) @ kv.translation(0.5, 0, 0), body(Box((0.3, 0.05, 4)))
+        )
+        edit.constrain("lift/range", -0.5, lift, 0.5)
+    return Planner(model, ["turn", "lift"])
+
+
+@pytest.mark.parametrize("goal", [1.6, 1.6 - 2 * np.pi, 1.6 + 2 * np.pi])
+def test_joint_goes_the_long_way_round_where_the_short_one_is_blocked(turnstile, goal):
+    path = turnstile.plan([0.0, 0.0], [goal, 0.1], seconds=2.0)
+    assert path, path.why
+    np.testing.assert_allclose(path.points[-1], [1.6 - 2 * np.pi, 0.1], atol=1e-9)
+    assert is_free(turnstile, path.points)
+
+
+@pytest.mark.parametrize("goal", [-4.0, -5.2, -2.0])
+def test_goal_more_than_half_a_turn_away_is_reached_at_its_value(turnstile, goal):
+    path = turnstile.plan([0.0, 0.0], [goal, 0.1], seconds=2.0)
+    assert path, path.why
+    np.testing.assert_array_equal(path.points[-1], [goal, 0.1])
+    assert is_free(turnstile, path.points)

@@ -13,7 +13,7 @@ from planning_models import body
 
 import kineverse as kv
 from kineverse.errors import CompileError, InvalidValueError, KineverseError, ShapeError, UnknownNameError
-from kineverse.model.body import Box, Sphere
+from kineverse.model.body import Box, Capsule, Cone, Cylinder, Sphere
 from kineverse.planning import Mode, Planner, bindings
 from kineverse.planning.checker import CollisionChecker
 from kineverse.planning.search import RrtConnect
@@ -254,6 +254,26 @@ def test_planners_in_two_threads_do_not_meet(ball):
         assert list(pool.map(work, range(2))) == alone
 
 
+def test_threads_share_a_planner_and_its_roadmap():
+    planner = Planner(points(2, 100))
+    rng = np.random.default_rng(0)
+    Q = rng.uniform(-12, -6, (12, 2))
+    Q = Q[planner.valid(Q)]
+
+    def work(k: int) -> None:
+        method = "prm" if k % 2 else "rrt-connect"
+        for a, b in itertools.pairwise(np.roll(Q, k, axis=0)):
+            path = planner.plan(a, b, method=method, seconds=30.0, seed=k)
+            assert path, path.why
+            np.testing.assert_array_equal(path.points[[0, -1]], [a, b])
+            assert path.trajectory(velocity=1.0, acceleration=1.0).duration > 0.0
+            assert path.clearance() > 0.0
+            assert planner.valid(path.points).all()
+
+    with ThreadPoolExecutor(4) as pool:
+        list(pool.map(work, range(4)))
+
+
 def test_missing_compiler_is_said_with_what_works_without(ball, monkeypatch):
     class Missing:
         def prepare(self, wait: bool) -> bool:
@@ -262,3 +282,52 @@ def test_missing_compiler_is_said_with_what_works_without(ball, monkeypatch):
     monkeypatch.setattr(bindings, "_library", Missing)
     with pytest.raises(CompileError, match="inverse_kinematics"):
         Planner(ball.model)
+
+
+@pytest.mark.parametrize("method", ["rrt-connect", "prm"])
+def test_coordinates_that_move_no_shape_are_planned_within_limits_and_locks(method):
+    x, y = kv.position("x"), kv.position("y")
+    model = points(1, 3)
+    with model.edit() as edit:
+        edit.add_frame("needle", "world", kv.translation(x, y, 0))
+        edit.constrain("x/range", -1, x, 1)
+        edit.constrain("y/range", -1, y, 1)
+        # Between x = -.1 and .1 there is a way at y > .5 only.
+        edit.constrain("x/lock", 0.5 * ((x > -0.1) & (x < 0.1)) - 2, y, 2)
+        edit.constrain("x/gate", -2 + 2.5 * ((x > -0.1) & (x < 0.1)), y, 2)
+    planner = Planner(model, [x, y])
+    assert planner.valid([[0.0, 0.7], [0.0, 0.0], [0.5, 0.0], [2.0, 0.0]]).tolist() == [
+        True,
+        False,
+        True,
+        False,
+    ]
+    path = planner.plan([-0.5, 0.0], [0.5, 0.0], method=method, seconds=30.0)
+    assert path, path.why
+    assert planner.valid(np.vstack([path.at(t).vector([x, y]) for t in np.linspace(0, 1, 200)])).all()
+    assert np.isinf(path.clearance())
+    assert "range is -1 to 1" in planner.plan([-0.5, 0.0], [2.0, 0.0], method=method).why
+
+
+@pytest.mark.parametrize(
+    "solid",
+    [
+        Cylinder(1, 1e-6),
+        Capsule(1e-6, 100),
+        *(pytest.param(solid, marks=pytest.mark.long) for solid in (Cone(1, 1e-6), Cylinder(1e3, 1e-3))),
+    ],
+)
+def test_plates_and_needles_are_planned_with(solid):
+    model = points(2)
+    with model.edit() as edit:
+        edit.add_frame("plate", "ball", kv.rotation_x(0.3), body(solid))
+        edit.add_frame("post", "world", kv.translation(0, 0, 3000), body(Sphere(0.1)))
+    assert Planner(model).plan([0, 0], [1, 0.5], seconds=30.0)
+
+
+def test_body_without_a_cover_is_named():
+    model = points(2)
+    with model.edit() as edit:
+        edit.add_frame("needle", "ball", np.eye(4), body(Cylinder(1e-6, 1)))
+    with pytest.raises(InvalidValueError, match=r"'needle'.*leave_out"):
+        Planner(model)

@@ -237,7 +237,7 @@ class Batch:
         streaming = sum(result.nbytes for result in results) > _STREAMED_BYTES
         begin, *begins = map(_address, (points, *results))
 
-        def work(first: int, end: int) -> None:
+        def work(first: int, end: int, _alive: object = (points, *results)) -> None:
             places = (ctypes.c_void_p * len(sizes))(
                 *(b + 8 * first * s for b, s in zip(begins, sizes, strict=True))
             )

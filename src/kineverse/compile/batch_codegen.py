@@ -37,8 +37,9 @@ EXPORTED int kineverse_batch(const double *in, double *const *out, long long row
   const int left = (int)(rows - full);
   for (long long row = 0; row < rows; row += W) {
     const double *from = in + row * INPUTS;
-    if (row == full || (INPUTS % W && row + W >= rows)) {
-      /* The last rows are read from a copy: behind them may be nothing. */
+    /* Vectors of the last row of a block reach beyond it. Behind the last row of all may be nothing: blocks
+       whose vectors reach there are read from a copy. */
+    if ((rows - row - W) * INPUTS < PADDED(INPUTS) - INPUTS) {
       const int there = row == full ? left : W;
       for (int i = 0; i < W; i++)
         memcpy(padded + i * INPUTS, from + (i < there ? i : there - 1) * INPUTS, INPUTS * sizeof(double));
@@ -69,7 +70,7 @@ EXPORTED int kineverse_batch(const double *in, double *const *out, long long row
 _TEXTS = vector_header("double") + ROWS
 
 # Raise the number when other source is generated from the same program and texts.
-BATCH_KIND = "batch 3 " + hashlib.sha256((_TEXTS + _LOOP + repr(VECTOR)).encode()).hexdigest()
+BATCH_KIND = "batch 4 " + hashlib.sha256((_TEXTS + _LOOP + repr(VECTOR)).encode()).hexdigest()
 
 
 def generate_batch_source(program: Program) -> str:

@@ -15,6 +15,7 @@ from weakref import WeakMethod
 
 from .build_queue import BuildJob, request
 from .cache import library_cache
+from .interruption import watch_signals
 from .parallel import cores
 from .program import Program
 from .toolchain import (
@@ -216,6 +217,7 @@ class SourceLibrary:
 
     def _load(self, path: str) -> Any:
         code = ctypes.CDLL(path)
+        watch_signals(code)
         self._declare(code)
         return code
 

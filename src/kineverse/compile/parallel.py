@@ -4,10 +4,12 @@ from __future__ import annotations
 
 import os
 from collections.abc import Callable
-from concurrent.futures import ThreadPoolExecutor
+from concurrent.futures import ThreadPoolExecutor, wait
 
 # Pieces per thread on average, so that the other threads take over from a delayed one.
 _PIECES = 4
+# A piece has at most so many times the smallest number of rows that is worth a thread: some 20 ms.
+_LARGEST = 200
 
 _threads: ThreadPoolExecutor | None = None
 
@@ -32,15 +34,22 @@ def parallel_rows(work: Callable[[int, int], object], rows: int, smallest: int, 
         The smallest number of rows that is worth a thread.
     align
         Pieces begin at multiples of this.
+
+    Notes
+    -----
+    A signal, such as Ctrl-C, ends the call between two pieces. No thread works on when it has ended, since
+    memory of the rows may be gone then.
     """
-    threads = min(cores(), rows // max(smallest, 1))
-    if threads < 2:
-        if rows:
-            work(0, rows)
-        return
-    piece = max(-(-rows // (threads * _PIECES)), smallest)
+    threads = max(min(cores(), rows // max(smallest, 1)), 1)
+    piece = _LARGEST * max(smallest, 1)
+    if threads > 1:
+        piece = min(piece, max(-(-rows // (threads * _PIECES)), smallest))
     piece = -(-piece // align) * align
     starts = iter(range(0, rows, piece))
+    if threads == 1:
+        for first in starts:
+            work(first, min(first + piece, rows))
+        return
 
     def take() -> None:
         # Advancing a range iterator is atomic; every thread takes the next piece after finishing one.
@@ -48,7 +57,12 @@ def parallel_rows(work: Callable[[int, int], object], rows: int, smallest: int, 
             work(first, min(first + piece, rows))
 
     helpers = [_pool().submit(take) for _ in range(threads - 1)]
-    take()
+    try:
+        take()
+    finally:
+        for _ in starts:  # none are left for the others, if an exception ends this
+            pass
+        wait(helpers)
     for helper in helpers:
         helper.result()
 

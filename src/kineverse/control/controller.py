@@ -11,6 +11,7 @@ import numpy as np
 import numpy.typing as npt
 
 from kineverse._gc import no_collection
+from kineverse._threads import CallLock, one_at_a_time
 from kineverse.compile import CompiledFunction
 from kineverse.compile.function import WantedTier
 from kineverse.errors import (
@@ -192,6 +193,7 @@ class Controller:
         self._coordinates = tuple(s for s in self.inputs if s.value is None)
         self._parameters = {s: k for k, s in enumerate(self.inputs) if s.value is not None}
         # In a state a parameter may also have the name of a coordinate, see State.given.
+        self._lock = CallLock()
         self._settable = frozenset(n for s in self._parameters for n in (s, Symbol(s.path, s.order)))
         self._settings = np.array([s.value or 0.0 for s in self._parameters])
         self._values[len(self._coordinates) :] = self._settings
@@ -234,6 +236,7 @@ class Controller:
             for function in self._functions
         )
 
+    @one_at_a_time
     def reset(self, speeds: StateLike | None = None) -> None:
         """Forget the last commands and solutions: the next step starts from given speeds, or from rest."""
         self._solver.reset()
@@ -243,6 +246,7 @@ class Controller:
         if len(self._before):
             self._before[:] = self._last
 
+    @one_at_a_time
     def set(self, target: Target | Symbol | str, value: npt.ArrayLike) -> None:
         """Set a target, or a parameter by symbol or name, for all further steps.
 
@@ -300,6 +304,7 @@ class Controller:
             raise InvalidValueError("This controller has no rows of contacts; give it a scene=.")
         return self._contacts
 
+    @one_at_a_time
     def query_contacts(self, state: StateLike | npt.ArrayLike) -> DistanceResults:
         """Return the near pairs at a state, for parameters of tasks that depend on them.
 
@@ -336,7 +341,7 @@ class Controller:
             For a state that lacks a value, or has another length, or a NaN.
         """
         # A collection of the whole program takes many times as long as a step; it has time between steps.
-        with no_collection():
+        with self._lock, no_collection():
             return self._step(state)
 
     def _step(self, state: StateLike | npt.ArrayLike) -> Command:

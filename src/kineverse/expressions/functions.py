@@ -164,8 +164,11 @@ def ceil(x: ExpressionLike) -> Expression:
 
 
 def copysign(x: ExpressionLike, y: ExpressionLike) -> Expression:
-    """Return |x| with the sign of y, elementwise."""
-    return binary(ca.OP_COPYSIGN, x, y)
+    """Return |x| with the sign of y, elementwise. NaN counts as positive: processors give it either sign."""
+    sign_of = as_expression(y)
+    if not sign_of.is_constant:
+        sign_of = binary(ca.OP_IF_ELSE_ZERO, _is_number(sign_of), sign_of)
+    return binary(ca.OP_COPYSIGN, x, sign_of)
 
 
 def where(condition: ExpressionLike, if_true: ExpressionLike, if_false: ExpressionLike) -> Expression:
@@ -255,7 +258,7 @@ def floor_divide(a: ExpressionLike, b: ExpressionLike) -> Expression:
         infinite = binary(ca.OP_IF_ELSE_ZERO, by_zero, sign(numerator) * math.inf)
         whole = binary(ca.OP_IF_ELSE_ZERO, unary(ca.OP_NOT, by_zero), whole) + infinite
     # Last, as sums lose the sign of 0.
-    return copysign(whole, numerator)
+    return binary(ca.OP_COPYSIGN, whole, numerator)
 
 
 def remainder(a: ExpressionLike, b: ExpressionLike) -> Expression:
@@ -269,7 +272,7 @@ def remainder(a: ExpressionLike, b: ExpressionLike) -> Expression:
 def _with_positive_divisor(a: ExpressionLike, b: ExpressionLike) -> tuple[Expression, Expression, Expression]:
     """Return the sign of b, and both operands times that sign."""
     divisor = as_expression(b)
-    sense = copysign(1.0, divisor)
+    sense = binary(ca.OP_COPYSIGN, 1.0, divisor)
     return sense, sense * as_expression(a), sense * divisor
 
 

@@ -11,6 +11,7 @@ import numpy as np
 import numpy.typing as npt
 
 from kineverse._checks import as_entries
+from kineverse._threads import CallLock
 from kineverse.compile.function import CompiledFunction
 from kineverse.compile.function import compile as compile_expressions
 from kineverse.errors import (
@@ -71,6 +72,8 @@ class CollisionWorld:
         (M,) index of the shape of each object among the shapes of its body.
     table, narrowphase
         Tables of the broad phase, and the narrow phase by coal.
+    lock
+        Lock of the tables, which one thread uses at a time.
     """
 
     def __init__(
@@ -82,6 +85,7 @@ class CollisionWorld:
         leave_out: Iterable[Exclusion],
     ) -> None:
         self.model = model
+        self.lock = CallLock()
         self._own_rules = parse_known_rules(rules, model)
         meshes = (("triangles", triangles), ("decomposed", decomposed))
         wanted = "names or patterns of bodies"

@@ -187,7 +187,7 @@ EXPORT void measure(
     if (t->bounds && !isnan(distances[k]))
       t->bounds[t->count * i + j] = low + t->travel[i] + t->travel[j];
     if (distances[k] < INFINITY) {
-      *known = (Memory){t->count * i + j + 1, t->travel[i], t->travel[j], distances[k]};
+      *known = (Memory){t->count * i + j + 1, t->travel[i], t->travel[j], distances[k], {0}};
       for (int r = 0; r < 9; r++) known->witness[r] = witnesses[9 * k + r];
     }
   }

@@ -8,6 +8,7 @@ from typing import TypeAlias
 import numpy as np
 import numpy.typing as npt
 
+from kineverse._threads import one_at_a_time
 from kineverse.errors import InvalidValueError, ShapeError, UnknownNameError, suggest
 from kineverse.model.frame import WORLD
 from kineverse.model.frame_dependence import FrameDependence
@@ -50,7 +51,7 @@ class PreparedQuery:
         self, world: CollisionWorld, choose: Callable[[], PairFlags], radius: float, per_shape: bool = False
     ) -> None:
         check_radius(radius)
-        self._world, self._choose = world, choose
+        self._world, self._choose, self._lock = world, choose, world.lock
         self.radius, self.per_shape = float(radius), per_shape
         self._version: int | None = None
         self._flags: Flags = np.zeros((0, 0), dtype=np.uint8)
@@ -63,7 +64,8 @@ class PreparedQuery:
         With ``facing``, pairs with parallel faces are there with further facing points.
         """
         within = self.radius if radius is None else radius
-        return find_pairs_within(self._world, within, self._select(), self.per_shape, facing)
+        with self._lock:
+            return find_pairs_within(self._world, within, self._select(), self.per_shape, facing)
 
     def at(
         self, values: Floats, radius: float | None = None, facing: FacingPoints | None = None
@@ -84,12 +86,14 @@ class PreparedQuery:
         """
         within = self.radius if radius is None else radius
         check_radius(within)
-        found = self._world.search_at(values, within, self._select(), self.per_shape, facing)
-        if found is not None:
-            return DistanceResults(self._world, *found)
-        self._world.update(values)
-        return self(within, facing)
+        with self._lock:
+            found = self._world.search_at(values, within, self._select(), self.per_shape, facing)
+            if found is not None:
+                return DistanceResults(self._world, *found)
+            self._world.update(values)
+            return self(within, facing)
 
+    @one_at_a_time
     def first_within(
         self, coordinates: Sequence[Symbol | str], Q: npt.ArrayLike, radius: float | None = None
     ) -> int | None:
@@ -125,6 +129,7 @@ class PreparedQuery:
                 return k
         return None
 
+    @one_at_a_time
     def least_distance(
         self, coordinates: Sequence[Symbol | str], Q: npt.ArrayLike, radius: float | None = None
     ) -> float:
@@ -143,6 +148,7 @@ class PreparedQuery:
                 found.limit = max(found.least, 0.0)
         return float(found.least)
 
+    @one_at_a_time
     def prepare(self) -> None:
         """Make what the first query makes otherwise: solids of the selected bodies, tables; without a state.
 

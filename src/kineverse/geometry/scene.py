@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
+from kineverse._threads import one_at_a_time
 from kineverse.model.frame_dependence import FrameDependence
 from kineverse.model.model_view import ModelView
 from kineverse.state import StateLike
@@ -78,6 +79,7 @@ class Scene:
     ) -> None:
         self.model = model
         self._world = CollisionWorld(model, rules, triangles, decomposed, leave_out)
+        self._lock = self._world.lock
         self._parameters: dict[tuple[str, str], DistanceParameters] = {}
         self._pair_queries: dict[tuple[str, str], PreparedQuery] = {}
         self._queries: dict[tuple[Any, ...], PreparedQuery] = {}
@@ -118,8 +120,10 @@ class Scene:
             If a value is NaN, or a pose is not finite or 1e12 m away; the message names the bodies. Then all
             poses stay as they were.
         """
-        self._world.update(state)
+        with self._lock:
+            self._world.update(state)
 
+    @one_at_a_time
     def pose(self, body: str) -> npt.NDArray[np.float64]:
         """Return the pose of a body at the last update, world_T_body, (4, 4) [m]."""
         self._world.prepare(())
@@ -229,6 +233,7 @@ class Scene:
             self._parameters[a, b] = distance_parameters(self.model, closest, *poses)
         return distance_expression(self.model, a, b, self._parameters[a, b])
 
+    @one_at_a_time
     def expression_values(self, pairs: PairDistance | Iterable[PairDistance]) -> dict[Symbol, float]:
         """Return the present values of the parameters of distances, for ``state | kv.State(values)``."""
         values: dict[Symbol, float] = {}
@@ -236,6 +241,7 @@ class Scene:
             values.update(pair.values(*self._with_poses(pair.a, pair.b)))
         return values
 
+    @one_at_a_time
     def _with_poses(self, a: str, b: str) -> tuple[DistanceResult, Floats, Floats]:
         if (a, b) not in self._pair_queries:
             if len(self._pair_queries) >= _MAX_PAIR_QUERIES:
@@ -246,6 +252,7 @@ class Scene:
         (closest,) = self._pair_queries[a, b]()
         return closest if closest.a == a else closest.swap(), self.pose(a), self.pose(b)
 
+    @one_at_a_time
     def first_contact(self, margin: float = 0.0) -> DistanceResult | None:
         """Return a pair within a margin [m], or None; always the same pair at the same state."""
         return distance_queries.find_first_contact(self._world, margin)
@@ -265,6 +272,7 @@ class Scene:
         """The rules of the collision filter in their order: those of the model, then those of the scene."""
         return self._world.rules
 
+    @one_at_a_time
     def find_never_colliding(
         self, states: Iterable[StateLike] | None = None, margin: float = 0.0
     ) -> tuple[Rule, ...]:
@@ -285,6 +293,7 @@ class Scene:
         """
         return except_never_within(self._world, states, margin)
 
+    @one_at_a_time
     def find_always_colliding(
         self, states: Iterable[StateLike] | None = None, margin: float = 0.0
     ) -> tuple[Rule, ...]:
@@ -298,6 +307,7 @@ class Scene:
 
     # -- rays and points -----------------------------------------------------------------------------------
 
+    @one_at_a_time
     def ray(self, origin: npt.ArrayLike, direction: npt.ArrayLike, length: float = math.inf) -> RayHit | None:
         """Return the first hit of a ray, or None.
 
@@ -310,6 +320,7 @@ class Scene:
         """
         return rays.cast_ray(self._world, origin, direction, length)
 
+    @one_at_a_time
     def point(self, point: npt.ArrayLike, radius: float = math.inf) -> NearestPoint | None:
         """Return the body nearest to a point (3,) in the world within a radius [m], or None.
 

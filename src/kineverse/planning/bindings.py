@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 
 from kineverse.compile.c_library import NO_COMPILER, SourceLibrary
+from kineverse.compile.interruption import WATCH, raise_signal
 from kineverse.compile.toolchain import NO_UNDEFINED_FLAGS
 from kineverse.compile.vector_program import vector_header
 from kineverse.control.contact_rows import row_library
@@ -53,7 +54,7 @@ MOST_COORDINATES = 64
 BOX, CYLINDER, CAPSULE, SPHERE, HULL = range(5)
 """Kinds of obstacles."""
 
-FOUND, TIME_IS_UP, TOO_MANY_NODES, NO_MEMORY = range(4)
+FOUND, TIME_IS_UP, TOO_MANY_NODES, NO_MEMORY, TOO_LONG = range(5)
 """Outcomes of a search."""
 
 
@@ -115,9 +116,8 @@ class PlanningLibrary(SourceLibrary):
 
     def __init__(self) -> None:
         folder = resources.files("kineverse.planning") / "c_source"
-        source = "\n".join(
-            [vector_header("float"), *((folder / name).read_text("utf-8") for name in SOURCES)]
-        )
+        files = ((folder / name).read_text(encoding="utf-8") for name in SOURCES)
+        source = "\n".join([vector_header("float"), WATCH, *files])
         flags = ("-O3", "-ffp-contract=fast", "-fno-rounding-math", *NO_UNDEFINED_FLAGS)
         super().__init__(source, _declare_signatures, flags)
 
@@ -155,7 +155,7 @@ def _declare_signatures(code: Any) -> None:
     signatures = {
         "kineverse_valid": (ctypes.c_int, [pointer, pointer, count, pointer]),
         "kineverse_edges": (ctypes.c_int, [pointer, pointer, pointer, count, number, number, pointer]),
-        "kineverse_certify": (count, [pointer, pointer, count, number, number, pointer]),
+        "kineverse_certify": (count, [pointer, pointer, count, number, number, number, pointer]),
         "kineverse_poses": (ctypes.c_int, [pointer, pointer, pointer]),
         "kineverse_rrt_connect": (count, [pointer, pointer, count, pointer, count, pointer, count]),
         "kineverse_project": (ctypes.c_int, [pointer, pointer, pointer, count, pointer]),
@@ -168,12 +168,18 @@ def _declare_signatures(code: Any) -> None:
     for name, (result, arguments) in signatures.items():
         function = getattr(code, name)
         function.restype, function.argtypes = result, arguments
-        if result is ctypes.c_int:
-            function.errcheck = _ensure_memory
+        function.errcheck = _ensure_memory if result is ctypes.c_int else _ensure_whole
 
 
 def _ensure_memory(failed: int, function: Any, arguments: tuple[Any, ...]) -> int:
     """Raise MemoryError where a function of C says that it has failed, which is for lack of memory only."""
+    raise_signal()
     if failed:
         raise MemoryError("There is no memory for the check of configurations.")
     return failed
+
+
+def _ensure_whole(result: int, function: Any, arguments: tuple[Any, ...]) -> int:
+    """Raise the exception for which a function of C has ended early, if there is one."""
+    raise_signal()
+    return result

@@ -15,6 +15,7 @@ import numpy as np
 import numpy.typing as npt
 
 from kineverse.compile.vector_program import VectorProgram
+from kineverse.errors import NoSolutionError
 from kineverse.expressions.expression import Expression, as_expression
 from kineverse.geometry import Scene
 from kineverse.geometry.bindings import ObjectPlacement
@@ -47,6 +48,10 @@ _SWITCHES = {ca.OP_LT, ca.OP_LE, ca.OP_EQ, ca.OP_NE, ca.OP_NOT, ca.OP_AND, ca.OP
 _placements = itertools.count()
 LEAST_INFLATION = 2e-4
 """Growth of spheres below which a collision between two samples counts as one [m]."""
+
+
+class LateCheckError(NoSolutionError):
+    """The check of a path that was found takes longer than it may."""
 
 
 class CollisionChecker:
@@ -340,17 +345,26 @@ class CollisionChecker:
         )
         return found.astype(bool)
 
-    def find_collision(self, points: Floats32, resolution: float = RESOLUTION) -> tuple[int, float] | None:
-        """Return the first edge of a polyline (N, n) that is not certainly free, and a fraction of it."""
+    def find_collision(self, points: Floats32, seconds: float = math.inf) -> tuple[int, float] | None:
+        """Return the first edge of a polyline (N, n) that is not certainly free, and a fraction of it.
+
+        Raises
+        ------
+        LateCheckError
+            If that takes more than some seconds.
+        """
         where = ctypes.c_double()
         found = self._code.kineverse_certify(
             self.address,
             points.ctypes.data,
             len(points),
-            resolution,
+            RESOLUTION,
             LEAST_INFLATION,
+            seconds,
             ctypes.addressof(where),
         )
+        if found == -3:
+            raise LateCheckError
         if found < -1:
             raise MemoryError("There is no memory for the check of a path.")
         return None if found < 0 else (int(found), where.value)

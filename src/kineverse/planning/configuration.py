@@ -25,7 +25,9 @@ from .bindings import MOST_COORDINATES
 _WILDCARDS = "*?["
 _LARGEST = 1e6
 """Largest coordinate of a configuration [rad], [m]; edges are computed in single precision."""
-_HALF_TURN = math.pi + 0.3
+HALF_TURN, FULL_TURN = math.pi + 0.3, math.tau + 0.3
+"""Angles by which joints that turn fully may turn to either side of the start: for the short way to
+everything, and for the long way round as well [rad]."""
 BEYOND = 2.0
 """Length by which coordinates without limits may go beyond what is given [m], [rad]."""
 CONDITION_TOLERANCE = 1e-5
@@ -117,16 +119,17 @@ class PlanningSpace:
         # An empty range makes every configuration invalid, and messages name it.
         self.upper[:] = np.maximum(self.lower, self.upper)
 
-    def bounds(self, start: Array, points: Array, beyond: float = BEYOND) -> tuple[Array, Array]:
+    def bounds(
+        self, start: Array, points: Array, beyond: float = BEYOND, turn: float | Array = HALF_TURN
+    ) -> tuple[Array, Array]:
         """Return finite bounds (n,) of a search from a start (n,) to or about configurations (N, n).
 
-        A joint that turns fully, without limits, may turn by a little more than half a turn to either side
-        of the start; another coordinate without limits may go beyond the start and the given ones by a length
-        [m], [rad].
+        A joint that turns fully, without limits, may turn by an angle to either side of the start [rad];
+        another coordinate without limits may go beyond the start and the given ones by a length [m], [rad].
         """
         given = np.vstack([start[None], points])
-        low = np.where(self.turning, start - _HALF_TURN, given.min(axis=0) - beyond)
-        high = np.where(self.turning, start + _HALF_TURN, given.max(axis=0) + beyond)
+        low = np.where(self.turning, start - turn, given.min(axis=0) - beyond)
+        high = np.where(self.turning, start + turn, given.max(axis=0) + beyond)
         finite = np.isfinite(self.lower), np.isfinite(self.upper)
         return np.where(finite[0], self.lower, low), np.where(finite[1], self.upper, high)
 
@@ -136,14 +139,14 @@ class PlanningSpace:
         bounded = self.turning | np.isfinite(self.lower) & np.isfinite(self.upper)
         return tuple(s for s, stays in zip(self.symbols, bounded, strict=True) if not stays)
 
-    def equivalents(self, q: Array, start: Array, most: int = 32) -> Array:
+    def equivalents(self, q: Array, start: Array, most: int = 32, turn: float = HALF_TURN) -> Array:
         """Return configurations (K, n) within bounds about a start that are q but for full turns of joints.
 
         The nearest to the start come first. Without any there is q itself.
         """
         if not self.turning.any():
             return q[None]
-        low, high = self.bounds(start, q[None])
+        low, high = self.bounds(start, q[None], turn=turn)
         found = q[None].copy()
         for i in np.flatnonzero(self.turning).tolist():
             first = math.ceil((low[i] - q[i]) / math.tau - 1e-9)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 
@@ -10,12 +11,12 @@ import numpy as np
 from kineverse.compile.build_queue import working_seconds
 from kineverse.lie import Array
 
-from .bindings import TIME_IS_UP
+from .bindings import TIME_IS_UP, TOO_LONG
 from .checker import RESOLUTION, CollisionChecker
 from .manifold import Manifold
 from .obstacles import Floats32
 from .roadmap import Roadmap
-from .search import MOST_EDGES, RrtConnect, SearchResult
+from .search import MOST_EDGES, PATH_ROOM, RrtConnect, SearchResult
 
 PATIENCE, MORE_PATIENCE = 40, 160
 """Numbers of shortcuts in a row that may bring nothing: for the first path, and where paths are optimized."""
@@ -24,6 +25,8 @@ _FINER = 8.0
 """Factor of the resolution where an edge collides between its samples."""
 _FINEST = 4000.0
 _ATTEMPTS, _NEXT_SEED = 16, 7919
+_LEAST_CHECK = 1.0
+"""Time for the checks of what is found [s]; or as long as the search may take, if that is longer."""
 _TELLING = 100
 """Number of samples after which a small tree says that its root cannot be left."""
 _WIDER, _WIDE_EDGES = 1e-3, 10_000
@@ -59,6 +62,7 @@ def connect(
     edges: int = MOST_EDGES,
     roadmap: Roadmap | None = None,
     patience: int = PATIENCE,
+    asked: float | None = None,
 ) -> Connected:
     """Return a path from one of (S, n) starts to one of (G, n) goals, certified between its samples.
 
@@ -70,6 +74,8 @@ def connect(
         Roadmap that is searched; None for trees (RRT-Connect).
     patience
         Number of shortcuts in a row that may bring nothing.
+    asked
+        Time that messages name, of which ``seconds`` are a part [s].
     """
     begin = working_seconds()
     search = RrtConnect(checker)
@@ -90,11 +96,15 @@ def connect(
             if found.found or not wider:
                 break
         if not found.found:
-            return Connected(found.points.astype(float), explain_failure(found, seconds), iterations)
+            return Connected(
+                found.points.astype(float),
+                explain_failure(found, seconds if asked is None else asked),
+                iterations,
+            )
         # Parts of a shortcut that just passes would not be certain by themselves.
         with checker.widened(_WIDER / 2, np.vstack([starts, goals])):
             points = search.shorten(found.points, seconds - (working_seconds() - begin), seed, patience)
-        certain = _repair(search, checker, points, begin + seconds, seed, edges)
+        certain = _repair(search, checker, points, begin + seconds, checked_by(begin, seconds), seed, edges)
         if certain is not None:
             return Connected(certain.astype(float), "", iterations)
     problem = (
@@ -105,12 +115,18 @@ def connect(
 
 
 def _repair(
-    search: RrtConnect, checker: CollisionChecker, points: Floats32, end: float, seed: int, edges: int
+    search: RrtConnect,
+    checker: CollisionChecker,
+    points: Floats32,
+    end: float,
+    checked: float,
+    seed: int,
+    edges: int,
 ) -> Floats32 | None:
     """Return a path that is certainly free: edges that are not are planned anew, with more samples."""
     resolution = RESOLUTION
     for _ in range(_REPAIRS):
-        collision = checker.find_collision(points)
+        collision = checker.find_collision(points, checked - working_seconds())
         if collision is None:
             return points
         k, _fraction = collision
@@ -131,6 +147,7 @@ def connect_on_manifold(
     seconds: float,
     seed: int,
     edges: int = MOST_EDGES,
+    asked: float | None = None,
 ) -> Connected:
     """Return a path on a manifold from any of some starts (S, n) to any of some goals (G, n).
 
@@ -156,31 +173,39 @@ def connect_on_manifold(
             if found.found or not wider:
                 break
         if not found.found:
-            return Connected(points.astype(float), problem or explain_failure(found, seconds), iterations)
+            problem = problem or explain_failure(found, seconds if asked is None else asked)
+            return Connected(points.astype(float), problem, iterations)
         exact = manifold.refine(points)
         if exact is None:
             problem = "A path was found, but within limits its holds cannot be met exactly all along it."
             continue
-        if checker.find_collision(np.ascontiguousarray(exact, dtype=np.float32)) is None:
+        left = checked_by(begin, seconds) - working_seconds()
+        if checker.find_collision(np.ascontiguousarray(exact, dtype=np.float32), left) is None:
             return Connected(exact, "", iterations)
         problem = "A path was found whose samples are free, but something thin lies between two of them."
         resolution *= 2.0
     return Connected(points.astype(float), problem, iterations)
 
 
+def checked_by(begin: float, seconds: float) -> float:
+    """Return when what a search has found is checked, which began and may last some seconds."""
+    return begin + seconds + max(seconds, _LEAST_CHECK)
+
+
 def explain_failure(found: SearchResult, seconds: float) -> str:
     """Return why a search has found no path, and how far it has come."""
     own, other = found.nodes
+    if found.status == TOO_LONG:
+        return f"A way was found, but it has more than the {PATH_ROOM} points of a path: choose nearer goals."
     reached = f"{own} configurations were reached from the start and {other} from the goals"
     names = ("the start", "the goal") if found.iterations >= _TELLING else ()
     enclosed = [name for name, count in zip(names, found.nodes, strict=False) if count < 8]
     hint = f" It seems that {' and '.join(enclosed)} cannot be left." if enclosed else ""
+    if math.isfinite(found.gap):
+        reached += f", and the nearest pair is {found.gap:.3g} apart"
     if found.status == TIME_IS_UP:
-        return (
-            f"The time of {seconds:g} s is up: {reached}, and the nearest pair is {found.gap:.3g} apart."
-            f"{hint} Give more seconds=, or other goals."
-        )
-    return f"The search ended: {reached}, and the nearest pair is {found.gap:.3g} apart.{hint}"
+        return f"The time of {seconds:g} s is up: {reached}.{hint} Give more seconds=, or other goals."
+    return f"The search ended: {reached}.{hint}"
 
 
 def unique_rows(Q: Array, apart: float) -> Sequence[int]:

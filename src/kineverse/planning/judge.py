@@ -2,17 +2,23 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 
 import numpy as np
 
+from kineverse.compile.build_queue import working_seconds
 from kineverse.geometry import Rule, Scene
 from kineverse.geometry.results import DistanceResult, DistanceResults
 from kineverse.lie import Array
 from kineverse.state import State
 from kineverse.symbols import Symbol
 
+from .checker import LateCheckError
 from .path import densify, sample_path
+
+_AT_ONCE = 512
+"""Number of samples after which the time is looked at."""
 
 
 class SceneJudge:
@@ -52,14 +58,28 @@ class SceneJudge:
         self._values[self._columns[self._moved]] = q[self._moved]
         self._scene.update(self._values)
 
-    def first_contact(self, points: Array, step: float) -> tuple[Array, DistanceResult] | None:
-        """Return the first sample of a polyline (N, n) with a contact, and the contact."""
+    def first_contact(
+        self, points: Array, step: float, until: float = math.inf
+    ) -> tuple[Array, DistanceResult] | None:
+        """Return the first sample of a polyline (N, n) with a contact, and the contact.
+
+        Raises
+        ------
+        LateCheckError
+            If that lasts until some time of :func:`.working_seconds`.
+        """
         if not len(points):
             return None
         samples = sample_path(points, step)
-        self._update(samples[0])
-        k = self._query.first_within(self._coordinates, samples)
-        return None if k is None else (samples[k], self._query()[0])
+        for begin in range(0, len(samples), _AT_ONCE):
+            some = samples[begin : begin + _AT_ONCE]
+            self._update(some[0])
+            k = self._query.first_within(self._coordinates, some)
+            if k is not None:
+                return some[k], self._query()[0]
+            if working_seconds() > until:
+                raise LateCheckError
+        return None
 
     def clearance(self, points: Array, step: float, radius: float = 0.5) -> float:
         """Return the least distance of a pair at samples of a polyline [m]; infinite beyond a radius."""

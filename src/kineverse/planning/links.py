@@ -49,7 +49,8 @@ class LinkTable:
         self.spheres: list[Array] = []
         count = 0
         self.shapes = np.zeros(sum(map(len, members)), dtype=SHAPE)
-        self.shapes["pose"] = [T[:3].ravel() for items in members for _, _, T in items]
+        placed = [T[:3] for items in members for _, _, T in items]
+        self.shapes["pose"] = np.reshape(placed, (-1, 12))
         shapes = 0
         for k, (items, pose) in enumerate(zip(members, poses, strict=True)):
             link = self.links[k]

@@ -301,5 +301,7 @@ class ModeSearch:
         mode, still, edges = self._modes[node.mode], self._still[node.mode], _EDGES * 4**self._round
         self._compile(mode.along)
         left = max(self._left(), 0.0)
-        path = self._scene.between(node.q, ends, mode.along, touching, left, self._seed, still, edges)
+        path = self._scene.between(
+            node.q, ends, mode.along, touching, left, self._seed, still, edges, around=self._round > 0
+        )
         return path.points if path.found else None

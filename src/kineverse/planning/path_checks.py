@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 import numpy.typing as npt
 
+from kineverse._threads import CallLock
 from kineverse.errors import InvalidValueError
 from kineverse.lie import Array
 from kineverse.model.model_view import ModelView
@@ -42,6 +43,8 @@ class PathChecks:
         Pairs of bodies that may touch.
     restore
         Function that places the planner where it stands at the time of a check.
+    lock
+        Lock of the planner, which checks at the same time would disturb.
     """
 
     def __init__(
@@ -53,17 +56,19 @@ class PathChecks:
         manifold: Manifold | None,
         touching: BodyPairs,
         restore: Callable[[], None],
+        lock: CallLock,
     ) -> None:
         self.model, self.state, self._version = model, state, model.version
         self._checker, self._judge, self._manifold = checker, judge, manifold
         self._targets = None if manifold is None else manifold.targets
-        self._touching, self._restore = touching, restore
+        self._touching, self._restore, self._lock = touching, restore, lock
 
     def clearance(self, points: Array) -> float:
         """Return the least signed distance of bodies along a polyline (N, n) by the scene [m]."""
         self.ensure_current()
-        self._judge.place(self.state)
-        return self._judge.clearance(points, 1 / RESOLUTION)
+        with self._lock:
+            self._judge.place(self.state)
+            return self._judge.clearance(points, 1 / RESOLUTION)
 
     def ensure_current(self) -> None:
         """Ensure that the model is the one for which the path was planned.
@@ -80,18 +85,20 @@ class PathChecks:
     def placed(self, points: Array) -> Iterator[None]:
         """Place the checker for a path, with limits about its points (N, n), while the context lasts."""
         checker = self._checker
-        limits = checker.lower.copy(), checker.upper.copy()
-        checker.place(self.state)
-        if self._manifold is not None and self._targets is not None:
-            self._manifold.place(self.state, self._targets)
-        narrow = points.astype(np.float32)
-        checker.lower[:], checker.upper[:] = narrow.min(axis=0) - _ROUNDING, narrow.max(axis=0) + _ROUNDING
-        try:
-            with checker.excepting(self._touching):
-                yield
-        finally:
-            checker.lower[:], checker.upper[:] = limits
-            self._restore()
+        with self._lock:
+            limits = checker.lower.copy(), checker.upper.copy()
+            checker.place(self.state)
+            if self._manifold is not None and self._targets is not None:
+                self._manifold.place(self.state, self._targets)
+            narrow = points.astype(np.float32)
+            checker.lower[:] = narrow.min(axis=0) - _ROUNDING
+            checker.upper[:] = narrow.max(axis=0) + _ROUNDING
+            try:
+                with checker.excepting(self._touching):
+                    yield
+            finally:
+                checker.lower[:], checker.upper[:] = limits
+                self._restore()
 
     def valid(self, Q: Array, residual: float) -> npt.NDArray[np.bool_]:
         """Return flags (N,) of configurations (N, n) that are free and meet holds up to a residual."""

@@ -12,6 +12,7 @@ import numpy.typing as npt
 
 from kineverse._checks import as_count, as_entries, as_tolerance
 from kineverse._gc import no_collection
+from kineverse._threads import CallLock, one_at_a_time
 from kineverse.control.tasks import Goal, Hold
 from kineverse.errors import InvalidValueError, ShapeError
 from kineverse.expressions.expression import ExpressionLike
@@ -50,8 +51,9 @@ class Planner:
     against obstacles, then the shapes themselves where spheres touch. A path is
     certified between its samples too, and judged by the collision scene before it is returned.
 
-    Everything is computed from the model: an edit of the model is followed at the next call. A planner is
-    for one thread at a time. Pickled, it is built again in the other process, without its roadmap.
+    Everything is computed from the model: an edit of the model is followed at the next call. Calls of several
+    threads wait for each other: planners of their own are faster. Pickled, a planner is built again in the
+    other process, without its roadmap.
 
     Parameters
     ----------
@@ -102,6 +104,7 @@ class Planner:
         if not isinstance(model, ModelView):
             raise InvalidValueError(f"A planner takes a model, such as kv.load(...), not {model!r:.80}.")
         planning_functions()  # says at once that there is no compiler
+        self._lock = CallLock()
         self.model = model
         self.margin = as_tolerance(margin, "The margin")
         wanted = "coordinates, as symbols, names or patterns"
@@ -118,7 +121,7 @@ class Planner:
         with no_collection():
             return PlanningScene(
                 self.model, self._move, self._rules, self.margin, self._protrusion, self._options, state,
-                self._separate,
+                self._separate, self._lock,
             )  # fmt: skip
 
     def _check_separate_pairs(self, Q: Array) -> PlanningScene:
@@ -171,6 +174,7 @@ class Planner:
 
     # -- the state -----------------------------------------------------------------------------------------
 
+    @one_at_a_time
     def place(self, state: StateLike) -> None:
         """Place everything that the planner does not move, and the obstacles with it.
 
@@ -192,6 +196,7 @@ class Planner:
 
     # -- configurations ------------------------------------------------------------------------------------
 
+    @one_at_a_time
     def valid(self, Q: npt.ArrayLike) -> npt.NDArray[np.bool_]:
         """Return flags (N,) of configurations (N, n) that are within limits and free of collisions.
 
@@ -207,6 +212,7 @@ class Planner:
         self.checker.upper[:] = np.where(self.space.turning, np.maximum(upper, points.max(axis=0)), upper)
         return self.checker.valid(points.astype(np.float32))
 
+    @one_at_a_time
     def edges(self, A: npt.ArrayLike, B: npt.ArrayLike) -> npt.NDArray[np.bool_]:
         """Return flags (N,) of straight ways from A to B, (N, n) each, that are free at 32 samples a unit.
 
@@ -247,6 +253,7 @@ class Planner:
                 raise InvalidValueError(f"{what} of a hold is a text, not {text!r:.80}.")
         return hold_frames(self.model, a, b, mask, offset)
 
+    @one_at_a_time
     def solutions(
         self,
         tasks: Hold | Goal | Iterable[Hold | Goal],
@@ -279,6 +286,7 @@ class Planner:
 
     # -- paths ---------------------------------------------------------------------------------------------
 
+    @one_at_a_time
     def plan(
         self,
         start: StateLike | npt.ArrayLike | None,

@@ -12,6 +12,7 @@ from typing import Any, TypeAlias
 import numpy as np
 import numpy.typing as npt
 
+from kineverse._threads import CallLock
 from kineverse.compile.build_queue import working_seconds
 from kineverse.control.tasks import Hold
 from kineverse.errors import InvalidValueError
@@ -24,10 +25,10 @@ from kineverse.model.model_view import ModelView
 from kineverse.state import State
 from kineverse.symbols import Symbol
 
-from .checker import BodyPairs, CollisionChecker
-from .configuration import BEYOND, PlanningSpace
-from .connection import MORE_PATIENCE, PATIENCE, connect, connect_on_manifold
-from .endpoints import Endpoint, Endpoints
+from .checker import BodyPairs, CollisionChecker, LateCheckError
+from .configuration import BEYOND, FULL_TURN, HALF_TURN, PlanningSpace
+from .connection import MORE_PATIENCE, PATIENCE, checked_by, connect, connect_on_manifold
+from .endpoints import Endpoints
 from .judge import SceneJudge, describe_contacts
 from .manifold import FrameHold, Manifold, hold_targets, manifold_key
 from .overlapping_pairs import find_overlapping_pairs, find_separate_pairs
@@ -41,6 +42,10 @@ Flags: TypeAlias = npt.NDArray[np.bool_]
 
 _JUDGED = 0.5
 """Longest step between judged configurations of a path that is certified [rad], [m]."""
+_TOO_FAR = (
+    "A way was found to a goal that is {:.4g} away, but to check it takes longer than the time given. Give "
+    "more seconds=, or nearer goals."
+)
 _MOST_MANIFOLDS = 16
 _SAME = 1e-5
 """Difference of lengths that is rounding [rad], [m]."""
@@ -61,6 +66,8 @@ class PlanningScene:
         Where everything stands.
     separate
         Pairs of bodies that do not always touch, whatever samples say.
+    lock
+        Lock of the planner, for the checks of its paths.
 
     Attributes
     ----------
@@ -90,9 +97,10 @@ class PlanningScene:
         protrusion: float | None,
         options: Mapping[str, Any],
         state: State,
-        separate: BodyPairs = frozenset(),
+        separate: BodyPairs,
+        lock: CallLock,
     ) -> None:
-        self.model, self.version = model, model.version
+        self.model, self.version, self._lock = model, model.version, lock
         self.space = space = PlanningSpace(model, move)
         self.scene = scene = Scene(model, rules=rules, **options)
         if not scene.bodies:
@@ -135,10 +143,15 @@ class PlanningScene:
         self.checker.place(self.state)
 
     def set_bounds(
-        self, start: Array, points: Array, still: Flags | None = None, beyond: float = BEYOND
+        self,
+        start: Array,
+        points: Array,
+        still: Flags | None = None,
+        beyond: float = BEYOND,
+        turn: float | Array = HALF_TURN,
     ) -> None:
         """Set the bounds of a search from a start (n,) to points (N, n); some coordinates may stand still."""
-        lower, upper = self.space.bounds(start, points, beyond)
+        lower, upper = self.space.bounds(start, points, beyond, turn)
         if still is not None:
             lower, upper = np.where(still, start, lower), np.where(still, start, upper)
         self.checker.lower[:], self.checker.upper[:] = lower, upper
@@ -214,14 +227,15 @@ class PlanningScene:
         edges: int = MOST_EDGES,
         roadmap: Roadmap | None = None,
         optimize: bool = False,
+        around: bool = True,
     ) -> Path:
         """Return a path from a configuration (n,) to any of some ends (K, n), see :meth:`.Planner.plan`.
 
-        Bodies of the pairs ``touching`` may touch, and some coordinates may stand still.
+        Bodies of the pairs ``touching`` may touch, and some coordinates may stand still. With ``around``,
+        joints that turn fully also go the long way round.
         """
         begin, worked = perf_counter(), working_seconds()
-        # A goal that is full turns away is the nearest one that is the same.
-        ends = np.array([self.space.equivalents(end, q, most=1)[0] for end in ends])
+        given, ends = ends, np.array([self.space.equivalents(end, q, most=1)[0] for end in ends])
         self.set_bounds(q, ends, still)
         manifold = self.manifold(holds)
         with self.checker.excepting(touching):
@@ -232,25 +246,58 @@ class PlanningScene:
             usable = endpoints.check_goals(ends)
             if isinstance(usable, str):
                 return self.no_path(q, usable, begin)
-            straight = float(np.linalg.norm(ends - q, axis=1).min())
-            search = partial(
-                self._connect, first, usable, manifold, touching,
-                begin=begin, edges=edges, roadmap=roadmap, optimize=optimize,
-            )  # fmt: skip
-            best = search(seconds, seed)
+            ways = self._ways(first.q, [goal.q for goal in usable], given, ends, around and roadmap is None)
+            for k, (turn, variants) in enumerate(ways):
+                self.set_bounds(q, ends, still, turn=turn)
+                search = partial(
+                    self._connect, first.q, variants, manifold, touching,
+                    begin=begin, edges=edges, roadmap=roadmap, optimize=optimize, asked=seconds,
+                )  # fmt: skip
+                straight = min(float(np.linalg.norm(v - first.q)) for v in variants)
+                left = seconds - (working_seconds() - worked)
+                try:
+                    best = search(left if k == len(ways) - 1 else left / 2, seed)
+                except LateCheckError:
+                    why = _TOO_FAR.format(straight)
+                    return self.no_path(q, why, begin, perf_counter() - begin)
+                if best.found:
+                    break
             while optimize and best.found and best.length > straight + _SAME:
                 seed, left = seed + 1, seconds - (working_seconds() - worked)
                 if left <= 0.0:
                     break
-                path = search(left, seed)
+                try:
+                    path = search(left, seed)
+                except LateCheckError:
+                    break
                 if path.found and path.length < best.length:
                     best = path
             return replace(best, seconds=perf_counter() - begin)
 
+    def _ways(
+        self, q: Array, goals: list[Array], given: Array, ends: Array, around: bool
+    ) -> list[tuple[float | Array, list[Array]]]:
+        """Return the searches from a configuration (n,): how far joints may turn, and goals (n,).
+
+        Goals that are more than half a turn away by their values are first sought as they are given (K, n).
+        Then any that are full turns from a goal are, by the shortest ways, as the ends (K, n) are, and last
+        by the long way round. A roadmap is on a circle and needs one search.
+        """
+        short = [v for goal in goals for v in self.space.equivalents(goal, q)]
+        found: list[tuple[float | Array, list[Array]]] = [(HALF_TURN, short)]
+        if not around or not self.space.turning.any():
+            return found
+        wound = [int(np.argmin(np.abs(ends - goal).max(axis=1))) for goal in goals]
+        far = [goal + given[k] - ends[k] for goal, k in zip(goals, wound, strict=True)]
+        if any(np.abs(a - b).max() > _SAME for a, b in zip(far, goals, strict=True)):
+            found.insert(0, (np.maximum(np.abs(np.array(far) - q).max(axis=0) + _SAME, HALF_TURN), far))
+        long = [v for goal in goals for v in self.space.equivalents(goal, q, turn=FULL_TURN)]
+        return [*found, (FULL_TURN, long)]
+
     def _connect(
         self,
-        first: Endpoint,
-        goals: Sequence[Endpoint],
+        q: Array,
+        variants: Sequence[Array],
         manifold: Manifold | None,
         touching: BodyPairs,
         seconds: float,
@@ -259,18 +306,17 @@ class PlanningScene:
         edges: int,
         roadmap: Roadmap | None,
         optimize: bool,
+        asked: float,
     ) -> Path:
         """Return a path between checked ends."""
-        q = first.q
-        variants = [v for goal in goals for v in self.space.equivalents(goal.q, q)]
         targets = np.ascontiguousarray(variants, dtype=np.float32)
         starts = np.ascontiguousarray(q[None], dtype=np.float32)
-        searched = perf_counter()
+        searched, until = perf_counter(), checked_by(working_seconds(), seconds)
         if manifold is None:
             patience = MORE_PATIENCE if optimize else PATIENCE
-            found = connect(self.checker, starts, targets, seconds, seed, edges, roadmap, patience)
+            found = connect(self.checker, starts, targets, seconds, seed, edges, roadmap, patience, asked)
         else:
-            found = connect_on_manifold(self.checker, manifold, starts, targets, seconds, seed, edges)
+            found = connect_on_manifold(self.checker, manifold, starts, targets, seconds, seed, edges, asked)
         spent = perf_counter() - searched
         if found.problem:
             return self.no_path(found.points, found.problem, begin, spent, found.iterations)
@@ -279,7 +325,7 @@ class PlanningScene:
         turns = np.where(self.space.turning, np.round((points[-1] - targets) / math.tau), 0.0) * math.tau
         k = int(np.argmin(np.abs(targets + turns - points[-1]).max(axis=1)))
         points[0], points[-1] = q, variants[k] + turns[k]
-        contact = self.judge(touching).first_contact(points, _JUDGED)
+        contact = self.judge(touching).first_contact(points, _JUDGED, until)
         if contact is not None:
             problem = f"The scene finds a contact on the path: {describe_contacts([contact[1]])}."
             return self.no_path(points, problem, begin, spent, found.iterations)
@@ -322,7 +368,9 @@ class PlanningScene:
     def checks(self, touching: BodyPairs, manifold: Manifold | None) -> PathChecks:
         """Return the checks of a path at the present place."""
         state, judge = self.state, self.judge(touching)
-        return PathChecks(self.model, state, self.checker, judge, manifold, touching, self._replace)
+        return PathChecks(
+            self.model, state, self.checker, judge, manifold, touching, self._replace, self._lock
+        )
 
 
 def find_carried_bodies(model: ModelView, bodies: Sequence[str], frame: str) -> tuple[str, ...]:

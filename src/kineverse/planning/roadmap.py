@@ -160,7 +160,7 @@ class Roadmap:
             self._path.ctypes.data, len(self._path),
         )  # fmt: skip
         self.nodes_checked, self.edges_checked = s.nodes_checked, s.edges_checked
-        points = self._path[: max(count, 0)].copy() if count else starts[:1]
+        points = self._path[:count].copy() if count > 0 else starts[:1]
         return SearchResult(points, s.status, s.samples, (s.reached_start, s.reached_goal), s.gap)
 
     def _forget(self, checker: CollisionChecker) -> None:

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import itertools
+
 import numpy as np
 import pytest
 from hypothesis import example, given, settings
@@ -229,3 +231,33 @@ def test_limits_that_are_none_are_refused(
         time_parameterize([[0, 0], [1, 1]], velocity, acceleration, names(2))  # type: ignore[arg-type]
     with pytest.raises(ShapeError, match="2 columns"):
         time_parameterize([[0, 0], [1, 1]], 1, 1, names(3))
+
+
+@settings(max_examples=attempts(25), deadline=None)
+@given(seed=seeds, blended=st.booleans())
+@example(seed=0, blended=False)
+def test_points_within_rounding_of_others_or_of_a_segment_do_not_change_the_duration(
+    seed: int, blended: bool
+) -> None:
+    rng = np.random.default_rng(seed)
+    scale, n = 10.0 ** rng.integers(-3, 4), int(rng.integers(1, 5))
+    points = (
+        rng.normal(size=(int(rng.integers(2, 6)), n)) + rng.normal(size=n) * 10.0 ** rng.integers(0, 3)
+    ) * scale
+    limits = rng.uniform(0.3, 2, n) * scale, rng.uniform(0.5, 8, n) * scale
+    rounding = np.abs(points).max() * 10.0 ** rng.uniform(-16, -12.5)
+    more = [points[0]]
+    for before, after in itertools.pairwise(points):
+        fraction = rng.choice([rng.uniform(), 10.0 ** rng.uniform(-13, -2)])
+        more += [before, before + rounding * rng.normal(size=n), before + fraction * (after - before), after]
+    durations = [
+        time_parameterize(p, *limits, names(n), deviation=0.05 * scale * blended).duration
+        for p in (points, more)
+    ]
+    assert durations[1] == pytest.approx(durations[0], rel=1e-8)
+
+
+def test_waypoints_that_differ_by_rounding_do_not_stop_the_motion() -> None:
+    # 1 unit in each direction at a speed of 1, without ramps worth mentioning.
+    path = [[0.0], [1.0], [1.0 + 1e-13], [2.0]]
+    assert time_parameterize(path, 1.0, 1e3, names(1)).duration == pytest.approx(2.001, abs=1e-6)

@@ -11,6 +11,7 @@ from functools import partial
 import numpy as np
 import numpy.typing as npt
 
+from kineverse._threads import CallLock, one_at_a_time
 from kineverse.errors import InvalidValueError, ShapeError
 from kineverse.estimation.linear_algebra import singularity_named, squared_errors
 from kineverse.estimation.robust import Outliers, as_outliers
@@ -215,6 +216,7 @@ class Identifier:
         outliers: Outliers | bool | None = None,
         sequential: bool = True,
     ) -> None:
+        self._lock = CallLock()
         self._sequential = sequential
         self._outliers = as_outliers(outliers)
         self._weights = family_weights(families)
@@ -233,6 +235,7 @@ class Identifier:
     def __len__(self) -> int:
         return len(self._buffer)
 
+    @one_at_a_time
     def add(
         self,
         parent_pose: npt.ArrayLike | None,
@@ -271,6 +274,7 @@ class Identifier:
         self._result = None
 
     @property
+    @one_at_a_time
     def result(self) -> IdentificationResult:
         """Result of all poses so far.
 

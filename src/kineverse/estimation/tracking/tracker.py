@@ -14,6 +14,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import numpy.typing as npt
 
+from kineverse._threads import CallLock, one_at_a_time
 from kineverse.errors import InvalidValueError
 from kineverse.estimation.robust import Outliers, as_outliers
 from kineverse.lie import Array
@@ -161,6 +162,7 @@ class Tracker:
         )
         self._now = self._recursion.start(values, getattr(start, "stamp", None))
         self._buffer = FixedLag[TrackerState](lag)
+        self._lock = CallLock()
         self._recent: deque[tuple[float | None, Measurements, Array]] = deque(maxlen=keep)
 
     @property
@@ -215,10 +217,13 @@ class Tracker:
 
     def copy(self) -> Tracker:
         """Return an independent tracker in the same state; compiled code is shared, also between threads."""
-        other = copy.copy(self)
-        other._recent, other._buffer = self._recent.copy(), self._buffer.copy()
+        with self._lock:
+            other = copy.copy(self)
+            other._lock = CallLock()
+            other._recent, other._buffer = self._recent.copy(), self._buffer.copy()
         return other
 
+    @one_at_a_time
     def rebuild(self, model: ModelView | None = None) -> Tracker:
         """Return a tracker of an edited model with the same observations and options.
 
@@ -272,6 +277,7 @@ class Tracker:
             ]
         )
 
+    @one_at_a_time
     def reset(
         self,
         start: StateLike | None = None,
@@ -337,6 +343,7 @@ class Tracker:
             self._recent.clear()
         return self.estimate
 
+    @one_at_a_time
     def predict(
         self,
         dt: float,
@@ -394,6 +401,7 @@ class Tracker:
         given = require_mapping({} if process_noise is None else process_noise, "process_noise=")
         return {self._update_step.process_model.speed(k): require_noise(k, v) for k, v in given.items()}
 
+    @one_at_a_time
     def update(
         self,
         seen: Mapping[str, Any],
@@ -428,6 +436,7 @@ class Tracker:
         """
         return self._update(self._update_step.reader.read(seen), at, commands, inputs, process_noise)
 
+    @one_at_a_time
     def update_poses(
         self,
         poses: npt.ArrayLike,

@@ -82,9 +82,12 @@ typedef struct {
   V *x, *store, *o, *centre, *relative, *before;
   float *inflation; /* of every link */
   void *memory;
+  Watch watch;
 } Work;
 
-static int work_begin(Work *w, const Checker *c) {
+/* Work that ends after some seconds. */
+static int work_begin(Work *w, const Checker *c, double seconds) {
+  watch_begin(&w->watch, seconds);
   const size_t outputs = 12 * c->poses + c->conditions;
   const size_t vectors = 2 * c->coordinates + c->stored + outputs + 12 * c->poses + 3 * c->links + 12 + 8;
   w->memory = malloc(vectors * sizeof(V) + (c->links + 1) * sizeof(float) + 64);

@@ -31,12 +31,19 @@ INLINE void interpolate(const Checker *c, Work *w, const float *a, const float *
 /* Return 1 if all conditions hold on the way from a to b. Those that switch, such as locks, forbid thin ranges of their
    coordinates, so that these are sampled more often than collisions are. */
 static int conditions_hold(const Checker *c, Work *w, const float *a, const float *b) {
-  float samples = 0.0f;
-  for (int i = 0; i < c->coordinates; i++) samples += c->fineness[i] * fabsf(b[i] - a[i]);
-  const int blocks = (int)ceilf(samples / W);
-  const float step = 1.0f / fmaxf(samples, 1.0f);
-  for (int k = 0; k < blocks; k++) {
-    interpolate(c, w, a, b, smaller((ramp() + splat(k * W + 1.0f)) * splat(step), splat(1.0f)));
+  double samples = 0.0;
+  for (int i = 0; i < c->coordinates; i++) samples += (double)c->fineness[i] * fabsf(b[i] - a[i]);
+  const long long blocks = (long long)ceil(samples / W);
+  const double step = 1.0 / fmax(samples, 1.0);
+  for (long long k = 0; k < blocks; k++) {
+    if (is_over(&w->watch)) return 0;
+    /* The first sample of a block is computed in double: a fraction of a long way has not enough digits. */
+    const double first = (k * W + 1) * step;
+    const V lanes = smaller(ramp(), splat((float)fmax(samples - (k * W + 1), 0.0)));
+    for (int i = 0; i < c->coordinates; i++) {
+      const double way = (double)b[i] - a[i];
+      w->x[i] = fused(lanes, splat((float)(step * way)), splat((float)(a[i] + first * way)));
+    }
     evaluate(c, w);
     const V *conditions = w->o + 12 * c->poses;
     for (int i = 0; i < c->conditions; i++)
@@ -48,10 +55,11 @@ static int conditions_hold(const Checker *c, Work *w, const float *a, const floa
 /* Return 1 if no sample on the way from a, exclusive, to b, inclusive, collides. Every block sees the whole edge. */
 static int edge_is_free(const Checker *c, Work *w, const float *a, const float *b, float resolution) {
   if (!conditions_hold(c, w, a, b)) return 0;
-  const int blocks = (int)ceilf(fmaxf(distance(a, b, c->coordinates) * resolution, 1.0f) / W);
+  const long long blocks = (long long)ceilf(fmaxf(distance(a, b, c->coordinates) * resolution, 1.0f) / W);
   const float step = 1.0f / (blocks * W);
-  for (int k = 0; k < blocks; k++) {
-    interpolate(c, w, a, b, (ramp() * splat((float)blocks) + splat(blocks - k)) * splat(step));
+  for (long long k = 0; k < blocks; k++) {
+    if (is_over(&w->watch)) return 0;
+    interpolate(c, w, a, b, (ramp() * splat((float)blocks) + splat((float)(blocks - k))) * splat(step));
     evaluate(c, w);
     if (collides(c, w)) return 0;
   }
@@ -85,24 +93,20 @@ static float inflate(const Checker *c, Work *w, const V *before) {
   return largest;
 }
 
-/* Return 1 if nothing collides on the way from a to b, not only at samples. The way is cut into intervals. In each,
-   no point of a link is further from where it is in the middle than half of the way that it goes, up to second order,
-   for which 5 % are added: spheres that are larger by that cover the interval. Where larger spheres collide, the
-   interval is cut into four, until spheres grow by less than `least`. On failure the fraction is written. */
-static int edge_is_certain(const Checker *c, Work *w, const float *a, const float *b, float resolution, float least,
+/* As `edge_is_certain`, for a way that is cut into so few intervals at first that they are looked at together. */
+static int part_is_certain(const Checker *c, Work *w, const float *a, const float *b, int count, float least,
                            float *where) {
   float middle[MOST_INTERVALS];
-  *where = 0.0f;
-  if (!conditions_hold(c, w, a, b)) return 0;
-  int count = (int)ceilf(fmaxf(intervals(c, a, b, resolution), 1.0f));
-  count = (count + W - 1) / W * W;
-  if (count > MOST_INTERVALS / 4) count = MOST_INTERVALS / 4;
   float width = 1.0f / count;
   for (int k = 0; k < count; k++) middle[k] = (k + 0.5f) * width;
   while (count) {
     int hits = 0;
     float grown = 0.0f;
     for (int first = 0; first < count; first += W) {
+      if (is_over(&w->watch)) {
+        memset(w->inflation, 0, c->links * sizeof(float));
+        return 0;
+      }
       V t;
       for (int j = 0; j < W; j++) t[j] = middle[first + j < count ? first + j : count - 1];
       interpolate(c, w, a, b, t + splat(0.5f * width));
@@ -126,6 +130,32 @@ static int edge_is_certain(const Checker *c, Work *w, const float *a, const floa
     for (int k = hits - 1; k >= 0; k--)
       for (int j = 3; j >= 0; j--) middle[4 * k + j] = middle[k] + (j - 1.5f) * width;
     count = 4 * hits;
+  }
+  return 1;
+}
+
+/* Return 1 if nothing collides on the way from a to b, not only at samples. The way is cut into intervals. In each,
+   no point of a link is further from where it is in the middle than half of the way that it goes, up to second order,
+   for which 5 % are added: spheres that are larger by that cover the interval. Where larger spheres collide, the
+   interval is cut into four, until spheres grow by less than `least`. On failure the fraction is written. */
+static int edge_is_certain(const Checker *c, Work *w, const float *a, const float *b, float resolution, float least,
+                           float *where) {
+  *where = 0.0f;
+  if (!conditions_hold(c, w, a, b)) return 0;
+  const long long wanted = (long long)ceilf(fmaxf(intervals(c, a, b, resolution), 1.0f));
+  const long long parts = (wanted + MOST_INTERVALS / 4 - 1) / (MOST_INTERVALS / 4);
+  const int count = (int)((wanted + parts * W - 1) / (parts * W) * W);
+  float from[MOST_COORDINATES], to[MOST_COORDINATES];
+  for (long long k = 0; k < parts; k++) {
+    const double begin = (double)k / parts, end = (double)(k + 1) / parts;
+    for (int i = 0; i < c->coordinates; i++) {
+      from[i] = k ? to[i] : a[i];
+      to[i] = k + 1 < parts ? (float)(a[i] + end * ((double)b[i] - a[i])) : b[i];
+    }
+    if (!part_is_certain(c, w, from, to, count, least, where)) {
+      *where = (float)(begin + *where / parts);
+      return 0;
+    }
   }
   return 1;
 }
@@ -183,6 +213,7 @@ static int edge_on_manifold(const Checker *c, const Projection *p, Work *w, V *s
   int count = 0;
   *full = 0;
   for (int k = 0; k < blocks; k++) {
+    if (is_over(&w->watch)) return count;
     interpolate(c, w, a, b, (ramp() + splat(k * W + 1.0f)) * splat(step));
     I good = project(c, p, w, store, o);
     V gaps = splat(0.0f);
@@ -224,8 +255,8 @@ static void read_lanes(const Checker *c, Work *w, const float *rows, long long c
 /* Write 1 for every configuration (count, n) that is within limits, holds all conditions and does not collide. */
 EXPORTED int kineverse_valid(const Checker *c, const float *rows, long long count, unsigned char *valid) {
   Work w;
-  if (work_begin(&w, c)) return -1;
-  for (long long first = 0; first < count; first += W) {
+  if (work_begin(&w, c, INFINITY)) return -1;
+  for (long long first = 0; first < count && !is_over(&w.watch); first += W) {
     read_lanes(c, &w, rows + first * c->coordinates, count - first);
     I good = splat(0.0f) <= splat(0.0f);
     for (int i = 0; i < c->coordinates; i++)
@@ -242,8 +273,8 @@ EXPORTED int kineverse_valid(const Checker *c, const float *rows, long long coun
 EXPORTED int kineverse_edges(const Checker *c, const float *from, const float *to, long long count, double resolution,
                            double least, unsigned char *valid) {
   Work w;
-  if (work_begin(&w, c)) return -1;
-  for (long long k = 0; k < count; k++) {
+  if (work_begin(&w, c, INFINITY)) return -1;
+  for (long long k = 0; k < count && !is_over(&w.watch); k++) {
     const float *a = from + k * c->coordinates, *b = to + k * c->coordinates;
     float where;
     valid[k] = (unsigned char)(least > 0 ? edge_is_certain(c, &w, a, b, resolution, least, &where)
@@ -272,15 +303,15 @@ static void certify_short_edges(const Checker *c, Work *w, const float *points, 
 }
 
 /* Find the first collision on a polyline (count, n): return the number of its edge and write the fraction of the
-   way along it, or return -1. */
+   way along it, or return -1; -2 without memory, and -3 if the time is up. */
 EXPORTED long long kineverse_certify(const Checker *c, const float *points, long long count, double resolution,
-                                   double least, double *where) {
+                                   double least, double seconds, double *where) {
   Work w;
-  if (work_begin(&w, c)) return -2;
+  if (work_begin(&w, c, seconds)) return -2;
   const int n = (int)c->coordinates;
   long long found = -1;
   float fraction = 0.0f;
-  for (long long k = 0; k + 1 < count && found < 0;) {
+  for (long long k = 0; k + 1 < count && found < 0 && !is_over(&w.watch);) {
     unsigned char certain[W] = {0};
     int edges = 0;
     while (edges < W && k + edges + 1 < count &&
@@ -298,13 +329,13 @@ EXPORTED long long kineverse_certify(const Checker *c, const float *points, long
   }
   *where = fraction;
   work_end(&w);
-  return found;
+  return w.watch.over ? -3 : found;
 }
 
 /* Write the poses of one configuration (12 each) and the conditions; for messages and tests. */
 EXPORTED int kineverse_poses(const Checker *c, const float *row, float *outputs) {
   Work w;
-  if (work_begin(&w, c)) return -1;
+  if (work_begin(&w, c, INFINITY)) return -1;
   read_lanes(c, &w, row, 1);
   evaluate(c, &w);
   for (int k = 0; k < 12 * c->poses + c->conditions; k++) outputs[k] = w.o[k][0];

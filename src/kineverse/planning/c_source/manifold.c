@@ -3,14 +3,14 @@
 /* Project configurations (count, n) in place; write 1 for those that arrive within limits. */
 EXPORTED int kineverse_project(const Checker *c, const Projection *p, float *rows, long long count,
                              unsigned char *arrived) {
-  Search s = {.checker = c, .projection = p, .range = 1.0, .resolution = 1.0};
+  Search s = {.checker = c, .projection = p, .range = 1.0, .resolution = 1.0, .seconds = INFINITY};
   Walk k;
   const int n = (int)c->coordinates;
   if (walk_begin(&k, &s)) {
     walk_end(&k);
     return -1;
   }
-  for (long long first = 0; first < count; first += W) {
+  for (long long first = 0; first < count && !is_over(&k.w.watch); first += W) {
     read_lanes(c, &k.w, rows + first * n, count - first);
     const I good = project(c, p, &k.w, k.store, k.o);
     for (int j = 0; j < W && first + j < count; j++) {
@@ -51,7 +51,7 @@ static float relax_nodes(Walk *k, float *path, long long count, long long first,
   const int n = (int)k->s->checker->coordinates;
   V a[MOST_COORDINATES], b[MOST_COORDINATES], q[MOST_COORDINATES], *x = k->w.x;
   float gain = 0.0f;
-  for (long long block = first; block < count - 1; block += 2 * W) {
+  for (long long block = first; block < count - 1 && !is_over(&k->w.watch); block += 2 * W) {
     V before = splat(0.0f), after = splat(0.0f);
     for (int i = 0; i < n; i++) {
       for (int j = 0; j < W; j++) {
@@ -90,7 +90,7 @@ static int insert_middles(Walk *k, float *path, long long count) {
       const float *row = path + (block + 2 * j < 2 * count - 1 ? block + 2 * j : block) * n;
       for (int i = 0; i < n; i++) k->w.x[i][j] = 0.5f * (row[i - n] + row[i + n]);
     }
-    if (any(~project_free(k))) return 0;
+    if (is_over(&k->w.watch) || any(~project_free(k))) return 0;
     for (int j = 0; j < W && block + 2 * j < 2 * count - 1; j++) {
       float *row = path + (block + 2 * j) * n;
       for (int i = 0; i < n; i++) row[i] = k->w.x[i][j];
@@ -145,14 +145,13 @@ static long long relax(Walk *k, const float *path, long long count, int halvings
    are fast to relax; where something lies between them, more are tried. */
 EXPORTED long long kineverse_relax(Search *s, float *path, long long count, long long room) {
   const int n = (int)s->checker->coordinates;
-  const double begin = now();
   Walk k;
   s->range = polyline_length(path, count, n);
   int most = HALVINGS;
   while (most && (1 << most) > s->range * s->resolution) most--;
   long long found = 0;
   if (!walk_begin(&k, s))
-    for (int halvings = most, careful = 0; halvings >= 0 && !found && now() - begin < s->seconds; careful = 1) {
+    for (int halvings = most, careful = 0; halvings >= 0 && !found && !look_at_clock(&k.w.watch); careful = 1) {
       found = relax(&k, path, count, halvings, careful, k.points);
       halvings -= careful;
     }
@@ -177,11 +176,13 @@ typedef struct {
   const Projection *p;
   Doubles *x, *o, *store;
   void *memory;
+  Watch watch;
 } Polish;
 
 static int polish_begin(Polish *w, const Checker *c, const Projection *p) {
   const size_t n = c->coordinates;
   w->c = c, w->p = p;
+  watch_begin(&w->watch, INFINITY);
   w->memory = malloc((3 * n + 2 + p->exact_stored) * REGISTER + 64);
   if (!w->memory) return 1;
   w->x = (Doubles *)(((size_t)w->memory + 63) & ~(size_t)63);
@@ -224,7 +225,7 @@ EXPORTED int kineverse_polish(const Checker *c, const Projection *p, double *row
                             double *residuals) {
   Polish w;
   if (polish_begin(&w, c, p)) return -1;
-  for (long long k = 0; k < count; k += D)
+  for (long long k = 0; k < count && !is_over(&w.watch); k += D)
     polish_block(&w, rows + k * c->coordinates, count - k, steps, residuals + k);
   free(w.memory);
   return 0;
@@ -291,6 +292,10 @@ EXPORTED long long kineverse_refine(const Checker *c, const Projection *p, doubl
     before = count;
     for (long long k = 0; k < count && before > 0; k += D) {
       double residuals[D];
+      if (is_over(&w.watch)) {
+        before = -1;
+        break;
+      }
       polish_block(&w, points + k * n, count - k, steps, residuals);
       for (int j = 0; j < D && k + j < count; j++)
         if (!(residuals[j] <= p->exact_tolerance)) before = -1;

@@ -233,15 +233,17 @@ static int node_is_usable(Query *s, int k) {
   return r->node[k] == FREE;
 }
 
-/* The state of the way from a to b, free, blocked, or certain. */
+/* The state of the way from a to b, free, blocked, or certain; unknown if the time was up before it was clear. */
 static int check_way(Query *s, const float *a, const float *b, int certain) {
   Roadmap *r = s->r;
   float to[MOST_COORDINATES], where;
   for (int i = 0; i < r->checker->coordinates; i++) to[i] = unwind(b[i], a[i], r->period[i]);
   r->edges_checked++;
   const float resolution = (float)r->resolution;
-  if (certain) return edge_is_certain(r->checker, &s->w, a, to, resolution, (float)r->least, &where) ? CERTAIN : BLOCKED;
-  return edge_is_free(r->checker, &s->w, a, to, resolution) ? FREE : BLOCKED;
+  const int free_ = certain ? edge_is_certain(r->checker, &s->w, a, to, resolution, (float)r->least, &where)
+                            : edge_is_free(r->checker, &s->w, a, to, resolution);
+  if (free_) return certain ? CERTAIN : FREE;
+  return s->w.watch.over ? UNKNOWN : BLOCKED;
 }
 
 static int edge_is_usable(Query *s, long long e, int certain) {
@@ -250,7 +252,9 @@ static int edge_is_usable(Query *s, long long e, int certain) {
     float a[MOST_COORDINATES], b[MOST_COORDINATES];
     node_read(r, e / r->degree, a);
     node_read(r, r->targets[e], b);
-    r->edge[e] = (unsigned char)check_way(s, a, b, certain);
+    const int state = check_way(s, a, b, certain);
+    if (state == UNKNOWN) return 0;
+    r->edge[e] = (unsigned char)state;
   }
   return r->edge[e] != BLOCKED;
 }
@@ -315,7 +319,7 @@ static int search_round(Query *s, double until, int only_start, int *met) {
   }
   for (long long steps = 0;; steps++) {
     if (!s->queues[0].count || (!s->queues[1].count && !only_start)) return 0;
-    if ((steps & 15) == 15 && now() - s->begin > until) return 0;
+    if (s->w.watch.over || ((steps & 15) == 15 && (look_at_clock(&s->w.watch) || now() - s->begin > until))) return 0;
     const int side = s->queues[1].count && (steps & 1);
     const int outcome = advance(s, side, met);
     if (outcome) return outcome;
@@ -364,7 +368,7 @@ static int grow(Query *s, long long batch, double until) {
   const long long most = r->room - r->room / 8;
   int near[MOST_DEGREE];
   float rows[W * MOST_COORDINATES], away[MOST_DEGREE];
-  for (long long tries = 0; batch > 0 && tries < 64 && now() - s->begin < until; tries++) {
+  for (long long tries = 0; batch > 0 && tries < 64 && !look_at_clock(&s->w.watch) && now() - s->begin < until; tries++) {
     for (int j = 0; j < W; j++) {
       float *q = rows + j * n;
       for (int i = 0; i < n; i++) {
@@ -444,7 +448,8 @@ static long long straight_way(Query *s, const float *starts, long long start_cou
     for (long long j = 1; j < goal_count; j++)
       if (distance_around(s->r, starts + i * n, goals + j * n) < distance_around(s->r, starts + i * n, goal))
         goal = goals + j * n;
-    if (check_way(s, starts + i * n, goal, 0) == BLOCKED) continue;
+    const int state = check_way(s, starts + i * n, goal, 0);
+    if (state == BLOCKED || state == UNKNOWN) continue;
     memcpy(path, starts + i * n, n * sizeof(float));
     memcpy(path + n, goal, n * sizeof(float));
     return 2;
@@ -472,7 +477,7 @@ static long long search_roadmap(Query *s, float *path, long long room) {
     r->status = FOUND;
     if (outcome < 0 || (outcome && path_is_certain(s, met))) break;
     r->status = TIME_IS_UP;
-    if (now() - s->begin > until) break;
+    if (s->w.watch.over || now() - s->begin > until) break;
     if (outcome) continue;
     /* A round costs as much as the smaller side is large, and so may nodes. */
     const long long smaller_side = s->reached[0] < s->reached[1] ? s->reached[0] : s->reached[1];
@@ -488,12 +493,12 @@ static long long search_roadmap(Query *s, float *path, long long room) {
   }
   if (r->status != FOUND)
     do outcome = search_round(s, r->seconds, 1, &met);
-    while (outcome > 0 && !path_is_certain(s, met));
+    while (outcome > 0 && !path_is_certain(s, met) && !s->w.watch.over);
   if (outcome < 0) {
     r->status = NO_MEMORY;
     return -1;
   }
-  if (outcome == 0) {
+  if (outcome == 0 || s->w.watch.over) {
     float gap;
     const int best = nearest_pair(s, &gap);
     r->gap = gap;
@@ -504,7 +509,7 @@ static long long search_roadmap(Query *s, float *path, long long room) {
   const int n = (int)r->checker->coordinates;
   /* Both sides have the node at which they meet. */
   const long long rest = first < 0 ? -1 : trace(s, 1, met, 1, path + (first - 1) * n, room - first + 1);
-  if (rest < 0) r->status = NO_MEMORY;
+  if (rest < 0) r->status = TOO_LONG;
   return rest < 0 ? -1 : first + rest - 1;
 }
 
@@ -524,7 +529,7 @@ EXPORTED long long kineverse_roadmap(Roadmap *r, const float *starts, long long 
   s.ends[0] = malloc((start_count + goal_count + 1) * sizeof(int));
   s.ends[1] = s.ends[0] + start_count;
   long long count = -1;
-  if (!s.ends[0] || work_begin(&s.w, r->checker)) goto end;
+  if (!s.ends[0] || work_begin(&s.w, r->checker, r->seconds)) goto end;
   count = straight_way(&s, starts, start_count, goals, goal_count, path);
   if (count) {
     r->status = FOUND;

@@ -3,14 +3,6 @@
    Both trees grow step by step until something is in the way. Samples lie in a box around the tree that grows: others
    would mostly pull nodes at its rim against the same obstacles, as those that dynamic domains reject (Yershova et al.
    2005). The box grows with the tree. */
-#include <time.h>
-
-static double now(void) {
-  struct timespec t;
-  clock_gettime(CLOCK_MONOTONIC, &t);
-  return t.tv_sec + 1e-9 * t.tv_nsec;
-}
-
 /* splitmix64 */
 typedef unsigned long long Random;
 INLINE Random random_bits(Random *state) {
@@ -109,7 +101,7 @@ typedef struct {
   double elapsed, gap;
 } Search;
 
-enum { FOUND, TIME_IS_UP, TOO_MANY_NODES, NO_MEMORY };
+enum { FOUND, TIME_IS_UP, TOO_MANY_NODES, NO_MEMORY, TOO_LONG };
 
 typedef struct {
   Search *s;
@@ -124,7 +116,7 @@ static int walk_begin(Walk *k, Search *s) {
   memset(k, 0, sizeof *k);
   k->s = s;
   const int n = (int)s->checker->coordinates;
-  if (work_begin(&k->w, s->checker)) return 1;
+  if (work_begin(&k->w, s->checker, s->seconds)) return 1;
   if (s->projection) {
     const size_t vectors = s->projection->stored + n + 4;
     k->room = (int)ceil(s->range * s->resolution) + 4 * W + 2;
@@ -181,7 +173,7 @@ static int tree_advance(Walk *k, Tree *t, int first, const float *goal, int *met
     if (*met) break;
     towards(from, goal, n, range, to);
     outcome = extend(k, from, to, reached);
-    if (!outcome) break;
+    if (!outcome || k->w.watch.over) break;
     /* Points between two points of a manifold are off it, and their projections are not where they were. */
     const float after = distance(reached, goal, n);
     *met = outcome == 2 && before <= range && after < 1e-3f;
@@ -192,11 +184,12 @@ static int tree_advance(Walk *k, Tree *t, int first, const float *goal, int *met
 }
 
 /* Write the configurations from a root to node j, or backwards; return their number, or -1 without room. On a manifold
-   the edges are gone again, with all their points. */
+   the edges are gone again, with all their points, also when the time is up: they are few. */
 static long long branch(Walk *k, const Tree *t, int j, int backwards, float *out, long long room) {
   const Checker *c = k->s->checker;
   const int n = (int)c->coordinates;
   long long depth = 0, count = 0;
+  if (k->w.watch.over != INTERRUPTED) watch_begin(&k->w.watch, INFINITY);
   for (int i = j; i >= 0; i = t->parent[i]) depth++;
   int *nodes = malloc(depth * sizeof(int));
   if (!nodes) return -1;
@@ -210,7 +203,7 @@ static long long branch(Walk *k, const Tree *t, int j, int backwards, float *out
       points = edge_on_manifold(c, k->s->projection, &k->w, k->store, k->o, from, t->aims + (long long)nodes[i] * n,
                                 (float)k->s->resolution, k->points, &full, to);
     }
-    if (count + points > room) {
+    if (k->w.watch.over || count + points > room) {
       count = -1;
       break;
     }
@@ -259,7 +252,7 @@ EXPORTED long long kineverse_rrt_connect(Search *s, const float *starts, long lo
   int grown = 0;
   s->status = TIME_IS_UP;
   for (;; s->iterations++) {
-    if ((s->iterations & 15) == 0 && now() - begin > s->seconds) break;
+    if (k.w.watch.over || ((s->iterations & 15) == 0 && look_at_clock(&k.w.watch))) break;
     if (trees[0].count + trees[1].count > s->nodes || s->edges > s->most_edges) {
       s->status = TOO_MANY_NODES;
       break;
@@ -290,13 +283,14 @@ EXPORTED long long kineverse_rrt_connect(Search *s, const float *starts, long lo
       s->status = NO_MEMORY;
       break;
     }
+    if (k.w.watch.over) break;
     if (met) {
       const int a = grown ? last : fresh, b = grown ? fresh : last;
       const long long first = branch(&k, &trees[0], a, 0, path, room);
       /* In the whole space both trees have the same configuration where they meet. */
       const long long joint = s->projection ? first : first - 1;
       const long long rest = first < 0 ? -1 : branch(&k, &trees[1], b, 1, path + joint * n, room - joint);
-      s->status = rest < 0 ? NO_MEMORY : FOUND;
+      s->status = rest < 0 ? TOO_LONG : FOUND;
       if (rest >= 0) count = joint + rest;
       best_gap = 0.0f;
       break;
@@ -324,10 +318,10 @@ EXPORTED long long kineverse_shortcut(Search *s, float *path, long long count, l
   const double begin = now();
   Random random = (Random)s->seed * 0x2545f4914f6cdd1dULL + 0x9e3779b97f4a7c15ULL;
   Work w;
-  if (work_begin(&w, c)) return count;
+  if (work_begin(&w, c, s->seconds)) return count;
   float *along = malloc(room * sizeof(float));
   for (long long tries = 0, failures = 0; along && failures < patience && count > 2; tries++, failures++) {
-    if ((tries & 7) == 0 && now() - begin > s->seconds) break;
+    if (w.watch.over || ((tries & 7) == 0 && look_at_clock(&w.watch))) break;
     along[0] = 0.0f;
     for (long long k = 1; k < count; k++) along[k] = along[k - 1] + distance(path + (k - 1) * n, path + k * n, n);
     float one = random_unit(&random) * along[count - 1], other = random_unit(&random) * along[count - 1];

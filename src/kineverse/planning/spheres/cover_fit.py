@@ -155,7 +155,8 @@ def _search_start(
         # A greedy choice may need more spheres for a larger protrusion.
         while len(centres := start.greedy(wanted)) > most:
             wanted *= 1.1
-        if len(centres) in tried:
+        # No candidate may be inside of a thin plate, nor any point of a lattice.
+        if not len(centres) or len(centres) in tried:
             break
         tried.add(len(centres))
         found = descend(problem, centres, aim, _FEW_ROUNDS)
@@ -165,7 +166,7 @@ def _search_start(
     for factor in (1.3, 1.1):
         centres = start.lattice(factor * aim, most)
         reached = best.protrusion <= aim
-        if len(centres) in tried or len(centres) > (len(best.radii) if reached else most):
+        if not len(centres) or len(centres) in tried or len(centres) > (len(best.radii) if reached else most):
             continue
         tried.add(len(centres))
         found = descend(problem, centres, aim, _FEW_ROUNDS)

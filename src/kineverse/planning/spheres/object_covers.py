@@ -40,7 +40,13 @@ def cover_objects(
     solids, key = _request(items, protrusion, most)
     found = None if force else find_cover(key)
     if found is None:
-        found = cover_solids(solids, protrusion, most)
+        try:
+            found = cover_solids(solids, protrusion, most)
+        except InvalidValueError as error:
+            raise InvalidValueError(
+                f"No spheres cover the shapes of body '{items[0].body}' ({_name(items)}): {error} Make them "
+                "thicker, or leave the body out: Planner(model, leave_out=[...])."
+            ) from None
         keep_cover(key, _name(items), found)
     return found
 

@@ -9,6 +9,7 @@ nearest to the corner in its middle, at the distance l·|d₂ - d₁|/4.
 
 from __future__ import annotations
 
+import itertools
 from collections.abc import Callable
 from dataclasses import dataclass
 from typing import TypeAlias
@@ -26,7 +27,12 @@ _HALVINGS = 8
 """Number of times that a blend is halved before the path stops at the corner."""
 
 _STRAIGHT = 1e-9
-"""Norm of d₂ - d₁ below which there is no corner."""
+"""Norm of d₂ - d₁ below which there is no corner; and the length of a step, relative to that of the path,
+below which it has no direction."""
+
+_ROUNDING = 1e-12
+"""Error of points, relative to 1 and to their largest coordinate: some thousand units in the last place, as
+computations leave them."""
 
 _RESOLUTION = 1 / 32
 """Largest distance between two configurations of a blend that are checked [rad], [m]."""
@@ -56,9 +62,7 @@ class BlendedPath:
     @property
     def turns(self) -> npt.NDArray[np.bool_]:
         """Flags of the inner corners where the direction changes (N-2,)."""
-        turn = np.linalg.norm(np.diff(self.directions, axis=0), axis=1)
-        turns: npt.NDArray[np.bool_] = turn > _STRAIGHT
-        return turns
+        return _find_turns(self.points, self.directions, self.lengths)
 
     @property
     def deviation(self) -> Array:
@@ -89,9 +93,10 @@ def round_corners(
 ) -> BlendedPath:
     """Return a polyline with rounded corners.
 
-    Successive equal points count once. A blend takes at most half of an inner segment. It is halved until all
-    its configurations are valid, at most 8 times; after that, the path goes through the corner, and has to
-    stop there.
+    Successive points that are equal up to rounding count once, and points on the line between their
+    neighbours take no room from blends. A blend takes at most half of an inner segment. It is halved until
+    all its configurations are valid, at most 8 times; after that, the path goes through the corner, and has
+    to stop there.
 
     Parameters
     ----------
@@ -124,25 +129,79 @@ def round_corners(
         )
     if not (allowed >= 0).all():
         raise InvalidValueError(f"deviation= is a distance from 0, not {allowed}.")
-    steps = np.linalg.norm(np.diff(polyline, axis=0), axis=1)
-    # A step below the rounding of the points has no direction.
-    keep = np.concatenate(([True], steps > 8 * np.finfo(float).eps * (1 + np.abs(polyline).max())))
+    keep = _find_distinct(polyline)
+    if len(keep) > 2 and allowed.any():
+        keep = keep[_find_corners(polyline[keep])]
     kept = polyline[keep]
+    directions, lengths = _segments(kept)
     if len(kept) == 1:
-        return _frozen(kept, np.zeros((0, kept.shape[1])), np.zeros(0), np.zeros(0))
-    kept[-1] = polyline[-1]
-    segments = np.diff(kept, axis=0)
-    lengths = np.linalg.norm(segments, axis=1)
-    directions = segments / lengths[:, None]
+        return _frozen(kept, directions, lengths, np.zeros(0))
     turn = np.linalg.norm(np.diff(directions, axis=0), axis=1)
+    turns = _find_turns(kept, directions, lengths)
     room = lengths / 2
     room[[0, -1]] = lengths[[0, -1]]  # no blend takes the other half
     inner = np.broadcast_to(allowed, polyline.shape[:1])[keep][1:-1]
     reach = np.minimum(room[:-1], room[1:])
-    wide = np.where(turn > _STRAIGHT, turn, 1.0)
-    reach = np.where(turn > _STRAIGHT, np.minimum(reach, 4 * inner / wide), 0.0)
+    reach = np.where(turns, np.minimum(reach, 4 * inner / np.where(turns, turn, 1.0)), 0.0)
     path = _frozen(kept, directions, lengths, reach)
     return path if valid is None else _shrink(path, valid, resolution)
+
+
+def _segments(points: Array) -> tuple[Array, Array]:
+    """Return the directions (N-1, n) and lengths (N-1,) of a polyline (N, n)."""
+    steps = np.diff(points, axis=0)
+    lengths = np.linalg.norm(steps, axis=1)
+    return steps / lengths[:, None], lengths
+
+
+def _rounding(points: Array) -> float:
+    """Return the error of the coordinates of points (N, n)."""
+    return _ROUNDING * (1.0 + float(np.abs(points).max()))
+
+
+def _find_turns(points: Array, directions: Array, lengths: Array) -> npt.NDArray[np.bool_]:
+    """Return flags of the inner corners (N-2,) where the direction changes by more than rounding explains."""
+    turn = np.linalg.norm(np.diff(directions, axis=0), axis=1)
+    shorter = np.minimum(lengths[:-1], lengths[1:])
+    turns: npt.NDArray[np.bool_] = turn > _STRAIGHT + _rounding(points) / shorter
+    return turns
+
+
+def _find_distinct(points: Array) -> npt.NDArray[np.intp]:
+    """Return the indices of points (N, n) without those that are as good as equal to the one before."""
+    steps = np.linalg.norm(np.diff(points, axis=0), axis=1)
+    apart = max(_rounding(points), _STRAIGHT * float(steps.sum()))
+    if (steps > apart).all():
+        return np.arange(len(points))
+    kept = [0]
+    for k in range(1, len(points)):
+        if np.linalg.norm(points[k] - points[kept[-1]]) > apart:
+            kept.append(k)
+    if len(kept) > 1:
+        kept[-1] = len(points) - 1 if np.linalg.norm(points[-1] - points[kept[-1]]) <= apart else kept[-1]
+    return np.array(kept)
+
+
+def _find_corners(points: Array) -> npt.NDArray[np.intp]:
+    """Return the indices of points (N, n), no two equal in a row, without those on a line with others.
+
+    A curve of many points turns at none of them, so that the line between the ends of a straight part
+    decides. On a path that never turns all count.
+    """
+    turns = _find_turns(points, *_segments(points))
+    if not turns.any():
+        return np.arange(len(points))
+    ends = np.concatenate(([0], 1 + np.flatnonzero(turns), [len(points) - 1]))
+    kept = [np.array([0])]
+    for first, last in itertools.pairwise(ends.tolist()):
+        inner = points[first + 1 : last] - points[first]
+        chord = points[last] - points[first]
+        length = float(np.linalg.norm(chord))
+        direction = chord / max(length, np.finfo(float).tiny)
+        off = np.linalg.norm(inner - (inner @ direction)[:, None] * direction, axis=1)
+        straight = off.max(initial=0.0) <= _STRAIGHT * length + _rounding(points)
+        kept.append(np.array([last]) if straight else np.arange(first + 1, last + 1))
+    return np.concatenate(kept)
 
 
 def _shrink(path: BlendedPath, valid: Validity, resolution: float) -> BlendedPath:

@@ -1,0 +1,178 @@
+"""Build all C with sanitizers for addresses and undefined behaviour, and run what uses it.
+
+python tools/sanitize.py             warnings of the hand-written C, and the tests of the packages with C
+python tools/sanitize.py tests/...   some tests only
+python tools/sanitize.py --short     a batch, a distance, a plan and an update instead of the tests
+
+Needs gcc with its libraries libasan and libubsan. The first report ends a run.
+"""
+
+import os
+import shutil
+import stat
+import subprocess
+import sys
+import tempfile
+from pathlib import Path
+
+ROOT = Path(__file__).parents[1]
+PACKAGES = ("compile", "geometry", "planning", "estimation", "control")
+WARNINGS = ("-Wall", "-Wextra", "-Werror", "-Wno-unused-function")  # shared headers have functions for others
+
+# What is compiled once and run once is compiled faster than it is optimised.
+COMPILER = """#!/bin/sh
+for argument; do
+    shift
+    case "$argument" in -O2 | -O3) argument=-Og ;; esac
+    set -- "$@" "$argument"
+done
+exec gcc -fsanitize=address,undefined -fno-sanitize-recover=undefined -fno-omit-frame-pointer -g1 "$@"
+"""
+
+# CasADi asks for symbols of its own first, which the library of the sanitizer refuses.
+PRELOADED = """
+#define _GNU_SOURCE
+#include <dlfcn.h>
+void *dlopen(const char *path, int flags) {
+  void *(*next)(const char *, int) = (void *(*)(const char *, int))dlsym(RTLD_NEXT, "dlopen");
+  return next(path, flags & ~RTLD_DEEPBIND);
+}
+"""
+
+
+def find_libraries() -> list[str] | None:
+    """Return the paths of gcc's libraries for sanitizers, or None."""
+    if shutil.which("gcc") is None or not sys.platform.startswith("linux"):
+        return None
+    found = []
+    for name in ("libasan.so", "libubsan.so"):
+        path = subprocess.run(
+            ["gcc", f"-print-file-name={name}"], capture_output=True, text=True
+        ).stdout.strip()
+        if not os.path.isabs(path):
+            return None
+        found.append(path)
+    return found
+
+
+def environment(folder: Path, libraries: list[str]) -> dict[str, str]:
+    """Return an environment in which all C is built with sanitizers, with files in a folder."""
+    compiler, preloaded = folder / "sanitizing-gcc", folder / "preloaded.so"
+    compiler.write_text(COMPILER)
+    compiler.chmod(compiler.stat().st_mode | stat.S_IXUSR)
+    build = ["gcc", "-shared", "-fPIC", "-x", "c", "-", "-o", str(preloaded)]
+    subprocess.run(build, input=PRELOADED, text=True, check=True)
+    source = os.pathsep.join(filter(None, (str(ROOT / "src"), os.environ.get("PYTHONPATH"))))
+    return {
+        **os.environ,
+        "PYTHONPATH": source,
+        "CC": str(compiler),
+        "KINEVERSE_CACHE_DIR": str(folder / "cache"),
+        "LD_PRELOAD": ":".join([str(preloaded), *libraries]),
+        # Python keeps memory until it ends, and preloaded.so comes before the sanitizer.
+        "ASAN_OPTIONS": "detect_leaks=0:verify_asan_link_order=0:allocator_may_return_null=1",
+        "UBSAN_OPTIONS": "print_stacktrace=1",
+        # Arrays have an end of their own each.
+        "PYTHONMALLOC": "malloc",
+    }
+
+
+def find_warnings() -> list[str]:
+    """Return the compiler's warnings about each of the hand-written sources."""
+    from kineverse.compile.c_library import SourceLibrary
+    from kineverse.compile.toolchain import FLOATING_POINT_FLAGS
+    from kineverse.control import contact_rows, qp_solver
+    from kineverse.estimation.identification import bindings as identification
+    from kineverse.estimation.tracking import bindings as tracking
+    from kineverse.geometry import bindings as geometry
+    from kineverse.planning import bindings as planning
+
+    planning._library()
+    libraries = {
+        id(found): (module.__name__, found)
+        for module in (contact_rows, qp_solver, identification, tracking, geometry)
+        for found in vars(module).values()
+        if isinstance(found, SourceLibrary)
+    }
+    libraries[0] = (planning.__name__, planning._library())
+    reports = []
+    for name, library in libraries.values():
+        flags = (*FLOATING_POINT_FLAGS, "-std=gnu11", "-O1", *WARNINGS)
+        command = ["gcc", *flags, "-fsyntax-only", "-x", "c", "-"]
+        result = subprocess.run(command, input=library._source, text=True, capture_output=True)
+        if result.returncode:
+            reports.append(f"{name}:\n{result.stderr}")
+    return reports
+
+
+def run_short() -> None:
+    """Compute a bit of everything; for a process in the environment."""
+    import numpy as np
+
+    import kineverse as kv
+    from kineverse.model.body import Body, Box, Capsule, Shape, Sphere
+
+    symbols = [kv.position(name) for name in "xyz"]
+    for inputs in (1, 2, 3):
+        f = kv.compile(sum(symbols[:inputs], kv.expressions.array(0.0)), symbols[:inputs], tier="c")
+        for rows in (0, 1, *range(8, 24)):
+            points = np.arange(float(rows * inputs)).reshape(rows, inputs)
+            assert np.array_equal(f.batch(points), points.sum(axis=1))
+
+    model, (x, y, _) = kv.Model(), symbols
+    with model.edit() as edit:
+        shapes = (Box((0.1, 0.2, 0.1)), Capsule(0.05, 0.2), Sphere(0.05))
+        pose = kv.translation(x, y, 0)
+        edit.add_frame("hand", "world", pose, Body(collisions=tuple(map(Shape, shapes))))
+        for k in range(9):
+            edit.add_frame(
+                f"post{k}", "world", kv.translation(0, k - 4, 0), Body(collisions=(Shape(shapes[k % 3]),))
+            )
+        edit.constrain("x", -2, x, 2)
+        edit.constrain("y", -5, y, 5)
+    scene = kv.geometry.Scene(model)
+    scene.update({"x": -1.0, "y": 0.0})
+    assert 0.5 < scene.distance("hand", "post4").distance < 1.0
+
+    planner = kv.planning.Planner(model)
+    path = planner.plan([-1.0, 0.0], [1.0, 0.0], seconds=30.0)
+    assert path, path.why
+    assert path.clearance() > 0.0
+
+    tracker = kv.estimation.Tracker(model, ["hand"], start={"x": 0.1, "y": 0.1})
+    tracker.wait()
+    for _ in range(3):
+        tracker.update({"hand": np.array(kv.translation(0.2, 0.1, 0)())})
+    assert abs(tracker.estimate.state[x] - 0.2) < 0.05
+
+    controller = kv.control.Controller(model, [kv.control.Goal(x, 1.0)], scene=scene, dt=0.02)
+    controller.wait()
+    controller.step({"x": 0.3, "y": 0.5})
+
+
+def main(arguments: list[str]) -> int:
+    """Run the command line and return its status."""
+    libraries = find_libraries()
+    if libraries is None:
+        print(
+            "Sanitizers need gcc with libasan and libubsan, on Linux: install gcc, or the package libgcc-dev."
+        )
+        return 2
+    reports = [] if arguments == ["--short"] else find_warnings()
+    print(*reports, sep="\n", end="")
+    with tempfile.TemporaryDirectory(prefix="kineverse-sanitizers-") as name:
+        command = [sys.executable, "-m", "pytest", "-q", "-x", "--assert=plain", "-p", "no:cacheprovider"]
+        command += arguments or [str(ROOT / "tests" / package) for package in PACKAGES]
+        if arguments == ["--short"]:
+            command = [sys.executable, __file__, "--inside"]
+        status = subprocess.run(command, env=environment(Path(name), libraries), cwd=ROOT).returncode
+    if reports or status:
+        print("Found: warnings, or what stands above.")
+    return status or bool(reports)
+
+
+if __name__ == "__main__":
+    if sys.argv[1:] == ["--inside"]:
+        run_short()
+    else:
+        sys.exit(main(sys.argv[1:]))
