@@ -228,7 +228,7 @@ def test_plan_after_its_budget_is_undecided():
     plan = plan_unlocking(model, goal_of(box), budget=1e-9)
     assert plan.verdict == "undecided"
     assert not plan.steps
-    assert "undecided after" in str(plan)
+    assert "undecided, since the budget was spent after" in str(plan)
 
 
 def test_plan_of_a_goal_that_is_reached():

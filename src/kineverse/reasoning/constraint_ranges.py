@@ -1,0 +1,133 @@
+"""Ranges of constraints over boxes of positions, by interval arithmetic, without a split into cases."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass
+
+from kineverse.expressions.expression import Expression
+from kineverse.expressions.substitution import apply_substitution
+from kineverse.intervals.arithmetic import REALS, RealInterval
+from kineverse.intervals.enclosure import Enclosures
+from kineverse.intervals.graph import Term, TermGraph
+from kineverse.model.constraint import Constraint
+from kineverse.model.model_view import ModelView
+from kineverse.model.rate_nodes import to_plain
+from kineverse.symbols import Symbol
+
+SLOW = 1e-6
+"""Speed that constraints admit wherever a coordinate may move [m/s] or [rad/s]."""
+NOTHING = 1e-9
+"""Largest excess of a constraint that counts as satisfied; also a speed that is none."""
+
+_NOT_MOVING: RealInterval = (0.0, 0.0)
+Box = Mapping[Symbol, RealInterval]
+
+
+@dataclass(frozen=True)
+class _Row:
+    """Terms of a constraint, and the symbols of each."""
+
+    order: int
+    lower: Term | float
+    value: Term
+    upper: Term | float
+    symbols: tuple[Symbol, ...]
+
+
+class ConstraintRanges:
+    """Excesses of the constraints of a model over boxes of positions.
+
+    Parameters
+    ----------
+    model
+        The model. Dependent coordinates follow the others, parameters have their values.
+    """
+
+    def __init__(self, model: ModelView) -> None:
+        self.rows: dict[str, Constraint] = {}
+        self.limits: dict[Symbol, RealInterval] = {}
+        for name, c in model.constraints.items():
+            row = Constraint(to_plain(c.lower), to_plain(c.expression), to_plain(c.upper))
+            self.rows[name] = row
+            if isinstance(row.expression, Symbol) and not row.lower.symbols and not row.upper.symbols:
+                low, high = self.limits.get(row.expression, REALS)
+                self.limits[row.expression] = max(low, float(row.lower)), min(high, float(row.upper))
+        self._dependent = dict(model.rates.dependent)
+        self._graph = TermGraph({})
+        self._enclosures = Enclosures(self._graph)
+        self._known: dict[str, _Row] = {}
+        self._excesses: dict[tuple[object, ...], tuple[RealInterval, RealInterval]] = {}
+        self._about: dict[Symbol, list[str]] = {}
+        for name, row in self.rows.items():
+            for symbol in self._symbols_of(row):
+                self._about.setdefault(symbol, []).append(name)
+
+    def about(self, symbol: Symbol) -> Iterable[str]:
+        """Return the names of the constraints that depend on a symbol."""
+        return self._about.get(symbol, ())
+
+    def refuses(self, speed: Symbol, forward: float, box: Box) -> bool | None:
+        """Return whether constraints admit no slow speed anywhere in a box, None if only in a part of it."""
+        answer: bool | None = False
+        for name in self.about(speed):
+            if self.rows[name].order == 1:
+                low, high = self.excess(name, {**box, speed: (forward * SLOW, forward * SLOW)})
+                if low > NOTHING:
+                    return True
+                if high > NOTHING:
+                    answer = None
+        return answer
+
+    def excess(self, name: str, box: Box) -> RealInterval:
+        """Return the range of the excess of a constraint over a box, negative where it holds strictly.
+
+        Positions that the box lacks are anywhere within their limits, and speeds are 0.
+        """
+        below, above = self.excesses(name, box)
+        return max(below[0], above[0]), max(below[1], above[1])
+
+    def excesses(self, name: str, box: Box) -> tuple[RealInterval, RealInterval]:
+        """Return the ranges of lower bound - value and of value - upper bound over a box."""
+        row = self._row(name)
+        sides = tuple(self._side(box, s) for s in row.symbols)
+        key = name, sides
+        if key not in self._excesses:
+            values = {s: (side,) for s, side in zip(row.symbols, sides, strict=True)}
+            terms = [t for t in (row.value, row.lower, row.upper) if isinstance(t, Term)]
+            ranges = dict(zip(terms, (s[0] for s in self._enclosures.enclose(terms, values)), strict=True))
+            low, high = ranges[row.value]
+            lower, upper = (
+                (end, end) if isinstance(end, float) else ranges[end] for end in (row.lower, row.upper)
+            )
+            self._excesses[key] = (lower[0] - high, lower[1] - low), (low - upper[1], high - upper[0])
+        return self._excesses[key]
+
+    def _side(self, box: Box, symbol: Symbol) -> RealInterval:
+        if symbol in box:
+            return box[symbol]
+        if symbol.value is not None:
+            return symbol.value, symbol.value
+        return _NOT_MOVING if symbol.order else self.limits.get(symbol, REALS)
+
+    def _row(self, name: str) -> _Row:
+        if name not in self._known:
+            row = self.rows[name]
+            ends = [
+                float(end) if not end.symbols else self._graph.term(self._follow(end))
+                for end in (row.lower, row.upper)
+            ]
+            value = self._graph.term(self._follow(row.expression))
+            symbols = tuple(sorted(self._symbols_of(row), key=lambda s: s.sort_key))
+            self._known[name] = _Row(row.order, ends[0], value, ends[1], symbols)
+        return self._known[name]
+
+    def _follow(self, expression: Expression) -> Expression:
+        return apply_substitution(expression, self._dependent) if self._dependent else expression
+
+    def _symbols_of(self, row: Constraint) -> set[Symbol]:
+        own = {s for part in (row.lower, row.expression, row.upper) for s in part.symbols}
+        for s in own & self._dependent.keys():
+            own = (own - {s}) | set(self._dependent[s].symbols)
+        return own
