@@ -19,9 +19,9 @@ if TYPE_CHECKING:
 
 HELP = """find the order in which locked parts have to move
 
-The interlocks of the model are derived from its constraints. Each step is printed with its reason. Both
-answers are checked by evaluating the constraints. If the goal cannot be reached, the locks that prevent it are
-printed, and the exit status is 1; it is 3 if that stays undecided.
+The interlocks of the model are derived from its constraints. Each step is printed with its reason. If the
+goal cannot be reached, the locks that prevent it are printed, and the exit status is 1; it is 3 if that stays
+undecided. Both answers are checked by evaluating the constraints.
 
 With --execute the parts are moved as planned, in a world that has the constraints of the model: by the
 velocity controller, one at a time. If one does not move, the plan is made again without it. This needs the

@@ -249,7 +249,7 @@ def _multiply_column(matrix: Array, column: list[RealInterval]) -> list[RealInte
 
 
 def _constant(term: Term) -> TaylorSeries:
-    return taylor_constant(term.data) if math.isfinite(term.data) else _UNKNOWN
+    return taylor_constant(term.data) if math.isfinite(term.data) else ((term.data, term.data),)
 
 
 _RATIONAL: dict[object, Callable[..., TaylorSeries]] = {

@@ -5,12 +5,16 @@ from __future__ import annotations
 import math
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
+from itertools import product
+
+import casadi as ca
 
 from kineverse.expressions.expression import Expression
 from kineverse.expressions.substitution import apply_substitution
 from kineverse.intervals.arithmetic import REALS, RealInterval
 from kineverse.intervals.enclosure import Enclosures
-from kineverse.intervals.graph import Term, TermGraph
+from kineverse.intervals.graph import SATURATED, SHARP_CONTRAST, Term, TermGraph, reachable_terms
+from kineverse.intervals.taylor import taylor_variable
 from kineverse.model.constraint import Constraint
 from kineverse.model.model_view import ModelView
 from kineverse.model.rate_nodes import to_plain
@@ -20,6 +24,9 @@ SLOW = 1e-6
 """Speed that constraints admit wherever a coordinate may move [m/s] or [rad/s]."""
 NOTHING = 1e-9
 """Largest excess of a constraint that counts as satisfied; also a speed that is none."""
+BESIDE = SATURATED / SHARP_CONTRAST
+"""Distance from a threshold within which a position counts as at it [m] or [rad]: its ramp is no wider."""
+_MOST_PIECES = 4096
 
 _NOT_MOVING: RealInterval = (0.0, 0.0)
 Box = Mapping[Symbol, RealInterval]
@@ -59,6 +66,7 @@ class ConstraintRanges:
         self._enclosures = Enclosures(self._graph)
         self._known: dict[str, _Row] = {}
         self._excesses: dict[tuple[object, ...], tuple[RealInterval, RealInterval]] = {}
+        self._cuts: dict[tuple[str, Symbol], list[float]] = {}
         self._about: dict[Symbol, list[str]] = {}
         for name, row in self.rows.items():
             for symbol in self._symbols_of(row):
@@ -68,17 +76,60 @@ class ConstraintRanges:
         """Return the names of the constraints that depend on a symbol."""
         return self._about.get(symbol, ())
 
-    def refuses(self, speed: Symbol, forward: float, box: Box) -> bool | None:
-        """Return whether constraints admit no slow speed anywhere in a box, None if only in a part of it."""
-        answer: bool | None = False
-        for name in self.about(speed):
-            if self.rows[name].order == 1:
-                low, high = self.excess(name, {**box, speed: (forward * SLOW, forward * SLOW)})
-                if low > NOTHING:
-                    return True
-                if high > NOTHING:
-                    answer = None
-        return answer
+    def refuses(self, speed: Symbol, forward: float, box: Box) -> bool:
+        """Return whether constraints admit no slow speed anywhere in a box, but beside thresholds.
+
+        If intervals do not decide it at once, the box is divided at the thresholds of these constraints.
+        """
+        names = [name for name in self.about(speed) if self.rows[name].order == 1]
+        moving: Box = {**box, speed: (forward * SLOW, forward * SLOW)}
+        if any(self.excess(name, moving)[0] > NOTHING for name in names):
+            return True
+        if all(self.excess(name, moving)[1] <= NOTHING for name in names):
+            return False
+        sides = {s: self._pieces(s, self._side(box, s), names) for s in self._symbols_within(names)}
+        if math.prod(map(len, sides.values())) > _MOST_PIECES:
+            return False
+        return all(
+            any(
+                self.excess(name, {**moving, **dict(zip(sides, piece, strict=True))})[0] > NOTHING
+                for name in names
+            )
+            for piece in product(*sides.values())
+        )
+
+    def _symbols_within(self, names: Iterable[str]) -> list[Symbol]:
+        found = {s for name in names for s in self._row(name).symbols}
+        return sorted((s for s in found if not s.order and s.value is None), key=lambda s: s.sort_key)
+
+    def _pieces(self, symbol: Symbol, side: RealInterval, names: Iterable[str]) -> list[RealInterval]:
+        """Return the parts of an interval of positions between thresholds of constraints, without these."""
+        cuts = sorted({x for name in names for x in self._thresholds(name, symbol) if side[0] < x < side[1]})
+        ends = [side[0], *(x + sign * BESIDE for x in cuts for sign in (-1, 1)), side[1]]
+        pieces = zip(ends[::2], ends[1::2], strict=True)
+        return [(low, high) for low, high in pieces if low <= high]
+
+    def _thresholds(self, name: str, symbol: Symbol) -> list[float]:
+        """Return where comparisons in the bounds of a constraint change, as far as one position decides."""
+        key = name, symbol
+        if key not in self._cuts:
+            row, found = self._row(name), list[float]()
+            terms = reachable_terms(tuple(t for t in (row.lower, row.upper) if isinstance(t, Term)))
+            for decider in dict.fromkeys(d for t in terms for d in t.deciders):
+                own = {t.data for t in reachable_terms((decider,)) if t.op == ca.OP_PARAMETER}
+                if own == {symbol}:
+                    found += self._linear_root(decider, symbol)
+            self._cuts[key] = found
+        return self._cuts[key]
+
+    def _linear_root(self, term: Term, symbol: Symbol) -> list[float]:
+        """Return where a linear function of a symbol is 0; nothing for other functions."""
+        ((_, *slopes),) = self._enclosures.enclose([term], {symbol: taylor_variable(REALS)})
+        (((low, high), *_),) = self._enclosures.enclose([term], {symbol: taylor_variable((0.0, 0.0))})
+        if not slopes or any(slope != (0.0, 0.0) for slope in slopes[1:]):
+            return []
+        slope = sum(slopes[0]) / 2
+        return [-(low + high) / 2 / slope] if slope and math.isfinite(slope) else []
 
     def excess(self, name: str, box: Box) -> RealInterval:
         """Return the range of the excess of a constraint over a box, negative where it holds strictly.
@@ -101,7 +152,7 @@ class ConstraintRanges:
             lower, upper = (
                 (end, end) if isinstance(end, float) else ranges[end] for end in (row.lower, row.upper)
             )
-            self._excesses[key] = (lower[0] - high, lower[1] - low), (low - upper[1], high - upper[0])
+            self._excesses[key] = _subtract(lower, (low, high)), _subtract((low, high), upper)
         return self._excesses[key]
 
     def _side(self, box: Box, symbol: Symbol) -> RealInterval:
@@ -131,3 +182,9 @@ class ConstraintRanges:
         for s in own & self._dependent.keys():
             own = (own - {s}) | set(self._dependent[s].symbols)
         return own
+
+
+def _subtract(a: RealInterval, b: RealInterval) -> RealInterval:
+    """Return the range of x - y; the difference of equal infinities is anything."""
+    low, high = a[0] - b[1], a[1] - b[0]
+    return -math.inf if math.isnan(low) else low, math.inf if math.isnan(high) else high

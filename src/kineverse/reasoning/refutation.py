@@ -8,22 +8,19 @@ from __future__ import annotations
 import math
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
+from itertools import pairwise
 from typing import TYPE_CHECKING, TypeAlias
 
 from kineverse.intervals.arithmetic import REALS, RealInterval
-from kineverse.intervals.graph import SATURATED, SHARP_CONTRAST
 from kineverse.model.model_view import ModelView
 from kineverse.state import StateLike, as_state
 from kineverse.symbols import Symbol
 
 from .boxes import Interval
-from .constraint_ranges import NOTHING, ConstraintRanges
+from .constraint_ranges import BESIDE, NOTHING, ConstraintRanges
 
 if TYPE_CHECKING:
     from .unlocking_plan import UnlockingPlan
-
-_BESIDE = SATURATED / SHARP_CONTRAST
-"""Distance from a threshold within which a position counts as at it [m] or [rad]: its ramp is no wider."""
 
 CellRange: TypeAlias = tuple[int, int]
 Region: TypeAlias = tuple[CellRange, ...]
@@ -117,10 +114,7 @@ class _InvarianceCheck:
         """Return whether the cells of a coordinate cover its range, and only thresholds are no rests."""
         cells, rests = self.known.cells[k], self.known.rests[k]
         low, high = self.ranges.limits.get(self.known.coordinates[k], REALS)
-        joined = all(
-            a.upper == b.lower and (a.upper_closed or b.lower_closed)
-            for a, b in zip(cells, cells[1:], strict=False)
-        )
+        joined = all(a.upper == b.lower and (a.upper_closed or b.lower_closed) for a, b in pairwise(cells))
         single = all(rest or cell.lower == cell.upper for rest, cell in zip(rests, cells, strict=True))
         return joined and single and cells[0].lower <= low and high <= cells[-1].upper
 
@@ -178,7 +172,7 @@ class _InvarianceCheck:
         ):
             low, high = float(cells[first].lower), float(cells[last].upper)
             least, most = self.ranges.limits.get(symbol, REALS)
-            margin = min(_BESIDE, (high - low) / 4)
+            margin = min(BESIDE, (high - low) / 4)
             box[symbol] = (
                 low + margin if least < low or not cells[first].lower_closed else low,
                 high - margin if high < most or not cells[last].upper_closed else high,
@@ -188,4 +182,3 @@ class _InvarianceCheck:
 
 def _covers(region: Region, other: Region) -> bool:
     return all(a <= c and d <= b for (a, b), (c, d) in zip(region, other, strict=True))
-

@@ -198,7 +198,8 @@ def plan_unlocking(
     still
         Coordinates that do not move, such as those that did not move when they should have.
     budget
-        Time for the search [s], after which the verdict is ``"undecided"``.
+        Time for the search [s], after which the verdict is ``"undecided"``. Reading the interlocks takes time
+        of its own.
 
     Raises
     ------
@@ -211,14 +212,13 @@ def plan_unlocking(
         raise InvalidValueError(f"The budget of a plan is a positive time in seconds, not {budget!r}.")
     if not goal:
         raise InvalidValueError("A plan has a goal, such as {'garage/door': 1.5}.")
-    end = perf_counter() + budget
     limits = constant_limits(dict(model.constraints.items()))
     goals = {model.degree_of_freedom(name): value for name, value in goal.items()}
     goals = {s: _check_goal(s, value, limits.get(s, Interval())) for s, value in goals.items()}
     fixed = tuple(model.degree_of_freedom(name) for name in still)
-    coordinates, rules = relevant_rules(
-        make_rules(model, interlocks(model) if found is None else found), goals
-    )
+    known = interlocks(model) if found is None else found
+    end = perf_counter() + budget
+    coordinates, rules = relevant_rules(make_rules(model, known), goals)
     given = dict(model.default_state())
     if state is not None:
         given |= dict(as_state(state, model.symbols))
@@ -282,9 +282,7 @@ def _make_invariant(graph: CellGraph, result: MoveSearchResult) -> InvariantSet:
     return InvariantSet(
         graph.coordinates,
         graph.cells,
-        tuple(
-            tuple(bool(graph.rests & graph.bit(k, n)) for n in range(len(graph.cells[k]))) for k in count
-        ),
+        tuple(tuple(bool(graph.rests & graph.bit(k, n)) for n in range(len(graph.cells[k]))) for k in count),
         tuple(map(region, result.regions)),
         result.following,
     )
