@@ -304,6 +304,15 @@ def test_refutation_gaps_finds_each_flaw():
     assert refutation_gaps(model, replace(plan, invariant=None)) != []
 
 
+def test_start_on_a_threshold_is_neither_used_nor_refuted():
+    """There the comparison is 0.5, which lets the goal move at half of its speed."""
+    model = three_sliders(a=B > 0.5)
+    plan = plan_unlocking(model, {A: 1}, {B: 0.5})
+    assert [str(step.coordinate) for step in plan.steps] == ["b", "a"]
+    assert plan_unlocking(model, {A: 1}, {B: 0.5}, still=[B]).verdict == "undecided"
+    assert plan_unlocking(model, {A: 1}, {B: 0.499}, still=[B]).verdict == "refuted"
+
+
 def test_wrong_interlocks_are_not_believed():
     """Plans and refutations by interlocks of another model are checked by the constraints."""
     open_, shut = three_sliders(a=B > 0.5), three_sliders(a=B > 2)

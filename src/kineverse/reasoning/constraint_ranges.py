@@ -62,7 +62,8 @@ class ConstraintRanges:
                 low, high = self.limits.get(row.expression, REALS)
                 self.limits[row.expression] = max(low, float(row.lower)), min(high, float(row.upper))
         self._dependent = dict(model.rates.dependent)
-        self._graph = TermGraph({})
+        every = {s for row in self.rows.values() for s in self._symbols_of(row)}
+        self._graph = TermGraph({s: s.value for s in every if s.value is not None})
         self._enclosures = Enclosures(self._graph)
         self._known: dict[str, _Row] = {}
         self._excesses: dict[tuple[object, ...], tuple[RealInterval, RealInterval]] = {}
@@ -76,10 +77,11 @@ class ConstraintRanges:
         """Return the names of the constraints that depend on a symbol."""
         return self._about.get(symbol, ())
 
-    def refuses(self, speed: Symbol, forward: float, box: Box) -> bool:
+    def refuses(self, speed: Symbol, forward: float, box: Box, start: Mapping[Symbol, float]) -> bool:
         """Return whether constraints admit no slow speed anywhere in a box, but beside thresholds.
 
-        If intervals do not decide it at once, the box is divided at the thresholds of these constraints.
+        If intervals do not decide it at once, the box is divided at the thresholds of these constraints. At
+        one of them, a coordinate is at most at the start.
         """
         names = [name for name in self.about(speed) if self.rows[name].order == 1]
         moving: Box = {**box, speed: (forward * SLOW, forward * SLOW)}
@@ -87,7 +89,9 @@ class ConstraintRanges:
             return True
         if all(self.excess(name, moving)[1] <= NOTHING for name in names):
             return False
-        sides = {s: self._pieces(s, self._side(box, s), names) for s in self._symbols_within(names)}
+        sides = {
+            s: self._pieces(s, self._side(box, s), names, start.get(s)) for s in self._symbols_within(names)
+        }
         if math.prod(map(len, sides.values())) > _MOST_PIECES:
             return False
         return all(
@@ -100,14 +104,18 @@ class ConstraintRanges:
 
     def _symbols_within(self, names: Iterable[str]) -> list[Symbol]:
         found = {s for name in names for s in self._row(name).symbols}
-        return sorted((s for s in found if not s.order and s.value is None), key=lambda s: s.sort_key)
+        return sorted((s for s in found if not s.order), key=lambda s: s.sort_key)
 
-    def _pieces(self, symbol: Symbol, side: RealInterval, names: Iterable[str]) -> list[RealInterval]:
-        """Return the parts of an interval of positions between thresholds of constraints, without these."""
+    def _pieces(
+        self, symbol: Symbol, side: RealInterval, names: Iterable[str], start: float | None
+    ) -> list[RealInterval]:
+        """Return the parts of an interval of positions between thresholds of constraints, and the start."""
         cuts = sorted({x for name in names for x in self._thresholds(name, symbol) if side[0] < x < side[1]})
         ends = [side[0], *(x + sign * BESIDE for x in cuts for sign in (-1, 1)), side[1]]
-        pieces = zip(ends[::2], ends[1::2], strict=True)
-        return [(low, high) for low, high in pieces if low <= high]
+        pieces = [(low, high) for low, high in zip(ends[::2], ends[1::2], strict=True) if low <= high]
+        if start is not None and any(abs(x - start) <= BESIDE for x in cuts):
+            pieces.append((start, start))
+        return pieces
 
     def _thresholds(self, name: str, symbol: Symbol) -> list[float]:
         """Return where comparisons in the bounds of a constraint change, as far as one position decides."""
@@ -158,8 +166,6 @@ class ConstraintRanges:
     def _side(self, box: Box, symbol: Symbol) -> RealInterval:
         if symbol in box:
             return box[symbol]
-        if symbol.value is not None:
-            return symbol.value, symbol.value
         return _NOT_MOVING if symbol.order else self.limits.get(symbol, REALS)
 
     def _row(self, name: str) -> _Row:
@@ -170,7 +176,8 @@ class ConstraintRanges:
                 for end in (row.lower, row.upper)
             ]
             value = self._graph.term(self._follow(row.expression))
-            symbols = tuple(sorted(self._symbols_of(row), key=lambda s: s.sort_key))
+            own = (s for s in self._symbols_of(row) if s.value is None)
+            symbols = tuple(sorted(own, key=lambda s: s.sort_key))
             self._known[name] = _Row(row.order, ends[0], value, ends[1], symbols)
         return self._known[name]
 

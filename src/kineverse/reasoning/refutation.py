@@ -58,7 +58,8 @@ def refutation_gaps(model: ModelView, plan: UnlockingPlan, state: StateLike | No
 
     From each region of :attr:`.UnlockingPlan.invariant`, a coordinate can only get into regions of the same
     set: otherwise a constraint admits no speed of it, or would be violated, everywhere in the region. That is
-    found by interval arithmetic on the constraints. Positions within 2 µm of a threshold are not considered.
+    found by interval arithmetic on the constraints. Positions within 2 µm of a threshold are not considered,
+    but for those at the start.
 
     Parameters
     ----------
@@ -75,8 +76,9 @@ def refutation_gaps(model: ModelView, plan: UnlockingPlan, state: StateLike | No
     given = dict(model.default_state())
     if state is not None:
         given |= dict(as_state(state, model.symbols))
-    check = _InvarianceCheck(ConstraintRanges(model), known, frozenset(plan.still))
-    return list(check.run({s: given.get(s, 0.0) for s in known.coordinates}, plan.goal))
+    start = {s: given.get(s, 0.0) for s in known.coordinates}
+    check = _InvarianceCheck(ConstraintRanges(model), known, frozenset(plan.still), start)
+    return list(check.run(plan.goal))
 
 
 @dataclass(frozen=True)
@@ -86,13 +88,14 @@ class _InvarianceCheck:
     ranges: ConstraintRanges
     known: InvariantSet
     still: frozenset[Symbol]
+    start: Mapping[Symbol, float]
 
-    def run(self, start: Mapping[Symbol, float], goal: Mapping[Symbol, float]) -> Iterator[str]:
+    def run(self, goal: Mapping[Symbol, float]) -> Iterator[str]:
         known = self.known
         for k, symbol in enumerate(known.coordinates):
             if not self._is_whole_range(k):
                 yield f"the intervals of {symbol} do not cover its range"
-        if not any(self._contains(region, start) for region in known.regions):
+        if not any(self._contains(region, self.start) for region in known.regions):
             yield "the start is outside"
         if any(self._contains(region, goal) for region in known.regions):
             yield "the goal is inside"
@@ -144,7 +147,7 @@ class _InvarianceCheck:
         here = self._box((*region[:k], (end, end), *region[k + 1 :]))
         there = self._box(into)
         boxes = [here, there] if there[symbol][0] < there[symbol][1] else [here]
-        if any(self.ranges.refuses(symbol.derivative(), way, box) for box in boxes):
+        if any(self.ranges.refuses(symbol.derivative(), way, box, self.start) for box in boxes):
             return True
         return any(
             self._is_left(name, k, way, here, there)
@@ -165,18 +168,17 @@ class _InvarianceCheck:
         return symbol not in (row.upper if way > 0 else row.lower).symbols or most - least <= room < math.inf
 
     def _box(self, region: Region) -> _Box:
-        """Return the positions of a region, without those beside thresholds."""
+        """Return the positions of a region, without those beside thresholds but with the start."""
         box = {}
         for (first, last), symbol, cells in zip(
             region, self.known.coordinates, self.known.cells, strict=True
         ):
             low, high = float(cells[first].lower), float(cells[last].upper)
             least, most = self.ranges.limits.get(symbol, REALS)
-            margin = min(BESIDE, (high - low) / 4)
-            box[symbol] = (
-                low + margin if least < low or not cells[first].lower_closed else low,
-                high - margin if high < most or not cells[last].upper_closed else high,
-            )
+            margin, here = min(BESIDE, (high - low) / 4), self.start[symbol]
+            at_low = (least == low and cells[first].lower_closed) or here == low
+            at_high = (high == most and cells[last].upper_closed) or here == high
+            box[symbol] = low if at_low else low + margin, high if at_high else high - margin
         return box
 
 
