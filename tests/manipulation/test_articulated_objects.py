@@ -11,6 +11,7 @@ from kineverse.manipulation.articulated_objects import (
     find_shut_value,
     select_objects,
 )
+from kineverse.manipulation.skill_arguments import limit_tolerance
 from kineverse.model.body import Body, Box, Shape
 from kineverse.model.operations import SetBody
 
@@ -61,3 +62,12 @@ def test_kinds_do_not_depend_on_the_pose_of_the_axis(lower, upper):
     assert kinds == {"upright/q": "door", "level/q": "flap", "slide/q": "drawer", "cam/q": "linkage"}
     assert all((one.shut, one.opened) == (0.0, lower + upper) for one in found.values())
     assert all(find_shut_value(model, one.coordinate) == one.shut for one in found.values())
+
+
+@pytest.mark.parametrize("name", ["microwave", "latch"])
+def test_locked_doors_are_found_with_their_whole_range(name):
+    model = kv.load(f"articulations/{name}")
+    (door,) = (one for one in find_articulated_objects(model) if one.coordinate.path.endswith("/door"))
+    assert (door.shut, door.opened) == (0.0, 1.9)
+    assert find_shut_value(model, door.coordinate) == 0.0
+    assert limit_tolerance(model, door.coordinate, 0.02) == 0.02

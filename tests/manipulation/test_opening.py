@@ -8,13 +8,14 @@ import numpy as np
 import pytest
 
 import kineverse as kv
-from kineverse.articulations.locks import speed_lock
+from kineverse.articulations.locks import position_lock, speed_lock
 from kineverse.errors import InvalidValueError, KineverseError, UnknownNameError
 from kineverse.grasping import find_gripper, find_handle, sample_grasps
 from kineverse.manipulation import PlacementSearch, Session, TrackedBelief, open_object
 from kineverse.manipulation.base_samples import find_planar_base
 from kineverse.manipulation.belief import EstimateError
 from kineverse.manipulation.opening.grasped_opening import _Run
+from kineverse.manipulation.opening.hand_motion import HandMotion
 from kineverse.manipulation.opening.hand_paths import HandPaths, find_least_time
 from kineverse.manipulation.opening.placement_samples import PlacementSamples
 from kineverse.manipulation.opening.way_check import WayCheck
@@ -290,6 +291,35 @@ def test_locked_drawer_is_told_at_once():
     assert not outcome
     assert "'room/drawer' is locked at 0 while 'room/bolt' is 0" in outcome.reason
     assert (outcome.measures["failure"], outcome.steps) == ("other", 0)
+
+
+@pytest.mark.long
+def test_drawer_with_a_position_lock_opens_while_that_is_open():
+    """The bolt locks it at the default state."""
+    model, drawer = pusher(), kv.position("room/drawer")
+    bolt = kv.position("room/bolt")
+    with model.edit() as edit:
+        edit.constrain("room/bolt/range", 0, bolt, 1)
+        lock = position_lock(drawer, open_if=bolt > 0.5, lower=0.0, upper=0.0)
+        edit.constrain("room/drawer/lock", *lock)
+    world = KinematicWorld(model, "robot")
+    world.reset(
+        model.default_state().updated({"robot/finger": 0.05, "robot/z": 2.0, bolt: 1.0, drawer: 0.02})
+    )
+    outcome = open_object(Session(world), "room/drawer", target=0.12)
+    assert outcome, outcome.reason
+
+
+def test_hand_believes_that_a_locked_door_is_open_where_it_is():
+    """The button holds the door at the default state, and is pressed now."""
+    model = kv.load("articulations/microwave")
+    door = model.symbol("microwave/oven/door")
+    handle = SimpleNamespace(frame="microwave/oven/door", coordinate=door)
+    search = SimpleNamespace(model=model, moving=())
+    state = model.default_state().updated({door: 0.5, "microwave/oven/button": 0.006})
+    hand = SimpleNamespace(hand="world")
+    motion = HandMotion(SimpleNamespace(state=state), hand, handle, search, None, None, 0.0)
+    assert motion.state[door] == 0.5
 
 
 def test_drawer_that_is_locked_on_the_way_is_said_not_to_move():

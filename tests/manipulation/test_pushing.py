@@ -431,3 +431,16 @@ def test_push_says_what_is_wrong() -> None:
     for wrong in ({"dt": 0.0}, {"dt": np.nan}, {"timeout": 0.0}):
         with pytest.raises(InvalidValueError, match="time"):
             Session(world, **wrong)
+
+
+def test_locked_door_that_is_open_can_be_pushed_shut() -> None:
+    """A bolt holds the door at the default state; it is out while the door stands open."""
+    model, bolt = room().copy(), kv.position("bolt")
+    with model.edit() as edit:
+        edit.constrain("bolt/range", 0, bolt, 1)
+        lock = kv.articulations.position_lock(model.symbol("door"), open_if=bolt > 0.5, lower=0, upper=0)
+        edit.constrain("door/lock", *lock)
+    start = model.default_state().updated({"robot/lift": 0.8, "door": 1.0, "bolt": 1.0})
+    Pushing(model, "door", PUSHER, start, target=0.4)
+    with pytest.raises(InvalidValueError, match=r"between 0 and 1\.5"):
+        Pushing(model, "door", PUSHER, start, target=1.6)

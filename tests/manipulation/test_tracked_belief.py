@@ -252,3 +252,16 @@ def test_what_cannot_be_tracked_is_refused(model):
     with pytest.raises(InvalidValueError, match="drifts"):
         TrackedBelief(rail, "lift", Sensors(odometry=0.01))
     assert "no frame" in TrackedBelief(rail, "lift").remarks[0].lower()
+
+
+def test_door_with_a_position_lock_is_believed_where_it_is(model):
+    """The bolt holds the door shut at the default state, and is out now."""
+    locked, door, bolt = model.copy(), kv.position("door"), kv.position("bolt")
+    with locked.edit() as edit:
+        edit.constrain("bolt/range", 0, bolt, 1)
+        lock = kv.articulations.position_lock(door, open_if=bolt > 0.5, lower=0.0, upper=0.0)
+        edit.constrain("door/lock", *lock)
+    world, belief = start(locked, bolt=1.0, door=0.5)
+    state = run(world, belief, 20)
+    assert state["door"] == pytest.approx(0.5, abs=0.02)
+    assert belief.deviation(locked.symbol("door")) < 0.02

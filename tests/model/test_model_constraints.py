@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 
 import kineverse as kv
+from kineverse.articulations import position_lock, speed_lock
 from kineverse.expressions.expression import as_expression
 from kineverse.model.constraint import Constraint, as_constraint
 
@@ -298,12 +299,62 @@ def test_limits_of_a_symbol_are_the_tightest() -> None:
     assert model.limits("a") == model.limits(a) == (-1, 2)
     assert model.limits("a:velocity") == (-4, 4)
     assert model.limits(b) == (-INF, INF)
-    assert model.limits(c) == (0, 1)
+    assert model.limits(c, {"b": 0}) == (0, 1)
+    assert model.limits(c) == (0, 1.5)
     assert model.limits(c, {"b": 0.5}) == (0.5, 1.5)
     assert model.limits(c, kv.State({"b": 2.5, "z": 1})) == (2.5, 3.5)
     assert model.limits(c, {"a": 0}) == (-INF, INF)
     with pytest.raises(kv.errors.UnknownNameError, match="no symbol"):
         model.limits("aa")
+
+
+@pytest.mark.parametrize(
+    ("low", "high"),
+    [
+        (0, kv.where(b < 0.3, 0.0, 2.0)),
+        (kv.where(b > 0.3, -1.0, -4 * a**2), 1 + b**2),
+        (-1.5 * (b < 0.3), 1.5 * ((b < 0.3) | (a > 0.2))),
+        (-np.exp(-b) + a, np.sin(3 * b) * a + 2),
+        (-2, kv.spline(b, [0.0, 0.5, 1.0], [1.0, 3.0, 2.0])),
+    ],
+)
+def test_limits_at_any_state_are_within_those_at_all(low, high) -> None:
+    model = constrained(a=(-1, a, 1), b=(-0.5, 2 * b, 4), c=(low, c, high))
+    least, most = model.limits(c)
+    rng = np.random.default_rng(0)
+    states = [{"a": x, "b": y} for x, y in rng.uniform([-1, -0.25], [1, 2], (200, 2))]
+    at = np.array([model.limits(c, state) for state in states])
+    assert (at[:, 0] >= least).all()
+    assert (at[:, 1] <= most).all()
+    assert least > at[:, 0].min() - 1.0
+    assert most < at[:, 1].max() + 1.0
+
+
+@pytest.mark.parametrize("blocks", ["both", "forward", "backward"])
+def test_limits_of_a_locked_coordinate_are_those_of_its_open_lock(blocks) -> None:
+    model = constrained(
+        a=(0, a, 1.5),
+        b=(0, b, 1),
+        shut=position_lock(a, open_if=b > 0.5, lower=0.0, upper=0.0),
+        lock=speed_lock(a, open_if=b > 0.5, max_speed=2.0, blocks=blocks),
+    )
+    assert model.limits(a) == (0.0, 1.5)
+    assert model.limits(a.derivative()) == (-2.0, 2.0)
+    shut, opened = {"a": 0.0, "b": 0.0}, {"a": 0.0, "b": 1.0}
+    assert model.limits(a, shut) == (0.0, 0.0)
+    assert model.limits(a, opened) == (0.0, 1.5)
+    assert model.limits(a.derivative(), shut) == (-2.0 * (blocks == "forward"), 2.0 * (blocks == "backward"))
+    assert model.limits(a.derivative(), opened) == (-2.0, 2.0)
+
+
+def test_limits_follow_parameters_dependent_coordinates_and_edits() -> None:
+    p = kv.parameter("p", 0.25)
+    model = constrained(a=(0, a, 2), c=(-p, c, p + a))
+    assert model.limits(c) == (-0.25, 2.25)
+    with model.edit() as edit:
+        edit.constrain("tighter", 0, a, 1)
+    assert model.limits(c) == (-0.25, 1.25)
+    assert constrained(c=(0, c, d)).limits(c) == (0, INF)
 
 
 def test_the_default_state_is_zero_within_limits() -> None:

@@ -22,9 +22,10 @@ from .arithmetic import (
     interval_hull,
     interval_multiply,
     interval_negate,
+    interval_unary,
     round_outwards,
 )
-from .graph import Term, TermGraph
+from .graph import SATURATED, Term, TermGraph
 from .taylor import (
     TaylorSeries,
     taylor_add,
@@ -248,7 +249,7 @@ def _multiply_column(matrix: Array, column: list[RealInterval]) -> list[RealInte
 
 
 def _constant(term: Term) -> TaylorSeries:
-    return taylor_constant(term.data) if math.isfinite(term.data) else _UNKNOWN
+    return taylor_constant(term.data) if math.isfinite(term.data) else ((term.data, term.data),)
 
 
 _RATIONAL: dict[object, Callable[..., TaylorSeries]] = {
@@ -280,9 +281,20 @@ def _step(term: Term, args: list[TaylorSeries]) -> TaylorSeries:
         if truth[0][0] >= 0.5 or truth[0][1] < 0.5:
             return yes if truth[0][0] >= 0.5 else no
         return (interval_hull(yes[0], no[0]),)
+    if op == "less":
+        return (_enclose_truth(args[0][0], term.data),)
     if len(args) == 1 and isinstance(op, int):
         return taylor_unary(op, args[0])
-    return (round_outwards(0.0, 1.0),) if op == "less" else _UNKNOWN
+    return _UNKNOWN
+
+
+def _enclose_truth(excess: RealInterval, contrast: float) -> RealInterval:
+    """Return the range of (1 + tanh(x·R))/2, which is 0 or 1 to the last bit from |x|·R = 20 on."""
+    low, high = interval_unary(ca.OP_TANH, (excess[0] * contrast, excess[1] * contrast))
+    return (
+        1.0 if excess[0] * contrast >= SATURATED else max(0.0, math.nextafter((1 + low) / 2, -math.inf)),
+        0.0 if excess[1] * contrast <= -SATURATED else min(1.0, math.nextafter((1 + high) / 2, math.inf)),
+    )
 
 
 def _piecewise(

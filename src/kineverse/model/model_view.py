@@ -16,10 +16,13 @@ import numpy as np
 from kineverse._checks import check_flag
 from kineverse.errors import DuplicateNameError, InvalidValueError, UnknownNameError, suggest
 from kineverse.expressions.expression import Expression, ExpressionLike
+from kineverse.expressions.substitution import apply_substitution
+from kineverse.intervals.arithmetic import RealInterval
 from kineverse.state import State, StateLike, as_state, check_meant
 from kineverse.symbols import Symbol, check_symbols, parse_symbol_name
 
 from . import registry
+from .bound_ranges import enclose_bound
 from .constraint import Constraint, ConstraintLike, as_constraint
 from .integration import StateIntegrator
 from .integrator import Integrator
@@ -28,6 +31,7 @@ from .projection import TOLERANCE, EqualityConstraints, project
 from .registry import SaveResult
 from .symbolic_view import SymbolicView
 from .velocity_rows import Recovery, VelocityRows, velocity_rows
+from .version_cache import cached_for_version
 from .violations import ConstraintChecker, Violations, find_violations
 
 
@@ -150,33 +154,64 @@ class ModelView(SymbolicView):
         return tuple(found)
 
     def limits(self, symbol: Symbol | str, values: StateLike | None = None) -> tuple[float, float]:
-        """Return the limits of a single symbol; ±inf for none.
+        """Return the limits of a single symbol, at all states or at one; ±inf for none.
 
-        Bounds that are expressions are evaluated at ``values``, by default at :meth:`default_state`. Bounds
-        that cannot be evaluated are ignored.
+        Without ``values``, the symbol is never beyond these limits, wherever the others are: a bound that is
+        an expression, such as that of a locked door, counts with its whole range where other coordinates are
+        within their constant limits. That is what clips estimates, and what samples are drawn from. With
+        ``values``, the limits are those at that state, where the door may be locked at 0: that is what a
+        controller needs to know now.
+
+        Parameters
+        ----------
+        symbol
+            A symbol or its name: a coordinate or a speed.
+        values
+            A state, or a mapping from symbols or names to numbers. Bounds that cannot be evaluated there are
+            ignored.
         """
         with self._lock:
             self._catch_up()
             wanted = symbol if isinstance(symbol, Symbol) else self.symbol(symbol)
-            if values is not None:
-                values = as_state(values, self._known(values))
+            known = None if values is None else as_state(values, self._known(values))
             lower, upper = -np.inf, np.inf
             for name in self._relevance.on(wanted):
                 c = self._head[CONSTRAINTS][name]
-                low, high = self._bound(c.lower, values), self._bound(c.upper, values)
+                low = self._range(c.lower)[0] if known is None else self._bound(c.lower, known)
+                high = self._range(c.upper)[1] if known is None else self._bound(c.upper, known)
                 lower, upper = (
                     max(lower, -np.inf if low is None else low),
                     min(upper, np.inf if high is None else high),
                 )
-            return float(lower), float(upper)
+            return float(lower) + 0.0, float(upper) + 0.0  # no -0.0, which people read
 
-    def _bound(self, bound: Expression, values: StateLike | None) -> float | None:
+    def _bound(self, bound: Expression, values: State) -> float | None:
         if not bound.symbols:
             return float(bound)
-        known = self.default_state() if values is None else values
-        if any(s not in known and s.value is None for s in bound.symbols):
+        if any(s not in values and s.value is None for s in bound.symbols):
             return None
-        return float(bound(known))
+        return float(bound(values))
+
+    def _range(self, bound: Expression) -> RealInterval:
+        """Return the range of a bound over all states within the constant limits of coordinates."""
+        if not bound.symbols:
+            return float(bound), float(bound)
+
+        def compute() -> RealInterval:
+            followed = apply_substitution(bound, dict(self.rates.dependent))
+            return enclose_bound(followed, {s: self._constant_limits(s) for s in followed.symbols})
+
+        return cached_for_version(self, ("range of a bound", bound), compute)
+
+    def _constant_limits(self, symbol: Symbol) -> RealInterval:
+        lower, upper = -math.inf, math.inf
+        for name in self._relevance.about(symbol):
+            c = self._head[CONSTRAINTS][name]
+            if c.line is not None and not (c.lower.symbols or c.upper.symbols):
+                slope, offset = c.line
+                low, high = sorted((float(bound) - offset) / slope for bound in (c.lower, c.upper))
+                lower, upper = max(lower, low), min(upper, high)
+        return lower, upper
 
     def symbol(self, name: str) -> Symbol:
         """Return the symbol of a name; its coordinate is a free or dependent coordinate of the model.

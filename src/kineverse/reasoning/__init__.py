@@ -9,6 +9,7 @@ from .find_interlocks import interlocks
 from .interlock import Hold, Interlock, Interlocks, Undecided
 from .opening_order import opening_order
 from .plan_check import plan_violations
+from .refutation import InvariantSet, refutation_gaps
 from .unlocking_plan import UnlockingPlan, UnlockingStep, plan_unlocking
 
 __all__ = [
@@ -17,6 +18,7 @@ __all__ = [
     "Interlocks",
     "Interval",
     "IntervalBox",
+    "InvariantSet",
     "Undecided",
     "UnlockingPlan",
     "UnlockingStep",
@@ -25,6 +27,7 @@ __all__ = [
     "opening_order",
     "plan_unlocking",
     "plan_violations",
+    "refutation_gaps",
 ]
 
 

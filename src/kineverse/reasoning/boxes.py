@@ -50,8 +50,10 @@ class Interval:
 
     def covers(self, other: Interval) -> bool:
         """Return True if this interval contains another one, which is not empty."""
-        starts = (self.lower, not self.lower_closed) <= (other.lower, not other.lower_closed)
-        return starts and (self.upper, self.upper_closed) >= (other.upper, other.upper_closed)
+        if self.lower > other.lower or self.upper < other.upper:
+            return False
+        starts = self.lower_closed or not other.lower_closed or self.lower < other.lower
+        return starts and (self.upper_closed or not other.upper_closed or self.upper > other.upper)
 
     def join(self, other: Interval) -> Interval | None:
         """Return the union with another interval if it is an interval, else None; neither is empty."""
@@ -136,7 +138,14 @@ class IntervalBox(Mapping[Expression, Interval]):
 
     def covers(self, other: IntervalBox) -> bool:
         """Return True if this box contains another one."""
-        return all(axis in other and side.covers(other[axis]) for axis, side in self._sides.items())
+        sides = other._sides
+        if len(self._sides) > len(sides):
+            return False
+        for axis, side in self._sides.items():
+            own = sides.get(axis)
+            if own is None or not side.covers(own):
+                return False
+        return True
 
     def subtract(self, other: IntervalBox) -> list[IntervalBox]:
         """Return the difference of this box and another one, as boxes that do not overlap."""

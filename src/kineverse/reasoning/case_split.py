@@ -17,7 +17,7 @@ from kineverse.symbols import Symbol
 from . import polynomial as exact
 from . import root_isolation
 from .abstract_values import AbstractValue, evaluate_term, find_implicit_functions, live_arguments
-from .boxes import Interval, IntervalBox
+from .boxes import Interval, IntervalBox, Number
 from .domain import Domain
 from .polynomial import LinearForm, Polynomial, linear_form_expression
 
@@ -120,8 +120,8 @@ class Case:
             low = side.lower == limit.lower and side.lower_closed == limit.lower_closed
             high = side.upper == limit.upper and side.upper_closed == limit.upper_closed
             sides[linear_form_expression(axis)] = Interval(
-                -math.inf if low else side.lower,
-                math.inf if high else side.upper,
+                -math.inf if low else _as_float(side.lower),
+                math.inf if high else _as_float(side.upper),
                 side.lower_closed and not low,
                 side.upper_closed and not high,
             )
@@ -313,6 +313,12 @@ class Case:
                 axes, narrowed = {**self._axes, axis: side}, frozenset(s for s, _ in axis)
                 cases.append(Case(self._roots, self.domain, axes, signs, self._order, self.values, narrowed))
         return [case for case in cases if not case.is_empty]
+
+
+def _as_float(number: Number) -> Number:
+    """Return a number as a float if that is exact: fractions take ten times as long to compare."""
+    near = float(number)
+    return near if near == number else number
 
 
 def _as_linear_form(side: Interval, scale: Fraction, offset: Fraction) -> Interval:

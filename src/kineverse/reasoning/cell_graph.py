@@ -47,7 +47,8 @@ class CellGraph:
         For each coordinate, steps upward from each cell and steps downward from each cell; the last one
         upward and the first one downward lead nowhere and are None.
     rests
-        Bits of the cells in which a move may end: all but single thresholds, which are on both sides.
+        Bits of the cells in which a move may end: all but single thresholds, which count as on both sides,
+        unless they are goals.
     start, goal
         State at the start, and the bits that are set at the goal.
     """
@@ -146,7 +147,11 @@ def make_graph(
             own = _divide(limit, sides)
         first.append(first[-1] + len(cells[-1]) if cells else 0)
         cells.append(own)
-        rests += sum(1 << (first[-1] + n) for n in range(len(own)) if _may_rest(own, n, sides))
+        rests += sum(
+            1 << (first[-1] + n)
+            for n, cell in enumerate(own)
+            if _may_rest(own, n, sides) or (symbol in goals and goals[symbol] in cell)
+        )
 
     def bits(symbol: Symbol, side: Interval) -> int:
         k = place[symbol]
@@ -203,16 +208,16 @@ def _make_step(
     """Return the step of a coordinate from a cell to its neighbour, None at the end.
 
     Rules about the direction have to leave the coordinate free in its cell, and in the neighbour, unless that
-    is closed on this side: then the coordinate may rest at its end.
+    is a single position, at which the move ends.
     """
     following = cell + way
     if not 0 <= following < len(cells):
         return None
     here, there = 1 << (first + cell), 1 << (first + following)
-    closed = cells[following].lower_closed if way > 0 else cells[following].upper_closed
+    ends = cells[following].lower == cells[following].upper
     needed: dict[int, MoveRule] = {}
     for rule, mask in about:
-        if not mask & here or (not closed and not mask & there):
+        if not mask & here or (not ends and not mask & there):
             needed.setdefault(mask & ~whole, rule)
     for rule, mask in entry:
         if mask & here and not mask & there:

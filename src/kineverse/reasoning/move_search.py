@@ -41,6 +41,11 @@ class MoveSearchResult:
         Number of states.
     reached
         Bits of all cells that were reached, or for a refutation an upper bound of them.
+    regions
+        For a refutation, sets of states that no move leaves together: the start is in the first one, and the
+        goal in none. Each is the product of the cells whose bits are set.
+    following
+        For each region the numbers of those to which moves lead, as far as these are not regions themselves.
     """
 
     verdict: Verdict
@@ -48,6 +53,8 @@ class MoveSearchResult:
     shortest: bool = False
     explored: int = 0
     reached: int = 0
+    regions: tuple[int, ...] = ()
+    following: tuple[tuple[int, ...], ...] = ()
 
 
 @dataclass(frozen=True)
@@ -68,9 +75,9 @@ class MoveSearch:
     def run(self) -> MoveSearchResult:
         """Return the moves to the goal, the shortest ones if the graph is small."""
         graph = self.graph
-        reached, _ = self.relax(graph.start)
+        reached = self._reach
         if graph.goal & ~reached:
-            return MoveSearchResult("refuted", explored=1, reached=reached)
+            return MoveSearchResult("refuted", explored=1, reached=reached, regions=(reached,))
         if all(self._best[k] is not None for k in range(len(graph.coordinates))):
             return self.search_best_first()
         rests = ((graph.rests & graph.field(k)).bit_count() for k in range(len(graph.coordinates)))
@@ -103,6 +110,11 @@ class MoveSearch:
             if reached == before:
                 return reached, by
             waiting = later
+
+    @cached_property
+    def _reach(self) -> int:
+        """The cells that are not out of reach from the start."""
+        return self.relax(self.graph.start)[0]
 
     def estimate(self, state: int) -> tuple[float, int]:
         """Return the number of moves of a relaxed plan, infinite if there is none, and the bits it visits."""
@@ -142,23 +154,25 @@ class MoveSearch:
         """For each coordinate the distinct sets of its cells that the steps of others, or the goal, want."""
         graph = self.graph
         masks = {mask for *_, step in self._edges for mask in step.needs} | set(_bits(graph.goal))
-        reached, _ = self.relax(graph.start)
         return [
-            sorted({mask & graph.field(k) & reached for mask in masks} - {0})
+            sorted({mask & graph.field(k) & self._reach for mask in masks} - {0})
             for k in range(len(graph.coordinates))
         ]
 
     @cached_property
     def _best(self) -> list[int | None]:
-        """The cell of each coordinate that serves all others at least as well as any other cell, or None."""
+        """The cell of each coordinate that serves all others at least as well as any other cell, or None.
+
+        It is the nearest one to the start.
+        """
         graph, best = self.graph, list[int | None]()
         for k, wanted in enumerate(self._wanted):
             common = graph.field(k) & (graph.rests | graph.start)
             for mask in wanted:
                 common &= mask
-            start = graph.start & graph.field(k)
-            chosen = start if common & start else common & -common
-            best.append(chosen.bit_length() - 1 - graph.first[k] if chosen else None)
+            start, first = graph.cell_of(graph.start, k), graph.first[k]
+            cells = (bit.bit_length() - 1 - first for bit in _bits(common))
+            best.append(min(cells, key=lambda cell: abs(cell - start), default=None))
         return best
 
     @cached_property
@@ -166,7 +180,9 @@ class MoveSearch:
         """For each coordinate with a best cell, the cells from which there is no reason to go back.
 
         These are cells that serve others at least as well as all that are farther away from the best one on
-        the same side; on the way to the best cell every state passes them.
+        the same side; on the way to the best cell every state passes them. So whatever can be reached with
+        the coordinate farther away can also be reached from there. All other cells may have to be left
+        backwards before there is a way to the best one.
         """
         graph, found = self.graph, list[frozenset[int]]()
         for k, best in enumerate(self._best):
@@ -210,39 +226,42 @@ class MoveSearch:
 
     def search_breadth_first(self) -> MoveSearchResult:
         """Return the shortest sequence of moves; every state is reached at most once."""
-        graph = self.graph
+        graph, every = self.graph, (1, -1)
         parents: dict[int, tuple[int, Move] | None] = {graph.start: None}
         waiting, reached = deque([graph.start]), graph.start
         if graph.is_goal(graph.start):
             return MoveSearchResult("found", (), True, 1, reached)
         for expansions in count():
             if not waiting:
-                return MoveSearchResult("refuted", explored=len(parents), reached=reached)
+                return MoveSearchResult(
+                    "refuted", explored=len(parents), reached=reached, regions=tuple(parents)
+                )
             if expansions % _CLOCK == 0 and self.is_late():
                 return MoveSearchResult("undecided", explored=len(parents), reached=reached)
             state = waiting.popleft()
-            for move, after in self._moves(state, range(len(graph.coordinates))):
-                if after in parents:
-                    continue
-                parents[after] = state, move
-                reached |= after
-                if graph.is_goal(after):
-                    return MoveSearchResult("found", _trace(parents, after), True, len(parents), reached)
-                waiting.append(after)
+            for k in range(len(graph.coordinates)):
+                for move, after in self._moves(state, k, every):
+                    if after in parents:
+                        continue
+                    parents[after] = state, move
+                    reached |= after
+                    if graph.is_goal(after):
+                        return MoveSearchResult("found", _trace(parents, after), True, len(parents), reached)
+                    waiting.append(after)
         raise AssertionError  # pragma: no cover - count() has no end
 
     def search_best_first(self) -> MoveSearchResult:
         """Return a sequence of moves without superfluous ones, or prove that there is none.
 
-        Coordinates with a best cell move there as soon as they can, which never harms; only the others are
-        branched over. States are expanded by the length of a relaxed plan; those without one are left out.
+        Coordinates with a best cell move towards it as far as that never harms; moves that cannot help are
+        left out. States are expanded by the length of a relaxed plan; those without one are left out.
         """
         graph = self.graph
-        branching = [k for k, best in enumerate(self._best) if best is None]
         start, first = self.advance(graph.start)
         parents: dict[int, tuple[int, list[Move]] | None] = {start: None}
         length, _ = self.estimate(start)
         queue, numbers, reached = [(length, 0, start)], count(1), start
+        following: dict[int, list[int]] = {}
         while queue:
             if self.is_late():
                 return MoveSearchResult("undecided", explored=len(parents), reached=reached)
@@ -250,22 +269,54 @@ class MoveSearch:
             if graph.is_goal(state):
                 moves = [*first, *_trace_lists(parents, state)]
                 return MoveSearchResult("found", self.prune(moves), False, len(parents), reached)
-            for move, moved in self._moves(state, branching):
-                after, more = self.advance(moved)
-                if after in parents:
-                    continue
-                parents[after] = state, [move, *more]
-                reached |= after
-                length, _ = self.estimate(after)
-                if length < math.inf:
-                    heapq.heappush(queue, (length, next(numbers), after))
-        return MoveSearchResult("refuted", explored=len(parents), reached=reached)
+            following[state] = []
+            for k in range(len(graph.coordinates)):
+                for move, moved in self._moves(state, k, self._useful_ways(state, k)):
+                    after, more = self.advance(moved)
+                    following[state].append(after)
+                    if after in parents:
+                        continue
+                    parents[after] = state, [move, *more]
+                    reached |= after
+                    length, _ = self.estimate(after)
+                    if length < math.inf:
+                        heapq.heappush(queue, (length, next(numbers), after))
+        place = {state: n for n, state in enumerate(parents)}
+        regions = [self._dominated(state) for state in parents]
+        for n, state in enumerate(parents):
+            if state not in following:
+                regions[n], _ = self.relax(regions[n])
+        return MoveSearchResult(
+            "refuted",
+            explored=len(parents),
+            reached=reached,
+            regions=tuple(regions),
+            following=tuple(tuple(place[s] for s in following.get(state, ())) for state in parents),
+        )
 
-    def _moves(self, state: int, coordinates: Sequence[int]) -> Iterator[tuple[Move, int]]:
-        for k in coordinates:
-            for way in (1, -1):
-                for cell, after in self.graph.sweep(state, k, way):
-                    yield (k, cell), after
+    def _useful_ways(self, state: int, k: int) -> tuple[int, ...]:
+        """Return the directions in which a coordinate may have to move from a state."""
+        best, cell = self._best[k], self.graph.cell_of(state, k)
+        if best is None or cell not in self._harmless[k]:
+            return (1, -1)
+        return () if cell == best else (1,) if best > cell else (-1,)
+
+    def _dominated(self, state: int) -> int:
+        """Return the bits of the cells from which no more can be reached than from a state."""
+        graph, every = self.graph, self._reach
+        for k, best in enumerate(self._best):
+            cell = graph.cell_of(state, k)
+            if best is None or cell not in self._harmless[k]:
+                continue
+            below = (graph.bit(k, cell) << 1) - 1
+            beyond = -1 if cell == best else below if cell < best else ~(below >> 1)
+            state |= graph.field(k) & every & beyond
+        return state
+
+    def _moves(self, state: int, k: int, ways: Sequence[int]) -> Iterator[tuple[Move, int]]:
+        for way in ways:
+            for cell, after in self.graph.sweep(state, k, way):
+                yield (k, cell), after
 
     def prune(self, moves: Sequence[Move]) -> tuple[Move, ...]:
         """Return the moves without those that are not needed, the last ones tried first."""

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Collection, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field, replace
 from time import perf_counter
 from types import MappingProxyType
 from typing import Any
@@ -22,6 +22,8 @@ from .find_interlocks import constant_limits, interlocks
 from .interlock import Interlock, Interlocks, Undecided
 from .move_rules import MoveRule, make_rules, relevant_rules
 from .move_search import MoveSearch, MoveSearchResult, Verdict, find_circle
+from .plan_check import plan_violations
+from .refutation import InvariantSet, Region, refutation_gaps
 
 BUDGET = 10.0
 """Default budget of a plan [s]."""
@@ -88,8 +90,8 @@ class UnlockingPlan:
     goal
         Positions to reach, by coordinate.
     verdict
-        ``"found"``; ``"refuted"`` if no sequence of moves of one coordinate at a time reaches the goal; or
-        ``"undecided"``, after the budget, or if locks that could not be read are in the way.
+        ``"found"``, if :func:`.plan_violations` finds nothing wrong with the steps; ``"refuted"``, if
+        :func:`.refutation_gaps` finds no way out of ``invariant``; otherwise ``"undecided"``.
     steps
         The moves, empty unless found.
     shortest
@@ -104,6 +106,10 @@ class UnlockingPlan:
         Coordinates that were said not to move.
     explored
         Number of combinations of intervals that were looked at.
+    reason
+        Reason why it is undecided.
+    invariant
+        Positions without the goal that no move of one coordinate at a time leaves, for a refutation.
     """
 
     goal: Mapping[Symbol, float]
@@ -115,6 +121,8 @@ class UnlockingPlan:
     unread: tuple[Interlock | Undecided, ...] = ()
     still: tuple[Symbol, ...] = ()
     explored: int = 0
+    reason: str = ""
+    invariant: InvariantSet | None = field(default=None, repr=False)
 
     def as_data(self) -> dict[str, Any]:
         """Return the plan as data for JSON: lists, mappings, texts and numbers."""
@@ -128,6 +136,7 @@ class UnlockingPlan:
             "unread": [str(lock) for lock in self.unread],
             "still": [str(s) for s in self.still],
             "explored": self.explored,
+            "reason": self.reason,
         }
 
     def __str__(self) -> str:
@@ -146,9 +155,7 @@ class UnlockingPlan:
 
     def _explain(self) -> str:
         if self.verdict == "undecided":
-            if self.blocking:
-                return "undecided, since a lock that could not be read may be open"
-            return f"undecided after {self.explored} combinations of intervals"
+            return f"undecided, since {self.reason}"
         without = f" without {_list_words(map(str, self.still))}" if self.still else ""
         if not self.blocking:
             return f"cannot be reached{without}"
@@ -167,14 +174,15 @@ def plan_unlocking(
 ) -> UnlockingPlan:
     """Return the order in which coordinates have to move so that a goal is reached, or a refutation.
 
-    One coordinate moves at a time, along its axis, from one interval between thresholds to another. If all
-    locks want their keys on one side, the plan has no superfluous move. Otherwise, up to 50 000 combinations
-    of intervals, it has the fewest possible ones.
+    One coordinate moves at a time, along its axis, from one interval between thresholds to another, back and
+    forth as often as it takes. If all locks want their keys on one side, the plan has no superfluous move.
+    Otherwise, up to 50 000 combinations of intervals, it has the fewest possible ones.
 
-    A refutation is certain: either a coordinate cannot be moved even if all others keep every position that
-    they ever had, or all combinations were explored. It holds for positions off the thresholds. Interlocks
-    whose conditions are not intervals of single coordinates, and undecided constraints, count as shut. They
-    are listed, and the verdict is never a refutation because of them.
+    Both answers are checked by evaluation of the constraints, without the code that found them: steps by
+    :func:`.plan_violations`, a refutation by :func:`.refutation_gaps`. It holds for positions off the
+    thresholds: there, comparisons are neither true nor false. Interlocks whose conditions are not intervals
+    of single coordinates, and undecided constraints, count as shut in a plan, and as open in a refutation.
+    They are listed if they may matter.
 
     Parameters
     ----------
@@ -190,7 +198,8 @@ def plan_unlocking(
     still
         Coordinates that do not move, such as those that did not move when they should have.
     budget
-        Time for the search [s], after which the verdict is ``"undecided"``.
+        Time for the search [s], after which the verdict is ``"undecided"``. Reading the interlocks takes time
+        of its own.
 
     Raises
     ------
@@ -203,14 +212,13 @@ def plan_unlocking(
         raise InvalidValueError(f"The budget of a plan is a positive time in seconds, not {budget!r}.")
     if not goal:
         raise InvalidValueError("A plan has a goal, such as {'garage/door': 1.5}.")
-    end = perf_counter() + budget
     limits = constant_limits(dict(model.constraints.items()))
     goals = {model.degree_of_freedom(name): value for name, value in goal.items()}
     goals = {s: _check_goal(s, value, limits.get(s, Interval())) for s, value in goals.items()}
     fixed = tuple(model.degree_of_freedom(name) for name in still)
-    coordinates, rules = relevant_rules(
-        make_rules(model, interlocks(model) if found is None else found), goals
-    )
+    known = interlocks(model) if found is None else found
+    end = perf_counter() + budget
+    coordinates, rules = relevant_rules(make_rules(model, known), goals)
     given = dict(model.default_state())
     if state is not None:
         given |= dict(as_state(state, model.symbols))
@@ -222,17 +230,33 @@ def plan_unlocking(
 
     graph, result = search(rules)
     unread = tuple(dict.fromkeys(rule.lock for rule in rules if not rule.is_exact))
+    plan = UnlockingPlan(
+        MappingProxyType(goals), result.verdict, unread=unread, still=fixed, explored=result.explored
+    )
     if result.verdict == "found":
-        steps = _make_steps(graph, result.moves, start, goals)
-        shown = MappingProxyType(goals)
-        return UnlockingPlan(
-            shown, "found", steps, result.shortest, unread=unread, still=fixed, explored=result.explored
-        )
+        steps = _make_steps(graph, result.moves, {s: given.get(s, 0.0) for s in coordinates}, goals)
+        plan = replace(plan, steps=steps, shortest=result.shortest)
+        wrong = plan_violations(model, plan, state)
+        return replace(plan, verdict="undecided", steps=(), reason=_say_wrong(wrong)) if wrong else plan
+    if result.verdict == "undecided":
+        return replace(plan, reason=f"the budget was spent after {result.explored} combinations of intervals")
     chain, is_circle = find_circle(graph, result.reached)
-    if not chain and result.verdict == "refuted":
+    if not chain:
         # Each lock could be opened, but not all that are needed at once.
         chain = _find_conflict(rules, search)
-    return _make_refutation(result, chain, is_circle, goals, unread, fixed)
+    plan = replace(plan, blocking=tuple(dict.fromkeys(rule.lock for rule in chain)), is_circle=is_circle)
+    if unread:
+        graph, result = search([rule for rule in rules if rule.is_exact])
+        if result.verdict != "refuted":
+            return replace(plan, verdict="undecided", reason="a lock that could not be read may be open")
+    plan = replace(plan, invariant=_make_invariant(graph, result))
+    gaps = refutation_gaps(model, plan, state)
+    return replace(plan, verdict="undecided", reason=_say_wrong(gaps)) if gaps else plan
+
+
+def _say_wrong(found: Sequence[str]) -> str:
+    more = f", and {len(found) - 1} more" if len(found) > 1 else ""
+    return f"the constraints do not confirm the answer: {found[0]}{more}"
 
 
 def _find_conflict(
@@ -247,25 +271,20 @@ def _find_conflict(
     return tuple(kept)
 
 
-def _make_refutation(
-    result: MoveSearchResult,
-    chain: tuple[MoveRule, ...],
-    is_circle: bool,
-    goals: dict[Symbol, float],
-    unread: tuple[Interlock | Undecided, ...],
-    fixed: tuple[Symbol, ...],
-) -> UnlockingPlan:
-    """Return the plan without steps for a search that found no moves."""
-    blocking = tuple(dict.fromkeys(rule.lock for rule in chain))
-    verdict: Verdict = "undecided" if unread else result.verdict
-    return UnlockingPlan(
-        MappingProxyType(goals),
-        verdict,
-        blocking=blocking if result.verdict == "refuted" else (),
-        is_circle=is_circle and result.verdict == "refuted",
-        unread=unread,
-        still=fixed,
-        explored=result.explored,
+def _make_invariant(graph: CellGraph, result: MoveSearchResult) -> InvariantSet:
+    """Return the states that a search has exhausted."""
+    count = range(len(graph.coordinates))
+
+    def region(states: int) -> Region:
+        fields = ((states & graph.field(k)) >> graph.first[k] for k in count)
+        return tuple(((field & -field).bit_length() - 1, field.bit_length() - 1) for field in fields)
+
+    return InvariantSet(
+        graph.coordinates,
+        graph.cells,
+        tuple(tuple(bool(graph.rests & graph.bit(k, n)) for n in range(len(graph.cells[k]))) for k in count),
+        tuple(map(region, result.regions)),
+        result.following,
     )
 
 
@@ -284,7 +303,7 @@ def _make_steps(
         symbol, side = graph.coordinates[k], graph.cells[k][cell]
         way = 1 if cell > graph.cell_of(states[n], k) else -1
         ends = symbol in goals and goals[symbol] in side
-        target = goals[symbol] if ends else _inside(graph, states[n + 1], k, cell, way)
+        target = goals[symbol] if ends else _inside(side, way)
         last = following[n] == len(moves)
         releases = _released(graph, moves, states, n, following[n])
         bound = side.lower if way > 0 else side.upper
@@ -317,16 +336,10 @@ def _released(
     return tuple(found)
 
 
-def _inside(graph: CellGraph, state: int, k: int, cell: int, way: int) -> float:
+def _inside(side: Interval, way: int) -> float:
     """Return a position within a cell, a little beyond the end where it is entered."""
-    side = graph.cells[k][cell]
     lower, upper = float(side.lower), float(side.upper)
-    entered = lower if way > 0 else upper
-    closed = side.lower_closed if way > 0 else side.upper_closed
-    step = graph.step(k, cell, way)
-    if closed and step is not None and not all(map(state.__and__, step.needs)):
-        return entered
-    return entered + way * min(_BEYOND, (upper - lower) / 2)
+    return (lower if way > 0 else upper) + way * min(_BEYOND, (upper - lower) / 2)
 
 
 def _check_goal(symbol: Symbol, value: object, limit: Interval) -> float:
