@@ -175,7 +175,7 @@ def _table_by_noise(results: Fig4Results) -> ReportTable:
             )
     return ReportTable(
         "Errors against noise, and the time of one prediction and update",
-        ("noise", "filter", "mean", "sd", "max", "NEES", "time [ms]", "sd", "median"),
+        ("noise", "filter", "mean", "sd", "max", "NEES", "time [ms]", "its sd", "its median"),
         tuple(rows),
     )
 
