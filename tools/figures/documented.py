@@ -183,7 +183,7 @@ STURM = (
     ),
 )
 
-# Errors with a correlation of .95 from look to look are independent after some 20 looks. The hand moves for 7 s.
+# Errors with a correlation of .95 from look to look are independent after some 20. The hand moves for 7 s.
 _MOVING, _RESTING = 10 * STREAMS, 60 * STREAMS
 
 STREAM = (
@@ -235,7 +235,13 @@ JOINTS = (
         "experiments.md",
         "kineverse reproduce joint-types",
         "Right types",
-        {"given": KEY, "right [%]": _CASES, "sure [%]": _CASES, "sure and wrong [%]": _CASES, "asked for": SAME},
+        {
+            "given": KEY,
+            "right [%]": _CASES,
+            "sure [%]": _CASES,
+            "sure and wrong [%]": _CASES,
+            "asked for": SAME,
+        },
         short_forms.joint_types,
     ),
     DocumentedTable(
@@ -249,7 +255,7 @@ JOINTS = (
     DocumentedTable(
         "estimation-grid",
         "experiments.md",
-        "kineverse reproduce estimation-grid",
+        "kineverse reproduce estimation-grid --count 5",
         "What is asked for",
         {
             "": KEY,
@@ -372,13 +378,30 @@ LOCKBOX = (
         },
         short_forms.lockbox,
     ),
+    DocumentedTable(
+        "lockbox-unknown",
+        "experiments.md",
+        f"kineverse reproduce lockbox --count {LOCKBOXES}",
+        "Unknown locks",
+        {
+            "boxes": KEY,
+            "opened": CountOf(),
+            "tries (mean)": FEWER,
+            "(most)": LARGEST,
+            "systematic, depth first": FEWER,
+            "breadth first": FEWER,
+        },
+        short_forms.lockbox,
+    ),
 )
+
+_QUICKER = {"planning": " --queries 50 --quick"}
 
 BENCH = tuple(
     DocumentedTable(
         f"bench-{name}",
         "benchmarks.md",
-        f"kineverse bench {name}",
+        f"kineverse bench {name}{_QUICKER.get(name, '')}",
         f"{name}:",
         {name: KEY, "median": TIME, "best": TIME, "takes": TIME},
     )

@@ -68,7 +68,12 @@ def find_titled_tables(text: str) -> Iterator[tuple[str, Table]]:
 
 def pages() -> list[Path]:
     """Return all pages that may have figures."""
-    return [ROOT / "README.md", ROOT / "CONTRIBUTING.md", ROOT / "examples" / "README.md", *sorted(DOCS.glob("*.md"))]
+    return [
+        ROOT / "README.md",
+        ROOT / "CONTRIBUTING.md",
+        ROOT / "examples" / "README.md",
+        *sorted(DOCS.glob("*.md")),
+    ]
 
 
 def find_blocks(page: Path) -> list[Block]:
@@ -91,6 +96,8 @@ def write_block(page: Path, name: str, text: str) -> None:
     """
     before = page.read_text("utf-8")
     if name not in {block.name for block in find_blocks(page)}:
-        raise ValueError(f"{page.name} has no mark '<!-- figures: {name} -->' with an '<!-- end -->' below it")
+        raise ValueError(
+            f"{page.name} has no mark '<!-- figures: {name} -->' with an '<!-- end -->' below it"
+        )
     marked = f"<!-- figures: {name} -->\n{text}<!-- end -->"
     page.write_text(_MARKED.sub(lambda m: marked if m[1] == name else m[0], before), "utf-8")

@@ -1,7 +1,7 @@
 """Rules by which a cell of a page agrees with that of a short form of its command.
 
 The short form has fewer samples, so it differs by its sampling error. Four standard errors are allowed, which
-errors of a normal distribution exceed once in 16 000 times, and half a unit of the last digit that is printed.
+a normal distribution exceeds once in 16 000 times, and half a unit of the last digit that is printed.
 """
 
 from __future__ import annotations
@@ -221,7 +221,9 @@ def find_disagreements(
         True if the short form has all rows of the page, False if it has some of them.
     """
     wrong = [f"column '{column}' has no rule" for column in said.head if column not in rules]
-    wrong += [f"no column '{column}' in what the command prints" for column in said.head if column not in found.head]
+    wrong += [
+        f"no column '{column}' in what the command prints" for column in said.head if column not in found.head
+    ]
     if wrong:
         return wrong
     names = [column for column in said.head if isinstance(rules[column], Key)]

@@ -179,7 +179,7 @@ def pushes() -> Tables:
 
 @cache
 def lockbox() -> Tables:
-    """Open the first random box, and plan the smallest of each kind."""
+    """Open the first random box, plan the first of each kind, and explore the first with unknown locks."""
     from kineverse.experiments.lockbox import (
         KINDS,
         list_explorer_jobs,
@@ -189,11 +189,17 @@ def lockbox() -> Tables:
         run_explorer,
         run_planner,
     )
+    from kineverse.experiments.lockbox.unknown_locks import list_unknown_jobs, make_unknown_table, run_unknown
 
     explored = run_explorer(list_explorer_jobs(LOCKBOXES, 0, quick=False)[0])
     jobs = list_planner_jobs(LOCKBOXES, 0, quick=False)
     plans = {kind: run_planner(next(job for job in jobs if job.kind == kind)) for kind in KINDS}
-    return tables_of(make_explorer_table({("and", False): explored}), make_planner_table(plans))
+    unknown = run_unknown(list_unknown_jobs(LOCKBOXES, 0)[0])
+    return tables_of(
+        make_explorer_table({("and", False): explored}),
+        make_planner_table(plans),
+        make_unknown_table(unknown),
+    )
 
 
 def missing_data(folder: str) -> Path | None:

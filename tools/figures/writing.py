@@ -25,9 +25,9 @@ def write_tables(chosen: Iterable[DocumentedTable]) -> None:
 
 
 def run_command(command: str, needs_data: bool) -> str:
-    """Return what a command prints with ``--markdown``, in the folder of other people's data or in an empty one.
+    """Return what a command prints with ``--markdown``.
 
-    Some experiments take those people's robots and kitchens where they find them.
+    It runs in the folder of other people's data, or in an empty one: some experiments take what they find.
     """
     words = [sys.executable, "-m", *shlex.split(command), "--markdown"]
     with tempfile.TemporaryDirectory() as empty:

@@ -52,7 +52,10 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--record", metavar="FOLDER", type=Path, help="folder for a recording of each trial")
     figure = parser.add_mutually_exclusive_group()
     figure.add_argument(
-        "--figure", metavar="FILE", type=Path, help="file of the figure (NAME.png; with --json, --markdown: none)"
+        "--figure",
+        metavar="FILE",
+        type=Path,
+        help="file of the figure (NAME.png; with --json, --markdown: none)",
     )
     figure.add_argument("--no-figure", action="store_true", help="draw nothing")
     form = parser.add_mutually_exclusive_group()

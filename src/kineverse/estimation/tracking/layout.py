@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from functools import cached_property
@@ -160,7 +161,7 @@ class Layout:
             if one.is_pose:
                 if not coordinates.isdisjoint(value[:3, :3].symbols):
                     return False
-            elif one.period is not None:
+            elif math.isfinite(one.period):
                 return False
             if not coordinates.isdisjoint(self._jacobian(one, value, group).symbols):
                 return False

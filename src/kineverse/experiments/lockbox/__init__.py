@@ -247,7 +247,12 @@ def make_lockbox_report(
     return Report(
         "lockbox",
         "Lockboxes opened by trends, plans of their opening, and unknown locks",
-        (_thesis_table(thesis), make_explorer_table(groups), make_planner_table(plans), make_unknown_table(unknown)),
+        (
+            _thesis_table(thesis),
+            make_explorer_table(groups),
+            make_planner_table(plans),
+            make_unknown_table(unknown),
+        ),
         numbers,
         Figure(lambda canvas: draw_boxes(canvas, ablated), FIGURE_SIZE),
     )
