@@ -2,7 +2,10 @@ from __future__ import annotations
 
 import importlib.util
 import math
+import re
+import sys
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -13,7 +16,12 @@ from kineverse.bench.control_workloads import WORKLOADS
 from kineverse.bench.harness import ProgramError, has_peer, run_program
 from kineverse.bench.large_models import READERS, count_reruns, make_large_model
 from kineverse.bench.reaching import ARMS
+from kineverse.cli.bench import benchmark_to_markdown
 from kineverse.compile.toolchain import require_compiler
+
+sys.path.append(str(Path(__file__).parents[2] / "tools"))
+
+from figures.pages import DOCS, find_blocks, find_tables
 
 HAS_PEERS = all(importlib.util.find_spec(name) for name in ("pinocchio", "mujoco"))
 # One of those it compares is casadi's map in C.
@@ -22,6 +30,22 @@ BATCH = pytest.param("batch", marks=pytest.mark.compiler)
 
 # test_control_bench.py and test_planning_bench.py run these without their long parts.
 LONG = ("control", "planning")
+
+
+# Some of their rows are about robots, kitchens and examples that the minimal settings leave out.
+PARTS = ("geometry", "inverse_kinematics", "examples", "document", "edit", "motion", "identification")
+
+
+def rows_of_markdown(text):
+    """Return the first cells of a table, without numbers and the names of files."""
+    (table,) = find_tables(text)
+    return {re.sub(r"[\w.]+\.(urdf|kv\.json)|\d+(\s\d+)*", "#", row[0]) for row in table.rows}
+
+
+def documented_rows(name):
+    """Return the rows of a benchmark in docs/benchmarks.md."""
+    blocks = {block.name: block.text for block in find_blocks(DOCS / "benchmarks.md")}
+    return rows_of_markdown(blocks[f"bench-{name}"])
 
 
 @pytest.fixture
@@ -46,7 +70,7 @@ def programs_run_once(monkeypatch):
     "name", [BATCH if name == "batch" else name for name in BENCHMARKS if name not in LONG]
 )
 @pytest.mark.usefixtures("programs_run_once", "clutter_made_once")
-def test_a_benchmark_measures_all_installed_peers(name, tiny, monkeypatch):
+def test_a_benchmark_measures_all_installed_peers_and_its_rows_are_documented(name, tiny, monkeypatch):
     workload = replace(WORKLOADS[tiny.examples[0]], steps=40)
     monkeypatch.setattr("kineverse.bench.measure_examples.WORKLOADS", {tiny.examples[0]: workload})
     for module in ("measure_inverse_kinematics", "reaching"):
@@ -61,7 +85,10 @@ def test_a_benchmark_measures_all_installed_peers(name, tiny, monkeypatch):
         assert all(math.isfinite(sample) for sample in measurement.samples)
         assert len(measurement.samples) in (1, tiny.rounds, tiny.processes)
     assert result.comparisons
+    measured, documented = rows_of_markdown(benchmark_to_markdown(result)), documented_rows(name)
+    assert measured <= documented
     if HAS_PEERS:
+        assert name in PARTS or measured == documented
         # Pinocchio has no closed loops, no search for what is near, and no filters.
         others = {"loop": "casadi", "geometry": "mujoco", "tracking": "numpy,", "identification": "scipy"}
         others |= {"examples": "mink", "inverse_kinematics": "pink"}

@@ -100,6 +100,23 @@ def test_reproduce_as_json_is_one_object(tmp_path, monkeypatch, capsys):
     assert not list(tmp_path.iterdir())
 
 
+def test_the_lock_opens_at_the_threshold_of_the_paper(fig3):
+    """Equation 13 has b < .3; at a = 1 the door is never locked."""
+    table = next(table for table in fig3.tables if "unlocked from b =" in table.head)
+    opens = {row[0]: row[-1] for row in table.rows}
+    assert opens == {1.0: 0.0, 2.0: pytest.approx(0.3, abs=1e-9)}
+
+
+def test_reproduce_in_markdown_prints_tables_and_writes_nothing(tmp_path, monkeypatch, capsys):
+    monkeypatch.chdir(tmp_path)
+    assert main(["reproduce", "fig3", "--markdown"]) == 0
+    out = capsys.readouterr().out
+    assert out.startswith("# The garage door")
+    assert "## Ends of the door at some openings\n\n| a [m] | A: x [m] |" in out
+    assert "\n| 2 | 0 | 0 | 1 | 1 | 0.3 |\n" in out
+    assert not list(tmp_path.iterdir())
+
+
 def test_reproduce_as_json_writes_a_requested_figure(tmp_path, monkeypatch, capsys):
     pytest.importorskip("matplotlib")
     monkeypatch.chdir(tmp_path)

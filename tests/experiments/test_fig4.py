@@ -25,6 +25,7 @@ from kineverse.experiments.fig4.protocol import (
     add_gaussian_noise,
     add_published_noise,
     make_observed_model,
+    make_tracker,
     run_published,
 )
 
@@ -95,6 +96,17 @@ def test_first_groups_form_an_observed_model(kitchen):
     assert {s for f in part.frames for s in kitchen.model.fk(f).symbols} == set(part.symbols)
     q = kitchen.configurations(np.random.default_rng(5), 3)
     np.testing.assert_array_equal(part.poses(q[:, :8]), kitchen.poses(q)[:, : len(part.frames)])
+
+
+def test_the_tracker_has_no_process_noise_as_in_the_papers(kitchen):
+    """The deviation stays as it is between two measurements, however long."""
+    tracker = make_tracker(kitchen, NOISE)
+    q = kitchen.configurations(np.random.default_rng(8), 1)
+    before = tracker.update_poses(kitchen.poses(q)[0])
+    after = tracker.predict(1000.0)
+    for symbol in kitchen.symbols:
+        assert after.deviation[symbol] == pytest.approx(before.deviation[symbol], rel=1e-9)
+        assert after.state[symbol] == before.state[symbol]
 
 
 def test_a_model_without_moving_frames_is_refused():

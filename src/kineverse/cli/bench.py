@@ -11,7 +11,7 @@ from dataclasses import asdict, replace
 from typing import TYPE_CHECKING, Any
 
 from kineverse._checks import as_count
-from kineverse.cli.output import format_table, show_progress
+from kineverse.cli.output import format_markdown, format_table, show_progress
 from kineverse.expressions.printing import format_number
 
 if TYPE_CHECKING:
@@ -44,7 +44,9 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--queries", metavar="N", type=int, help="number of queries of 'planning' in kitchens (1000)"
     )
-    parser.add_argument("--json", action="store_true", help="one JSON object on standard output")
+    form = parser.add_mutually_exclusive_group()
+    form.add_argument("--json", action="store_true", help="one JSON object on standard output")
+    form.add_argument("--markdown", action="store_true", help="tables in Markdown on standard output")
 
 
 def run(arguments: argparse.Namespace) -> int:
@@ -68,6 +70,10 @@ def run(arguments: argparse.Namespace) -> int:
         results = list(bench.run_benchmarks(names, settings))
         answer = {"machine": asdict(here), "benchmarks": list(map(benchmark_to_json, results))}
         print(json.dumps(answer, indent=2, allow_nan=False))
+        return 0
+    if arguments.markdown:
+        for result in bench.run_benchmarks(names, settings):
+            print(f"## {result.name}: {result.work}\n\n{benchmark_to_markdown(result)}\n", flush=True)
         return 0
     print(_format_machine(here), flush=True)
     print(f"\n{RATIO_NOTE}")
@@ -108,6 +114,21 @@ def benchmark_to_json(result: BenchmarkResult) -> dict[str, Any]:
         ],
         "missing": list(result.missing),
     }
+
+
+def benchmark_to_markdown(result: BenchmarkResult) -> str:
+    """Return one table in Markdown: each contender, and how many times as long it takes as the first.
+
+    A ratio without an entry in :attr:`~.BenchmarkResult.comparisons` is left out.
+    """
+    rows = []
+    for m in result.measurements:
+        slower = [f"{_format_speedup(c)} × {c.ours}" for c in result.comparisons if c.theirs == m.name]
+        cells = (m.name, format_quantity(m.median, m.unit), format_quantity(m.best, m.unit))
+        rows.append((*cells, "; ".join(slower)))
+    known = [c for c in result.comparisons if c.unit == "x" and not c.theirs and c.value is not None]
+    rows += [(c.name, f"{_format_speedup(c)} ×", "", "") for c in known]
+    return format_markdown((result.name, "median", "best", "takes"), rows)
 
 
 def format_benchmark(result: BenchmarkResult, targets: bool = False) -> str:

@@ -69,6 +69,12 @@ def format_table(
     return "\n".join(lines)
 
 
+def format_markdown(head: Sequence[str], rows: Iterable[Sequence[str]]) -> str:
+    """Return rows of cells as a table in Markdown."""
+    lines = [head, ["---"] * len(head), *rows]
+    return "\n".join(f"| {' | '.join(cell.replace('|', chr(92) + '|') for cell in row)} |" for row in lines)
+
+
 def format_cells(head: Sequence[str], rows: Iterable[Sequence[str]]) -> str:
     """Return a table of names and, aligned to the right, of what is known about them."""
     return format_table(head, rows, "<" + ">" * (len(head) - 1))

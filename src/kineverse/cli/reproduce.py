@@ -7,7 +7,7 @@ import json
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from kineverse.cli.output import format_table, show_progress
+from kineverse.cli.output import format_markdown, format_table, show_progress
 from kineverse.cli.requirements import require
 from kineverse.errors import MissingDependencyError, UnknownNameError
 from kineverse.expressions.printing import format_number
@@ -53,10 +53,15 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--record", metavar="FOLDER", type=Path, help="folder for a recording of each trial")
     figure = parser.add_mutually_exclusive_group()
     figure.add_argument(
-        "--figure", metavar="FILE", type=Path, help="file of the figure (NAME.png; with --json: none)"
+        "--figure",
+        metavar="FILE",
+        type=Path,
+        help="file of the figure (NAME.png; with --json, --markdown: none)",
     )
     figure.add_argument("--no-figure", action="store_true", help="draw nothing")
-    parser.add_argument("--json", action="store_true", help="one JSON object on standard output")
+    form = parser.add_mutually_exclusive_group()
+    form.add_argument("--json", action="store_true", help="one JSON object on standard output")
+    form.add_argument("--markdown", action="store_true", help="tables in Markdown on standard output")
 
 
 def run(arguments: argparse.Namespace) -> int:
@@ -96,9 +101,9 @@ def run(arguments: argparse.Namespace) -> int:
     }
     require(f"kineverse reproduce {arguments.name}", extras, compiler=arguments.name in PLANNED)
     report = reproduce(arguments.name, show_progress, options)
+    if arguments.figure is not None and (arguments.json or arguments.markdown):
+        _save_figures(report, arguments.figure)
     if arguments.json:
-        if arguments.figure is not None:
-            _save_figures(report, arguments.figure)
         answer = {
             "name": report.name,
             "title": report.title,
@@ -107,8 +112,8 @@ def run(arguments: argparse.Namespace) -> int:
         }
         print(json.dumps(answer, indent=2, allow_nan=False))
         return 0
-    print(format_report(report), flush=True)
-    if arguments.no_figure:
+    print(format_report(report, arguments.markdown), flush=True)
+    if arguments.no_figure or arguments.markdown:
         return 0
     try:
         paths = _save_figures(report, arguments.figure or Path(f"{report.name}.png"))
@@ -132,11 +137,14 @@ def _save_figures(report: Report, requested: Path) -> list[Path]:
     return list(paths)
 
 
-def format_report(report: Report) -> str:
-    """Return a report as tables."""
-    return "\n\n".join([report.title, *map(_format_report_table, report.tables)])
+def format_report(report: Report, markdown: bool = False) -> str:
+    """Return a report as tables, plain ones or in Markdown."""
+    title = f"# {report.title}" if markdown else report.title
+    return "\n\n".join([title, *(_format_report_table(table, markdown) for table in report.tables)])
 
 
-def _format_report_table(table: ReportTable) -> str:
+def _format_report_table(table: ReportTable, markdown: bool) -> str:
     rows = [[cell if isinstance(cell, str) else format_number(cell) for cell in row] for row in table.rows]
+    if markdown:
+        return f"## {table.title}\n\n{format_markdown(table.head, rows)}"
     return f"{table.title}\n{format_table(table.head, rows, '>' * len(table.head))}"

@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from kineverse.articulations import GarageDoor
-from kineverse.compile import compile  # noqa: A004
+from kineverse.compile import CompiledFunction, compile  # noqa: A004
 from kineverse.lie import Array
 from kineverse.model.frame import WORLD
 from kineverse.model.model import Model
@@ -82,7 +82,7 @@ def run(progress: Progress, options: Options) -> Report:
         _slopes(published, np.linspace(0, LENGTH - 1e-3, 200)),
         _slopes(regular, np.linspace(0, math.pi / 2, 200)),
     )
-    steps = {a: float(_HANDLE[np.argmax(u > 0.5)]) for a, u in unlocked.items()}
+    steps = {a: _unlocking_bolt(bound, a) for a in _LOCK_AT}
     return Report(
         name="fig3",
         title="The garage door and its lock (2022 paper, Fig. 3, Eqs. 11-13)",
@@ -141,6 +141,17 @@ def _edge_path(model: Model, part: float, coordinates: Array) -> Array:
     position = (model.fk("garage/door") @ point(0, 0, part * LENGTH))[[0, 2]]
     path: Array = compile(position, [model.symbol("garage/door")]).batch(coordinates[:, None])
     return path
+
+
+def _unlocking_bolt(bound: CompiledFunction, a: float) -> float:
+    """Return the least position of the bolt in [0, .6] at which a door at a is unlocked, by bisection."""
+    low, high = 0.0, float(_HANDLE[-1])
+    if float(bound([a, low])) > 0.5:
+        return low
+    while high - low > 1e-12:
+        middle = (low + high) / 2
+        low, high = (low, middle) if float(bound([a, middle])) > 0.5 else (middle, high)
+    return high
 
 
 def _slopes(model: Model, coordinates: Array) -> Array:

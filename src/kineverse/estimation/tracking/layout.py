@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from functools import cached_property
@@ -144,6 +145,27 @@ class Layout:
             result[kind].append(slice(at, at + size))
             at += size
         return tuple(result[0]), tuple(result[1]), tuple(result[2])
+
+    def is_affine(self, number: int) -> bool:
+        """Return True if all measurements of a group are affine functions of its coordinates.
+
+        Frames that are shifted only, by amounts that are affine, and vectors without a period.
+        """
+        group = self.groups[number]
+        if group.by_speeds or group.limits:
+            return False
+        coordinates = set(group.coordinates)
+        for i in group.observation_indices:
+            one = self.observations[i]
+            value = self.tangent_space.resolve(one.value)
+            if one.is_pose:
+                if not coordinates.isdisjoint(value[:3, :3].symbols):
+                    return False
+            elif math.isfinite(one.period):
+                return False
+            if not coordinates.isdisjoint(self._jacobian(one, value, group).symbols):
+                return False
+        return True
 
     def compile_function(self) -> CompiledFunction:
         """Compile the values and derivatives of all observations and limits as one function."""

@@ -114,12 +114,16 @@ class StationaryPoints:
             unobservable,
             group_bounds,
         )
+        # The cost of such a group is convex: a restart ends where the update did.
+        self._is_affine = [layout.is_affine(number) for number in range(len(layout.groups))]
 
     def unexplained(self, before: InformationState, result: MapResult) -> list[int]:
         """Return the groups whose residuals exceed the noise and that have unobservable directions."""
         return [n for n in find_unexplained(result) if self._may_have_moved(n, before, result.belief)]
 
     def _may_have_moved(self, number: int, before: InformationState, after: InformationState) -> bool:
+        if self._is_affine[number]:
+            return False
         t = self._layout.groups[number].t
         is_kept = before.records[number] is not None
         return is_kept or self._unobservable.is_unobservable(number, after.information[np.ix_(t, t)])

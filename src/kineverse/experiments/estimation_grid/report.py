@@ -75,7 +75,7 @@ def _scatter(axes: Axes, results: Sequence[CellResult], across: Sequence[float],
             axes.scatter(xs, ys, s=14.0, alpha=0.7, color=color, label=JOINT_NAMES[joint])
 
 
-OPTIONS = ("quick",)
+OPTIONS = ("quick", "count", "processes")
 
 QUICK_SAMPLES = 10
 WORST = 10
@@ -85,9 +85,9 @@ Cells = tuple[float | str, ...]
 
 
 def run(progress: Progress, options: Options) -> Report:
-    """Fit the grid; with the option ``quick`` a few cells and fewer samples."""
+    """Fit the grid; ``quick`` takes a few cells and fewer samples, ``count`` so many samples of each cell."""
     cells, samples = (make_quick_grid(), QUICK_SAMPLES) if options.quick else (make_grid(), SAMPLES)
-    return report_grid(fit_all(cells, samples, progress))
+    return report_grid(fit_all(cells, options.count or samples, progress, options.processes))
 
 
 def report_grid(results: Sequence[CellResult]) -> Report:

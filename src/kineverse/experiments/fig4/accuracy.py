@@ -115,11 +115,15 @@ def measure_errors(
 
 
 def measure_variants(
-    scene: ObservedModel, seeds: Sequence[int], configurations: int, progress: Progress
+    scene: ObservedModel,
+    seeds: Sequence[int],
+    configurations: int,
+    progress: Progress,
+    variants: Sequence[Variant] = VARIANTS,
 ) -> dict[str, list[float]]:
     """Return the mean error of each variant at the papers' levels of noise."""
     mean_errors = {}
-    for variant in progress(VARIANTS, "fig4: variants", "variant"):
+    for variant in progress(variants, "fig4: variants", "variant"):
         means = []
         for noise in LEVELS:
             errors = []

@@ -231,7 +231,11 @@ def run_published(
 def make_tracker(scene: ObservedModel, noise: PoseNoise) -> Tracker:
     """Return the tracker of a scene, for noise on each axis."""
     covariance = pose_covariance(noise.position, noise.orientation)
-    return Tracker(scene.model, [ObservedPose(frame, covariance=covariance) for frame in scene.frames])
+    return Tracker(
+        scene.model,
+        [ObservedPose(frame, covariance=covariance) for frame in scene.frames],
+        process="static",
+    )
 
 
 def run_proper(scene: ObservedModel, observations: Array, noise: PoseNoise) -> FilterRun:

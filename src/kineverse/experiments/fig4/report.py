@@ -174,8 +174,8 @@ def _table_by_noise(results: Fig4Results) -> ReportTable:
                 (str(errors.noise), FILTER_NAMES[filter_name], *values, nees, *_format_ms(times[filter_name]))
             )
     return ReportTable(
-        "Errors against noise, and the time of one prediction and update",
-        ("noise", "filter", "mean", "sd", "max", "NEES", "time [ms]", "sd", "median"),
+        "Errors against noise, and the processor time of one prediction and update",
+        ("noise", "filter", "mean", "sd", "max", "NEES", "time [ms]", "its sd", "its median"),
         tuple(rows),
     )
 

@@ -1,11 +1,11 @@
-"""Time of one prediction and update, by degrees of freedom and noise."""
+"""Processor time of one prediction and update, by degrees of freedom and noise."""
 
 from __future__ import annotations
 
 from collections.abc import Callable
 from copy import copy
 from dataclasses import dataclass
-from time import perf_counter
+from time import process_time
 from typing import TypeAlias
 
 import numpy as np
@@ -26,9 +26,9 @@ REPORTED = 4.0
 
 @dataclass(frozen=True)
 class Duration:
-    """Mean, standard deviation and median of times [ms], and number of updates.
+    """Mean, standard deviation and median of processor times [ms], and number of updates.
 
-    The papers plot mean and deviation. The median depends least on other load of the machine.
+    The papers plot mean and deviation.
     """
 
     mean: float
@@ -55,6 +55,7 @@ def time_updates(scene: ObservedModel, noise: PoseNoise, configurations: int) ->
     published.learn_noise(training)
     published.function.wait()
     initial = make_tracker(scene, noise.on_axes)
+    initial.wait()
 
     def start_published() -> Step:
         published.reset()
@@ -95,7 +96,7 @@ def _run_step(step: Step, observations: Array) -> list[float]:
     step(observations[0])
     times = []
     for poses in observations[1:]:
-        before = perf_counter()
+        before = process_time()
         step(poses)
-        times.append(perf_counter() - before)
+        times.append(process_time() - before)
     return times

@@ -59,12 +59,15 @@ class KitchenJob:
         World, noise and recordings.
     most
         Largest number of objects; None for all.
+    only
+        Name of the coordinate of the only object; None for all.
     """
 
     kitchen: str
     robot: RobotSource
     setting: TrialSetting = field(default_factory=TrialSetting)
     most: int | None = None
+    only: str | None = None
 
 
 def run(progress: Progress, options: Options) -> Report:
@@ -104,7 +107,11 @@ def report_trials(trials: list[Trial], names: Sequence[str]) -> Report:
 def run_kitchen(job: KitchenJob) -> list[Trial]:
     """Return the trials of one kitchen and one robot."""
     model = make_kitchen_with(job.robot, job.kitchen)
-    objects = [one for one in find_articulated_objects(model, job.robot.prefix) if one.kind != "knob"]
+    objects = [
+        one
+        for one in find_articulated_objects(model, job.robot.prefix)
+        if one.kind != "knob" and job.only in (None, str(one.coordinate))
+    ]
     cases = [
         TrialCase(
             job.kitchen,

@@ -247,7 +247,12 @@ def make_lockbox_report(
     return Report(
         "lockbox",
         "Lockboxes opened by trends, plans of their opening, and unknown locks",
-        (_thesis_table(thesis), _explorer_table(groups), _planner_table(plans), make_unknown_table(unknown)),
+        (
+            _thesis_table(thesis),
+            make_explorer_table(groups),
+            make_planner_table(plans),
+            make_unknown_table(unknown),
+        ),
         numbers,
         Figure(lambda canvas: draw_boxes(canvas, ablated), FIGURE_SIZE),
     )
@@ -261,7 +266,8 @@ def _thesis_table(runs: dict[Rule, UnlockingRun]) -> ReportTable:
     return ReportTable("The lockbox of the thesis", ("trends", "opened", "steps", "order of the parts"), rows)
 
 
-def _explorer_table(groups: dict[tuple[Rule, bool], list[ExplorerResult]]) -> ReportTable:
+def make_explorer_table(groups: dict[tuple[Rule, bool], list[ExplorerResult]]) -> ReportTable:
+    """Return the table of boxes that a controller opens, by rule of trends and whether locks are negated."""
     rows: list[tuple[float | str, ...]] = []
     for (rule, negated), own in groups.items():
         solvable = [r for r in own if r.solvable]
@@ -286,7 +292,8 @@ def _format_parts(parts: Iterable[int]) -> str:
     return str(numbers[0]) if numbers[0] == numbers[-1] else f"{numbers[0]} to {numbers[-1]}"
 
 
-def _planner_table(plans: dict[Kind, list[PlannerResult]]) -> ReportTable:
+def make_planner_table(plans: dict[Kind, list[PlannerResult]]) -> ReportTable:
+    """Return the table of plans by kind of box."""
     rows: list[tuple[float | str, ...]] = []
     for kind, own in plans.items():
         counts = [sum(p.verdict == v for p in own) for v in ("found", "refuted", "undecided")]

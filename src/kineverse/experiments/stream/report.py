@@ -31,7 +31,7 @@ def make_report(tracked: Mapping[str, Sequence[TrackedStream]], monitored: Seque
             f"A door that a hand moves, seen by two markers at 30 Hz: {1000 * POSITION:.0f} mm, "
             f"{math.degrees(ORIENTATION):.1f}°, correlated errors, dropouts, outliers"
         ),
-        tables=(_tracking_table(summaries, count), _monitoring_table(monitored)),
+        tables=(_tracking_table(summaries, count), monitoring_table(monitored)),
         numbers={
             "tracking": [_numbers(asdict(summary)) for summary in summaries],
             "monitoring": [_numbers(asdict(row)) for row in monitored],
@@ -83,7 +83,8 @@ def _milliseconds(seconds: float) -> str:
     return "-" if math.isnan(seconds) else f"{1000 * seconds:.2f}"
 
 
-def _monitoring_table(rows: Sequence[MonitoringRow]) -> ReportTable:
+def monitoring_table(rows: Sequence[MonitoringRow]) -> ReportTable:
+    """Return the table of the monitor."""
     return ReportTable(
         "Monitor of the model's plausibility",
         (

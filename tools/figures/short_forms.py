@@ -1,0 +1,208 @@
+"""Short forms of the commands that make the tables: fewer samples, seconds in place of minutes and hours.
+
+Each returns the tables of the command's report. Several tables of one command share a run.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterable
+from functools import cache
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+import kineverse as kv
+from kineverse.cli.reproduce import format_report
+from kineverse.experiments.report import Figure, Report, ReportTable
+
+from .pages import ROOT, Table, find_titled_tables
+
+DATA = ROOT.parent / "shared" / "data"
+"""Other people's models and recordings, see ``tests/DATA.md``."""
+
+Tables = list[tuple[str, Table]]
+
+FIG4_CONFIGURATIONS = 20
+STREAMS, STREAM_SECONDS = 2, 45.0
+TYPE_CASES = 20
+GRID_STEP = 9
+LOCKBOXES = 20
+"""Every ninth cell of the grid, with one sample."""
+
+
+def _quiet(items: Iterable[Any], what: str, unit: str) -> Iterable[Any]:
+    return items
+
+
+def as_tables(report: Report) -> Tables:
+    """Return the tables of a report as the command prints them."""
+    return list(find_titled_tables(format_report(report, markdown=True)))
+
+
+def tables_of(*tables: ReportTable) -> Tables:
+    """Return tables of a report that the short form does not make as a whole."""
+    return as_tables(Report("", "", tables, {}, Figure(lambda canvas: None, (1.0, 1.0))))
+
+
+@cache
+def fig4() -> Tables:
+    """Track few configurations, with one seed, and without times and mechanisms."""
+    from kineverse.experiments.fig4.accuracy import measure_errors
+    from kineverse.experiments.fig4.consistency import measure_consistency
+    from kineverse.experiments.fig4.protocol import make_observed_model
+
+    scene = make_observed_model(kv.load("kitchen"))
+    errors = measure_errors(scene, range(1), FIG4_CONFIGURATIONS, _quiet)
+    consistency = measure_consistency(scene, range(1), FIG4_CONFIGURATIONS, _quiet)
+    return _fig4_tables(scene, errors, consistency=consistency)
+
+
+@cache
+def fig4_authors() -> Tables:
+    """Track few configurations of the authors' kitchen by the papers' filter, and by two of its variants."""
+    from kineverse.experiments.fig4.accuracy import VARIANTS, Errors, measure_variants, simulate_observations
+    from kineverse.experiments.fig4.protocol import LEVELS, make_observed_model, run_published
+
+    model = DATA / "iai_kitchen" / "iai_kitchen" / "urdf_obj" / "IAI_kitchen.urdf"
+    scene = make_observed_model(kv.load(model))
+    errors = []
+    for noise in LEVELS:
+        truth, observations, training = simulate_observations(scene, noise, 0, FIG4_CONFIGURATIONS)
+        found = np.abs(run_published(scene, observations, training).q - truth)[None]
+        errors.append(Errors(noise, {"published": found, "proper": found}, {"published": 0.0, "proper": 0.0}))
+    chosen = [one for one in VARIANTS if one.steps == 1 or one.directions == "uniform"]
+    variants = measure_variants(scene, range(1), FIG4_CONFIGURATIONS, _quiet, chosen)
+    return _fig4_tables(scene, tuple(errors), variants=variants)
+
+
+def _fig4_tables(scene: Any, errors: Any, variants: Any = None, consistency: Any = None) -> Tables:
+    from kineverse.experiments.fig4.accuracy import FILTERS
+    from kineverse.experiments.fig4.report import Fig4Results, make_tables
+    from kineverse.experiments.fig4.timing import Duration
+
+    untimed = dict.fromkeys(FILTERS, Duration(math.nan, math.nan, math.nan, 0))
+    results = Fig4Results(
+        model="",
+        scene=scene,
+        seeds=(0,),
+        configurations=FIG4_CONFIGURATIONS,
+        errors=errors,
+        variants=variants or {},
+        by_size=[],
+        by_noise=[(one.noise, untimed) for one in errors],
+        consistency=consistency or {},
+        mechanisms=[],
+    )
+    return tables_of(*make_tables(results))
+
+
+@cache
+def sturm() -> Tables:
+    """Classify all recordings, reduced to 20 poses each."""
+    from kineverse.experiments import Options, reproduce
+
+    return as_tables(reproduce("sturm", options=Options(quick=True, data=DATA / "sturm_tracks")))
+
+
+@cache
+def sturm_statements() -> Tables:
+    """Identify the shortest recording by all of its poses."""
+    from kineverse.experiments.sturm.noise_statements import answer_statements, statement_table
+    from kineverse.experiments.sturm.recordings import read_labelled_pairs
+
+    pairs = read_labelled_pairs(DATA / "sturm_tracks")
+    shortest = min(pairs, key=lambda one: len(one[2].child_poses))
+    return tables_of(statement_table(answer_statements(*shortest)))
+
+
+@cache
+def stream_tracking() -> Tables:
+    """Track two streams of 45 s."""
+    from kineverse.experiments.stream.report import make_report
+    from kineverse.experiments.stream.tracking import make_streams, run_trackers
+
+    model = kv.load("kitchen")
+    streams = make_streams(model, range(STREAMS), _quiet, STREAM_SECONDS)
+    return as_tables(make_report(run_trackers(model, streams, _quiet), []))
+
+
+@cache
+def stream_monitoring() -> Tables:
+    """Monitor one stream of a minute of each kind."""
+    from kineverse.experiments.stream.monitoring import measure_monitoring
+    from kineverse.experiments.stream.report import monitoring_table
+
+    return tables_of(monitoring_table(measure_monitoring(kv.load("kitchen"), seeds=1, minutes=1.0)))
+
+
+@cache
+def joint_types() -> Tables:
+    """Identify the first cases."""
+    from kineverse.experiments.joint_types.answers import identify_cases
+    from kineverse.experiments.joint_types.report import report_answers
+
+    return as_tables(report_answers(identify_cases(TYPE_CASES, _quiet, workers=1)))
+
+
+@cache
+def estimation_grid() -> Tables:
+    """Fit one sample of every ninth cell."""
+    from kineverse.experiments.estimation_grid.fits import fit_all, make_grid
+    from kineverse.experiments.estimation_grid.report import report_grid
+
+    return as_tables(report_grid(fit_all(make_grid()[::GRID_STEP], 1, _quiet, workers=1)))
+
+
+@cache
+def kitchen(what: str) -> Tables:
+    """Open and close one object of the shipped kitchen, with the last robot."""
+    from kineverse.experiments.kitchens import KitchenJob, report_trials, run_kitchen
+    from kineverse.experiments.manipulation.robots import find_robots
+
+    trials = run_kitchen(KitchenJob("kitchen", find_robots((), None)[-1], only=what))
+    return as_tables(report_trials(trials, ["kitchen"]))
+
+
+@cache
+def pushes() -> Tables:
+    """Push the fridge door shut with the last robot."""
+    from kineverse.experiments.manipulation.robots import find_robots
+    from kineverse.experiments.table1_push import PushJob, run_push
+    from kineverse.experiments.table1_push.objects import SHIPPED_KITCHEN
+    from kineverse.experiments.table1_push.report import make_push_report
+
+    job = PushJob(find_robots((), None)[-1], SHIPPED_KITCHEN, None, "fridge door")
+    return as_tables(make_push_report(run_push(job), seed=0))
+
+
+@cache
+def lockbox() -> Tables:
+    """Open the first random box, plan the first of each kind, and explore the first with unknown locks."""
+    from kineverse.experiments.lockbox import (
+        KINDS,
+        list_explorer_jobs,
+        list_planner_jobs,
+        make_explorer_table,
+        make_planner_table,
+        run_explorer,
+        run_planner,
+    )
+    from kineverse.experiments.lockbox.unknown_locks import list_unknown_jobs, make_unknown_table, run_unknown
+
+    explored = run_explorer(list_explorer_jobs(LOCKBOXES, 0, quick=False)[0])
+    jobs = list_planner_jobs(LOCKBOXES, 0, quick=False)
+    plans = {kind: run_planner(next(job for job in jobs if job.kind == kind)) for kind in KINDS}
+    unknown = run_unknown(list_unknown_jobs(LOCKBOXES, 0)[0])
+    return tables_of(
+        make_explorer_table({("and", False): explored}),
+        make_planner_table(plans),
+        make_unknown_table(unknown),
+    )
+
+
+def missing_data(folder: str) -> Path | None:
+    """Return the folder of data that is not there; None if it is, or if none is named."""
+    place = DATA / folder
+    return place if folder and not place.exists() else None
