@@ -292,8 +292,6 @@ def test_symbolic_links_do_not_lead_out_of_a_package(put, tmp_path):
 @pytest.mark.parametrize(
     ("name", "expected"),
     [
-        ("robot.urdf.xacro", "Run xacro first: xacro robot.urdf.xacro > robot.urdf"),
-        ("robot.xacro", "Run xacro first: xacro robot.xacro > robot.urdf"),
         ("door.stl", "is a mesh, and no model"),
         ("scene.usda", "is USD"),
         ("robot.mjb", "Load the MJCF it was made of"),

@@ -29,7 +29,7 @@ CASES = {
     ),
     "no name": (robot(links=1, attributes=""), "r.urdf, line 1, <robot>: has no name"),
     "no links": (robot(), 'r.urdf, line 1, <robot name="r">: has no <link>'),
-    "only xacro": (robot("<xacro:arm/>"), "Run xacro first: xacro robot.urdf.xacro > robot.urdf"),
+    "only xacro": (robot("<xacro:arm/>"), "A file called robot.urdf.xacro is expanded"),
     "version 2": (
         robot(links=1, attributes='name="r" version="2.0"'),
         'version="2.0" is not one that is read',

@@ -66,5 +66,14 @@ def register_file_formats() -> None:
             reference=b"include",
         )
     )
+    registry.register_format(
+        FileFormat(
+            name="xacro",
+            suffixes=(".xacro",),
+            read=f"{formats}.xacro:xacro_file_operations",
+            loop_element="joint",
+            reference=b"<",
+        )
+    )
     registry.register_service("include", f"{formats}.loader:include")
     registry.register_service("save", f"{formats}.saver:save")

@@ -5,13 +5,13 @@ from __future__ import annotations
 import hashlib
 import os
 from collections import OrderedDict
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable, Iterator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
 from typing import TypeAlias
 
 from kineverse._gc import no_collection
-from kineverse.errors import FormatError, KineverseError, MissingDependencyError
+from kineverse.errors import FormatError, InvalidValueError, KineverseError, MissingDependencyError
 from kineverse.model import registry
 from kineverse.model.edit import Edit
 from kineverse.model.model import Model, Snapshot
@@ -25,8 +25,12 @@ from .loop_closures import LoopClosures
 from .names import check_prefix
 from .reader_warnings import collect_warnings, warn
 from .root_folder import NOWHERE, find_root
+from .xacro import split_arguments
 
-READ = "URDF (.urdf, .xml), SDF (.sdf, .world), MJCF (.xml, .mjcf) and documents (.kv.json, .kv.msgpack)"
+READ = (
+    "URDF (.urdf, .xml), SDF (.sdf, .world), MJCF (.xml, .mjcf), templates of xacro (.xacro) and documents "
+    "(.kv.json, .kv.msgpack)"
+)
 
 _MESHES = (".stl", ".obj", ".dae", ".ply", ".glb", ".gltf", ".off", ".3mf", ".msh")
 _USD = (".usd", ".usda", ".usdc", ".usdz")
@@ -60,13 +64,6 @@ _ADVICE = {
 
 def unsupported_format_error(path: Path) -> FormatError:
     """Return the error for a file of another format, with the format and the remedy."""
-    if path.suffix.lower() == ".xacro":
-        plain = path.name[: -len(path.suffix)]
-        plain = plain if "." in plain else f"{plain}.urdf"
-        return FormatError(
-            f"{path}: is a template of xacro, which is not expanded here. "
-            f"Run xacro first: xacro {path.name} > {plain}"
-        )
     advice = _ADVICE.get(path.suffix.lower())
     if advice is not None:
         return FormatError(f"{path}: {advice}")
@@ -92,14 +89,15 @@ def load(
     root: str | os.PathLike[str] | None = None,
     strict: bool = False,
     loops: LoopTreatment = "solve",
+    arguments: Mapping[str, object] | None = None,
 ) -> Model:
     """Load a model from a file or by name.
 
     Parameters
     ----------
     source
-        Path of a ``.urdf``, ``.sdf``, ``.xml`` (MJCF, or URDF), ``.kv.json`` or ``.kv.msgpack`` file, or a
-        name such as ``kitchen``, ``pr2`` or ``articulations/screw``, see
+        Path of a ``.urdf``, ``.sdf``, ``.xml`` (MJCF, or URDF), ``.xacro``, ``.kv.json`` or ``.kv.msgpack``
+        file, or a name such as ``kitchen``, ``pr2`` or ``articulations/screw``, see
         :func:`kineverse.formats.locate.locate_model`.
     prefix
         Prefix of the names of all frames and degrees of freedom, without the slash. A shipped model has its
@@ -117,6 +115,8 @@ def load(
         the free ones, see :class:`kineverse.CloseLoop`; if that fails, the closure is kept as an equality
         constraint, :class:`kineverse.loops.LoopConstraint`, with a warning. ``"constraint"``: all are kept as
         constraints. ``"refuse"``: a loop that cannot be solved is an error.
+    arguments
+        Arguments of a ``.xacro`` template by name. They may also follow the path, ``"arm.xacro side:=left"``.
 
     Raises
     ------
@@ -133,6 +133,7 @@ def load(
         model = Model()
         model.include(source, prefix, root=root, strict=strict, loops=loops)
         return model
+    source, given = _arguments(source, arguments)
     found = locate_model(source)
     content = _content(found)
     remembered = _stands_alone(found, content)
@@ -142,7 +143,7 @@ def load(
     if known is None:
         model = Model()
         with collect_warnings() as remarks, _blaming(found.path), model.edit() as edit, no_collection():
-            for _ in _applied(edit, found, content, prefix, below, strict, loops):
+            for _ in _applied(edit, found, content, prefix, below, strict, loops, given):
                 pass
         if len(content) > LARGEST_REMEMBERED or not remembered:
             return model
@@ -181,8 +182,30 @@ def include(
     """Append the operations of a file or shipped model to an edit and return their tags; see :func:`load`."""
     check_prefix(prefix)
     check_loops(loops)
+    source, given = _arguments(source, None)
     found = locate_model(source)
-    return list(_applied(edit, found, _content(found), prefix, _root(found, root), strict, loops))
+    return list(_applied(edit, found, _content(found), prefix, _root(found, root), strict, loops, given))
+
+
+def _arguments(
+    source: str | os.PathLike[str], arguments: Mapping[str, object] | None
+) -> tuple[str | os.PathLike[str], dict[str, str]]:
+    """Return the path of a template and its arguments, of which some may follow the path.
+
+    Raises
+    ------
+    InvalidValueError
+        If there are arguments for another file.
+    """
+    given = {str(name): str(value) for name, value in (arguments or {}).items()}
+    if isinstance(source, str) and ":=" in source:
+        source, more = split_arguments(source)
+        given |= more
+    if given and not os.fspath(source).endswith(".xacro"):
+        raise InvalidValueError(
+            f"{os.fspath(source)} takes no arguments such as {next(iter(given))}; templates (.xacro) do."
+        )
+    return source, given
 
 
 def _applied(
@@ -193,6 +216,7 @@ def _applied(
     root: str,
     strict: bool,
     loops: LoopTreatment,
+    arguments: Mapping[str, str],
 ) -> Iterator[str]:
     """Apply the operations of a source, and yield their tags."""
     prefix = source.shipped if prefix is None else prefix
@@ -201,7 +225,7 @@ def _applied(
     if file_format is None:
         operations = _build(source, prefix or None)
     else:
-        file = FileContent(source.path, content, prefix or None, root, strict, source.shipped)
+        file = FileContent(source.path, content, prefix or None, root, strict, source.shipped, arguments)
         operations = file_format.operations(file)
     if file_format is None or not file_format.loop_element:
         for tag, operation in operations:

@@ -150,7 +150,8 @@ def _files(folder: Path, depth: int = _DEPTH) -> Iterator[Path]:
             folders.clear()
         folders[:] = sorted(f for f in folders if not f.startswith("."))
         for file in sorted(files):
-            if file.endswith(suffixes):
+            # A template beside the file that it expands to does not make its name ambiguous.
+            if file.endswith(suffixes) and not file.endswith(".xacro"):
                 yield Path(root, file)
 
 

@@ -110,6 +110,41 @@ def locate_resource(
     )
 
 
+def find_package(name: str, folder: Folder, root: str, inside: str = "") -> tuple[Path, bool]:
+    """Return the folder of a package, searched as for ``package://``, and whether it is a substitute.
+
+    Without such a package, the nearest folder above ``folder`` that has ``inside`` is the substitute, else
+    the parent of ``folder``.
+
+    Raises
+    ------
+    FormatError
+        If there is none, or it may not be opened.
+    """
+    if not name or name in (".", "..") or "/" in name or "\\" in name:
+        raise FormatError(f"{quote(name)} is no name of a package.")
+    log = _SearchLog()
+    for package in _folders_of(name, Path(folder), (), log, root):
+        if log.trusted or _may_open(package, root, package):
+            return package, False
+    here = Path(folder).absolute()
+    for place in (here, *here.parents) if inside and not log.outside else ():
+        if is_common(os.path.realpath(place)) or not may_open(place / inside, root, folder):
+            continue
+        if os.path.exists(place / inside):
+            return place, True
+    if not log.outside and may_open(here.parent, root, folder):
+        return here.parent, True
+    if log.outside:
+        raise outside_root_error(name, root)
+    raise FormatError(_not_found_message(f"$(find {name})", name, "", log))
+
+
+def may_open(path: Folder, root: str, folder: Folder) -> bool:
+    """Return True if a description in a folder, with a root, may open a path."""
+    return _may_open(path, root, folder=folder)
+
+
 def model_paths() -> Iterator[tuple[str, Path]]:
     """Yield the folders of models in environment variables, each with its variable."""
     for variable in _MODELS:

@@ -109,7 +109,7 @@ def _expected(count: int) -> str:
 
 def _hint(text: str) -> str:
     if "${" in text or "$(" in text:
-        return "; this is xacro, expand it first: xacro robot.urdf.xacro > robot.urdf"
+        return "; this is xacro, expand it first: a file called robot.urdf.xacro is expanded"
     if "," in text:
         return "; numbers are separated by spaces and have a decimal point"
     return ""

@@ -58,6 +58,8 @@ class FileContent:
         True if mistakes that have no effect on motion are errors.
     shipped
         Name of the model if it comes with the package.
+    arguments
+        Arguments of a template, by name.
     """
 
     path: Path
@@ -66,6 +68,7 @@ class FileContent:
     root: str
     strict: bool
     shipped: str | None = None
+    arguments: Mapping[str, str] = field(default_factory=dict)
 
 
 @dataclass(frozen=True, slots=True)

@@ -26,7 +26,7 @@ from kineverse.formats.xml_reader import Element, ElementError, Visit, label, pa
 
 _VERSIONS = {"1.0": (1, 0), "1.1": (1, 1), "1.2": (1, 2)}
 _EXTENSIONS = frozenset(("gazebo", "transmission"))
-XACRO_HINT = "Run xacro first: xacro robot.urdf.xacro > robot.urdf"
+XACRO_HINT = "A file called robot.urdf.xacro is expanded"
 
 _OTHER_FORMATS = {
     "sdf": "an SDF",

@@ -1,0 +1,228 @@
+"""Expansion of a xacro template, in a process that does nothing else.
+
+xacro evaluates expressions of Python by ``eval``, from which a lambda or a comprehension leads to all of
+Python. Here they are checked first: :func:`check_expression` allows arithmetic, comparisons, indices,
+literals, comprehensions and calls, but no attribute that begins with an underscore or leads to frames, code
+or types, and no lambda. Files are opened below the root of the description and in packages only.
+"""
+
+from __future__ import annotations
+
+import ast
+import os
+import re
+from collections.abc import Callable, Mapping
+from pathlib import Path
+from typing import Any
+
+from kineverse.errors import FormatError, summarize_error
+
+from .resource_paths import find_package, may_open
+from .root_folder import outside_root_error
+from .xml_reader import abbreviate, quote
+
+_FORBIDDEN_NODES = (ast.Lambda, ast.NamedExpr, ast.Await, ast.Yield, ast.YieldFrom)
+_FORBIDDEN_ATTRIBUTES = frozenset(("format", "format_map", "mro"))
+_FORBIDDEN_PREFIXES = ("_", "gi_", "cr_", "ag_", "f_", "tb_", "co_")
+_FORBIDDEN_FUNCTIONS = ("type", "vars")
+
+
+def expand(path: str, root: str, arguments: Mapping[str, str]) -> dict[str, Any]:
+    """Expand a template and return ``text``, or ``error``, with ``remarks``."""
+    import xacro  # an extra
+
+    expansion = _Expansion(xacro, path, root)
+    found: dict[str, Any] = {"remarks": expansion.remarks}
+    try:
+        document = xacro.process_file(path, mappings=dict(arguments))
+        expansion.check_arguments(arguments)
+        found["text"] = document.toxml()
+    except RecursionError:
+        found["error"] = f"{expansion.where()}: macros or includes lead back to themselves without end."
+    except Exception as error:  # xacro raises all kinds of exceptions
+        found["error"] = f"{expansion.where()}: {_reason(error)}"
+    return found
+
+
+def check_expression(text: str, allowed: type[Exception]) -> None:
+    """Check that an expression calls nothing but what xacro gives it.
+
+    Raises
+    ------
+    SyntaxError
+        If it is no expression.
+    allowed
+        If it is not allowed.
+    """
+    for node in ast.walk(ast.parse(text.strip(), mode="eval")):
+        name = node.attr if isinstance(node, ast.Attribute) else node.id if isinstance(node, ast.Name) else ""
+        wrong = name.startswith(_FORBIDDEN_PREFIXES if isinstance(node, ast.Attribute) else "__")
+        if wrong or (isinstance(node, ast.Attribute) and name in _FORBIDDEN_ATTRIBUTES):
+            raise allowed(f"the name {name!r} is not allowed in an expression")
+        if isinstance(node, _FORBIDDEN_NODES):
+            raise allowed(f"a {type(node).__name__.lower()} is not allowed in an expression")
+
+
+class _Expansion:
+    """xacro with checked expressions and files, and with the places of elements for errors."""
+
+    def __init__(self, xacro: Any, path: str, root: str) -> None:
+        self._xacro, self._path, self._root = xacro, path, root
+        self._folder = os.path.dirname(path)
+        self.remarks: list[str] = []
+        self._packages: dict[str, str] = {}
+        self._declared: set[str] = set()
+        self._failed: Any = None
+        xacro.verbosity = 0
+        xacro.warning = lambda *words, **_: self._remark(" ".join(map(str, words)))
+        self._restrict_expressions()
+        self._restrict_files()
+        self._keep_places()
+
+    def where(self) -> str:
+        """Return file, line and element of the failure."""
+        file, line = getattr(self._failed, "place", (self._path, 0))
+        tag = getattr(self._failed, "tagName", "")
+        parts = [
+            os.path.basename(file),
+            f"line {line}" if line else "",
+            f"<{abbreviate(tag)}>" if tag else "",
+        ]
+        return ", ".join(part for part in parts if part)
+
+    def check_arguments(self, given: Mapping[str, str]) -> None:
+        """Raise an error for arguments that the template does not declare."""
+        self._failed = None
+        unknown = [name for name in given if name not in self._declared]
+        if unknown:
+            known = ", ".join(sorted(self._declared)) or "none"
+            raise FormatError(f"it has no argument {quote(unknown[0])}. Its arguments: {known}.")
+
+    def _remark(self, text: str) -> None:
+        if text not in self.remarks:
+            self.remarks.append(text)
+
+    def _restrict_expressions(self) -> None:
+        """Check expressions before they are evaluated, without the builtins of Python."""
+        xacro = self._xacro
+        from xacro import substitution_args
+
+        plain, refuse = xacro.safe_eval, xacro.XacroException
+
+        def evaluate(text: str, names: Any, local: Any = None) -> Any:
+            check_expression(text, refuse)
+            return plain(text, names, local)
+
+        def evaluate_substitution(text: str, context: dict[str, Any]) -> str:
+            check_expression(text, substitution_args.SubstitutionException)
+            given = {k: substitution_args.convert_value(v, "auto") for k, v in context.get("arg", {}).items()}
+            names = {k: v for k, v in substitution_args._eval_dict.items() if not k.startswith("_")}
+            own = {"arg": given.__getitem__, "dirname": lambda: os.path.dirname(xacro.filestack[-1])}
+            basic = substitution_args._eval_dict["__builtins__"]
+            return str(eval(text.strip(), {"__builtins__": basic}, given | names | own))
+
+        xacro.safe_eval = evaluate
+        substitution_args._eval = evaluate_substitution
+        substitution_args._eval_find = substitution_args._eval_dict["find"] = self._find_package
+        for name in _FORBIDDEN_FUNCTIONS:
+            xacro._global_symbols["python"].pop(name, None)
+
+    def _restrict_files(self) -> None:
+        """Open files only where a description may."""
+        xacro = self._xacro
+        parse, load_yaml, include = xacro.parse, xacro.load_yaml, xacro.get_include_files
+
+        def checked_parse(inp: Any, filename: str | None = None) -> Any:
+            if inp is None:
+                self._check_file(str(filename))
+            return parse(inp, filename)
+
+        def checked_yaml(filename: str) -> Any:
+            self._check_file(xacro.abs_filename_spec(filename))
+            return load_yaml(filename)
+
+        def wanted_files(specification: str, symbols: Any) -> Any:
+            self._wanted = specification
+            return include(specification, symbols)
+
+        self._wanted = ""
+        xacro.parse, xacro.load_yaml, xacro.get_include_files = checked_parse, checked_yaml, wanted_files
+        for names in (xacro._global_symbols, xacro._global_symbols["xacro"]):
+            names["load_yaml"] = checked_yaml
+
+    def _check_file(self, path: str) -> None:
+        """Check that a file may be opened."""
+        real = os.path.realpath(path)
+        inside = any(Path(real).is_relative_to(package) for package in self._packages.values())
+        if not inside and not may_open(path, self._root, self._folder):
+            raise outside_root_error(path, self._root)
+        if not os.path.isfile(real):
+            raise FormatError(f"there is no file {quote(path)}.")
+
+    def _find_package(self, name: str) -> str:
+        """Return the folder of a package, as ``package://`` finds it."""
+        if name not in self._packages:
+            match = re.match(rf"\s*\$\(find\s+{re.escape(name)}\s*\)/*([^$]*)$", self._wanted)
+            folder, is_substitute = find_package(name, self._folder, self._root, match[1] if match else "")
+            if is_substitute:
+                self._remark(f"there is no package {quote(name)}; {folder} is taken for it.")
+            self._packages[name] = os.path.realpath(folder)
+        return self._packages[name]
+
+    def _keep_places(self) -> None:
+        """Give each element its file and line, and keep the innermost one at which xacro fails."""
+        from xml.dom import expatbuilder, minidom
+
+        xacro = self._xacro
+        start, clone = expatbuilder.ExpatBuilderNS.start_element_handler, minidom._clone_node  # type: ignore[attr-defined]
+
+        def start_with_place(builder: Any, name: str, attributes: Any) -> None:
+            start(builder, name, attributes)
+            builder.curNode.place = xacro.filestack[-1], builder._parser.CurrentLineNumber
+
+        def clone_with_place(node: Any, *more: Any) -> Any:
+            copy = clone(node, *more)
+            if hasattr(node, "place"):
+                copy.place = node.place
+            return copy
+
+        expatbuilder.ExpatBuilderNS.start_element_handler = start_with_place  # type: ignore[method-assign]
+        minidom._clone_node = clone_with_place  # type: ignore[attr-defined]
+        for name in (
+            "check_attrs",
+            "grab_property",
+            "grab_macro",
+            "process_include",
+            "handle_macro_call",
+            "eval_all",
+        ):
+            setattr(xacro, name, self._noting(getattr(xacro, name)))
+
+    def _noting(self, function: Callable[..., Any]) -> Callable[..., Any]:
+        """Return a function of an element that keeps the element if it raises."""
+
+        def noting(node: Any, *more: Any) -> Any:
+            try:
+                result = function(node, *more)
+            except Exception:
+                if self._failed is None and hasattr(node, "place"):
+                    self._failed = node
+                raise
+            if function.__name__ == "check_attrs" and node.tagName == "xacro:arg":
+                self._declared.add(result[0])
+            return result
+
+        return noting
+
+
+def _reason(error: Exception) -> str:
+    """Return the message of an error of xacro on one line, without its own account of the place."""
+    inner = getattr(error, "exc", None)
+    if isinstance(inner, FormatError):
+        return str(inner)
+    text = str(error)
+    if isinstance(error, FormatError):
+        return text
+    if inner is not None and text.startswith("<class"):  # xacro repeats the error with its type
+        text = str(inner)
+    return " ".join(text.split()) or summarize_error(error)
