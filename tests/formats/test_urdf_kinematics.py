@@ -133,7 +133,7 @@ def test_robots_that_break_the_specification_are_read_with_a_remark(name: str) -
         read_urdf(with_name(name), strict=True)
     assert REFUSED[name] in str(info.value)
     if name.endswith("ur3.urdf"):
-        with pytest.raises(kv.errors.FormatError, match=r"has no <link>.*Run xacro first"):
+        with pytest.raises(kv.errors.FormatError, match=r"has no <link>.*is expanded"):
             read_urdf(with_name(name))
     else:
         assert REFUSED[name] in "".join(read_urdf(with_name(name)).remarks)

@@ -186,7 +186,7 @@ class _Expansion:
                 copy.place = node.place
             return copy
 
-        expatbuilder.ExpatBuilderNS.start_element_handler = start_with_place  # type: ignore[method-assign]
+        expatbuilder.ExpatBuilderNS.start_element_handler = start_with_place  # type: ignore[assignment, method-assign]
         minidom._clone_node = clone_with_place  # type: ignore[attr-defined]
         for name in (
             "check_attrs",
