@@ -127,7 +127,7 @@ def test_urdf_that_cannot_be_read_back_is_not_written(
     """The writer is broken on purpose: all links have one name."""
     model = moving(1.0, (1, 1, 1))
     with model.edit() as edit:
-        edit.apply(kv.Planar(name="p", parent="f", child="p", lower=-1, upper=1))
+        edit.apply(kv.articulations.Universal(name="p", parent="f", child="p"))
     monkeypatch.setattr(urdf_writing.TakenNames, "take", lambda self, *wishes: "f")
     with pytest.raises(
         kv.errors.FormatError,

@@ -294,3 +294,12 @@ def test_meshes_of_an_mjcf_may_lie_beside_its_folder(tmp_path: Path):
         '<body name="b"><joint/><geom type="mesh" mesh="m"/></body></worldbody></mujoco>'
     )
     assert kv.load(path).bodies["b"].inertia.mass == pytest.approx(1000 / 6)
+
+
+def test_a_document_opens_no_meshes_beside_a_folder_that_it_states(tmp_path: Path):
+    path = robot_beside_meshes(tmp_path, "../meshes/a.stl")
+    mesh = kv.load(path).bodies["l"].visuals[0].geometry
+    (tmp_path / "elsewhere").mkdir()
+    for uri in ("../meshes/a.stl", "package://some_robot/meshes/a.stl"):
+        with pytest.raises(FormatError):
+            locate_resource(uri, mesh.folder, root=str(tmp_path / "elsewhere"))

@@ -123,6 +123,14 @@ def test_arguments_that_a_template_does_not_have_are_refused(write, tmp_path: Pa
 
 
 @pytest.mark.usefixtures("needs_xacro")
+def test_what_is_taken_for_a_package_opens_no_further_files(write, tmp_path: Path):
+    (tmp_path / "robot" / "secret.xacro").write_text(f'<robot {XMLNS}><link name="secret"/></robot>')
+    lines = [f'<xacro:include filename="$(find x)/{path}"/>' for path in ("urdf/leg.xacro", "secret.xacro")]
+    with pytest.raises(FormatError, match=r"line 4, <xacro:include>: .*leads out of the root"):
+        kv.load(write(*lines))
+
+
+@pytest.mark.usefixtures("needs_xacro")
 def test_templates_of_sdf_are_read(write):
     model = kv.load(
         write(

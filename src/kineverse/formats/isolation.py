@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import importlib
 import json
+import os
 import subprocess
 import sys
 from contextlib import suppress
@@ -23,6 +24,9 @@ MEMORY = 4 << 30
 
 _WAIT_SECONDS = 15 * CPU_SECONDS
 """Longest wait for a call, on a machine that is busy otherwise [s]."""
+
+_ONE_THREAD = {"OMP_NUM_THREADS": "1", "OPENBLAS_NUM_THREADS": "1", "MKL_NUM_THREADS": "1"}
+"""Libraries of linear algebra reserve memory for each thread, which counts as used."""
 
 _CHILD = (
     "import json, sys; job = json.load(sys.stdin.buffer); sys.path[:] = job['path']; "
@@ -57,6 +61,7 @@ def call_isolated(module: str, function: str, *arguments: Any) -> Any:
                 input=json.dumps(job).encode(),
                 capture_output=True,
                 cwd=folder,
+                env={**os.environ, **_ONE_THREAD},
                 timeout=_WAIT_SECONDS,
                 check=False,
             )

@@ -239,8 +239,7 @@ def _allowed_folders(root: str, package: Path | None, folder: Folder) -> Iterato
     yield root
     if package is not None:
         yield os.path.realpath(package)
-    if root != NOWHERE:
-        yield from mesh_folders(folder)
+    yield from mesh_folders(folder, root)
     yield from declared_roots()
     yield from declared_folders()
 

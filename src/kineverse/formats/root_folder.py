@@ -76,16 +76,16 @@ def declared_roots() -> Iterator[str]:
         yield os.path.realpath(os.path.expanduser(place))
 
 
-def mesh_folders(folder: Folder) -> Iterator[str]:
-    """Yield the folders of meshes beside the folder of a description: ``../meshes``, whatever the root.
+def mesh_folders(folder: Folder, root: str) -> Iterator[str]:
+    """Yield the folders of meshes beside the folder of a description, ``../meshes``, if it is in the root.
 
     Robots that are no package have them there, as those of ROS: ``robot/urdf`` beside ``robot/meshes``. A
-    link to another place is no such folder.
+    link to another place is no such folder. A document states its folder itself, which may be outside.
     """
-    if os.fspath(folder):
-        beside = os.path.dirname(os.path.realpath(folder))
+    here = os.path.realpath(folder) if os.fspath(folder) else ""
+    if here and is_below(here, root):
         for name in MESH_FOLDERS:
-            path = os.path.join(beside, name)
+            path = os.path.join(os.path.dirname(here), name)
             if os.path.realpath(path) == path and os.path.isdir(path):
                 yield path
 

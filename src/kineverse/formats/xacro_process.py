@@ -12,13 +12,12 @@ import ast
 import os
 import re
 from collections.abc import Callable, Mapping
-from pathlib import Path
 from typing import Any
 
 from kineverse.errors import FormatError, summarize_error
 
 from .resource_paths import find_package, may_open
-from .root_folder import outside_root_error
+from .root_folder import is_below, outside_root_error
 from .xml_reader import abbreviate, quote
 
 _FORBIDDEN_NODES = (ast.Lambda, ast.NamedExpr, ast.Await, ast.Yield, ast.YieldFrom)
@@ -71,6 +70,7 @@ class _Expansion:
         self._folder = os.path.dirname(path)
         self.remarks: list[str] = []
         self._packages: dict[str, str] = {}
+        self._found: set[str] = set()
         self._declared: set[str] = set()
         self._failed: Any = None
         xacro.verbosity = 0
@@ -153,7 +153,8 @@ class _Expansion:
     def _check_file(self, path: str) -> None:
         """Check that a file may be opened."""
         real = os.path.realpath(path)
-        inside = any(Path(real).is_relative_to(package) for package in self._packages.values())
+        # What is taken for a package that is not there opens nothing.
+        inside = any(is_below(real, package) for package in self._found)
         if not inside and not may_open(path, self._root, self._folder):
             raise outside_root_error(path, self._root)
         if not os.path.isfile(real):
@@ -166,6 +167,8 @@ class _Expansion:
             folder, is_substitute = find_package(name, self._folder, self._root, match[1] if match else "")
             if is_substitute:
                 self._remark(f"there is no package {quote(name)}; {folder} is taken for it.")
+            else:
+                self._found.add(os.path.realpath(folder))
             self._packages[name] = os.path.realpath(folder)
         return self._packages[name]
 
@@ -186,7 +189,7 @@ class _Expansion:
                 copy.place = node.place
             return copy
 
-        expatbuilder.ExpatBuilderNS.start_element_handler = start_with_place  # type: ignore[method-assign]
+        expatbuilder.ExpatBuilderNS.start_element_handler = start_with_place  # type: ignore[assignment, method-assign]
         minidom._clone_node = clone_with_place  # type: ignore[attr-defined]
         for name in (
             "check_attrs",

@@ -147,7 +147,7 @@ def find_below_root(node: MjcfElement, name: str, root: str, *places: str) -> Pa
         node.refuse(f"names the file {quote(name)}, and the text has no folder. Load it from its file.")
     if not name or "\0" in name:
         node.refuse("names no file.")
-    allowed = [root, *declared_roots(), *(m for place in places if root for m in mesh_folders(place))]
+    allowed = [root, *declared_roots(), *(beside for place in places for beside in mesh_folders(place, root))]
     outside = False
     for place in dict.fromkeys(places):
         path = os.path.realpath(os.path.join(place, name))
