@@ -228,6 +228,24 @@ def add_contact_rules(
     remark(f"contacts have friction {friction:g}, elliptic cones and impratio {option.impratio:g}")
 
 
+def weigh_contacts(compiled: Any, bodies: Iterable[int]) -> None:
+    """Give contacts of some bodies the inertia that their shapes have, not that of their centres of mass.
+
+    MuJoCo regularises a contact by the motion that a force at the centre of mass causes. Of a door whose
+    description puts that on the hinge, as many do that state none, this is zero, and the solver fails.
+    """
+    engine, data = mujoco(), mujoco().MjData(compiled)
+    engine.mj_forward(compiled, data)
+    jacobian, solved = np.zeros((3, compiled.nv)), np.zeros((3, compiled.nv))
+    for body in bodies:
+        first = int(compiled.body_geomadr[body])
+        for geom in range(first, first + int(compiled.body_geomnum[body])):
+            engine.mj_jac(compiled, data, jacobian, None, data.geom_xpos[geom], body)
+            engine.mj_solveM(compiled, data, solved, jacobian)
+            weight = float((jacobian * solved).sum()) / 3.0
+            compiled.body_invweight0[body, 0] = max(compiled.body_invweight0[body, 0], weight)
+
+
 def overlapping_pairs(
     compiled: Any, coordinates: MujocoCoordinates, samples: int, seed: int
 ) -> list[tuple[str, str]]:

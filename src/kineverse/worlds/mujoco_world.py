@@ -172,6 +172,10 @@ class MujocoWorld:
             spec, compiled, self._coordinates, driven, model, self._step, bandwidth, seed, self._remark
         )
         self._compiled = mujoco_model.compile_world(spec)
+        moving = np.flatnonzero(self._compiled.body_weldid).tolist()
+        mujoco_model.weigh_contacts(
+            self._compiled, [k for k in moving if not self._is_robot(self._compiled.body(k).name)]
+        )
         self._data = mujoco().MjData(self._compiled)
         self._contacts = MujocoContacts(self._compiled, self._is_robot, fingers)
         self._servos.connect(self._compiled)
