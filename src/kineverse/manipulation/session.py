@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING
 
 from kineverse._checks import finite_number
 from kineverse.control import Command
-from kineverse.errors import InvalidValueError, ShapeError, UnknownNameError, suggest
+from kineverse.errors import InvalidValueError, ShapeError, SimulationError, UnknownNameError, suggest
 from kineverse.expressions import Expression
 from kineverse.lie import Array
 from kineverse.model.frame import is_of_robot
@@ -82,6 +82,10 @@ class Session:
         Placements of the grasped motions that were made, the last one at the end: their ways lead back, too.
     answers
         Whether the world has answered the last step within the time-out.
+    untrusted
+        Why the world's simulation is not to be trusted any more, until a restart; empty if it is.
+    peak_force
+        Largest force between the robot and another body so far [N]; NaN in a world that does not say it.
 
     Raises
     ------
@@ -111,7 +115,8 @@ class Session:
                 f"stand still for the rest of each step. Make the world with timeout={dt:g} or more."
             )
         self.world, self.dt = world, dt
-        self._timeout, self.answers = timeout, True
+        self._timeout, self.answers, self.untrusted = timeout, True, ""
+        self.peak_force = math.nan
         self._speeds: dict[object, Symbol] = {name: s for s in world.model.speeds for name in (s, str(s))}
         self.belief = belief or TrueBelief()
         self._on_step = on_step
@@ -180,8 +185,9 @@ class Session:
         UnknownNameError, InvalidValueError
             For speeds that the model does not have, and those that are not finite. Then nothing has changed.
         SkillError
-            If the world does not answer within the time-out, stands still, or has not been observed for more
-            than :data:`STALE`. Worlds refuse commands from then on, and their robots stop.
+            If the world does not answer within the time-out, stands still, is not to be trusted, or has not
+            been observed for more than :data:`STALE`. Worlds refuse commands from then on, and their robots
+            stop.
         """
         resolved = self._resolve(speeds)
         before, self.command = self.world.time, command
@@ -221,7 +227,14 @@ class Session:
         """Advance the world by a step, and update the belief."""
         robot = self.world.robot
         self.commands = {s: v for s, v in speeds.items() if is_of_robot(s.path, robot)}
-        self._wait(lambda: self.world.apply(self.commands, self.dt, stamp=self.state.stamp))
+        try:
+            self._wait(lambda: self.world.apply(self.commands, self.dt, stamp=self.state.stamp))
+        except SimulationError as error:
+            self.untrusted = str(error)
+            raise SkillError("other", self.untrusted) from error
+        force = getattr(self.world, "peak_force", math.nan)
+        if not force <= self.peak_force:
+            self.peak_force = force
         self._wait(lambda: self._update(speeds))
         self.steps += 1
         if self._on_step is not None:
@@ -254,6 +267,7 @@ class Session:
     def restart(self, state: State) -> None:
         """Reset the world to a state, at time 0, and update the belief."""
         self.world.reset(state)
+        self.untrusted = ""
         self._update({})
 
     def _update(self, speeds: Speeds) -> None:

@@ -106,8 +106,8 @@ def push(
     -------
     Outcome
         With ``measures``: ``losses``, ``blocked``, ``contacts``, ``jammed``, ``planned``, ``jitter`` (largest
-        mean change of a speed from step to step while touching, [m/s], [rad/s]), and ``failure``:
-        ``"collision"``, ``"time"`` or ``"other"``, if it was not done.
+        mean change of a speed from step to step while touching, [m/s], [rad/s]), ``peak_force`` [N] in a
+        world with forces, and ``failure``: ``"collision"``, ``"time"`` or ``"other"``, if it was not done.
 
     Raises
     ------
@@ -159,6 +159,7 @@ def push(
             logic=logic,
         )
     pushing.reset()
+    session.peak_force = math.nan
     run = _Run(session, pushing, seconds, tolerance, plan, on_step)
     try:
         failure = run.push()
@@ -170,7 +171,7 @@ def push(
         failure = SkillError("other", f"{type(error).__name__}: {error}")
     session.stop()
     value, measures = world.state[coordinate], run.measures()
-    done = abs(value - pushing.target) < tolerance
+    done = abs(value - pushing.target) < tolerance and not session.untrusted
     if not done:
         measures["failure"] = failure.kind
     reason = f"'{coordinate}' is at {value:.3g}" if done else str(failure)
@@ -324,8 +325,9 @@ class _Run:
 
     def measures(self) -> dict[str, Any]:
         """Return figures of the push."""
-        pushing = self._pushing
+        pushing, force = self._pushing, self._session.peak_force
         return {
+            **({} if math.isnan(force) else {"peak_force": force}),
             "losses": pushing.losses,
             "blocked": pushing.choice.blocked,
             "contacts": pushing.choice.contacts,
