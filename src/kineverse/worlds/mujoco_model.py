@@ -14,7 +14,7 @@ from kineverse.errors import FormatError
 from kineverse.formats.export.capabilities import UnsupportedError
 from kineverse.formats.mjcf.mujoco_api import capture_mujoco_warnings, mujoco
 from kineverse.formats.mjcf.writer import to_mjcf
-from kineverse.geometry.collision_filter import allowed_pairs, apply_rules, read_rules
+from kineverse.geometry.collision_filter import adjacent_pairs, allowed_pairs, apply_rules, read_rules
 from kineverse.geometry.prepared_query import flag_between, flag_relatively_moving
 from kineverse.model.model_view import ModelView
 
@@ -34,6 +34,8 @@ _STIFF_SOLIMP = (0.99, 0.999, 0.001)
 """Impedance of limits, ties and friction in joints; MuJoCo's default gives way by some 10 %."""
 _RESTING = 1e-4
 """Depth up to which shapes of furniture rest on each other, and collide [m]."""
+_SWEEP = 65
+"""Number of places between its limits where a joint is looked at."""
 _FOLDER = Path("/")
 
 
@@ -268,6 +270,7 @@ def weigh_contacts(compiled: Any, bodies: Iterable[int]) -> None:
 def exclude_overlaps(
     spec: Any,
     compiled: Any,
+    model: ModelView,
     coordinates: MujocoCoordinates,
     is_robot: Callable[[str], bool],
     samples: int,
@@ -277,14 +280,16 @@ def exclude_overlaps(
 
     These are pairs of bodies of the robot that overlap at the default state or in all sampled ones, and pairs
     of shapes of furniture that overlap at the default state. Of two bodies of furniture, some of whose shapes
-    overlap, the others collide.
+    overlap, the others collide. Excluded are also bodies that one joint keeps apart between its limits.
 
     Parameters
     ----------
     spec, compiled
         The specification, whose shapes have names, and its ``MjModel``.
+    model
+        The model.
     coordinates
-        Positions of the model in it.
+        Positions of the model in ``compiled``.
     is_robot
         Function that tells bodies of the robot.
     samples
@@ -313,7 +318,7 @@ def exclude_overlaps(
         return {(a, b) for a, b in pairs if own[a] and own[b]}
 
     data.qpos[:] = coordinates.positions(coordinates.default)
-    at_home, move = touching(), coordinates.sampler()
+    at_home, move, sweep = touching(), coordinates.sampler(), coordinates.sweep()
     always: set[tuple[int, int]] | None = None
     for _ in range(samples):
         move(data, random)
@@ -336,9 +341,29 @@ def exclude_overlaps(
                 pair = spec.add_pair(geomname1=geoms[0].name, geomname2=geoms[1].name)
                 pair.condim, pair.friction[:2] = 3, geoms[0].friction[0]
     names = [(compiled.body(a).name, compiled.body(b).name) for a, b in sorted(bodies)]
-    for a, b in names:
+    met = {*shapes}
+    for share in np.linspace(0.0, 1.0, _SWEEP):
+        sweep(data, float(share))
+        deep = (pair for pair, gap in touching().items() if gap < -_RESTING)
+        met |= {tuple(sorted(compiled.geom_bodyid[list(pair)].tolist())) for pair in deep}
+    apart = [pair for pair in _limited_joints(model, compiled) if tuple(sorted(pair)) not in met]
+    for a, b in (*names, *((compiled.body(a).name, compiled.body(b).name) for a, b in apart)):
         spec.add_exclude(bodyname1=a, bodyname2=b)
     return names
+
+
+def _limited_joints(model: ModelView, compiled: Any) -> list[tuple[int, int]]:
+    """Return the pairs of bodies that one joint with limits connects."""
+    names = [compiled.body(k).name for k in range(compiled.nbody)]
+    known = {name: k for k, name in enumerate(names) if name in model.frames and compiled.body_geomnum[k]}
+    found = []
+    bodies = list(known)
+    for i, k in np.argwhere(np.triu(adjacent_pairs(model, bodies), 1)).tolist():
+        symbols = model.fk(bodies[i], bodies[k]).symbols
+        limited = all(np.isfinite(model.limits(s)).all() for s in symbols)
+        if len(symbols) == 1 and limited:
+            found.append((known[bodies[i]], known[bodies[k]]))
+    return found
 
 
 def _geoms_of(compiled: Any, body: int) -> range:

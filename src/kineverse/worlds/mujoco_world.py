@@ -377,7 +377,7 @@ class MujocoWorld:
     def _exclude_overlaps(self, spec: Any, compiled: Any, seed: int) -> None:
         """Exclude what overlaps by design, of the robot and of furniture."""
         pairs = mujoco_model.exclude_overlaps(
-            spec, compiled, self._coordinates, self._is_robot, _SAMPLES, seed
+            spec, compiled, self.model, self._coordinates, self._is_robot, _SAMPLES, seed
         )
         if pairs:
             self._remark(
