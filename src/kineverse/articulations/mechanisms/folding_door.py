@@ -142,8 +142,11 @@ class FoldingDoor(Mechanism, document_kind="FoldingDoor"):
         grip = box_shape((grip_depth, grip_width, grip_thickness), (-grip_depth / 2, 0.0, 0.0), STEEL)
         side = self.size[1] / 2 - 2 * self.wall
         bar = rod_shape((0.0, side, 0.0), (0.0, side, self.arm), 0.008, STEEL)
+        depth, *front = self.size
+        # The case ends where the upper panel, which turns about a point in it, does not reach.
+        shorter = (depth - 0.8 * thickness, *front)
         return {
-            "base": self.base(*case(self.size, self.wall, PALE)),
+            "base": self.base(*case(shorter, self.wall, PALE)),
             "upper_panel": MechanismPart(
                 "base", (shift(ax, 0, az), rotation_about(Y, q), _on(self.upper_middle)), (leaf,)
             ),
