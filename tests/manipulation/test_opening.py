@@ -46,11 +46,15 @@ def start(model):
     return model.default_state().updated(START)
 
 
+RETRACTS = []
+"""Times in the world at which hands of the session began to go away."""
+
+
 @pytest.fixture(scope="module")
 def session(model):
     world = KinematicWorld(model, "hsr")
     world.reset(start(model))
-    return Session(world)
+    return Session(world, on_step=lambda s: s.phase == "retract" and RETRACTS.append(s.world.time))
 
 
 @pytest.fixture(scope="module")
@@ -65,6 +69,18 @@ def test_drawer_opens_without_contact_or_slip(opened, session):
     assert opened.measures["penetration"] < 5e-4
     assert opened.measures["limit_violation"] < 1e-6
     assert opened.measures["grasp_error"] < 5e-4
+
+
+def test_what_is_reached_counts_though_no_time_is_left_to_take_the_hand_away(opened, model):
+    world = KinematicWorld(model, "hsr")
+    world.reset(start(model))
+    outcome = open_object(Session(world), DRAWER, seconds=RETRACTS[0] + 0.1)
+    assert outcome, outcome.reason
+    assert outcome.value == opened.value
+    assert outcome.seconds < opened.seconds
+    # With a closed hand it does not.
+    world.reset(start(model))
+    assert not open_object(Session(world), DRAWER, seconds=RETRACTS[0] - 0.5)
 
 
 def test_drawer_closes_again(opened, session):
