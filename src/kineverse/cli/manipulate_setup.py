@@ -22,8 +22,6 @@ if TYPE_CHECKING:
 
 OPENING = 0.4
 """Distance from shut at which closing and pushing begin [m], [rad]."""
-TOLERANCE = 0.02
-"""Distance from the target within which an object is there, unless its whole range is short [m], [rad]."""
 _NEXT_STEP = (
     "Name a hand with two opposed fingers by --hand FRAME, or move the object with any body of the robot: "
     "kineverse push ... --hand BODY --to VALUE.",
@@ -93,7 +91,7 @@ def make_scene(arguments: argparse.Namespace, skill: str) -> ManipulationScene:
     """
     from kineverse.experiments.manipulation.robots import SHIPPED, remove_unusable_shapes
     from kineverse.manipulation.articulated_objects import find_shut_value
-    from kineverse.manipulation.skill_arguments import explain_fixed, limit_tolerance
+    from kineverse.manipulation.skill_arguments import choose_tolerance, explain_fixed
     from kineverse.view.sliders import infer_units
 
     begin, end = (None if v is None else parse_value(v) for v in (arguments.start, arguments.to))
@@ -151,7 +149,7 @@ def make_scene(arguments: argparse.Namespace, skill: str) -> ManipulationScene:
         pusher,
         place is not None,
         fixed,
-        limit_tolerance(model, coordinate, TOLERANCE),
+        choose_tolerance(model, coordinate, state, end),
     )
 
 

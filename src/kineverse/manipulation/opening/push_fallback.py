@@ -111,14 +111,10 @@ class PushFallback:
         """
         motion, session = self.motion, self.motion.session
         assert self.approach.trajectory is not None
-        motion.judge.allow(self.pushing.object_bodies)
         session.phase = "approach"
         motion.follow(self.approach.trajectory)
         self.begun = True
         before = abs(session.state[motion.handle.coordinate] - self.target)
-
-        def look(pushing: Pushing) -> None:
-            motion.judge.update(session.world.state, session.commands, pushing=session.phase == "push")
 
         outcome = push(
             session,
@@ -129,7 +125,7 @@ class PushFallback:
             pushing=self.pushing,
             plan=False,
             retreat=True,
-            on_step=look,
+            judge=motion.judge,
         )
         left = abs(session.state[motion.handle.coordinate] - self.target)
         if not outcome and left > (1.0 - _LEAST_SHARE / 2) * before:

@@ -112,6 +112,7 @@ def find_push_start(
     kinematics brings the pusher to the point, at first without collisions, in every other pair of samples
     with the base where it stands, which has to be free. If the base touches nothing then, the arm is led out
     of collisions, and the push is rolled out. The first one without lost contacts and penetration is taken.
+    Nothing is sampled where something is in the way of the object.
     The search ends early after 60 roll-outs none of which moves the object, or 120 that move it no further
     than the best one before. Robots without a mobile base are sampled over their arms alone, at those points
     that are within reach.
@@ -140,6 +141,10 @@ def find_push_start(
     """
     begin, worked, reasons = perf_counter(), working_seconds(), Counter[str]()
     samples, seed = as_count("samples", samples, 1), as_count("seed", seed, 0)
+    obstacle = pushing.find_obstacle(state)
+    if obstacle is not None:  # wherever the robot stands
+        reasons[f"{obstacle.body} at {obstacle.other}"] = 1
+        return PushStart(None, 0, reasons, 0, perf_counter() - begin)
     sampler = _Sampler(pushing, state, np.random.default_rng(seed))
     if sampler.unreachable:
         reasons[_UNREACHED] = sampler.unreachable
@@ -196,7 +201,7 @@ def roll_out(pushing: Pushing, start: State, steps: int, tolerance: float = 0.01
     state, taken = start, 0
     pushing.reset()
     try:
-        problem = pushing.first_contact(state)
+        problem = pushing.first_contact(state) or str(pushing.find_obstacle(state) or "")
         while not problem and not pushing.done(state, tolerance):
             command = pushing.step(state)
             if pushing.losses:
