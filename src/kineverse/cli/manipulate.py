@@ -36,10 +36,12 @@ if TYPE_CHECKING:
 DONE, NOT_DONE = 0, 1
 
 _COMMON = """
-MODEL is any model or file, ROBOT any shipped robot or robot file; ROBOT@X,Y,ANGLE places its base. The world
-gets the speeds of the robot alone, and judges by its own truth: kinematic (the default), or mujoco with
-contacts, forces and friction. The exit status is 0 if it is done, 1 if not, 2 if the request is wrong. This
-needs the extras 'control' and 'geometry', the other world 'mjcf', and --record 'recording'.
+MODEL is any model or file, ROBOT any shipped robot or robot file; ROBOT@X,Y,ANGLE places it, and
+ROBOT@X,Y,Z,ANGLE one that is bolted to something. The world gets the speeds of the robot alone, and judges by
+its own truth: kinematic (the default), or mujoco with contacts, forces and friction. Nothing is moved where
+something is in the way of the object. The exit status is 0 if it is done and nothing went through anything, 1
+if not, 2 if the request is wrong. This needs the extras 'control' and 'geometry', the other world 'mjcf', and
+--record 'recording'.
 
 examples:
 """
@@ -127,7 +129,7 @@ def _add_arguments(parser: argparse.ArgumentParser, skill: str) -> None:
         metavar="ROBOT[@X,Y,ANGLE]",
         required=True,
         action=_Once,
-        help="the robot, by name or file, and the place of its base",
+        help="the robot, by name or file, and its place (X,Y,Z,ANGLE if it is bolted to something)",
     )
     parser.add_argument(
         "--what", metavar="COORDINATE", required=True, action=_Once, help="coordinate of the object"

@@ -75,12 +75,13 @@ class FurnitureOverlaps:
     robot
         Prefix of the robot, which is no furniture; none if empty.
     strict
-        Whether the default state excuses meshes alone, whose hulls fill cupboards. A primitive shape that is in
-        the way there is in the way.
+        Whether the default state excuses meshes alone. A primitive shape that is in the way there is in the way,
+        and a mesh is its hull, which fills a cupboard: where one overlaps something at the start or by default,
+        any depth is allowed.
     """
 
     def __init__(self, scene: Scene, robot: str, *, strict: bool = False) -> None:
-        self.scene, self.robot = scene, robot
+        self.scene, self.robot, self._strict = scene, robot, strict
         self._objects = [v for v in scene.model.speeds if not self._is_of_robot(v.path)]
         self._query = self.watch(self._objects)
         # Scenes without rules of their own find the same.
@@ -144,6 +145,8 @@ class FurnitureOverlaps:
         pairs = sorted(depths)
         self._codes: Indices = np.array(pairs, dtype=np.int64)
         self._allowed = np.array([depths[pair] + self._play.get(pair, 0.0) for pair in pairs])
+        if self._strict:
+            self._allowed[[self._has_mesh(pair) for pair in pairs]] = math.inf
 
     def _sample(self) -> tuple[dict[int, float], dict[int, float]]:
         """Return the depths by default, and the play of shapes that overlap everywhere, by pair of shapes."""
