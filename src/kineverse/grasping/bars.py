@@ -23,8 +23,8 @@ MOST_THICK = 0.09
 """Largest thickness of a bar [m]: hardly a gripper opens further."""
 _LONG = 1.5
 """Length per width above which a part is a bar, and a knob below."""
-_FLAT = 3.0
-"""Width per thickness from which on a part is a plate."""
+_FLAT, _WIDE = 3.0, 2.0
+"""Width per thickness from which on a part is a plate, and per width of what it carries, if it is a panel."""
 _STANDS_OUT = 3e-3
 """Least length by which a bar stands out from what it is fixed to [m]."""
 _TOUCH = 2e-3
@@ -175,11 +175,13 @@ def find_bars(link: Sequence[Part], around: Sequence[Part]) -> list[ProtrudingBa
 
 
 def _find_panel(link: Sequence[Part]) -> Part | None:
-    """Return the largest plate of a link that has nothing but slim parts: it carries the others, if there are any."""
+    """Return the narrow panel that carries the other parts of a link, all of them slim; None if there is none."""
     plates = [part for part in link if part.size[1] >= _FLAT * part.size[2]]
-    if not plates or len(plates) == len(link) or not all(part.is_slim for part in link):
+    others = [part for part in link if all(part is not plate for plate in plates)]
+    if not plates or not others or not all(part.is_slim for part in link):
         return None
-    return max(plates, key=lambda part: float(part.size[0] * part.size[1]))
+    widest = max(plates, key=lambda part: float(part.size[0] * part.size[1]))
+    return widest if widest.size[1] >= _WIDE * max(part.size[1] for part in others) else None
 
 
 def _clusters(parts: Sequence[Part]) -> list[tuple[Part, ...]]:

@@ -112,6 +112,7 @@ def find_obstacle(
     robot: str = "",
     rules: Iterable[Rule] = (),
     leave_out: Iterable[Exclusion] = (),
+    least: float = OVERLAP,
 ) -> Obstacle | None:
     """Return the first thing in the way of an object from its value to a target; None if the way is free.
 
@@ -132,6 +133,8 @@ def find_obstacle(
         Prefix of the robot; empty for none.
     rules, leave_out
         Rules of the collision filter, and excluded bodies, as for :class:`.Scene`.
+    least
+        Depth from which on an overlap counts [m]; a larger one for a joint that is not known exactly.
     """
     own = tuple(rules), tuple(leave_out)
 
@@ -139,7 +142,7 @@ def find_obstacle(
         return _Sweep(model, robot, *own)
 
     sweep = make() if any(own) else cached_for_version(model, ("swept motion", robot), make)
-    found = sweep.find(coordinate, state, target)
+    found = sweep.find(coordinate, state, target, least)
     return None if found is None else sweep.find_aside(found, state)
 
 
@@ -154,7 +157,9 @@ class _Sweep:
         self._overlaps = FurnitureOverlaps(self._scene, robot, strict=True)
         self._queries: dict[Symbol, tuple[PreparedQuery, FrameDependence]] = {}
 
-    def find(self, coordinate: Symbol, state: State, target: float) -> Obstacle | None:
+    def find(
+        self, coordinate: Symbol, state: State, target: float, least: float = OVERLAP
+    ) -> Obstacle | None:
         """Return the first obstacle of a coordinate on its way to a target; None without."""
         scene, start = self._scene, float(state[coordinate])
         if start == target or coordinate not in scene.inputs:
@@ -169,7 +174,7 @@ class _Sweep:
             found = query(0.0)
             excess = -found.distances - self._overlaps.allowances(found)
             worst = int(np.argmax(excess)) if len(excess) else 0
-            if not len(excess) or excess[worst] <= OVERLAP:
+            if not len(excess) or excess[worst] <= least:
                 continue
             pair = found[worst]
             one, other = (pair.a, pair.b) if motion.moves(pair.a) else (pair.b, pair.a)

@@ -14,6 +14,7 @@ from kineverse.geometry import Scene
 from kineverse.lie import Array, adjoint, exp_se3, inverse
 from kineverse.manipulation.opening.hand_motion import HandMotion
 from kineverse.manipulation.opening.hand_paths import row_at
+from kineverse.manipulation.swept_motion import find_obstacle
 from kineverse.model.frame import WORLD
 from kineverse.model.model import Model
 from kineverse.model.model_view import ModelView
@@ -39,6 +40,8 @@ _STEP = 0.03
 """Way of the handle between two arms that are found for a learned joint [m]."""
 _QUICK = 0.5
 """Speed from which on joints take their whole part [m/s], [rad/s]."""
+_UNSURE = 0.01
+"""Depth from which on something counts as in the way along a learned joint, which is off by millimetres [m]."""
 _MARGIN = 0.002
 """Least distance of bodies while the part moves [m]."""
 
@@ -116,6 +119,8 @@ class LearnedPull:
     ----------
     coordinate, path
         Coordinate of the joint, and the part's path by it.
+    obstacle
+        What is in the way of the part along this joint; None if nothing is.
     """
 
     def __init__(
@@ -133,6 +138,11 @@ class LearnedPull:
         path.project(belief.relative_pose)
         belief.path = self.path = path
         end = path.start + path.direction * _BEYOND * opened
+        state = motion.session.state | State({self.coordinate: path.value})
+        self.obstacle = find_obstacle(
+            model, self.coordinate, state, path.start + path.direction * opened,
+            robot=motion.session.world.robot, least=_UNSURE,
+        )  # fmt: skip
         hand, bar = model.fk(motion.gripper.hand), model.fk(motion.handle.frame)
         hold = Hold(same_pose(bar @ bar_T_hand, hand), gain=_GAIN, name="grasp")
         twist = adjoint(inverse(model.fk(motion.handle.frame, unknown.frame)({}))) @ path.twist()
@@ -159,6 +169,12 @@ class LearnedPull:
         ways, reached = search.paths.follow(arm[None], base[None], np.array(hands)[None])
         self._arms = ways[0, : reached[0]] if reached[0] else arm[None]
         self._controller.set(self._speeds, np.zeros(len(arm)))
+
+    @property
+    def is_blocked(self) -> bool:
+        """Obstacle reached: True if the part is where its way ends before something."""
+        value = self.path.value
+        return self.obstacle is not None and self.path.direction * (value - self.obstacle.free) >= 0.0
 
     @property
     def ends(self) -> bool:

@@ -13,6 +13,7 @@ from kineverse.lie import Array, inverse
 from kineverse.manipulation.opening.hand_motion import HandMotion
 from kineverse.manipulation.outcome import SkillError
 from kineverse.manipulation.session import Session
+from kineverse.manipulation.swept_motion import BlockedError
 from kineverse.model.frame import is_of_robot
 from kineverse.model.model import Model
 
@@ -194,6 +195,9 @@ class PartPulling:
                     )  # fmt: skip
                 elif learning.likely is not None and isinstance(pull, StraightPull):
                     pull.likely = JointPath.of_fit(learning.likely, self.start)
+            if isinstance(pull, LearnedPull) and pull.obstacle is not None and pull.is_blocked:
+                self._let_go()
+                raise BlockedError(pull.obstacle)
             with session.timed("open"):
                 command = pull.step(way)
             motion.act(command.speeds)
