@@ -30,6 +30,7 @@ from kineverse.expressions.printing import format_number
 if TYPE_CHECKING:
     from kineverse.manipulation.belief import Belief
     from kineverse.manipulation.outcome import Outcome
+    from kineverse.manipulation.swept_motion import Obstacle
     from kineverse.worlds import World
     from kineverse.worlds.recorder import RecordedStep
 
@@ -291,6 +292,8 @@ def _act(
             outcome = skip_skill(scene, world, False, scene.fixed)
         elif there:
             outcome = skip_skill(scene, world, True, f"'{scene.coordinate}' is there from the start")
+        elif not arguments.unknown and (obstacle := _find_obstacle(scene)) is not None:
+            outcome = skip_skill(scene, world, False, str(obstacle), obstacle.measures)
         else:
             act = push_object if skill == "push" else open_as_unknown if arguments.unknown else grasp_object
             outcome = act(arguments, scene, world, belief, look)
@@ -302,6 +305,13 @@ def _act(
         if recorder is not None:
             recorder.write_outcome(outcome)
     return outcome
+
+
+def _find_obstacle(scene: ManipulationScene) -> Obstacle | None:
+    """Return what is in the way of the object at the start of a scene; None if nothing is."""
+    from kineverse.manipulation.swept_motion import find_obstacle
+
+    return find_obstacle(scene.model, scene.coordinate, scene.start, scene.target, robot=scene.robot)
 
 
 def _view(

@@ -4,10 +4,11 @@ from __future__ import annotations
 
 import argparse
 import sys
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from contextlib import ExitStack
 from dataclasses import replace
-from typing import TYPE_CHECKING
+from types import MappingProxyType
+from typing import TYPE_CHECKING, Any
 
 from kineverse.cli.manipulate_setup import ManipulationScene
 from kineverse.cli.output import join_lines, show_activity
@@ -174,8 +175,15 @@ def _find_gripper_and_handle(
     return scene.gripper, handle
 
 
-def skip_skill(scene: ManipulationScene, world: World, done: bool, reason: str) -> Outcome:
+def skip_skill(
+    scene: ManipulationScene,
+    world: World,
+    done: bool,
+    reason: str,
+    measures: Mapping[str, Any] = MappingProxyType({}),
+) -> Outcome:
     """Return the outcome of what was not begun."""
     from kineverse.manipulation.outcome import Outcome
 
-    return Outcome(done, world.state[scene.coordinate], join_lines(reason), world.name, 0.0, 0)
+    value = world.state[scene.coordinate]
+    return Outcome(done, value, join_lines(reason), world.name, 0.0, 0, measures)
