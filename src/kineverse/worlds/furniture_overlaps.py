@@ -32,7 +32,7 @@ from kineverse.geometry.prepared_query import (
     flag_between,
     flag_relatively_moving,
 )
-from kineverse.geometry.results import DistanceResults
+from kineverse.geometry.results import DistanceResult, DistanceResults
 from kineverse.lie import Array
 from kineverse.model.body import Mesh
 from kineverse.model.frame import is_of_robot
@@ -119,11 +119,18 @@ class FurnitureOverlaps:
 
         ``least`` is the excess from which on they count [m].
         """
+        found = [Overlap(r.a, r.b, -r.distance, allowed) for r, allowed in self.find_beyond(least)]
+        return sorted(found, key=lambda one: -one.excess)
+
+    def find_beyond(self, excess: float) -> list[tuple[DistanceResult, float]]:
+        """Return the pairs of shapes with a depth beyond their allowance by an excess [m], the deepest first.
+
+        Each pair is there with its allowance [m].
+        """
         found = self._query()
-        depths, allowed = -found.distances, self.allowances(found)
-        beyond = np.flatnonzero(depths > allowed + least).tolist()
-        overlaps = [Overlap(found[k].a, found[k].b, float(depths[k]), float(allowed[k])) for k in beyond]
-        return sorted(overlaps, key=lambda one: -one.excess)
+        allowed = self.allowances(found)
+        beyond = np.flatnonzero(-found.distances > allowed + excess).tolist()
+        return [(found[k], float(allowed[k])) for k in beyond]
 
     @property
     def excepted(self) -> tuple[tuple[str, str], ...]:
@@ -136,7 +143,7 @@ class FurnitureOverlaps:
         """Return the depths that are allowed to pairs of shapes (K,) [m]."""
         if not len(self._codes) or not len(found):
             return np.zeros(len(found))
-        codes = self._encode(found)
+        codes = self.encode(found)
         place = np.minimum(np.searchsorted(self._codes, codes), len(self._codes) - 1)
         return np.where(self._codes[place] == codes, self._allowed[place], 0.0)
 
@@ -185,9 +192,9 @@ class FurnitureOverlaps:
     def _depths(self) -> dict[int, float]:
         """Return the depths of the pairs of shapes that overlap at the state of the scene [m]."""
         found = self._query()
-        return dict(zip(self._encode(found).tolist(), (-found.distances).tolist(), strict=True))
+        return dict(zip(self.encode(found).tolist(), (-found.distances).tolist(), strict=True))
 
-    def _encode(self, found: DistanceResults) -> Indices:
+    def encode(self, found: DistanceResults) -> Indices:
         """Return a number for each pair of shapes (K,)."""
         pairs = np.sort(found.object_indices, axis=1).astype(np.int64)
         return np.asarray(pairs[:, 0] * len(self.scene.collision_world.objects) + pairs[:, 1])
