@@ -384,11 +384,12 @@ def main(words: list[str] | None = None) -> int:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--count", type=int, default=100, help="number of cupboards (100)")
     parser.add_argument("--robots", nargs="+", choices=ROBOTS, default=ROBOTS)
+    parser.add_argument("--first", type=int, default=0, help="number of the first cupboard (0)")
     parser.add_argument("--seed", type=int, default=0)
     arguments = parser.parse_args(words)
     free = done = wrong = unmoved = 0
     with tempfile.TemporaryDirectory() as folder:
-        for number in range(arguments.count):
+        for number in range(arguments.first, arguments.first + arguments.count):
             cupboard = draw_cupboard(number, arguments.seed)
             for robot in arguments.robots:
                 run = run_robot(robot, cupboard, Path(folder))

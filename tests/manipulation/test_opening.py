@@ -370,11 +370,14 @@ def test_measures_of_several_parts_name_what_was_worst():
     part |= dict.fromkeys(("reversals", "contact_losses", "distance", "hand_distance"), 1.0) | {
         "excepted": ()
     }
-    first = part | {"penetration": 0.1, "penetrating": ("robot", "wall"), "limit_violation": 0.0, "limit": ""}
-    then = part | {"penetration": 0.0, "penetrating": ("", ""), "limit_violation": 1e-9, "limit": "arm"}
+    first = part | {"penetration": 0.1, "penetrating": ("robot", "wall"), "penetration_from": 0.7}
+    first |= {"limit_violation": 0.0, "limit": ""}
+    then = part | {"penetration": 0.0, "penetrating": ("", ""), "penetration_from": np.nan}
+    then |= {"limit_violation": 1e-9, "limit": "arm"}
     run = SimpleNamespace(_earlier=[first], judge=SimpleNamespace(measures=then))
     measures = _Run.measures.fget(run)
     assert (measures["penetration"], measures["penetrating"]) == (0.1, ("robot", "wall"))
+    assert measures["penetration_from"] == 0.7
     assert (measures["limit_violation"], measures["limit"]) == (1e-9, "arm")
     assert measures["distance"] == 2.0
 

@@ -62,6 +62,8 @@ class Session:
     ----------
     belief
         Source of the state.
+    start
+        The true state at the begin of the session.
     state
         The believed state.
     commands
@@ -116,6 +118,7 @@ class Session:
         self.belief = belief or TrueBelief()
         self._on_step = on_step
         self.state: State = self.belief.update(world)
+        self.start: State = world.state
         self.commands: Speeds = {}
         self.command: Command | None = None
         self.reference: HandReference | None = None

@@ -112,6 +112,7 @@ def find_obstacle(
     robot: str = "",
     rules: Iterable[Rule] = (),
     leave_out: Iterable[Exclusion] = (),
+    start: State | None = None,
     least: float = OVERLAP,
 ) -> Obstacle | None:
     """Return the first thing in the way of an object from its value to a target; None if the way is free.
@@ -133,6 +134,8 @@ def find_obstacle(
         Prefix of the robot; empty for none.
     rules, leave_out
         Rules of the collision filter, and excluded bodies, as for :class:`.Scene`.
+    start
+        Earlier state whose overlaps are allowed as well, such as the one before the object was opened.
     least
         Depth from which on an overlap counts [m]; a larger one for a joint that is not known exactly.
     """
@@ -142,6 +145,7 @@ def find_obstacle(
         return _Sweep(model, robot, *own)
 
     sweep = make() if any(own) else cached_for_version(model, ("swept motion", robot), make)
+    sweep.start = start
     found = sweep.find(coordinate, state, target, least)
     return None if found is None else sweep.find_aside(found, state)
 
@@ -156,6 +160,7 @@ class _Sweep:
         self._scene = Scene(model, rules=rules, leave_out=leave_out)
         self._overlaps = FurnitureOverlaps(self._scene, robot, strict=True)
         self._queries: dict[Symbol, tuple[PreparedQuery, FrameDependence]] = {}
+        self.start: State | None = None
 
     def find(
         self, coordinate: Symbol, state: State, target: float, least: float = OVERLAP
@@ -168,7 +173,7 @@ class _Sweep:
         if not len(query.pairs):
             return None
         scene.update(state)
-        self._overlaps.begin()
+        self._overlaps.begin(*(() if self.start is None else (self.start,)))
         values = self._divide(coordinate, state, start, target)
         for k in self._find_near(query, coordinate, values):
             found = query(0.0)

@@ -39,6 +39,7 @@ from kineverse.model.frame import is_of_robot
 from kineverse.model.frame_dependence import FrameDependence
 from kineverse.model.sampling import StateSamples
 from kineverse.model.version_cache import cached_for_version
+from kineverse.state import StateLike
 from kineverse.symbols import Symbol
 
 OVERLAP = 5e-4
@@ -107,11 +108,16 @@ class FurnitureOverlaps:
 
         return PreparedQuery(scene.collision_world, choose, radius, per_shape=True)
 
-    def begin(self) -> None:
-        """Take the state of the scene as the start."""
-        depths = dict(self._default)
-        for pair, depth in self._depths().items():
-            depths[pair] = max(depth, depths.get(pair, 0.0))
+    def begin(self, *earlier: StateLike) -> None:
+        """Take the state of the scene as the start; what overlaps in earlier states may do so as well."""
+        depths, here = dict(self._default), self._depths()
+        values = self.scene.collision_world.values
+        for state in earlier:
+            self.scene.update(state)
+            _deepen(depths, self._depths())
+        if earlier:
+            self.scene.update(values)
+        _deepen(depths, here)
         self._allow(depths)
 
     def find(self, least: float = OVERLAP) -> list[Overlap]:
@@ -209,3 +215,9 @@ class FurnitureOverlaps:
 
     def _is_of_robot(self, name: str) -> bool:
         return bool(self.robot) and is_of_robot(name, self.robot)
+
+
+def _deepen(depths: dict[int, float], others: dict[int, float]) -> None:
+    """Raise depths to other ones, by pair of shapes."""
+    for pair, depth in others.items():
+        depths[pair] = max(depth, depths.get(pair, 0.0))

@@ -91,6 +91,8 @@ class Judge:
         Body that is grasped or pushed. Contacts with all bodies that move with it are counted.
     coordinate
         Coordinate of the object, whose value tells where an overlap came.
+    start
+        Earlier state in which furniture may have overlapped, such as the one before it was opened.
     scene
         Collision scene of the model, which from now on is the judge's; None for ``Scene(model)``.
     every
@@ -119,6 +121,7 @@ class Judge:
         handle: str | None = None,
         *,
         coordinate: Symbol | None = None,
+        start: State | None = None,
         scene: Scene | None = None,
         every: int = 1,
         contact_gap: float = CONTACT_GAP,
@@ -139,7 +142,7 @@ class Judge:
         self._speed_place: dict[Symbol | str, int] = {v: k for k, v in enumerate(self._robot_speeds)}
         self._speed_place |= {str(v): k for k, v in enumerate(self._robot_speeds)}
         self._scene_values = self._indices(self._scene.inputs)
-        self._coordinate = coordinate
+        self._coordinate, self._start = coordinate, start
         self._penetrations = self._scene.watch(self._own, radius=0.0)
         self._furniture = FurnitureOverlaps(self._scene, robot, strict=True)
         self._first_overlapping: tuple[tuple[str, str], ...] = ()
@@ -310,7 +313,7 @@ class Judge:
         own = set(self._own)
         found = ((pair.a, pair.b) for pair in self._penetrations() if pair.distance < -_TOUCHING)
         self._first_overlapping = tuple((a, b) for a, b in found if a in own and b in own)
-        self._furniture.begin()
+        self._furniture.begin(*(() if self._start is None else (self._start,)))
         self._select_pairs()
 
     def _select_pairs(self) -> None:

@@ -118,7 +118,9 @@ def open_object(
     goal = choose_target(model, coordinate, session.state, check_target(target))
     tolerance = choose_tolerance(model, coordinate, session.state, goal, tolerance)
     if not session.deviation(coordinate):  # an estimate is looked at before, see _Run
-        obstacle = find_obstacle(model, coordinate, session.state, goal, robot=world.robot)
+        obstacle = find_obstacle(
+            model, coordinate, session.state, goal, robot=world.robot, start=session.start
+        )
         if obstacle is not None:
             return Outcome(False, here, str(obstacle), world.name, 0.0, 0, obstacle.measures)
     found = find_handle(model, coordinate, handle)
@@ -186,8 +188,9 @@ class _Run:
         self._approach = Approach()
         self._ways_back = [made for made in session.made if self._is_of_this(made)]
         self.judge = Judge(
-            self.model, session.world.robot, self.gripper, handle.frame, coordinate=handle.coordinate
-        )
+            self.model, session.world.robot, self.gripper, handle.frame,
+            coordinate=handle.coordinate, start=session.start,
+        )  # fmt: skip
         self.judge.update(session.world.state)
         self.motion = HandMotion(
             session, self.gripper, handle, opener.search, opener.approaches, self.judge, self.begin + seconds,
@@ -328,8 +331,9 @@ class _Run:
         """Raise BlockedError if something is in the way of the object, as far as it is seen."""
         state, coordinate = self.session.state, self.handle.coordinate
         if self.session.deviation(coordinate):
+            session = self.session
             obstacle = find_obstacle(
-                self.model, coordinate, state, self.target, robot=self.session.world.robot
+                self.model, coordinate, state, self.target, robot=session.world.robot, start=session.start
             )
             if obstacle is not None:
                 raise BlockedError(obstacle)

@@ -154,8 +154,9 @@ def push(
             return skip(False, fixed)
         own = tuple(rules), tuple(leave_out)
         obstacle = find_obstacle(
-            model, coordinate, session.state, target, robot=world.robot, rules=own[0], leave_out=own[1]
-        )
+            model, coordinate, session.state, target,
+            robot=world.robot, rules=own[0], leave_out=own[1], start=session.start,
+        )  # fmt: skip
         if obstacle is not None:
             return skip(False, str(obstacle), **obstacle.measures)
         if bodies is None:
@@ -180,7 +181,7 @@ def push(
     measured = judge is None
     if judge is None:
         scene = Scene(model, rules=pushing.rules, leave_out=pushing.leave_out)
-        judge = Judge(model, world.robot, coordinate=coordinate, scene=scene)
+        judge = Judge(model, world.robot, coordinate=coordinate, start=session.start, scene=scene)
         judge.update(world.state)
     judge.allow(pushing.object_bodies, pushing.pusher)
     run = _Run(session, pushing, judge, seconds, tolerance, plan, on_step)
