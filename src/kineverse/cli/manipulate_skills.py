@@ -3,15 +3,16 @@
 from __future__ import annotations
 
 import argparse
+import math
 import sys
 from collections.abc import Callable, Mapping
-from contextlib import ExitStack
 from dataclasses import replace
+from time import perf_counter
 from types import MappingProxyType
 from typing import TYPE_CHECKING, Any
 
 from kineverse.cli.manipulate_setup import ManipulationScene
-from kineverse.cli.output import join_lines, show_activity
+from kineverse.cli.output import join_lines, print_line, show_activity
 from kineverse.errors import InvalidValueError, UnknownNameError
 
 if TYPE_CHECKING:
@@ -23,6 +24,8 @@ if TYPE_CHECKING:
 
 _PLACEMENT = 60.0
 """Largest time of the search for a place of the base [s]."""
+_BETWEEN_LINES = 1.0
+"""Least time between two lines on the progress of a search [s]."""
 
 
 def grasp_object(
@@ -41,24 +44,29 @@ def grasp_object(
     from kineverse.manipulation.opening.grasped_opening import open_object
     from kineverse.manipulation.session import Session
 
-    with ExitStack() as search:
-        search.enter_context(show_activity("searching for a place of the robot and a way of its hand"))
-
-        def watch(step: RecordedStep) -> None:
-            if step.phase != "look":
-                search.close()  # the first step on a way has been made
-            look(step)
-
-        outcome: Outcome = open_object(
-            Session(world, belief=belief, on_step=watch),
-            scene.coordinate,
-            target=scene.target,
-            hand=gripper.hand,
-            handle=arguments.handle,
-            seconds=arguments.seconds,
-            seed=arguments.seed,
-        )
+    outcome: Outcome = open_object(
+        Session(world, belief=belief, on_step=look, on_search=_SearchLines()),
+        scene.coordinate,
+        target=scene.target,
+        hand=gripper.hand,
+        handle=arguments.handle,
+        seconds=arguments.seconds,
+        seed=arguments.seed,
+    )
     return outcome
+
+
+class _SearchLines:
+    """Lines on standard error on the progress of a search, at most one in some seconds."""
+
+    def __init__(self) -> None:
+        self._last = -math.inf
+
+    def __call__(self, text: str) -> None:
+        """Print a line, unless another one was printed just now."""
+        if (now := perf_counter()) >= self._last + _BETWEEN_LINES:
+            self._last = now
+            print_line(f"searching: {text}")
 
 
 def open_as_unknown(
@@ -130,7 +138,12 @@ def push_object(
         if problem:
             with show_activity("searching for a place of the robot"):
                 found = find_push_start(
-                    pushing, scene.start, seconds=_PLACEMENT, steps=steps, seed=arguments.seed
+                    pushing,
+                    scene.start,
+                    seconds=_PLACEMENT,
+                    steps=steps,
+                    seed=arguments.seed,
+                    report=_SearchLines(),
                 )
             placed, why = found.samples, f"Another place of the robot: {found.why}"
             print(f"not from where the robot stands: {problem}. {why}", file=sys.stderr)

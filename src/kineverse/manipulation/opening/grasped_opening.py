@@ -279,9 +279,14 @@ class _Run:
         self._check_progress()
 
     @property
+    def here(self) -> float:
+        """Believed value of the object's coordinate [m], [rad]."""
+        return float(self.session.state[self.handle.coordinate])
+
+    @property
     def left(self) -> float:
         """Distance of the object from the target [m], [rad]."""
-        return abs(float(self.session.state[self.handle.coordinate]) - self.target)
+        return abs(self.here - self.target)
 
     def _push(self, failure: SkillError, attempt: int) -> None:
         """Push the object on where no grasp leads, or raise SkillError after the last attempt."""
@@ -415,6 +420,7 @@ class _Run:
         """Search a placement among the most sampled bases that are allowed, and count them."""
         session, search = self.session, self.opener.search
         session.phase = "place"
+        session.report_search(f"places of the robot from which it leads from {self.here:.3f} to {self.target:.3f}")
         with session.timed("place"):
             try:
                 grasps = self.opener.grasps(self.handle, session.state, self.seed, slant)
@@ -427,6 +433,7 @@ class _Run:
                 accept=self._plan,
                 samples=samples,
                 seed=self.seed + self.grasps,
+                report=session.report_search,
             )
         self.placements += found.samples
         return found

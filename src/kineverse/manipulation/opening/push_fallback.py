@@ -62,6 +62,7 @@ class PushFallback:
         """
         motion, session = self.motion, self.motion.session
         session.phase = "place"
+        session.report_search("starts of a push, as no grasp leads on")
         with session.timed("place"):
             state = session.state
             try:
@@ -83,6 +84,7 @@ class PushFallback:
                     seed=seed,
                     least=_LEAST_SHARE,
                     accept=self._plan,
+                    report=session.report_search,
                 )
             except InvalidValueError as error:
                 raise SkillError("reach", f"It cannot be pushed: {error}") from error
