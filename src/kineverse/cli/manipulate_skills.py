@@ -24,6 +24,8 @@ if TYPE_CHECKING:
 
 _PLACEMENT = 60.0
 """Largest time of the search for a place of the base [s]."""
+_SHORT = 0.1
+"""Share of a wanted opening that may be missing at the stop of a part whose joint is learned."""
 _BETWEEN_LINES = 1.0
 """Least time between two lines on the progress of a search [s]."""
 
@@ -104,6 +106,11 @@ def open_as_unknown(
         way=OPEN_WAY if far is None else far,
         turn=OPEN_TURN if far is None else far,
     )
+    there = abs(world.state[coordinate] - scene.start[coordinate])
+    if outcome and far is not None and there < (1.0 - _SHORT) * far:
+        reason = f"{outcome.reason} That is {there:.3g}, and not {far:.3g}, from where it began."
+        measures = {**outcome.measures, "failure": "other"}
+        outcome = replace(outcome, done=False, reason=reason, measures=measures)
     return outcome
 
 

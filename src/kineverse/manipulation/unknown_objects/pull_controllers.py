@@ -33,7 +33,7 @@ _BEYOND = 1.2
 _GAIN = 5.0
 """Rate at which errors of the hand's place on the part decay [1/s]."""
 _STRAIGHT = 0.035
-"""Way of the handle after which the likeliest joint counts as much as its normal for the direction [m]."""
+"""Way of the handle after which the likeliest joint counts as much as the first direction [m]."""
 _RAMP = 0.5
 """Time in which the pull begins [s]."""
 _STEP = 0.03
@@ -47,9 +47,9 @@ _MARGIN = 0.002
 
 
 class StraightPull:
-    """Pull along the outward normal of a handle, while the hand follows the part as it is seen.
+    """Pull straight at a handle, while the hand follows the part as it is seen.
 
-    The hand holds its place on the part, shifted ahead by speed / gain along the normal. So a part that does
+    The hand holds its place on the part, shifted ahead by speed / gain along the direction. So a part that does
     not follow stops the hand after 4 mm, and the hand yields to any other motion of the part. The pull begins
     slowly, as nothing is known of the direction.
 
@@ -61,6 +61,8 @@ class StraightPull:
         Belief about the part.
     bar_T_hand
         Place (4, 4) of the hand on the handle.
+    direction
+        Direction (3,) of the pull in the axes of the handle; by default its outward normal x.
 
     Attributes
     ----------
@@ -68,8 +70,15 @@ class StraightPull:
         The likeliest joint, which leads the pull the more the further the part has moved.
     """
 
-    def __init__(self, motion: HandMotion, belief: PartBelief, bar_T_hand: Array) -> None:
+    def __init__(
+        self,
+        motion: HandMotion,
+        belief: PartBelief,
+        bar_T_hand: Array,
+        direction: tuple[float, float, float] = (1.0, 0.0, 0.0),
+    ) -> None:
         self.motion, self.belief, self.bar_T_hand = motion, belief, bar_T_hand
+        self._direction = motion.handle.pose[:3, :3] @ np.array(direction)
         model, unknown = motion.model, belief.unknown
         self._part_T_bar = np.asarray(model.fk(motion.handle.frame, unknown.frame)({}))
         hand, bar = model.fk(motion.gripper.hand), model.fk(motion.handle.frame)
@@ -87,7 +96,7 @@ class StraightPull:
         share = min(1.0, (session.world.time - self._begin) / _RAMP)
         speed = _FIRST_SPEED + min(1.0, way / _SPEED_UP) * (PULL_SPEED - _FIRST_SPEED)
         lead = share * speed / _GAIN
-        twist = np.concatenate([self.motion.handle.pose[:3, 0], np.zeros(3)])
+        twist = np.concatenate([self._direction, np.zeros(3)])
         if self.likely is not None:
             self.likely.project(self.belief.relative_pose)
             weight = way**2 / (way**2 + _STRAIGHT**2)
