@@ -284,8 +284,7 @@ def _stand_free(model: kv.Model, robot: str, state: kv.State, base: Sequence[kv.
             print_line(f"start: {problem} touch, so the robot begins at {where}")
         return found
     raise InvalidValueError(
-        f"The robot '{robot}' begins in contact: {problem}. Give it another place: "
-        "--robot ROBOT@X,Y,ANGLE."
+        f"The robot '{robot}' begins in contact: {problem}. Give it another place: --robot ROBOT@X,Y,ANGLE."
     )
 
 

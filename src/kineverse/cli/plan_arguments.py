@@ -145,7 +145,7 @@ def add_robot_option(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--robot",
         metavar="ROBOT[@X,Y,ANGLE]",
-        help="a robot that is put into the model, by name or file, and its place (X,Y,Z,ANGLE if it is bolted)",
+        help="a robot that is put into the model, by name or file, and its place (X,Y,Z,ANGLE if bolted)",
     )
 
 
@@ -188,15 +188,15 @@ def parse_robot(text: str) -> tuple[str, Place | None]:
     parts = place.split(",")
     if len(parts) not in (3, 4):
         raise InvalidValueError(
-            f"--robot {text}: a place is X,Y,ANGLE, such as fetch@1,0.5,90deg, or X,Y,Z,ANGLE for a robot that "
-            "is bolted to something."
+            f"--robot {text}: a place is X,Y,ANGLE, such as fetch@1,0.5,90deg, or X,Y,Z,ANGLE for a robot "
+            "that is bolted to something."
         )
     numbers = [parse_value(part) for part in parts]
     return source, Place(numbers[0], numbers[1], numbers[2] if len(parts) == 4 else 0.0, numbers[-1])
 
 
 def find_base(model: kv.Model, joints: Iterable[str]) -> tuple[kv.Symbol, ...]:
-    """Return the coordinates x, y and angle of a mobile base among some articulations; none if there is none."""
+    """Return the coordinates x, y and angle of a mobile base among articulations; none without one."""
     for name in joints:
         coordinates = model.articulations[name].coordinates
         if tuple(s.path.rpartition("/")[2] for s in coordinates) == _BASE:
@@ -239,8 +239,8 @@ def place_robot(
     moving = [name for name in roots if model.speeds_of(name)]
     if moving:
         raise InvalidValueError(
-            f"'{moving[0]}' moves in the world by coordinates of its own, and not by x, y and angle: set those "
-            "instead of a place."
+            f"'{moving[0]}' moves in the world by coordinates of its own, and not by x, y and angle: set "
+            "those instead of a place."
         )
     _move_roots(model, roots, place)
     return {}

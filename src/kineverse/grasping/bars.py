@@ -175,7 +175,7 @@ def find_bars(link: Sequence[Part], around: Sequence[Part]) -> list[ProtrudingBa
 
 
 def _find_panel(link: Sequence[Part]) -> Part | None:
-    """Return the narrow panel that carries the other parts of a link, all of them slim; None if there is none."""
+    """Return the narrow panel that carries the other parts of a link, all slim; None if there is none."""
     plates = [part for part in link if part.size[1] >= _FLAT * part.size[2]]
     others = [part for part in link if all(part is not plate for plate in plates)]
     if not plates or not others or not all(part.is_slim for part in link):

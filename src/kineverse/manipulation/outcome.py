@@ -16,8 +16,8 @@ class Outcome:
     Attributes
     ----------
     done
-        Whether the object is where it was wanted, in the world's truth, and nothing went through anything on the
-        way: no two bodies overlapped by more than 0.5 mm that did not at the start.
+        Whether the object is where it was wanted, in the world's truth, and nothing went through anything on
+        the way: no two bodies overlapped by more than 0.5 mm that did not at the start.
     value
         Value of the coordinate at the end, in the world's truth [m], [rad].
     reason

@@ -14,7 +14,7 @@ from kineverse.symbols import Symbol
 from kineverse.worlds import World
 
 TOLERANCE = 0.02
-"""Distance from a limit within which an object is open or shut, unless its whole range is short [m], [rad]."""
+"""Distance from a limit within which an object is open or shut, unless its range is short [m], [rad]."""
 
 _FIXED = 1e-9
 """Range of a coordinate up to which it counts as fixed [m], [rad]."""
@@ -85,8 +85,8 @@ def choose_tolerance(
 ) -> float:
     """Return the distance from a target up to which an object is there [m], [rad].
 
-    By default that is 2 % of the way, between 1 and 20 mm (mrad). At a limit, where an object is open or shut,
-    it is 20 mm. It is never more than a tenth of the coordinate's range.
+    By default that is 2 % of the way, between 1 and 20 mm (mrad). At a limit, where an object is open or
+    shut, it is 20 mm. It is never more than a tenth of the coordinate's range.
     """
     lower, upper = (float(v) for v in model.limits(coordinate, state))
     if given is not None:

@@ -11,6 +11,7 @@ from __future__ import annotations
 import math
 from collections.abc import Iterable, Iterator
 from dataclasses import dataclass, replace
+from itertools import pairwise
 from typing import Any
 
 import numpy as np
@@ -215,7 +216,7 @@ class _Sweep:
         return self._queries[coordinate]
 
     def _find_near(self, query: PreparedQuery, coordinate: Symbol, values: Array) -> Iterator[int]:
-        """Place the scene at those values at which anything of the object touches, and yield their indices."""
+        """Place the scene at the values at which anything of the object touches, and yield their indices."""
         rows, k = values[:, None], 0
         at = self._scene.inputs.index(coordinate)
         while True:
@@ -256,7 +257,7 @@ class _Sweep:
         scene.update(state)
         radius = np.where(np.isfinite(table.radius), table.radius, 0.0)[: table.moving]
         parts = [np.array([start])]
-        for k, ((p, R), (p_next, R_next)) in enumerate(zip(places, places[1:], strict=False)):
+        for k, ((p, R), (p_next, R_next)) in enumerate(pairwise(places)):
             turn = np.linalg.norm((R_next - R).reshape(len(R), -1), axis=1) / math.sqrt(2.0)
             way = float((np.linalg.norm(p_next - p, axis=1) + turn * radius).max(initial=0.0))
             count = min(max(1, math.ceil(way / STEP)), _MOST_PLACES // _COARSE)

@@ -76,9 +76,9 @@ class FurnitureOverlaps:
     robot
         Prefix of the robot, which is no furniture; none if empty.
     strict
-        Whether the default state excuses meshes alone. A primitive shape that is in the way there is in the way,
-        and a mesh is its hull, which fills a cupboard: where one overlaps something at the start or by default,
-        any depth is allowed.
+        Whether the default state excuses meshes alone. A primitive shape that is in the way there is in the
+        way. A mesh is its hull, which fills a cupboard: where one overlaps something at the start or by
+        default, any depth is allowed.
     """
 
     def __init__(self, scene: Scene, robot: str, *, strict: bool = False) -> None:

@@ -420,7 +420,9 @@ class _Run:
         """Search a placement among the most sampled bases that are allowed, and count them."""
         session, search = self.session, self.opener.search
         session.phase = "place"
-        session.report_search(f"places of the robot from which it leads from {self.here:.3f} to {self.target:.3f}")
+        session.report_search(
+            f"places of the robot from which it leads from {self.here:.3f} to {self.target:.3f}"
+        )
         with session.timed("place"):
             try:
                 grasps = self.opener.grasps(self.handle, session.state, self.seed, slant)

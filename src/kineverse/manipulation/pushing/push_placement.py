@@ -117,9 +117,9 @@ def find_push_start(
     kinematics brings the pusher to the point, at first without collisions, in every other pair of samples
     with the base where it stands, which has to be free. If the base touches nothing then, the arm is led out
     of collisions, and the push is rolled out. The first one without lost contacts and penetration is taken.
-    Nothing is sampled where something is in the way of the object.
     The search ends early after 60 roll-outs none of which moves the object, or 120 that move it no further
-    than the best one before, and after 200 samples without a roll-out. Robots without a mobile base are sampled over their arms alone, at those points
+    than the best one before, and after 200 samples without a roll-out. Nothing is sampled where something is
+    in the way of the object. Robots without a mobile base are sampled over their arms alone, at those points
     that are within reach.
 
     Parameters

@@ -41,7 +41,7 @@ _STEP = 0.03
 _QUICK = 0.5
 """Speed from which on joints take their whole part [m/s], [rad/s]."""
 _UNSURE = 0.01
-"""Depth from which on something counts as in the way along a learned joint, which is off by millimetres [m]."""
+"""Depth from which on something is in the way along a learned joint, which is off by millimetres [m]."""
 _MARGIN = 0.002
 """Least distance of bodies while the part moves [m]."""
 
@@ -49,9 +49,9 @@ _MARGIN = 0.002
 class StraightPull:
     """Pull straight at a handle, while the hand follows the part as it is seen.
 
-    The hand holds its place on the part, shifted ahead by speed / gain along the direction. So a part that does
-    not follow stops the hand after 4 mm, and the hand yields to any other motion of the part. The pull begins
-    slowly, as nothing is known of the direction.
+    The hand holds its place on the part, shifted ahead by speed / gain along the direction. So a part that
+    does not follow stops the hand after 4 mm, and the hand yields to any other motion of the part. The pull
+    begins slowly, as nothing is known of the direction.
 
     Parameters
     ----------

@@ -30,8 +30,8 @@ _MOST_GRASPS = 3
 _DIRECTIONS = (
     (1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, -1.0, 0.0), (0.0, 0.0, 1.0), (0.0, 0.0, -1.0),
 )  # fmt: skip
-"""Directions in which a part is pulled one after the other until it follows, in the axes of its handle: along its
-outward normal, to both sides across the bar, and to both ends along it."""
+"""Directions in which a part is pulled one after the other until it follows, in the axes of its handle: along
+its outward normal, to both sides across the bar, and to both ends along it."""
 _REFIT = 0.5
 """Time between two controllers for a learned joint [s]."""
 _FOLLOWS, _STALLED, _PATIENCE = 0.01, 0.004, 1.5
@@ -146,9 +146,9 @@ class PartPulling:
         if opened < _FOLLOWS:
             raise SkillError(
                 "other",
-                f"'{self.part}' does not follow the hand, pulled outwards, to both sides, and to both ends of its "
-                f"handle: it moved by {1e3 * opened:.0f} mm. {why} It may be fixed, locked, or need more force "
-                "than the grip holds.",
+                f"'{self.part}' does not follow the hand, pulled outwards, to both sides, and to both ends of "
+                f"its handle: it moved by {1e3 * opened:.0f} mm. {why} It may be fixed, locked, or need more "
+                "force than the grip holds.",
             )
         words = f"{self._describe_opening('goes no further')} {why}"
         if opened >= LEAST_OPENING[0] or self.opening[1] >= LEAST_OPENING[1]:

@@ -218,7 +218,9 @@ class _Run:
         """Open the part, and return how far, or raise SkillError."""
         session, unknown = self.session, self.unknown
         robot = self.world.robot
-        self.judge = Judge(self.world.model, robot, self.gripper, unknown.handle.frame, coordinate=self._moved)
+        self.judge = Judge(
+            self.world.model, robot, self.gripper, unknown.handle.frame, coordinate=self._moved
+        )
         self.judge.update(self.world.state)
         self._prepare(unknown)
         self._look()

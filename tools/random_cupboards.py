@@ -1,4 +1,4 @@
-"""Robots at random cupboards with something in the way or beside it: `python tools/cupboards.py --count 100`.
+"""Robots at random cupboards with something in the way or beside it: `python tools/random_cupboards.py --count 100`.
 
 A cupboard has a door, a flap or a drawer of random size, side, axis and handle. A post, a board, the corner of a
 wall, or a second door or drawer stands in its swing or slide in half of the cupboards, and near to it in the
@@ -62,7 +62,9 @@ class Link:
     def rod(self, radius: float, length: float, at: tuple[float, ...], along: int) -> None:
         """Add a cylinder along an axis of the world."""
         turned = shift(*at)
-        turned[:3, :3] = {0: turn((0, 1, 0), math.pi / 2), 1: turn((1, 0, 0), math.pi / 2), 2: np.eye(3)}[along]
+        turned[:3, :3] = {0: turn((0, 1, 0), math.pi / 2), 1: turn((1, 0, 0), math.pi / 2), 2: np.eye(3)}[
+            along
+        ]
         self.shapes.append(("cylinder", (radius, length), turned))
 
     def pose(self, q: float) -> np.ndarray:
@@ -114,7 +116,11 @@ class Cupboard:
         for link in self.links:
             lines.append(f'<link name="{link.name}">')
             for kind, size, pose in link.shapes:
-                numbers = f'size="{_text(size)}"' if kind == "box" else f'radius="{size[0]:.17g}" length="{size[1]:.17g}"'
+                numbers = (
+                    f'size="{_text(size)}"'
+                    if kind == "box"
+                    else f'radius="{size[0]:.17g}" length="{size[1]:.17g}"'
+                )
                 x, y, z = pose[:3, 3] - link.point
                 roll, pitch = math.atan2(pose[2, 1], pose[2, 2]), math.asin(max(-1.0, min(1.0, -pose[2, 0])))
                 place = f'<origin xyz="{x:.17g} {y:.17g} {z:.17g}" rpy="{roll:.17g} {pitch:.17g} 0"/>'
@@ -238,9 +244,7 @@ def _other(pair: tuple[str, str]) -> bool:
     return "front" in pair and not {"carcass"} & {*pair}
 
 
-def _make_carcass(
-    name: str, x: float, y: float, z: float, width: float, height: float, depth: float
-) -> Link:
+def _make_carcass(name: str, x: float, y: float, z: float, width: float, height: float, depth: float) -> Link:
     link, middle = Link(name), x + depth / 2
     for side in (-1, 1):
         link.box((depth, BOARD, height), (middle, y + side * (width - BOARD) / 2, z))
@@ -269,7 +273,10 @@ def _make_front(
     if kind == "drawer":
         link.axis, link.upper = np.array([-1.0, 0.0, 0.0]), random.uniform(0.6, 0.9) * (depth - BOARD)
         inner = depth - BOARD - 0.02
-        link.box((inner, width - 2 * BOARD - 0.01, 0.01), (face + PANEL + inner / 2, y, z - height / 2 + BOARD + 0.01))
+        link.box(
+            (inner, width - 2 * BOARD - 0.01, 0.01),
+            (face + PANEL + inner / 2, y, z - height / 2 + BOARD + 0.01),
+        )
         at = (face - 0.05, y, z)
     elif kind == "door":
         link.point = np.array([face, y + side * width / 2, z])
@@ -381,7 +388,9 @@ def _find_wrong(cupboard: Cupboard, outcome: Outcome, states: list[dict[str, flo
 
 def main(words: list[str] | None = None) -> int:
     """Check the laws; return 0 if they hold."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
     parser.add_argument("--count", type=int, default=100, help="number of cupboards (100)")
     parser.add_argument("--robots", nargs="+", choices=ROBOTS, default=ROBOTS)
     parser.add_argument("--first", type=int, default=0, help="number of the first cupboard (0)")
