@@ -175,4 +175,3 @@ def test_what_overlaps_at_the_begin_is_listed_and_not_counted():
     assert folds["penetrating"] == ("robot/link", "robot/tip")
     assert folds["penetration"] == pytest.approx(0.05, abs=1e-6)
     assert run(judge, [{"robot/x": -3.0, "robot/fold": 0.5}])["penetration"] == pytest.approx(0.3, abs=1e-6)
-

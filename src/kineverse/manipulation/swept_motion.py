@@ -36,6 +36,8 @@ STEP = 5e-4
 _COARSE = 32
 """Number of parts of a way whose lengths are measured."""
 _MOST_PLACES = 100_000
+_TURNED = 1e-6
+"""Change of an entry of a rotation from which on a body has turned."""
 _CLEAR = 3e-3
 """Distance before the first contact up to which a way is said to be free [m]."""
 
@@ -56,6 +58,8 @@ class Obstacle:
         Largest depth of the two on the way to the target [m].
     free
         Value up to which the way is free, a little before the contact [m], [rad].
+    unit
+        ``"rad"`` if the object turns, ``"m"`` if it slides.
     carrier
         Coordinate that moves the other body; None if none does.
     aside
@@ -69,6 +73,7 @@ class Obstacle:
     value: float
     depth: float
     free: float
+    unit: str = ""
     carrier: Symbol | None = None
     aside: float | None = None
 
@@ -79,9 +84,9 @@ class Obstacle:
 
     def __str__(self) -> str:
         text = (
-            f"'{self.body}' meets '{self.other}' at {self.value:.3f} of '{self.coordinate}', on the way to "
-            f"{self.target:.3f}, where they would overlap by {1e3 * self.depth:.3g} mm. "
-            f"The way is free up to {self.free:.3f}."
+            f"'{self.body}' meets '{self.other}' at {self.value:.3f} {self.unit} of '{self.coordinate}': on the "
+            f"way to {self.target:.3f} {self.unit} they would overlap by {1e3 * self.depth:.3g} mm. "
+            f"The way is free up to {self.free:.3f} {self.unit}."
         )
         if self.aside is not None:
             return f"{text} Move '{self.carrier}' to {self.aside:.3f} first."
@@ -186,7 +191,8 @@ class _Sweep:
             one, other = (pair.a, pair.b) if motion.moves(pair.a) else (pair.b, pair.a)
             deepest = self._find_deepest(query, coordinate, values[k:], one, other)
             first = values[max(0, k - math.ceil(_CLEAR / STEP))]
-            return Obstacle(coordinate, target, one, other, float(values[k]), deepest, float(first))
+            unit = "rad" if self._turns(one, coordinate, state, target) else "m"
+            return Obstacle(coordinate, target, one, other, float(values[k]), deepest, float(first), unit)
         return None
 
     def find_aside(self, found: Obstacle, state: State) -> Obstacle:
@@ -263,6 +269,15 @@ class _Sweep:
             count = min(max(1, math.ceil(way / STEP)), _MOST_PLACES // _COARSE)
             parts.append(np.linspace(coarse[k], coarse[k + 1], count + 1)[1:])
         return np.concatenate(parts)
+
+    def _turns(self, body: str, coordinate: Symbol, state: State, value: float) -> bool:
+        """Return True if a body is turned when a coordinate changes to a value."""
+        scene = self._scene
+        scene.update(state)
+        before = scene.pose(body)[:3, :3]
+        middle = (float(state[coordinate]) + value) / 2
+        scene.update(state.updated({coordinate: middle}))
+        return bool(np.abs(scene.pose(body)[:3, :3] - before).max() > _TURNED)
 
     def _find_deepest(
         self, query: PreparedQuery, coordinate: Symbol, values: Array, one: str, other: str

@@ -177,8 +177,8 @@ class Judge:
         """The figures since the last reset by name.
 
         - ``limit_violation`` in the unit of the constraint ``limit``, 0 without any
-        - ``penetration`` [m] of the pair ``penetrating``, 0 without any, and ``penetration_from``, the value of
-          the coordinate at which it came, NaN without any or without a coordinate
+        - ``penetration`` [m] of the pair ``penetrating``, 0 without any, and ``penetration_from``, the value
+          of the coordinate at which it came, NaN without any or without a coordinate
         - ``grasp_error`` [m] and ``grasp_rotation`` [rad], NaN if nothing was held
         - ``contact_losses``
         - ``jitter`` [m/s], [rad/s] and ``reversals`` [1/s], NaN without commands
