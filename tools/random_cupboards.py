@@ -1,12 +1,12 @@
-"""Robots at random cupboards with something in the way or beside it: `python tools/random_cupboards.py --count 100`.
+"""Robots at random cupboards with something in the way or beside it: `python tools/random_cupboards.py`.
 
-A cupboard has a door, a flap or a drawer of random size, side, axis and handle. A post, a board, the corner of a
-wall, or a second door or drawer stands in its swing or slide in half of the cupboards, and near to it in the
-others. Robots open, close and push. The laws:
+A cupboard has a door, a flap or a drawer of random size, side, axis and handle. A post, a board, the corner
+of a wall, or a second door or drawer stands in its swing or slide in half of the cupboards, and near to it in
+the others. Robots open, close and push. The laws:
 
-- nothing is done, by the word of the skill, in which furniture overlaps by more than 0.5 mm in any state of the
-  world, unless it did at the start, or which did not end at its target. That is judged by coal on shapes, axes and
-  formulas of this file, and not by the library's scene or judge.
+- nothing is done, by the word of the skill, in which furniture overlaps by more than 0.5 mm in any state of
+  the world, unless it did at the start, or which did not end at its target. That is judged by coal on shapes,
+  axes and formulas of this file, and not by the library's scene or judge.
 - of the cupboards with nothing in the way, 95 % are done.
 """
 
@@ -24,7 +24,6 @@ from pathlib import Path
 import coal
 import numpy as np
 
-import kineverse as kv
 from kineverse.experiments.manipulation.robots import SHIPPED
 from kineverse.manipulation import Outcome, Session, open_object
 from kineverse.manipulation.pushing.trials import try_push
@@ -128,10 +127,11 @@ class Cupboard:
                 lines.append(f"<visual>{shape}</visual><collision>{shape}</collision>")
             inertia = 'ixx="0.1" iyy="0.1" izz="0.1" ixy="0" ixz="0" iyz="0"'
             lines.append(f'<inertial><mass value="3"/><inertia {inertia}/></inertial></link>')
-            moves = f'<axis xyz="{_text(link.axis)}"/><limit lower="0" upper="{link.upper:.17g}" velocity="1" effort="100"/>'
+            limit = f'<limit lower="0" upper="{link.upper:.17g}" velocity="1" effort="100"/>'
+            moves = f'<axis xyz="{_text(link.axis)}"/>{limit}' if link.kind != "fixed" else ""
             lines.append(
-                f'<joint name="{link.name}_joint" type="{link.kind}"><parent link="root"/><child link="{link.name}"/>'
-                f'<origin xyz="{_text(link.point)}"/>{moves if link.kind != "fixed" else ""}</joint>'
+                f'<joint name="{link.name}_joint" type="{link.kind}"><parent link="root"/>'
+                f'<child link="{link.name}"/><origin xyz="{_text(link.point)}"/>{moves}</joint>'
             )
         return "".join([*lines, "</robot>"])
 
@@ -168,21 +168,15 @@ class Judge:
                 for b, B, s in zip(self.shapes[j], placed[j], self.spheres[j], strict=True):
                     if np.linalg.norm(A[:3, 3] - B[:3, 3]) - r - s > radius:
                         continue
-                    result = coal.DistanceResult()
-                    request = coal.DistanceRequest()
-                    least = min(
-                        least,
-                        coal.distance(
-                            a, coal.Transform3s(A[:3, :3], A[:3, 3]), b, coal.Transform3s(B[:3, :3], B[:3, 3]),
-                            request, result,
-                        ),
-                    )  # fmt: skip
+                    placed_a, placed_b = (coal.Transform3s(T[:3, :3], T[:3, 3]) for T in (A, B))
+                    request, result = coal.DistanceRequest(), coal.DistanceResult()
+                    least = min(least, coal.distance(a, placed_a, b, placed_b, request, result))
             if least < radius:
                 found[self.links[i].name, self.links[j].name] = least
         return found
 
     def overlaps(self, states: list[dict[str, float]]) -> dict[tuple[str, str], float]:
-        """Return the largest depths of pairs beyond the allowed one, that do not overlap in the first state."""
+        """Return the largest depths of pairs, but for small ones and pairs that overlap in the first state."""
         first = self.distances(states[0])
         deepest: dict[tuple[str, str], float] = {}
         for values in states:

@@ -83,10 +83,10 @@ class Obstacle:
         return {"failure": "collision", "in_the_way": (self.body, self.other), "free": self.free}
 
     def __str__(self) -> str:
+        value, target, free = (f"{v:.3f} {self.unit}".rstrip() for v in (self.value, self.target, self.free))
         text = (
-            f"'{self.body}' meets '{self.other}' at {self.value:.3f} {self.unit} of '{self.coordinate}': on the "
-            f"way to {self.target:.3f} {self.unit} they would overlap by {1e3 * self.depth:.3g} mm. "
-            f"The way is free up to {self.free:.3f} {self.unit}."
+            f"'{self.body}' meets '{self.other}' at {value} of '{self.coordinate}': on the way to {target} "
+            f"they would overlap by {1e3 * self.depth:.3g} mm. The way is free up to {free}."
         )
         if self.aside is not None:
             return f"{text} Move '{self.carrier}' to {self.aside:.3f} first."

@@ -147,8 +147,8 @@ class PartPulling:
             raise SkillError(
                 "other",
                 f"'{self.part}' does not follow the hand, pulled outwards, to both sides, and to both ends "
-                f"of its handle: it moved by {1e3 * opened:.0f} mm. {why} It may be fixed, locked, or need more "
-                "force than the grip holds.",
+                f"of its handle: it moved by {1e3 * opened:.0f} mm. {why} It may be fixed, locked, or need "
+                "more force than the grip holds.",
             )
         words = f"{self._describe_opening('goes no further')} {why}"
         if opened >= LEAST_OPENING[0] or self.opening[1] >= LEAST_OPENING[1]:
