@@ -176,7 +176,7 @@ class Judge:
         return found
 
     def overlaps(self, states: list[dict[str, float]]) -> dict[tuple[str, str], float]:
-        """Return the largest depths of pairs, but for small ones and pairs that overlap in the first state."""
+        """Return the largest depths of pairs, without small ones, and pairs that overlap at the start."""
         first = self.distances(states[0])
         deepest: dict[tuple[str, str], float] = {}
         for values in states:

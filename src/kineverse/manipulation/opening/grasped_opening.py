@@ -138,8 +138,10 @@ def open_object(
             measures |= failure.obstacle.measures
     except (InfeasibleError, NotFiniteError) as error:
         reason, kind = f"The controller has no command: {error}", "other"
+    before = world.time
     session.stop()
-    run.judge.update(world.state)
+    if world.time > before:
+        run.judge.update(world.state)
     value, overlap = float(world.state[coordinate]), run.overlap
     claimed = not reason and abs(float(session.state[coordinate]) - goal) <= tolerance
     done = not reason and abs(value - goal) <= tolerance and overlap is None

@@ -318,12 +318,12 @@ class _Run:
 
     def act(self, speeds: Mapping[Symbol, float]) -> None:
         """Command speeds for one step, and judge it; none stop the robot, also where the world fails."""
-        session = self._session
+        session, before = self._session, self._session.world.time
         if speeds:
             session.act(speeds)
         else:
             session.stop()
-        if session.answers:
+        if session.world.time > before:
             self._judge.update(session.world.state, session.commands, pushing=self._pushing.touching)
 
     def _approach(self) -> str:
