@@ -55,6 +55,8 @@ class Session:
         Source of the state; the truth by default.
     on_step
         Is called with the session after each step, for recordings, measurements and pictures.
+    on_search
+        Is called with a text on the progress of a search that takes long, while nothing moves.
     timeout
         Longest wall time of a step of the world [s], for worlds that are elsewhere; None to wait for ever.
 
@@ -62,6 +64,8 @@ class Session:
     ----------
     belief
         Source of the state.
+    start
+        The true state at the begin of the session.
     state
         The believed state.
     commands
@@ -101,6 +105,7 @@ class Session:
         dt: float = 0.02,
         belief: Belief | None = None,
         on_step: Callable[[Session], object] | None = None,
+        on_search: Callable[[str], object] | None = None,
         timeout: float | None = None,
     ) -> None:
         if not 0.0 < dt < math.inf:
@@ -119,8 +124,9 @@ class Session:
         self.peak_force = math.nan
         self._speeds: dict[object, Symbol] = {name: s for s in world.model.speeds for name in (s, str(s))}
         self.belief = belief or TrueBelief()
-        self._on_step = on_step
+        self._on_step, self._on_search = on_step, on_search
         self.state: State = self.belief.update(world)
+        self.start: State = world.state
         self.commands: Speeds = {}
         self.command: Command | None = None
         self.reference: HandReference | None = None
@@ -164,6 +170,11 @@ class Session:
         yield
         self.cpu.setdefault(name, []).append(thread_time() - cpu)
         self.wall.setdefault(name, []).append(perf_counter() - wall)
+
+    def report_search(self, text: str) -> None:
+        """Tell the progress of a search, in which nothing moves."""
+        if self._on_search is not None:
+            self._on_search(text)
 
     def act(
         self, speeds: Mapping[Symbol, float] | Mapping[str, float], command: Command | None = None

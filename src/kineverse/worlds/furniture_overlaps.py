@@ -34,10 +34,12 @@ from kineverse.geometry.prepared_query import (
 )
 from kineverse.geometry.results import DistanceResult, DistanceResults
 from kineverse.lie import Array
+from kineverse.model.body import Mesh
 from kineverse.model.frame import is_of_robot
 from kineverse.model.frame_dependence import FrameDependence
 from kineverse.model.sampling import StateSamples
 from kineverse.model.version_cache import cached_for_version
+from kineverse.state import StateLike
 from kineverse.symbols import Symbol
 
 OVERLAP = 5e-4
@@ -72,18 +74,24 @@ class FurnitureOverlaps:
     scene
         Collision scene of the model. The constructor leaves it at the default state.
     robot
-        Prefix of the robot, which is no furniture.
+        Prefix of the robot, which is no furniture; none if empty.
+    strict
+        Whether the default state excuses meshes alone. A primitive shape that is in the way there is in the
+        way. A mesh is its hull, which fills a cupboard: where one overlaps something at the start or by
+        default, any depth is allowed.
     """
 
-    def __init__(self, scene: Scene, robot: str) -> None:
-        self.scene, self.robot = scene, robot
-        self._objects = [v for v in scene.model.speeds if not is_of_robot(v.path, robot)]
+    def __init__(self, scene: Scene, robot: str, *, strict: bool = False) -> None:
+        self.scene, self.robot, self._strict = scene, robot, strict
+        self._objects = [v for v in scene.model.speeds if not self._is_of_robot(v.path)]
         self._query = self.watch(self._objects)
         # Scenes without rules of their own find the same.
         plain = len(scene.rules) == len(Scene(scene.model).rules)
         key = ("furniture overlaps", robot)
         design = cached_for_version(scene.model, key, self._sample) if plain else self._sample()
         self._default, self._play = design
+        if strict:
+            self._default = {pair: d for pair, d in self._default.items() if self._has_mesh(pair)}
         self._allow(self._default)
         scene.update(scene.model.default_state())
 
@@ -93,23 +101,31 @@ class FurnitureOverlaps:
 
         def choose() -> PairFlags:
             bodies = scene.bodies
-            furniture = np.array([not is_of_robot(b, self.robot) for b in bodies], dtype=bool)
+            furniture = np.array([not self._is_of_robot(b) for b in bodies], dtype=bool)
             flags = apply_rules(np.ones((len(bodies),) * 2, dtype=np.uint8), bodies, scene.rules)
             moved = flag_relatively_moving(scene.model, bodies, moving)
             return np.asarray(flags * moved * flag_between(furniture, furniture))
 
         return PreparedQuery(scene.collision_world, choose, radius, per_shape=True)
 
-    def begin(self) -> None:
-        """Take the state of the scene as the start."""
-        depths = dict(self._default)
-        for pair, depth in self._depths().items():
-            depths[pair] = max(depth, depths.get(pair, 0.0))
+    def begin(self, *earlier: StateLike) -> None:
+        """Take the state of the scene as the start; what overlaps in earlier states may do so as well."""
+        depths, here = dict(self._default), self._depths()
+        values = self.scene.collision_world.values
+        for state in earlier:
+            self.scene.update(state)
+            _deepen(depths, self._depths())
+        if earlier:
+            self.scene.update(values)
+        _deepen(depths, here)
         self._allow(depths)
 
-    def find(self) -> list[Overlap]:
-        """Return the overlaps at the state of the scene beyond the allowance, the largest excess first."""
-        found = [Overlap(r.a, r.b, -r.distance, allowed) for r, allowed in self.find_beyond(OVERLAP)]
+    def find(self, least: float = OVERLAP) -> list[Overlap]:
+        """Return the overlaps at the state of the scene beyond the allowance, the largest excess first.
+
+        ``least`` is the excess from which on they count [m].
+        """
+        found = [Overlap(r.a, r.b, -r.distance, allowed) for r, allowed in self.find_beyond(least)]
         return sorted(found, key=lambda one: -one.excess)
 
     def find_beyond(self, excess: float) -> list[tuple[DistanceResult, float]]:
@@ -121,6 +137,13 @@ class FurnitureOverlaps:
         allowed = self.allowances(found)
         beyond = np.flatnonzero(-found.distances > allowed + excess).tolist()
         return [(found[k], float(allowed[k])) for k in beyond]
+
+    @property
+    def excepted(self) -> tuple[tuple[str, str], ...]:
+        """Pairs of bodies with an allowance."""
+        bodies, owners = self.scene.bodies, self.scene.collision_world.table.body
+        pairs = (self._decode(code) for code in self._codes.tolist())
+        return tuple(dict.fromkeys((bodies[owners[i]], bodies[owners[j]]) for i, j in pairs))
 
     def allowances(self, found: DistanceResults) -> Array:
         """Return the depths that are allowed to pairs of shapes (K,) [m]."""
@@ -135,6 +158,8 @@ class FurnitureOverlaps:
         pairs = sorted(depths)
         self._codes: Indices = np.array(pairs, dtype=np.int64)
         self._allowed = np.array([depths[pair] + self._play.get(pair, 0.0) for pair in pairs])
+        if self._strict:
+            self._allowed[[self._has_mesh(pair) for pair in pairs]] = math.inf
 
     def _sample(self) -> tuple[dict[int, float], dict[int, float]]:
         """Return the depths by default, and the play of shapes that overlap everywhere, by pair of shapes."""
@@ -145,7 +170,7 @@ class FurnitureOverlaps:
         bodies = dict(zip(default, found.body_indices.tolist(), strict=True))
         least = dict(default)
         samples = StateSamples(model, count=_SAMPLES)
-        columns = {s: samples.values_of(s) for s in scene.inputs if not is_of_robot(s.path, self.robot)}
+        columns = {s: samples.values_of(s) for s in scene.inputs if not self._is_of_robot(s.path)}
         for k in range(samples.size):
             if not least:
                 break
@@ -179,3 +204,20 @@ class FurnitureOverlaps:
         """Return a number for each pair of shapes (K,)."""
         pairs = np.sort(found.object_indices, axis=1).astype(np.int64)
         return np.asarray(pairs[:, 0] * len(self.scene.collision_world.objects) + pairs[:, 1])
+
+    def _decode(self, code: int) -> tuple[int, int]:
+        """Return the indices of both shapes of a pair."""
+        return divmod(code, len(self.scene.collision_world.objects))
+
+    def _has_mesh(self, code: int) -> bool:
+        objects = self.scene.collision_world.objects
+        return any(isinstance(objects[k].shape.geometry, Mesh) for k in self._decode(code))
+
+    def _is_of_robot(self, name: str) -> bool:
+        return bool(self.robot) and is_of_robot(name, self.robot)
+
+
+def _deepen(depths: dict[int, float], others: dict[int, float]) -> None:
+    """Raise depths to other ones, by pair of shapes."""
+    for pair, depth in others.items():
+        depths[pair] = max(depth, depths.get(pair, 0.0))

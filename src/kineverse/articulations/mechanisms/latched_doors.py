@@ -52,10 +52,11 @@ class HingedDoor(Mechanism):
         )
 
     def posts(self) -> tuple[Shape, Shape]:
-        """Return the posts on both sides of the door; its edge turns clear of the one at the hinge."""
-        size, clear = (self.thickness, 0.06, self.height), 0.75 * self.thickness
+        """Return the posts on both sides of the door, the first one clear of its corner that turns."""
+        size = (self.thickness, 0.06, self.height)
         first, second = (
-            box_shape(size, (0.0, y, self.height / 2), PALE) for y in (-0.03 - clear, self.width + 0.035)
+            box_shape(size, (0.0, y, self.height / 2), PALE)
+            for y in (-0.035 - self.thickness, self.width + 0.035)
         )
         return first, second
 
