@@ -113,8 +113,9 @@ def push(
     Outcome
         With ``measures``: those of :class:`.Judge`, ``losses``, ``blocked``, ``contacts``, ``jammed``,
         ``planned``, ``jitter`` (largest mean change of a speed from step to step while touching, [m/s],
-        [rad/s]), ``tolerance``, ``peak_force`` [N] in a world with forces, and ``failure``: ``"collision"``, ``"time"`` or ``"other"``, if it was not
-        done; ``free``, the value up to which the way is free, if something is in it.
+        [rad/s]), ``tolerance``, ``peak_force`` [N] in a world with forces, and ``failure``: ``"collision"``,
+        ``"time"`` or ``"other"``, if it was not done; ``free``, the value up to which the way is free, if
+        something is in it.
 
     Raises
     ------
