@@ -74,6 +74,10 @@ class FormatError(KineverseError, ValueError):
     """A file or document does not follow its format."""
 
 
+class SimulationError(KineverseError, RuntimeError):
+    """A simulation has come to a state that is not to be trusted; its world has to be reset."""
+
+
 class InfeasibleError(KineverseError, ValueError):
     """No command satisfies all hard constraints of a controller.
 

@@ -108,6 +108,23 @@ def test_a_push_on_estimates_from_noisy_sensors(run, files):
     assert "is not known" in answer["reason"]
 
 
+def test_what_is_in_the_way_is_said_before_anything_moves(run, files, asked):
+    blocked = DRAWER.replace(
+        '<link name="wall"/>',
+        '<link name="wall"><collision><origin xyz="1.0 0 0.5"/><geometry><box size="0.1 0.1 0.1"/></geometry>'
+        "</collision></link>",
+    )
+    (files / "blocked.urdf").write_text(blocked)
+    words = ["blocked.urdf", "--robot", "hsr@-1,0,0", "--what", "drawer", "--json"]
+    status, out, _ = run("open", *words)
+    answer = json.loads(out)
+    assert (status, answer["claimed"], answer["done"], answer["seconds"]) == (1, False, False, 0.0)
+    assert "'front' meets 'wall' at 0.141 m of 'drawer'" in answer["reason"]
+    assert answer["measures"]["in_the_way"] == ["front", "wall"]
+    assert answer["measures"]["free"] == pytest.approx(0.137, abs=1e-3)
+    assert not asked
+
+
 def test_without_a_gripper_it_is_not_done_and_says_why(run, files):
     for skill in ("open", "push"):
         status, out, _ = run(skill, "box.urdf", "--robot", "arm.urdf", "--what", "drawer", "--json")
@@ -234,7 +251,8 @@ def test_other_coordinates_are_set_at_the_start(run, asked):
         (["shelf_drawers", "--robot", "hrs", *HSR[2:]], "hsr"),
         (["hsr", "--robot", "hsr", "--what", "x"], "Give the furniture alone"),
         (["hsr", "--robot", "hsr", "--base", "omni", "--what", "x"], "Give the furniture alone"),
-        (["box.urdf", "--robot", "arm.urdf@1,0,0", "--what", "drawer"], "--base omni"),
+        (["box.urdf", "--robot", "arm.urdf@1,0", "--what", "drawer"], "a place is X,Y,ANGLE"),
+        (["box.urdf", "--robot", "hsr@1,0,0.5,0", "--what", "drawer"], "stands on the floor"),
         (["box.urdf", "--robot", "hsr", "--base", "omni", "--what", "drawer"], "moves already"),
         (["arm.urdf", "--robot", "box.urdf", "--what", "box/drawer"], "of the robot itself"),
     ],

@@ -145,3 +145,21 @@ def test_wrong_words_are_refused(run, words, message):
     assert (status, out) == (2, "")
     assert message in err
     assert len(err.splitlines()) == 1
+
+
+def test_a_bolted_arm_is_put_where_its_place_says(run, tmp_path):
+    """A slide of 1 m along x, which is turned to y and raised: the finger reaches along it."""
+    (tmp_path / "slide.urdf").write_text(
+        """<robot name="slide"><link name="root"/><link name="finger"/>
+        <joint name="slide" type="prismatic"><parent link="root"/><child link="finger"/><axis xyz="1 0 0"/>
+        <limit lower="0" upper="1" velocity="1" effort="9"/></joint></robot>"""
+    )
+    (tmp_path / "room.urdf").write_text('<robot name="room"><link name="floor"/></robot>')
+    words = ["reach", tmp_path / "room.urdf", "finger", "--position-only", "--json", "--robot"]
+    slide = f"{tmp_path / 'slide.urdf'}@0.3,-0.4,0.5,90deg"
+    status, out, _ = run(*words, slide, "--pose", 0.3, 0.2, 0.5)
+    answer = json.loads(out)
+    assert (status, answer["positions"]) == (0, {"slide": pytest.approx(0.6, abs=1e-4)})
+    assert run(*words, slide, "--pose", 0.9, -0.4, 0.5)[0] == 1
+    status, out, _ = run(*words, slide.replace(",0.5,90deg", ",0"), "--pose", 0.9, -0.4, 0)
+    assert json.loads(out)["positions"] == {"slide": pytest.approx(0.6, abs=1e-4)}

@@ -16,12 +16,12 @@ from kineverse import lie
 from kineverse.articulations.mechanisms import FoldingDoor
 from kineverse.errors import UnknownNameError
 from kineverse.grasping import find_handle, find_handles
-from kineverse.model.body import Body, Box, Cylinder, Pose, Shape
+from kineverse.model.body import Body, Box, Cylinder, Pose, Shape, Sphere
 
 HANDLE_POSE = st.tuples(st.floats(-3, 3), st.floats(-1.5, 1.5), st.floats(-3, 3))
 
 
-def shape(geometry: Box | Cylinder, pose: np.ndarray) -> Shape:
+def shape(geometry: Box | Cylinder | Sphere, pose: np.ndarray) -> Shape:
     return Shape(geometry, Pose.from_matrix(lie.orthonormalize(pose)))
 
 
@@ -109,6 +109,29 @@ def test_handles_of_the_shipped_kitchen(every: int) -> None:
         # The bar points into the room, which lies between the fronts at x = 1.2 and the island at x = -0.9.
         out = np.asarray(model.fk(handle.frame)(state))[:3, :3] @ handle.pose[:3, 0]
         assert np.allclose(out, [1.0 if "island" in name or "stove" in name else -1.0, 0, 0])
+
+
+@pytest.mark.parametrize("width", [0.05, 0.2])
+def test_a_knob_is_the_ball_and_not_its_shaft_also_on_a_narrow_front(width: float) -> None:
+    """The front, its tray, the shaft of 8 mm and the ball of 14 mm are all slim if the front is narrow."""
+    model, q = kv.Model(), kv.position("drawer")
+    shapes = (
+        shape(Box((0.01, width, width)), at(0.005, 0, 0)),
+        shape(Box((0.05, 0.8 * width, 0.005)), at(0.035, 0, -0.4 * width)),
+        shape(Cylinder(0.004, 0.02), at(-0.01, 0, 0) @ kv.rotation_y(np.pi / 2)({})),
+        shape(Sphere(0.007), at(-0.024, 0, 0)),
+    )
+    with model.edit() as edit:
+        edit.add_frame(
+            "case", "world", body=Body(collisions=(shape(Box((0.1, 0.3, 0.016)), at(0.07, 0, -0.15)),))
+        )
+        edit.add_frame("drawer", "case", kv.translation(-q, 0, 0), body=Body(collisions=shapes))
+        edit.constrain("drawer/range", 0, q, 0.05)
+    handle = find_handle(model, q)
+    assert handle.shape == 3
+    assert (handle.length, handle.thickness) == (pytest.approx(0.014), pytest.approx(0.014))
+    np.testing.assert_allclose(handle.pose[:3, 0], [-1, 0, 0], atol=1e-9)
+    assert handle.clearance == pytest.approx(0.017, abs=1e-4)
 
 
 def test_handle_of_the_folding_door() -> None:

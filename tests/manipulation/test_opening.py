@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 
 import kineverse as kv
+from cupboards import box
 from kineverse.articulations.locks import position_lock, speed_lock
 from kineverse.errors import InvalidValueError, KineverseError, UnknownNameError
 from kineverse.grasping import find_gripper, find_handle, sample_grasps
@@ -19,6 +20,7 @@ from kineverse.manipulation.opening.hand_motion import HandMotion
 from kineverse.manipulation.opening.hand_paths import HandPaths, find_least_time
 from kineverse.manipulation.opening.placement_samples import PlacementSamples
 from kineverse.manipulation.opening.way_check import WayCheck
+from kineverse.manipulation.skill_arguments import choose_tolerance
 from kineverse.worlds import KinematicWorld, MujocoWorld, Sensors
 
 sys.path.insert(0, str(Path(__file__).parents[1] / "worlds"))
@@ -47,11 +49,15 @@ def start(model):
     return model.default_state().updated(START)
 
 
+RETRACTS = []
+"""Times in the world at which hands of the session began to go away."""
+
+
 @pytest.fixture(scope="module")
 def session(model):
     world = KinematicWorld(model, "hsr")
     world.reset(start(model))
-    return Session(world)
+    return Session(world, on_step=lambda s: s.phase == "retract" and RETRACTS.append(s.world.time))
 
 
 @pytest.fixture(scope="module")
@@ -66,6 +72,18 @@ def test_drawer_opens_without_contact_or_slip(opened, session):
     assert opened.measures["penetration"] < 5e-4
     assert opened.measures["limit_violation"] < 1e-6
     assert opened.measures["grasp_error"] < 5e-4
+
+
+def test_what_is_reached_counts_though_no_time_is_left_to_take_the_hand_away(opened, model):
+    world = KinematicWorld(model, "hsr")
+    world.reset(start(model))
+    outcome = open_object(Session(world), DRAWER, seconds=RETRACTS[0] + 0.1)
+    assert outcome, outcome.reason
+    assert outcome.value == opened.value
+    assert outcome.seconds < opened.seconds
+    # What is not reached does not.
+    world.reset(start(model))
+    assert not open_object(Session(world), DRAWER, seconds=0.7 * RETRACTS[0])
 
 
 def test_drawer_closes_again(opened, session):
@@ -83,6 +101,9 @@ def test_ways_lead_back_for_their_own_coordinate_only(opened, session):
     again.made.append(replace(session.made[-1], grasp=other))
     moved = open_object(again, DRAWER, target=0.2)
     assert moved, moved.reason
+    # 2 % of the way, and not the 20 mm that are enough at a limit.
+    assert moved.measures["tolerance"] == pytest.approx(0.004, rel=0.1)
+    assert moved.value == pytest.approx(0.2, abs=moved.measures["tolerance"])
     assert moved.measures["placements"] > 0
 
 
@@ -385,6 +406,30 @@ def test_base_of_a_whole_arm_stands_in_a_part_of_the_samples():
     assert least["pr2"] == 0.0 < least["hsr"]
 
 
+@pytest.mark.parametrize(
+    ("start", "target", "given", "tolerance"),
+    [
+        (0.0, 0.22, None, 0.02), (0.2, 0.0, None, 0.02), (0.0, 0.1, None, 0.002), (0.1, 0.12, None, 1e-3),
+        (0.0, 0.1, 0.01, 0.01), (0.0, 0.1, 0.5, 0.022),
+    ],
+)  # fmt: skip
+def test_tolerances_are_a_share_of_the_way_but_at_limits(model, start, target, given, tolerance):
+    drawer = model.symbol(DRAWER)
+    state = model.default_state().updated({drawer: start})
+    assert choose_tolerance(model, drawer, state, target, given) == pytest.approx(tolerance, abs=1e-9)
+
+
+def test_a_wall_that_the_robot_stands_at_is_in_its_way():
+    """The base, a disc of .21 m, is 1 mm from a wall and from the floor; all arms are near to both."""
+    model = make_model("shelf_drawers")
+    with model.edit() as edit:
+        edit.add_frame("wall", "world", kv.translation(-1.5, -0.221, 0.2), body=box(1.0, 0.02, 0.4))
+        edit.add_frame("floor", "world", kv.translation(0.0, 0.0, -0.051), body=box(6.0, 6.0, 0.1))
+    search = PlacementSearch(model, find_gripper(model, "hsr"), start(model))
+    assert search.scene.checks_pair("hsr/base_link", "wall")
+    assert not search.scene.checks_pair("hsr/base_link", "floor")
+
+
 def test_start_in_contact_is_refused(model):
     world = KinematicWorld(model, "hsr")
     world.reset(model.default_state().updated({"hsr/base/x": 0.9}))
@@ -400,11 +445,14 @@ def test_measures_of_several_parts_name_what_was_worst():
     part |= dict.fromkeys(("reversals", "contact_losses", "distance", "hand_distance"), 1.0) | {
         "excepted": ()
     }
-    first = part | {"penetration": 0.1, "penetrating": ("robot", "wall"), "limit_violation": 0.0, "limit": ""}
-    then = part | {"penetration": 0.0, "penetrating": ("", ""), "limit_violation": 1e-9, "limit": "arm"}
+    first = part | {"penetration": 0.1, "penetrating": ("robot", "wall"), "penetration_from": 0.7}
+    first |= {"limit_violation": 0.0, "limit": ""}
+    then = part | {"penetration": 0.0, "penetrating": ("", ""), "penetration_from": np.nan}
+    then |= {"limit_violation": 1e-9, "limit": "arm"}
     run = SimpleNamespace(_earlier=[first], judge=SimpleNamespace(measures=then))
     measures = _Run.measures.fget(run)
     assert (measures["penetration"], measures["penetrating"]) == (0.1, ("robot", "wall"))
+    assert measures["penetration_from"] == 0.7
     assert (measures["limit_violation"], measures["limit"]) == (1e-9, "arm")
     assert measures["distance"] == 2.0
 

@@ -152,17 +152,26 @@ def test_what_overlaps_at_the_begin_is_listed_and_not_counted():
         )
         for s, lower, upper in ((slide, -5, 0), (drawer, 0, 0.9), (fold, 0, 0.9)):
             edit.constrain(f"{s}/range", lower, s, upper)
-    judge = Judge(model, "robot")
-    inside = [{"room/drawer": 0.5, "robot/fold": 0.0}, {"room/drawer": 0.0, "robot/fold": 0.1}]
-    found = run(judge, inside)
+    judge = Judge(model, "robot", coordinate=drawer)
+    shut, out = {"room/drawer": 0.0, "robot/fold": 0.0}, {"room/drawer": 0.5, "robot/fold": 0.1}
+    found = run(judge, [shut, out, shut])
     assert {frozenset(pair) for pair in found["excepted"]} == {
         frozenset({"room/case", "room/front"}),
         frozenset({"robot/link", "robot/tip"}),
     }
     assert found["penetration"] == 0.0
-    # A link that folds into its neighbour on the way counts, as does the robot in furniture from the begin.
+    assert judge.overlap is None
+    # What comes on the way counts, though the drawer is there by default; so does the robot in furniture.
+    inside = [out | {"room/drawer": x} for x in (0.5, 0.28, 0.1)]
+    found = run(judge, inside)
+    assert found["penetration"] == pytest.approx(0.2, abs=1e-6)
+    assert (set(found["penetrating"]), found["penetration_from"]) == ({"room/case", "room/front"}, 0.28)
+    assert "from 0.280 on" in str(judge.overlap)
+    assert run(judge, inside[:2])["penetration"] == pytest.approx(0.02, abs=1e-6)
+    before = Judge(model, "robot", start=model.default_state().updated(shut))
+    assert run(before, inside)["penetration"] == 0.0
     folds = run(judge, [{"robot/fold": 0.5}, {"robot/fold": 0.1}])
-    assert folds["excepted"] == (("room/case", "room/front"),)
+    assert [{*pair} for pair in folds["excepted"]] == [{"room/case", "room/front"}]
     assert folds["penetrating"] == ("robot/link", "robot/tip")
     assert folds["penetration"] == pytest.approx(0.05, abs=1e-6)
     assert run(judge, [{"robot/x": -3.0, "robot/fold": 0.5}])["penetration"] == pytest.approx(0.3, abs=1e-6)

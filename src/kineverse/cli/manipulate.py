@@ -31,17 +31,19 @@ from kineverse.expressions.printing import format_number
 if TYPE_CHECKING:
     from kineverse.manipulation.belief import Belief
     from kineverse.manipulation.outcome import Outcome
+    from kineverse.manipulation.swept_motion import Obstacle
     from kineverse.worlds import World
     from kineverse.worlds.recorder import RecordedStep
 
 DONE, NOT_DONE = 0, 1
 
 _COMMON = """
-MODEL is any model or file, ROBOT any shipped robot or robot file; ROBOT@X,Y,ANGLE places its base. The world
-gets the speeds of the robot alone, and judges by its own truth: kinematic (the default), or mujoco with
-contacts, forces and friction. The exit status is 0 if it is done, 1 if not, 2 if the request is wrong. This
-needs the extras 'control' and 'geometry', the other world 'mjcf', --record 'recording', and opening and
-closing a C compiler.
+MODEL is any model or file, ROBOT any shipped robot or robot file; ROBOT@X,Y,ANGLE places it, and
+ROBOT@X,Y,Z,ANGLE one that is bolted to something. The world gets the speeds of the robot alone, and judges by
+its own truth: kinematic (the default), or mujoco with contacts, forces and friction. Nothing is moved where
+something is in the way of the object. The exit status is 0 if it is done and nothing went through anything, 1
+if not, 2 if the request is wrong. This needs the extras 'control' and 'geometry', the other world 'mjcf',
+--record 'recording', and opening and closing a C compiler.
 
 examples:
 """
@@ -129,7 +131,7 @@ def _add_arguments(parser: argparse.ArgumentParser, skill: str) -> None:
         metavar="ROBOT[@X,Y,ANGLE]",
         required=True,
         action=_Once,
-        help="the robot, by name or file, and the place of its base",
+        help="the robot, by name or file, and its place (X,Y,Z,ANGLE if it is bolted to something)",
     )
     parser.add_argument(
         "--what", metavar="COORDINATE", required=True, action=_Once, help="coordinate of the object"
@@ -300,6 +302,8 @@ def _act(
             outcome = skip_skill(scene, world, False, scene.fixed)
         elif there:
             outcome = skip_skill(scene, world, True, f"'{scene.coordinate}' is there from the start")
+        elif not arguments.unknown and (obstacle := _find_obstacle(scene)) is not None:
+            outcome = skip_skill(scene, world, False, str(obstacle), obstacle.measures)
         else:
             act = push_object if skill == "push" else open_as_unknown if arguments.unknown else grasp_object
             outcome = act(arguments, scene, world, belief, look)
@@ -311,6 +315,13 @@ def _act(
         if recorder is not None:
             recorder.write_outcome(outcome)
     return outcome
+
+
+def _find_obstacle(scene: ManipulationScene) -> Obstacle | None:
+    """Return what is in the way of the object at the start of a scene; None if nothing is."""
+    from kineverse.manipulation.swept_motion import find_obstacle
+
+    return find_obstacle(scene.model, scene.coordinate, scene.start, scene.target, robot=scene.robot)
 
 
 def _view(

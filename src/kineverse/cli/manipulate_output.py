@@ -54,6 +54,7 @@ def report_outcome(
         print(f"picture: {arguments.picture}", file=sys.stderr)
     if arguments.json:
         answer = {
+            "claimed": outcome.claimed,
             "done": outcome.done,
             "value": outcome.value,
             "reason": outcome.reason,

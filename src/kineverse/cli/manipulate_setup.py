@@ -5,7 +5,7 @@ from __future__ import annotations
 import argparse
 import math
 import re
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from itertools import product
 from pathlib import Path
@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING
 
 from kineverse.cli.arguments import load_model, parse_assignments, parse_value, print_notes
 from kineverse.cli.output import print_line
-from kineverse.cli.plan_arguments import parse_robot, place_base
+from kineverse.cli.plan_arguments import find_base, parse_robot, place_robot
 from kineverse.errors import InvalidValueError, UnknownNameError, suggest
 
 if TYPE_CHECKING:
@@ -22,8 +22,6 @@ if TYPE_CHECKING:
 
 OPENING = 0.4
 """Distance from shut at which closing and pushing begin [m], [rad]."""
-TOLERANCE = 0.02
-"""Distance from the target within which an object is there, unless its whole range is short [m], [rad]."""
 _NEXT_STEP = (
     "Name a hand with two opposed fingers by --hand FRAME, or move the object with any body of the robot: "
     "kineverse push ... --hand BODY --to VALUE.",
@@ -93,22 +91,19 @@ def make_scene(arguments: argparse.Namespace, skill: str) -> ManipulationScene:
     """
     from kineverse.experiments.manipulation.robots import SHIPPED, remove_unusable_shapes
     from kineverse.manipulation.articulated_objects import find_shut_value
-    from kineverse.manipulation.skill_arguments import explain_fixed, limit_tolerance
+    from kineverse.manipulation.skill_arguments import choose_tolerance, explain_fixed
     from kineverse.view.sliders import infer_units
 
     begin, end = (None if v is None else parse_value(v) for v in (arguments.start, arguments.to))
     source, place = parse_robot(arguments.robot)
     model = load_model(arguments, arguments.model)
     prefix, named = _choose_prefix(arguments, source, model)
-    before = {*model.articulations}
+    before, frames = {*model.articulations}, {*model.frames}
     model.include(source, prefix, root=arguments.root, strict=arguments.strict, loops=arguments.loops)
     if arguments.base == "omni":
         _add_base(model, named)
     joints = [name for name in model.articulations if name not in before]
-    try:
-        standing = place_base(model, joints, place)
-    except InvalidValueError as error:
-        raise InvalidValueError(f"{error} --base omni gives it one.") from None
+    standing = place_robot(model, joints, [f for f in model.frames if f not in frames], place)
     lost = remove_unusable_shapes(model)
     more = [f"and {len(lost) - _MOST_NOTES} more"] if len(lost) > _MOST_NOTES else []
     print_notes([f"without this shape: {line}" for line in lost[:_MOST_NOTES]] + more)
@@ -136,7 +131,7 @@ def make_scene(arguments: argparse.Namespace, skill: str) -> ManipulationScene:
     state = SHIPPED[source].start_state(model) if source in SHIPPED else default
     state = state.updated(standing).updated(others).updated({coordinate: begin})
     if skill != "push":  # pushes search a place for the whole push
-        free = {} if place is not None else _base_coordinates(model, joints)
+        free = () if place is not None else find_base(model, joints)
         state = _stand_free(model, named, state, free)
     gripper, why, pusher = _find_pusher(model, named, arguments.hand, skill)
     return ManipulationScene(
@@ -151,7 +146,7 @@ def make_scene(arguments: argparse.Namespace, skill: str) -> ManipulationScene:
         pusher,
         place is not None,
         fixed,
-        limit_tolerance(model, coordinate, TOLERANCE),
+        choose_tolerance(model, coordinate, state, end),
     )
 
 
@@ -272,15 +267,7 @@ def _add_base(model: kv.Model, robot: str) -> None:
             edit.attach(root, carrier, np.asarray(model.fk(root)({})))
 
 
-def _base_coordinates(model: kv.Model, joints: list[str]) -> dict[kv.Symbol, float]:
-    """Return the coordinates of a mobile base among some articulations, in order; empty if there is none."""
-    try:
-        return place_base(model, joints, (0.0, 0.0, 0.0))
-    except InvalidValueError:
-        return {}
-
-
-def _stand_free(model: kv.Model, robot: str, state: kv.State, base: dict[kv.Symbol, float]) -> kv.State:
+def _stand_free(model: kv.Model, robot: str, state: kv.State, base: Sequence[kv.Symbol]) -> kv.State:
     """Return the state with the base of a robot where it touches nothing, the nearest of some places.
 
     Raises
@@ -293,21 +280,20 @@ def _stand_free(model: kv.Model, robot: str, state: kv.State, base: dict[kv.Symb
     found, problem = find_free_state(model, robot, _list_places(state, base), -_DEEPEST)
     if found is not None:
         if problem:
-            where = ", ".join(f"{found[s]:.2f}" for s in [*base][:2])
+            where = ", ".join(f"{found[s]:.2f}" for s in base[:2])
             print_line(f"start: {problem} touch, so the robot begins at {where}")
         return found
     raise InvalidValueError(
-        f"The robot '{robot}' begins in contact: {problem}. Give its base another place: "
-        "--robot ROBOT@X,Y,ANGLE."
+        f"The robot '{robot}' begins in contact: {problem}. Give it another place: --robot ROBOT@X,Y,ANGLE."
     )
 
 
-def _list_places(state: kv.State, base: dict[kv.Symbol, float]) -> Iterator[kv.State]:
+def _list_places(state: kv.State, base: Sequence[kv.Symbol]) -> Iterator[kv.State]:
     """Yield a state, and those with the base on rings around its place."""
     yield state
     if len(base) < 2:
         return
-    x, y = [*base][:2]
+    x, y = base[:2]
     for ring, turn in product(range(1, _RINGS + 1), range(_DIRECTIONS)):
         angle, radius = math.tau * turn / _DIRECTIONS, _RING * ring
         yield state.updated({x: state[x] + radius * math.cos(angle), y: state[y] + radius * math.sin(angle)})

@@ -3,14 +3,16 @@
 from __future__ import annotations
 
 import argparse
+import math
 import sys
-from collections.abc import Callable
-from contextlib import ExitStack
+from collections.abc import Callable, Mapping
 from dataclasses import replace
-from typing import TYPE_CHECKING
+from time import perf_counter
+from types import MappingProxyType
+from typing import TYPE_CHECKING, Any
 
 from kineverse.cli.manipulate_setup import ManipulationScene
-from kineverse.cli.output import join_lines, show_activity
+from kineverse.cli.output import join_lines, print_line, show_activity
 from kineverse.errors import InvalidValueError, UnknownNameError
 
 if TYPE_CHECKING:
@@ -22,6 +24,10 @@ if TYPE_CHECKING:
 
 _PLACEMENT = 60.0
 """Largest time of the search for a place of the base [s]."""
+_SHORT = 0.1
+"""Share of a wanted opening that may be missing at the stop of a part whose joint is learned."""
+_BETWEEN_LINES = 1.0
+"""Least time between two lines on the progress of a search [s]."""
 
 
 def grasp_object(
@@ -40,24 +46,29 @@ def grasp_object(
     from kineverse.manipulation.opening.grasped_opening import open_object
     from kineverse.manipulation.session import Session
 
-    with ExitStack() as search:
-        search.enter_context(show_activity("searching for a place of the robot and a way of its hand"))
-
-        def watch(step: RecordedStep) -> None:
-            if step.phase != "look":
-                search.close()  # the first step on a way has been made
-            look(step)
-
-        outcome: Outcome = open_object(
-            Session(world, belief=belief, on_step=watch),
-            scene.coordinate,
-            target=scene.target,
-            hand=gripper.hand,
-            handle=arguments.handle,
-            seconds=arguments.seconds,
-            seed=arguments.seed,
-        )
+    outcome: Outcome = open_object(
+        Session(world, belief=belief, on_step=look, on_search=_SearchLines()),
+        scene.coordinate,
+        target=scene.target,
+        hand=gripper.hand,
+        handle=arguments.handle,
+        seconds=arguments.seconds,
+        seed=arguments.seed,
+    )
     return outcome
+
+
+class _SearchLines:
+    """Lines on standard error on the progress of a search, at most one in some seconds."""
+
+    def __init__(self) -> None:
+        self._last = -math.inf
+
+    def __call__(self, text: str) -> None:
+        """Print a line, unless another one was printed just now."""
+        if (now := perf_counter()) >= self._last + _BETWEEN_LINES:
+            self._last = now
+            print_line(f"searching: {text}")
 
 
 def open_as_unknown(
@@ -95,6 +106,11 @@ def open_as_unknown(
         way=OPEN_WAY if far is None else far,
         turn=OPEN_TURN if far is None else far,
     )
+    there = abs(world.state[coordinate] - scene.start[coordinate])
+    if outcome and far is not None and there < (1.0 - _SHORT) * far:
+        reason = f"{outcome.reason} That is {there:.3g}, and not {far:.3g}, from where it began."
+        measures = {**outcome.measures, "failure": "other"}
+        outcome = replace(outcome, done=False, reason=reason, measures=measures)
     return outcome
 
 
@@ -129,7 +145,12 @@ def push_object(
         if problem:
             with show_activity("searching for a place of the robot"):
                 found = find_push_start(
-                    pushing, scene.start, seconds=_PLACEMENT, steps=steps, seed=arguments.seed
+                    pushing,
+                    scene.start,
+                    seconds=_PLACEMENT,
+                    steps=steps,
+                    seed=arguments.seed,
+                    report=_SearchLines(),
                 )
             placed, why = found.samples, f"Another place of the robot: {found.why}"
             print(f"not from where the robot stands: {problem}. {why}", file=sys.stderr)
@@ -174,8 +195,15 @@ def _find_gripper_and_handle(
     return scene.gripper, handle
 
 
-def skip_skill(scene: ManipulationScene, world: World, done: bool, reason: str) -> Outcome:
+def skip_skill(
+    scene: ManipulationScene,
+    world: World,
+    done: bool,
+    reason: str,
+    measures: Mapping[str, Any] = MappingProxyType({}),
+) -> Outcome:
     """Return the outcome of what was not begun."""
     from kineverse.manipulation.outcome import Outcome
 
-    return Outcome(done, world.state[scene.coordinate], join_lines(reason), world.name, 0.0, 0)
+    value = world.state[scene.coordinate]
+    return Outcome(done, value, join_lines(reason), world.name, 0.0, 0, measures)

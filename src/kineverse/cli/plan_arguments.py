@@ -8,7 +8,7 @@ import math
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, NamedTuple
 
 from kineverse.cli.arguments import parse_assignments, parse_value
 from kineverse.errors import FormatError, InvalidValueError, UnknownNameError, suggest
@@ -145,7 +145,7 @@ def add_robot_option(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--robot",
         metavar="ROBOT[@X,Y,ANGLE]",
-        help="a robot that is put into the model, by name or file, and the place of its base",
+        help="a robot that is put into the model, by name or file, and its place (X,Y,Z,ANGLE if bolted)",
     )
 
 
@@ -155,17 +155,27 @@ def include_robot(arguments: argparse.Namespace, model: kv.Model) -> tuple[str, 
     Raises
     ------
     KineverseError
-        If it cannot be loaded, or has no mobile base that could be placed.
+        If it cannot be loaded or placed.
     """
     source, place = parse_robot(arguments.robot)
-    before = {*model.articulations}
+    before, frames = {*model.articulations}, {*model.frames}
     names = model.include(source, root=arguments.root, strict=arguments.strict, loops=arguments.loops)
-    standing = place_base(model, [a for a in model.articulations if a not in before], place)
+    joints = [a for a in model.articulations if a not in before]
+    standing = place_robot(model, joints, [f for f in model.frames if f not in frames], place)
     return next((n.partition(" ")[2].partition("/")[0] for n in names if "/" in n), ""), standing
 
 
-def parse_robot(text: str) -> tuple[str, tuple[float, float, float] | None]:
-    """Return the source of a robot and the x, y [m] and angle [rad] of its base from ``ROBOT@X,Y,ANGLE``.
+class Place(NamedTuple):
+    """Place of a robot in the world: x, y, z [m] and its angle about z [rad]."""
+
+    x: float
+    y: float
+    z: float
+    angle: float
+
+
+def parse_robot(text: str) -> tuple[str, Place | None]:
+    """Return the source of a robot and its place from ``ROBOT@X,Y,ANGLE`` or ``ROBOT@X,Y,Z,ANGLE``.
 
     Raises
     ------
@@ -176,33 +186,77 @@ def parse_robot(text: str) -> tuple[str, tuple[float, float, float] | None]:
     if not at:
         return text, None
     parts = place.split(",")
-    if len(parts) != 3:
+    if len(parts) not in (3, 4):
         raise InvalidValueError(
-            f"--robot {text}: the place of a base is X,Y,ANGLE, such as fetch@1,0.5,90deg."
+            f"--robot {text}: a place is X,Y,ANGLE, such as fetch@1,0.5,90deg, or X,Y,Z,ANGLE for a robot "
+            "that is bolted to something."
         )
-    x, y, angle = map(parse_value, parts)
-    return source, (x, y, angle)
+    numbers = [parse_value(part) for part in parts]
+    return source, Place(numbers[0], numbers[1], numbers[2] if len(parts) == 4 else 0.0, numbers[-1])
 
 
-def place_base(
-    model: kv.Model, joints: Iterable[str], place: tuple[float, float, float] | None
+def find_base(model: kv.Model, joints: Iterable[str]) -> tuple[kv.Symbol, ...]:
+    """Return the coordinates x, y and angle of a mobile base among articulations; none without one."""
+    for name in joints:
+        coordinates = model.articulations[name].coordinates
+        if tuple(s.path.rpartition("/")[2] for s in coordinates) == _BASE:
+            return tuple(coordinates)
+    return ()
+
+
+def place_robot(
+    model: kv.Model, joints: Iterable[str], frames: Iterable[str], place: Place | None
 ) -> dict[kv.Symbol, float]:
-    """Return the values of the coordinates of a mobile base among some articulations; empty without a place.
+    """Put a robot to a place, and return the values of the coordinates of its mobile base.
+
+    A robot without such a base is moved with its root; then there are no values.
+
+    Parameters
+    ----------
+    model
+        The model, which has the robot.
+    joints, frames
+        Articulations and frames of the robot.
+    place
+        The place; None to leave it where it is.
 
     Raises
     ------
     InvalidValueError
-        If there is no such base.
+        For a height of a mobile base, and a base with other coordinates.
     """
     if place is None:
         return {}
-    for name in joints:
-        coordinates = model.articulations[name].coordinates
-        if tuple(s.path.rpartition("/")[2] for s in coordinates) == _BASE:
-            return dict(zip(coordinates, place, strict=True))
-    raise InvalidValueError(
-        "The robot has no mobile base that could be placed (x, y, angle); its file says where it stands."
-    )
+    if base := find_base(model, joints):
+        if place.z:
+            raise InvalidValueError(
+                f"The robot's base stands on the floor, so it has no height {place.z:g}: give X,Y,ANGLE."
+            )
+        return dict(zip(base, (place.x, place.y, place.angle), strict=True))
+    from kineverse.model.frame import WORLD
+
+    roots = [name for name in frames if model.frames[name].parent == WORLD]
+    moving = [name for name in roots if model.speeds_of(name)]
+    if moving:
+        raise InvalidValueError(
+            f"'{moving[0]}' moves in the world by coordinates of its own, and not by x, y and angle: set "
+            "those instead of a place."
+        )
+    _move_roots(model, roots, place)
+    return {}
+
+
+def _move_roots(model: kv.Model, roots: Iterable[str], place: Place) -> None:
+    """Move frames that are fixed in the world, as if the world's origin was at a place."""
+    import numpy as np
+
+    import kineverse as kv
+    from kineverse.model.frame import WORLD
+
+    moved = kv.translation(place.x, place.y, place.z) @ kv.rotation_z(place.angle)
+    with model.edit() as edit:
+        for root in roots:
+            edit.attach(root, WORLD, np.asarray((moved @ model.fk(root))({})))
 
 
 def make_hold(model: kv.Model, given: FrameTarget) -> Hold:

@@ -7,6 +7,7 @@ import json
 from typing import TYPE_CHECKING, Any
 
 from kineverse.cli.arguments import add_model_options, load_model, parse_assignments, parse_value
+from kineverse.cli.plan_arguments import add_robot_option, include_robot
 from kineverse.cli.requirements import is_mjcf, require
 from kineverse.cli.view import list_mesh_problems, print_mesh_problems
 from kineverse.errors import InvalidValueError
@@ -48,9 +49,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--relative-to", metavar="FRAME", default="world", help="frame in which the numbers are given (world)"
     )
-    parser.add_argument(
-        "--robot", metavar="ROBOT", help="a robot that is put into the model, by name or file"
-    )
+    add_robot_option(parser)
     parser.add_argument(
         "--still",
         nargs="+",
@@ -93,9 +92,12 @@ def run(arguments: argparse.Namespace) -> int:
     from kineverse.view import save_picture
 
     model = load_model(arguments, arguments.model)
+    standing: dict[kv.Symbol, float] = {}
     if arguments.robot is not None:
-        model.include(arguments.robot, root=arguments.root, strict=arguments.strict, loops=arguments.loops)
+        _, standing = include_robot(arguments, model)
+        assigned = {**{str(s): value for s, value in standing.items()}, **assigned}
     goal, still = make_goal(model, arguments, numbers)
+    still += [s for s in standing if s not in still]
     scene = Scene(model) if arguments.collisions else None
     solver = InverseKinematics(model, [goal], scene=scene, still=[*arguments.still, *still])
     result = solver.solve(assigned, starts=arguments.starts)

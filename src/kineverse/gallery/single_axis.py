@@ -20,9 +20,9 @@ def fixed(scene: SceneBuilder) -> None:
 
 def revolute(scene: SceneBuilder) -> None:
     """Show a door that turns about its hinges and stops at both ends."""
-    frame = box((0.08, 0.06, 1.1), (0, -0.05, 0.55), WOOD) + box((0.08, 0.06, 1.1), (0, 0.65, 0.55), WOOD)
-    scene.frame("frame", frame + box((0.08, 0.76, 0.08), (0, 0.3, 1.14), WOOD))
-    leaf = box((0.03, 0.58, 1.06), (0, 0.30, 0.55), WHITE) + sphere(0.03, (0.045, 0.53, 0.55), ORANGE)
+    frame = box((0.08, 0.06, 1.1), (0, -0.07, 0.55), WOOD) + box((0.08, 0.06, 1.1), (0, 0.65, 0.55), WOOD)
+    scene.frame("frame", frame + box((0.08, 0.78, 0.08), (0, 0.29, 1.14), WOOD))
+    leaf = box((0.03, 0.56, 1.06), (0, 0.31, 0.55), WHITE) + sphere(0.03, (0.045, 0.53, 0.55), ORANGE)
     leaf += sphere(0.03, (-0.045, 0.53, 0.55), ORANGE)
     for z in (0.2, 0.9):
         leaf += disc(0.02, 0.12, (0, 0, z), Z, DARK)

@@ -154,6 +154,11 @@ class DistanceResults(Sequence[DistanceResult]):
         return self.witnesses[:, 6:]
 
     @property
+    def object_indices(self) -> Indices:
+        """Indices (K, 2) of both collision objects in the scene: shapes, or hulls of decomposed meshes."""
+        return self._object_indices
+
+    @property
     def shape_indices(self) -> Indices:
         """Indices (K, 2) of both shapes among the shapes of their bodies."""
         return np.asarray(self._shape_numbers[self._object_indices])

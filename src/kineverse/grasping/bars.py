@@ -24,6 +24,8 @@ MOST_THICK = 0.09
 """Largest thickness of a bar [m]: hardly a gripper opens further."""
 _LONG = 1.5
 """Length per width above which a part is a bar, and a knob below."""
+_FLAT, _WIDE = 3.0, 2.0
+"""Width per thickness from which on a part is a plate, and per width of what it carries, if it is a panel."""
 _STANDS_OUT = 3e-3
 """Least length by which a bar stands out from what it is fixed to [m]."""
 _TOUCH = 2e-3
@@ -164,7 +166,8 @@ def find_bars(link: Sequence[Part], around: Sequence[Part]) -> list[ProtrudingBa
         Parts of other links, which carry the link.
     """
     bars = []
-    for cluster in _clusters([part for part in link if part.is_slim]):
+    panel = _find_panel(link)
+    for cluster in _clusters([part for part in link if part.is_slim and part is not panel]):
         inside = {id(part) for part in cluster}
         rest = [part for part in link if id(part) not in inside]
         found = [bar for part in cluster if (bar := _bar(part, cluster, rest, around))]
@@ -175,6 +178,16 @@ def find_bars(link: Sequence[Part], around: Sequence[Part]) -> list[ProtrudingBa
             outer = [bar for bar in found if bar.stands_out > furthest - _STANDS_OUT]
             bars.append(max(outer, key=lambda bar: float(bar.part.size[0])))
     return bars
+
+
+def _find_panel(link: Sequence[Part]) -> Part | None:
+    """Return the narrow panel that carries the other parts of a link, all slim; None if there is none."""
+    plates = [part for part in link if part.size[1] >= _FLAT * part.size[2]]
+    others = [part for part in link if all(part is not plate for plate in plates)]
+    if not plates or not others or not all(part.is_slim for part in link):
+        return None
+    widest = max(plates, key=lambda part: float(part.size[0] * part.size[1]))
+    return widest if widest.size[1] >= _WIDE * max(part.size[1] for part in others) else None
 
 
 def _clusters(parts: Sequence[Part]) -> list[tuple[Part, ...]]:

@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING
 
 from kineverse._checks import finite_number
 from kineverse.control import Command
-from kineverse.errors import InvalidValueError, ShapeError, UnknownNameError, suggest
+from kineverse.errors import InvalidValueError, ShapeError, SimulationError, UnknownNameError, suggest
 from kineverse.expressions import Expression
 from kineverse.lie import Array
 from kineverse.model.frame import is_of_robot
@@ -55,6 +55,8 @@ class Session:
         Source of the state; the truth by default.
     on_step
         Is called with the session after each step, for recordings, measurements and pictures.
+    on_search
+        Is called with a text on the progress of a search that takes long, while nothing moves.
     timeout
         Longest wall time of a step of the world [s], for worlds that are elsewhere; None to wait for ever.
 
@@ -62,6 +64,8 @@ class Session:
     ----------
     belief
         Source of the state.
+    start
+        The true state at the begin of the session.
     state
         The believed state.
     commands
@@ -82,6 +86,10 @@ class Session:
         Placements of the grasped motions that were made, the last one at the end: their ways lead back, too.
     answers
         Whether the world has answered the last step within the time-out.
+    untrusted
+        Why the world's simulation is not to be trusted any more, until a restart; empty if it is.
+    peak_force
+        Largest force between the robot and another body so far [N]; NaN in a world that does not say it.
 
     Raises
     ------
@@ -97,6 +105,7 @@ class Session:
         dt: float = 0.02,
         belief: Belief | None = None,
         on_step: Callable[[Session], object] | None = None,
+        on_search: Callable[[str], object] | None = None,
         timeout: float | None = None,
     ) -> None:
         if not 0.0 < dt < math.inf:
@@ -111,11 +120,13 @@ class Session:
                 f"stand still for the rest of each step. Make the world with timeout={dt:g} or more."
             )
         self.world, self.dt = world, dt
-        self._timeout, self.answers = timeout, True
+        self._timeout, self.answers, self.untrusted = timeout, True, ""
+        self.peak_force = math.nan
         self._speeds: dict[object, Symbol] = {name: s for s in world.model.speeds for name in (s, str(s))}
         self.belief = belief or TrueBelief()
-        self._on_step = on_step
+        self._on_step, self._on_search = on_step, on_search
         self.state: State = self.belief.update(world)
+        self.start: State = world.state
         self.commands: Speeds = {}
         self.command: Command | None = None
         self.reference: HandReference | None = None
@@ -160,6 +171,11 @@ class Session:
         self.cpu.setdefault(name, []).append(thread_time() - cpu)
         self.wall.setdefault(name, []).append(perf_counter() - wall)
 
+    def report_search(self, text: str) -> None:
+        """Tell the progress of a search, in which nothing moves."""
+        if self._on_search is not None:
+            self._on_search(text)
+
     def act(
         self, speeds: Mapping[Symbol, float] | Mapping[str, float], command: Command | None = None
     ) -> None:
@@ -180,8 +196,9 @@ class Session:
         UnknownNameError, InvalidValueError
             For speeds that the model does not have, and those that are not finite. Then nothing has changed.
         SkillError
-            If the world does not answer within the time-out, stands still, or has not been observed for more
-            than :data:`STALE`. Worlds refuse commands from then on, and their robots stop.
+            If the world does not answer within the time-out, stands still, is not to be trusted, or has not
+            been observed for more than :data:`STALE`. Worlds refuse commands from then on, and their robots
+            stop.
         """
         resolved = self._resolve(speeds)
         before, self.command = self.world.time, command
@@ -221,7 +238,14 @@ class Session:
         """Advance the world by a step, and update the belief."""
         robot = self.world.robot
         self.commands = {s: v for s, v in speeds.items() if is_of_robot(s.path, robot)}
-        self._wait(lambda: self.world.apply(self.commands, self.dt, stamp=self.state.stamp))
+        try:
+            self._wait(lambda: self.world.apply(self.commands, self.dt, stamp=self.state.stamp))
+        except SimulationError as error:
+            self.untrusted = str(error)
+            raise SkillError("other", self.untrusted) from error
+        force = getattr(self.world, "peak_force", math.nan)
+        if not force <= self.peak_force:
+            self.peak_force = force
         self._wait(lambda: self._update(speeds))
         self.steps += 1
         if self._on_step is not None:
@@ -254,6 +278,7 @@ class Session:
     def restart(self, state: State) -> None:
         """Reset the world to a state, at time 0, and update the belief."""
         self.world.reset(state)
+        self.untrusted = ""
         self._update({})
 
     def _update(self, speeds: Speeds) -> None:

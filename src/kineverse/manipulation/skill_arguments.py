@@ -13,8 +13,14 @@ from kineverse.state import State
 from kineverse.symbols import Symbol
 from kineverse.worlds import World
 
+TOLERANCE = 0.02
+"""Distance from a limit within which an object is open or shut, unless its range is short [m], [rad]."""
+
 _FIXED = 1e-9
 """Range of a coordinate up to which it counts as fixed [m], [rad]."""
+_LEAST_TOLERANCE, _SHARE = 1e-3, 0.02
+"""Least tolerance of a value between the limits [m], [rad], as near as controllers settle, and its share of
+the way."""
 
 
 def find_object_coordinate(world: World, what: Symbol | str) -> Symbol:
@@ -74,10 +80,22 @@ def explain_fixed(model: ModelView, coordinate: Symbol, state: State) -> str:
     return ""
 
 
-def limit_tolerance(model: ModelView, coordinate: Symbol, given: Any) -> float:
-    """Return a tolerance of a target [m], [rad], at most a tenth of the coordinate's range."""
-    tolerance = as_tolerance(given, "tolerance=")
-    lower, upper = (float(v) for v in model.limits(coordinate))
+def choose_tolerance(
+    model: ModelView, coordinate: Symbol, state: State, target: float, given: Any = None
+) -> float:
+    """Return the distance from a target up to which an object is there [m], [rad].
+
+    By default that is 2 % of the way, between 1 and 20 mm (mrad). At a limit, where an object is open or
+    shut, it is 20 mm. It is never more than a tenth of the coordinate's range.
+    """
+    lower, upper = (float(v) for v in model.limits(coordinate, state))
+    if given is not None:
+        tolerance = as_tolerance(given, "tolerance=")
+    elif min(abs(target - lower), abs(target - upper)) <= _FIXED:
+        tolerance = TOLERANCE
+    else:
+        way = abs(target - float(state[coordinate]))
+        tolerance = min(max(_LEAST_TOLERANCE, _SHARE * way), TOLERANCE)
     return min(tolerance, max(0.0, 0.1 * (upper - lower))) if math.isfinite(upper - lower) else tolerance
 
 

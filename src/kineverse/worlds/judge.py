@@ -4,7 +4,10 @@
   are differences of successive states by time; commanded speeds stand in where no coordinate is the integral
   of a speed. A limit of a speed that depends on the state, such as a lock, is violated if it was at the
   begin and at the end of a step.
-- *penetration*: largest depth of any pair of bodies, but for the excepted pairs, which are listed.
+- *penetration*: largest depth of any pair of bodies, furniture among itself included, but for the excepted
+  pairs, which are listed. Of furniture that overlaps by design, it is the depth beyond what is allowed by
+  :class:`.FurnitureOverlaps`.
+- *overlap*: a penetration beyond 0.5 mm that came on the way.
 - *contact losses*: number of times that the robot touched the object and then did not, while pushing.
 - *grasp error*: largest motion of the held body in the hand since the hold began, in the middle between the
   fingers.
@@ -18,7 +21,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterable
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 import numpy.typing as npt
@@ -33,18 +36,44 @@ from kineverse.lie import Array, inverse, rotation_angle
 from kineverse.model.frame import is_of_robot
 from kineverse.model.frame_dependence import FrameDependence
 from kineverse.model.model_view import ModelView
-from kineverse.model.version_cache import cached_for_version
 from kineverse.state import State, StateLike
 from kineverse.symbols import Symbol
 
+from .furniture_overlaps import OVERLAP, FurnitureOverlaps
 from .limit_judge import LimitJudge
 
 CONTACT_GAP = 1e-3
 """Largest gap of a contact of a push [m]."""
 
 _STILL = 5e-3
-_RESTING = 1e-4
-"""Depth up to which bodies that touch rest on each other [m]."""
+_TOUCHING = 1e-6
+"""Depth up to which links of a robot touch and do not overlap [m]."""
+
+
+class JudgedOverlap(NamedTuple):
+    """Overlap that came in a run.
+
+    Attributes
+    ----------
+    a, b
+        The bodies.
+    depth
+        Largest depth [m].
+    value
+        Value of the judged coordinate at which it came [m], [rad]; NaN without a coordinate.
+    time
+        Stamp of the state in which it came [s].
+    """
+
+    a: str
+    b: str
+    depth: float
+    value: float
+    time: float
+
+    def __str__(self) -> str:
+        where = "" if math.isnan(self.value) else f", from {self.value:.3f} on"
+        return f"On the way '{self.a}' and '{self.b}' overlapped by {1e3 * self.depth:.3g} mm{where}."
 
 
 class Judge:
@@ -60,6 +89,10 @@ class Judge:
         Gripper that grasps or pushes; its bodies may touch the handle.
     handle
         Body that is grasped or pushed. Contacts with all bodies that move with it are counted.
+    coordinate
+        Coordinate of the object, whose value tells where an overlap came.
+    start
+        Earlier state in which furniture may have overlapped, such as the one before it was opened.
     scene
         Collision scene of the model, which from now on is the judge's; None for ``Scene(model)``.
     every
@@ -70,9 +103,9 @@ class Judge:
     Attributes
     ----------
     excepted
-        Pairs of bodies whose penetration does not count: those of the robot, and those of furniture, that
-        overlap in every one of 201 sampled states or at the begin of the run; those of furniture that overlap
-        in the default state, such as a drawer in a solid box; and those of the gripper with the handle.
+        Pairs of bodies whose penetration does not count: those of the robot that overlap at the begin of the
+        run, and those of the gripper with the handle; and pairs of furniture that overlap by design, whose
+        penetration counts as far as it exceeds what :class:`.FurnitureOverlaps` allows.
 
     Raises
     ------
@@ -87,6 +120,8 @@ class Judge:
         gripper: Gripper | None = None,
         handle: str | None = None,
         *,
+        coordinate: Symbol | None = None,
+        start: State | None = None,
         scene: Scene | None = None,
         every: int = 1,
         contact_gap: float = CONTACT_GAP,
@@ -107,21 +142,15 @@ class Judge:
         self._speed_place: dict[Symbol | str, int] = {v: k for k, v in enumerate(self._robot_speeds)}
         self._speed_place |= {str(v): k for k, v in enumerate(self._robot_speeds)}
         self._scene_values = self._indices(self._scene.inputs)
-        self._penetrations = self._scene.watch(radius=0.0)
-        own = set(self._own)
-        find = self._scene.find_always_colliding
-        # Scenes without rules of their own find the same.
-        rules = find() if scene else cached_for_version(model, "always colliding", find)
-        always = [(rule.a, rule.b) for rule in rules if (rule.a in own) == (rule.b in own)]
-        self._scene.update(model.default_state())
-        shut = [(a, b) for a, b in self._find_overlapping() if a not in own]
-        self._always = tuple(dict.fromkeys((*always, *shut)))
+        self._coordinate, self._start = coordinate, start
+        self._penetrations = self._scene.watch(self._own, radius=0.0)
+        self._furniture = FurnitureOverlaps(self._scene, robot, strict=True)
         self._first_overlapping: tuple[tuple[str, str], ...] = ()
-        self._gripping: set[str] = set()
+        self._gripping: dict[str, set[str]] = {}
         self._touches: PreparedQuery | None = None
         if handle is not None:
             self._watch_handle(handle, contact_gap)
-            self._gripping.add(handle)
+            self._gripping[handle] = {*self._gripper_bodies}
         self._select_pairs()
         # A few calls a step: compiling C takes longer than all of them.
         self._place = compile([model.fk(name)[:3, 3] for name in self._followed()], tier="interpreter")
@@ -134,16 +163,22 @@ class Judge:
     @property
     def excepted(self) -> tuple[tuple[str, str], ...]:
         """Pairs of bodies whose penetration does not count."""
-        bodies = () if self.gripper is None else self.gripper.bodies
-        gripping = ((a, b) for b in sorted(self._gripping) for a in bodies)
-        return tuple(dict.fromkeys((*self._always, *self._first_overlapping, *gripping)))
+        gripping = ((a, b) for b, ones in sorted(self._gripping.items()) for a in sorted(ones))
+        return tuple(dict.fromkeys((*self._first_overlapping, *gripping, *self._furniture.excepted)))
+
+    @property
+    def overlap(self) -> JudgedOverlap | None:
+        """The deepest of the overlaps beyond 0.5 mm that came since the last reset; None without any."""
+        deep = (one for one in self._overlaps.values() if one.depth > OVERLAP)
+        return max(deep, key=lambda one: one.depth, default=None)
 
     @property
     def measures(self) -> dict[str, Any]:
         """The figures since the last reset by name.
 
         - ``limit_violation`` in the unit of the constraint ``limit``, 0 without any
-        - ``penetration`` [m] of the pair ``penetrating``, 0 without any
+        - ``penetration`` [m] of the pair ``penetrating``, 0 without any, and ``penetration_from``, the value
+          of the coordinate at which it came, NaN without any or without a coordinate
         - ``grasp_error`` [m] and ``grasp_rotation`` [rad], NaN if nothing was held
         - ``contact_losses``
         - ``jitter`` [m/s], [rad/s] and ``reversals`` [1/s], NaN without commands
@@ -152,11 +187,14 @@ class Judge:
         """
         rms = math.sqrt(self._squares / self._seconds) if self._seconds else math.nan
         elapsed = 0.0 if self._first is None or self._stamp is None else self._stamp - self._first
+        nothing = JudgedOverlap("", "", 0.0, math.nan, math.nan)
+        deepest = max(self._overlaps.values(), key=lambda one: one.depth, default=nothing)
         return {
             "limit_violation": self._limits.violation,
             "limit": self._limits.limit,
-            "penetration": self._depth,
-            "penetrating": self._deepest,
+            "penetration": deepest.depth,
+            "penetrating": (deepest.a, deepest.b),
+            "penetration_from": deepest.value,
             "grasp_error": self._slip,
             "grasp_rotation": self._turn,
             "contact_losses": self._losses,
@@ -167,15 +205,17 @@ class Judge:
             "excepted": self.excepted,
         }
 
-    def allow(self, bodies: Iterable[str]) -> None:
-        """Except penetrations of the gripper's bodies into some others, which are pushed."""
-        self._gripping.update(bodies)
+    def allow(self, bodies: Iterable[str], pusher: Iterable[str] | None = None) -> None:
+        """Except penetrations of the gripper's bodies, or of other ones, into some that are pushed."""
+        ones = self._gripper_bodies if pusher is None else tuple(pusher)
+        for body in bodies:
+            self._gripping.setdefault(body, set()).update(ones)
         self._select_pairs()
 
     def reset(self) -> None:
         """Forget all measurements."""
         self._limits.reset()
-        self._depth, self._deepest = 0.0, ("", "")
+        self._overlaps: dict[tuple[str, str], JudgedOverlap] = {}
         self._slip = self._turn = math.nan
         self._losses, self._reversals = 0, 0
         self._squares, self._seconds = 0.0, 0
@@ -233,10 +273,9 @@ class Judge:
         if searches or self._touches is not None:
             self._scene.update(values[self._scene_values])
         if self._first is None:
-            self._first_overlapping = self._find_overlapping()
-            self._select_pairs()
+            self._begin()
         if searches:
-            self._measure_penetration()
+            self._measure_penetration(state, stamp)
         if self._touches is not None:
             touched = len(self._touches()) > 0
             self._losses += pushing and self._touched and not touched
@@ -245,6 +284,10 @@ class Judge:
         if self._first is None:
             self._first = stamp
         self._stamp = stamp
+
+    @property
+    def _gripper_bodies(self) -> tuple[str, ...]:
+        return () if self.gripper is None else tuple(self.gripper.bodies)
 
     # -- preparation ---------------------------------------------------------------------------------------
 
@@ -265,11 +308,13 @@ class Judge:
         rules = [Rule(a, b, True) for a in self._own for b in group if a != b]
         self._touches = self._scene.watch(self._own, group, gap, rules=rules)
 
-    def _find_overlapping(self) -> tuple[tuple[str, str], ...]:
-        """Return the pairs of the robot, and of furniture, that overlap where the scene is."""
+    def _begin(self) -> None:
+        """Except what overlaps at the first state: pairs of the robot, and of furniture as far as it does."""
         own = set(self._own)
-        pairs = [(pair.a, pair.b) for pair in self._penetrations() if pair.distance < -_RESTING]
-        return tuple((a, b) for a, b in pairs if (a in own) == (b in own))
+        found = ((pair.a, pair.b) for pair in self._penetrations() if pair.distance < -_TOUCHING)
+        self._first_overlapping = tuple((a, b) for a, b in found if a in own and b in own)
+        self._furniture.begin(*(() if self._start is None else (self._start,)))
+        self._select_pairs()
 
     def _select_pairs(self) -> None:
         """Set the flags of excepted pairs."""
@@ -316,8 +361,7 @@ class Judge:
             relative = compile(self.model.fk(held, self.gripper.hand), tier="interpreter")
             self._in_hand[held] = relative, self._indices(relative.inputs)
             if held not in self._gripping:
-                self._gripping.add(held)
-                self._select_pairs()
+                self.allow([held])
         function, at = self._in_hand[held]
         pose = function(values[at])
         middle = self.gripper.grasp_pose[:, 3]
@@ -335,12 +379,21 @@ class Judge:
             self._way[: len(places)] += np.linalg.norm(places - self._places, axis=1)
         self._places = places
 
-    def _measure_penetration(self) -> None:
+    def _measure_penetration(self, state: State, stamp: float) -> None:
         found = self._penetrations()
         for k in range(len(found)):
             i, j = found.body_indices[k].tolist()
             if not self._is_excepted[i, j]:
-                depth = max(0.0, -float(found.distances[k]))
-                if depth > self._depth:
-                    self._depth, self._deepest = depth, (found[k].a, found[k].b)
-                return
+                pair = found[k]
+                self._note_overlap(pair.a, pair.b, -pair.distance, state, stamp)
+        for one in self._furniture.find(0.0):
+            self._note_overlap(one.a, one.b, one.excess, state, stamp)
+
+    def _note_overlap(self, a: str, b: str, depth: float, state: State, stamp: float) -> None:
+        """Note a depth of two bodies, and where it came if it is the first one beyond 0.5 mm."""
+        known = self._overlaps.get((a, b))
+        if known is not None and (known.depth > OVERLAP or depth <= OVERLAP):
+            self._overlaps[a, b] = known._replace(depth=max(depth, known.depth))
+        elif depth > 0.0:
+            value = math.nan if self._coordinate is None else float(state[self._coordinate])
+            self._overlaps[a, b] = JudgedOverlap(a, b, depth, value, stamp)

@@ -29,6 +29,7 @@ from kineverse.model.model_view import ModelView
 from kineverse.state import State, StateLike
 from kineverse.symbols import Symbol
 
+from .furniture_overlaps import FurnitureOverlaps
 from .kinematic_grip import TOUCH, KinematicGrip
 from .object_motion import ObjectMotion
 from .sensor_sampler import SensorSampler
@@ -39,6 +40,8 @@ logger = logging.getLogger(__name__)
 
 _SUBSTEP = 0.002
 """Longest way of a body between two checks of its gaps, while it is near an object [m]."""
+_HELD_SUBSTEP = 0.01
+"""Longest way of a hand between two checks of what it holds [m]: thinner furniture is rare."""
 _MOST_SUBSTEPS = 10_000
 _UNKNOWN_WAY = 0.1
 _ROUNDING = 1e-9
@@ -158,7 +161,11 @@ class KinematicWorld:
         fingers = () if gripper is None else gripper.joints
         objects = [v for v in model.speeds if not self._is_robot(v.path)]
         self._motion = ObjectMotion(
-            scene or Scene(model), objects, [s.derivative() for s in fingers], self._is_robot, left_out
+            FurnitureOverlaps(scene or Scene(model), robot),
+            objects,
+            [s.derivative() for s in fingers],
+            self._is_robot,
+            left_out,
         )
         remarks += [f"'{name}' is not enforced: {why}" for name, why in self._motion.skipped]
         self._grip = (
@@ -215,18 +222,22 @@ class KinematicWorld:
         """Return the bodies of the robot that touch something else, and those of furniture that collide.
 
         Bodies of the robot touch from a gap of 0.1 mm on. Furniture collides if it penetrates by more than
-        that, and does not at the default state. Forces are NaN.
+        that, and more than at the begin and at the default state. Forces are NaN.
         """
+        overlaps = self._motion.overlaps.find_beyond(TOUCH)
+        deepest = {(one.a, one.b): one for one, _ in reversed(overlaps)}
+        return (*self._touched(), *map(_make_contact, deepest.values()))
+
+    def _touched(self) -> tuple[Contact, ...]:
+        """Return the contacts of the robot."""
         if self._contacts is None:
-            robot, furniture = (query() for query in self._contact_queries)
-            found = [_make_contact(one if self._is_robot(one.a) else one.swap()) for one in robot]
-            found += [_make_contact(one) for one in furniture if one.distance < -TOUCH]
-            self._contacts = tuple(found)
+            found = (one if self._is_robot(one.a) else one.swap() for one in self._touching())
+            self._contacts = tuple(map(_make_contact, found))
         return self._contacts
 
     def observe(self) -> Observation:
         """Return the latest sensor readings that have arrived."""
-        return self._sampler.observe(self._time, self.state, self.contacts())
+        return self._sampler.observe(self._time, self.state, self._touched())
 
     # -- what happens --------------------------------------------------------------------------------------
 
@@ -352,7 +363,10 @@ class KinematicWorld:
         grips = grip is not None and (grip.held is not None or reach > 0.0)
         # What is not near now has not been touched on the way.
         longest = motion.longest_way(moved, way)
-        count = 0 if longest is None else min(math.ceil((longest + reach) / _SUBSTEP), _MOST_SUBSTEPS)
+        count = 0 if longest is None else math.ceil((longest + reach) / _SUBSTEP)
+        if grip is not None and grip.held is not None:
+            count = max(count, math.ceil(way / _HELD_SUBSTEP))
+        count = min(count, _MOST_SUBSTEPS)
         if count > 1:
             motion.place(start)
             for _ in range(count):
@@ -370,20 +384,11 @@ class KinematicWorld:
         self._motion.settle()
 
     def _watch_contacts(self) -> None:
-        """Prepare the queries of contacts."""
+        """Prepare the query of contacts."""
         motion, scene = self._motion, self._motion.scene
         robot = set(motion.robot_bodies)
         others = [b for b in scene.bodies if b not in robot]
-        rules = [
-            rule
-            for rule in scene.find_always_colliding([self.model.default_state()])
-            if rule.a not in robot and rule.b not in robot
-        ]
-        objects = motion.columns[: motion.count]
-        self._contact_queries = (
-            scene.watch(motion.robot_bodies, others, TOUCH),
-            scene.watch(others, others, 0.0, moving=objects, rules=rules),
-        )
+        self._touching = scene.watch(motion.robot_bodies, others, TOUCH)
 
     def _check_version(self) -> None:
         """Raise InvalidValueError after an edit of the model."""

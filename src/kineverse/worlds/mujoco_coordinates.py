@@ -140,17 +140,32 @@ class MujocoCoordinates:
 
         Coordinates without limits are within half a turn, loops stay where they are.
         """
-        compiled, free = self._compiled, np.array(sorted(self.address.values()), dtype=int)
-        joints = [int(np.flatnonzero(compiled.jnt_qposadr == at)[0]) for at in free.tolist()]
-        limited = compiled.jnt_limited[joints].astype(bool)
-        lower = np.where(limited, compiled.jnt_range[joints, 0], -np.pi)
-        upper = np.where(limited, compiled.jnt_range[joints, 1], np.pi)
+        free, lower, upper = self._ranges()
 
         def move(data: Any, random: np.random.Generator) -> None:
             data.qpos[free] = random.uniform(lower, upper)
             self.follow(data.qpos)
 
         return move
+
+    def sweep(self) -> Callable[[Any, float], None]:
+        """Return a function that sets an ``MjData`` to a share of the range of all coordinates."""
+        free, lower, upper = self._ranges()
+
+        def move(data: Any, share: float) -> None:
+            data.qpos[free] = lower + share * (upper - lower)
+            self.follow(data.qpos)
+
+        return move
+
+    def _ranges(self) -> tuple[Array, Array, Array]:
+        """Return the places of hinges and slides in ``qpos``, and the ends of their ranges."""
+        compiled, free = self._compiled, np.array(sorted(self.address.values()), dtype=int)
+        joints = [int(np.flatnonzero(compiled.jnt_qposadr == at)[0]) for at in free.tolist()]
+        limited = compiled.jnt_limited[joints].astype(bool)
+        lower = np.where(limited, compiled.jnt_range[joints, 0], -np.pi)
+        upper = np.where(limited, compiled.jnt_range[joints, 1], np.pi)
+        return free, lower, upper
 
 
 def _pose(position: Array, wxyz: Array) -> Array:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Iterable, Mapping, Sequence
+from itertools import product
 from pathlib import Path
 from typing import Any
 
@@ -13,7 +14,8 @@ from kineverse.errors import FormatError
 from kineverse.formats.export.capabilities import UnsupportedError
 from kineverse.formats.mjcf.mujoco_api import capture_mujoco_warnings, mujoco
 from kineverse.formats.mjcf.writer import to_mjcf
-from kineverse.geometry.collision_filter import allowed_pairs, read_rules
+from kineverse.geometry.collision_filter import adjacent_pairs, allowed_pairs, apply_rules, read_rules
+from kineverse.geometry.prepared_query import flag_between, flag_relatively_moving
 from kineverse.model.model_view import ModelView
 
 from .mujoco_coordinates import MujocoCoordinates
@@ -30,6 +32,10 @@ _DENSITY, _MESH_MASS = 500.0, 0.5
 _CONDIM = 6
 _STIFF_SOLIMP = (0.99, 0.999, 0.001)
 """Impedance of limits, ties and friction in joints; MuJoCo's default gives way by some 10 %."""
+_RESTING = 1e-4
+"""Depth up to which shapes of furniture rest on each other, and collide [m]."""
+_SWEEP = 65
+"""Number of places between its limits where a joint is looked at."""
 _FOLDER = Path("/")
 
 
@@ -189,9 +195,13 @@ def add_contact_rules(
     model: ModelView,
     fingers: Iterable[Sequence[str]],
     friction: float,
+    is_robot: Callable[[str], bool],
     remark: Callable[[str], None],
 ) -> None:
-    """Set the stiffness of constraints and exclude the pairs of bodies that a scene does not check.
+    """Set the stiffness of constraints and exclude the pairs of bodies that do not collide.
+
+    Those of furniture that moves relatively collide, also a door and its frame, unless a rule excepts them;
+    others, if a scene checks them.
 
     Parameters
     ----------
@@ -203,21 +213,33 @@ def add_contact_rules(
         Frames of each finger, whose contacts have six dimensions: they resist turning, too.
     friction
         Coefficient of sliding friction.
+    is_robot
+        Function that tells bodies and coordinates of the robot.
     remark
         Receives the assumptions.
     """
     engine, held = mujoco(), {name for finger in fingers for name in finger}
     for body in spec.bodies:
-        for geom in body.geoms:
+        for number, geom in enumerate(body.geoms):
             geom.friction[0] = friction
+            geom.name = geom.name or f"{body.name}/shape/{number}"
             if body.name in held:
                 geom.condim, geom.priority = _CONDIM, 1
                 geom.solref[:2], geom.solimp[:3] = _solref(spec), _STIFF_SOLIMP
     option = spec.option
     option.cone, option.impratio = engine.mjtCone.mjCONE_ELLIPTIC, 10.0
     option.integrator = engine.mjtIntegrator.mjINT_IMPLICITFAST
+    # Which bodies may touch is said for each pair; MuJoCo would leave out a door with a frame that moves.
+    option.disableflags |= engine.mjtDisableBit.mjDSBL_FILTERPARENT
     bodies = [body.name for body in spec.bodies if body.geoms and body.name in model.frames]
-    checked = allowed_pairs(model, bodies, read_rules(model))
+    furniture = np.array([not is_robot(name) for name in bodies], dtype=bool)
+    rules, objects = read_rules(model), [v for v in model.speeds if not is_robot(v.path)]
+    moved = flag_relatively_moving(model, bodies, objects)
+    checked = np.where(
+        flag_between(furniture, furniture),
+        apply_rules(np.ones_like(moved, dtype=np.uint8), bodies, rules) * moved,
+        allowed_pairs(model, bodies, rules),
+    )
     for i, k in zip(*np.nonzero(np.triu(1 - checked, 1)), strict=True):
         spec.add_exclude(bodyname1=bodies[i], bodyname2=bodies[k])
     solref = _solref(spec)
@@ -228,40 +250,126 @@ def add_contact_rules(
     remark(f"contacts have friction {friction:g}, elliptic cones and impratio {option.impratio:g}")
 
 
-def overlapping_pairs(
-    compiled: Any, coordinates: MujocoCoordinates, samples: int, seed: int
+def weigh_contacts(compiled: Any, bodies: Iterable[int]) -> None:
+    """Give contacts of some bodies the inertia that their shapes have, not that of their centres of mass.
+
+    MuJoCo regularises a contact by the motion that a force at the centre of mass causes. Of a door whose
+    description puts that on the hinge, as many do that state none, this is zero, and the solver fails.
+    """
+    engine, data = mujoco(), mujoco().MjData(compiled)
+    engine.mj_forward(compiled, data)
+    jacobian, solved = np.zeros((3, compiled.nv)), np.zeros((3, compiled.nv))
+    for body in bodies:
+        for geom in _geoms_of(compiled, body):
+            engine.mj_jac(compiled, data, jacobian, None, data.geom_xpos[geom], body)
+            engine.mj_solveM(compiled, data, solved, jacobian)
+            weight = float((jacobian * solved).sum()) / 3.0
+            compiled.body_invweight0[body, 0] = max(compiled.body_invweight0[body, 0], weight)
+
+
+def exclude_overlaps(
+    spec: Any,
+    compiled: Any,
+    model: ModelView,
+    coordinates: MujocoCoordinates,
+    is_robot: Callable[[str], bool],
+    samples: int,
+    seed: int,
 ) -> list[tuple[str, str]]:
-    """Return the pairs of bodies that overlap in the default state, or in all sampled ones.
+    """Exclude shapes that overlap by design, and return the pairs of their bodies.
+
+    These are pairs of bodies of the robot that overlap at the default state or in all sampled ones, and pairs
+    of shapes of furniture that overlap at the default state. Of two bodies of furniture, some of whose shapes
+    overlap, the others collide. Excluded are also bodies that one joint keeps apart between its limits.
 
     Parameters
     ----------
-    compiled
-        The ``MjModel``.
+    spec, compiled
+        The specification, whose shapes have names, and its ``MjModel``.
+    model
+        The model.
     coordinates
-        Positions of the model in it.
+        Positions of the model in ``compiled``.
+    is_robot
+        Function that tells bodies of the robot.
     samples
         Number of sampled states.
     seed
         Their seed.
     """
     engine, data, random = mujoco(), mujoco().MjData(compiled), np.random.default_rng(seed)
+    own = np.array([is_robot(compiled.body(k).name) for k in range(compiled.nbody)])
 
-    def touching() -> set[tuple[int, int]]:
+    def touching() -> dict[tuple[int, int], float]:
+        """Return the pairs of shapes that overlap, with their distances."""
         engine.mj_kinematics(compiled, data)
         engine.mj_comPos(compiled, data)
         engine.mj_collision(compiled, data)
-        geoms = data.contact.geom[data.contact.dist < 0]
-        return {(a, b) for a, b in np.sort(compiled.geom_bodyid[geoms], axis=1).tolist()}
+        return {
+            (a, b): gap
+            for (a, b), gap in zip(
+                np.sort(data.contact.geom, axis=1).tolist(), data.contact.dist.tolist(), strict=True
+            )
+            if gap < 0.0
+        }
+
+    def pairs_of_robot(found: Iterable[tuple[int, int]]) -> set[tuple[int, int]]:
+        pairs = (sorted(compiled.geom_bodyid[list(pair)].tolist()) for pair in found)
+        return {(a, b) for a, b in pairs if own[a] and own[b]}
 
     data.qpos[:] = coordinates.positions(coordinates.default)
-    at_home, move = touching(), coordinates.sampler()
+    at_home, move, sweep = touching(), coordinates.sampler(), coordinates.sweep()
     always: set[tuple[int, int]] | None = None
     for _ in range(samples):
         move(data, random)
-        always = touching() if always is None else always & touching()
+        here = pairs_of_robot(touching())
+        always = here if always is None else always & here
         if not always:
             break
-    return [(compiled.body(a).name, compiled.body(b).name) for a, b in sorted(at_home | (always or set()))]
+    bodies = pairs_of_robot(at_home) | (always or set())
+    shapes: dict[tuple[int, int], set[tuple[int, int]]] = {}
+    for (a, b), gap in at_home.items():
+        one, other = compiled.geom_bodyid[[a, b]].tolist()
+        if gap < -_RESTING and not own[one] and not own[other]:
+            pair = (a, b) if one < other else (b, a)
+            shapes.setdefault((min(one, other), max(one, other)), set()).add(pair)
+    for (one, other), overlapping in shapes.items():
+        bodies.add((one, other))
+        for a, b in product(*(_geoms_of(compiled, body) for body in (one, other))):
+            if (a, b) not in overlapping:
+                geoms = compiled.geom(a), compiled.geom(b)
+                pair = spec.add_pair(geomname1=geoms[0].name, geomname2=geoms[1].name)
+                pair.condim, pair.friction[:2] = 3, geoms[0].friction[0]
+    names = [(compiled.body(a).name, compiled.body(b).name) for a, b in sorted(bodies)]
+    met = {*shapes}
+    for share in np.linspace(0.0, 1.0, _SWEEP):
+        sweep(data, float(share))
+        deep = (pair for pair, gap in touching().items() if gap < -_RESTING)
+        met |= {tuple(sorted(compiled.geom_bodyid[list(pair)].tolist())) for pair in deep}
+    apart = [pair for pair in _limited_joints(model, compiled) if tuple(sorted(pair)) not in met]
+    for a, b in (*names, *((compiled.body(a).name, compiled.body(b).name) for a, b in apart)):
+        spec.add_exclude(bodyname1=a, bodyname2=b)
+    return names
+
+
+def _limited_joints(model: ModelView, compiled: Any) -> list[tuple[int, int]]:
+    """Return the pairs of bodies that one joint with limits connects."""
+    names = [compiled.body(k).name for k in range(compiled.nbody)]
+    known = {name: k for k, name in enumerate(names) if name in model.frames and compiled.body_geomnum[k]}
+    found = []
+    bodies = list(known)
+    for i, k in np.argwhere(np.triu(adjacent_pairs(model, bodies), 1)).tolist():
+        symbols = model.fk(bodies[i], bodies[k]).symbols
+        limited = all(np.isfinite(model.limits(s)).all() for s in symbols)
+        if len(symbols) == 1 and limited:
+            found.append((known[bodies[i]], known[bodies[k]]))
+    return found
+
+
+def _geoms_of(compiled: Any, body: int) -> range:
+    """Return the indices of the shapes of a body."""
+    first = int(compiled.body_geomadr[body])
+    return range(first, first + int(compiled.body_geomnum[body]))
 
 
 def _like(present: Any, value: float) -> Any:

@@ -156,6 +156,13 @@ class JointServos:
         Seed of the sampled configurations.
     remark
         Receives the assumptions.
+
+    Attributes
+    ----------
+    coordinates
+        Coordinates with a servo.
+    efforts
+        Largest force of each servo by coordinate [N], [N m].
     """
 
     def __init__(
@@ -178,6 +185,7 @@ class JointServos:
         self._step, self._ahead = step, 2 / bandwidth
         inertia = sampled_inertia(compiled, coordinates, self._dof, seed)
         accelerations: list[float] = []
+        forces: list[float] = []
         weight = _sampled_weight(compiled, coordinates, self._dof, seed)
         raised: list[str] = []
         assumed, effort = [], stated_effort(model)
@@ -195,6 +203,7 @@ class JointServos:
             elif force < (load := float(weight[len(accelerations)])):
                 raised.append(f"{symbol} {force:g} to {load:.3g}")
                 force = load
+            forces.append(force)
             fastest = float(np.abs(model.limits(symbol.derivative())).min())
             ramp = (fastest if 0 < fastest < math.inf else 1.0) / _RAMP
             accelerations.append(min(_RESERVE * force / i, ramp))
@@ -204,6 +213,7 @@ class JointServos:
             servo.gainprm[0], servo.biasprm[:3] = kp, (0, -kp, -kv)
             servo.forcelimited, servo.forcerange = True, (-force, force)
         self._acceleration: Array = np.array(accelerations)
+        self.efforts = dict(zip(driven, forces, strict=True))
         largest, smallest = (f(inertia) if len(inertia) else 0.0 for f in (np.max, np.min))
         remark(
             f"servos of bandwidth {bandwidth:g}/s drive {len(driven)} coordinates, with the largest "

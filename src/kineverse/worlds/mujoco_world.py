@@ -10,7 +10,7 @@ from typing import Any, Literal, NamedTuple
 import numpy as np
 
 from kineverse._checks import finite_number
-from kineverse.errors import InvalidValueError, UnknownNameError, suggest
+from kineverse.errors import InvalidValueError, SimulationError, UnknownNameError, suggest
 from kineverse.formats.mjcf.mujoco_api import mujoco
 from kineverse.grasping.gripper import Gripper, find_grippers
 from kineverse.lie import Array
@@ -20,6 +20,7 @@ from kineverse.state import State, StateLike
 from kineverse.symbols import Symbol
 
 from . import mujoco_model
+from .mujoco_bounds import SimulationBounds
 from .mujoco_contacts import MujocoContacts
 from .mujoco_coordinates import MujocoCoordinates
 from .mujoco_floor import add_floor
@@ -143,7 +144,7 @@ class MujocoWorld:
         compiled = mujoco_model.compile_world(spec)
         mujoco_model.add_joint_friction(spec, compiled, furniture, frictions, self._remark)
         mujoco_model.add_tipping_springs(spec, model, self._remark)
-        mujoco_model.add_contact_rules(spec, model, fingers, friction, self._remark)
+        mujoco_model.add_contact_rules(spec, model, fingers, friction, self._is_robot, self._remark)
         self._float_robot(spec)
         compiled = mujoco_model.compile_world(spec)
         self._coordinates = MujocoCoordinates(model, compiled)
@@ -172,9 +173,16 @@ class MujocoWorld:
             spec, compiled, self._coordinates, driven, model, self._step, bandwidth, seed, self._remark
         )
         self._compiled = mujoco_model.compile_world(spec)
+        moving = np.flatnonzero(self._compiled.body_weldid).tolist()
+        mujoco_model.weigh_contacts(
+            self._compiled, [k for k in moving if not self._is_robot(self._compiled.body(k).name)]
+        )
         self._data = mujoco().MjData(self._compiled)
         self._contacts = MujocoContacts(self._compiled, self._is_robot, fingers)
         self._servos.connect(self._compiled)
+        self._bounds = SimulationBounds(
+            self._compiled, self._coordinates, model, self._servos.efforts, self._is_robot
+        )
         if self._drive is not None:
             self._drive.connect(self._compiled, self._contacts, seed)
         self._map = SpeedMap(model, [*driven, *held], self._coordinates.address)
@@ -230,6 +238,7 @@ class MujocoWorld:
         data.qpos[:] = qpos
         engine.mj_forward(self._compiled, data)
         self._ticks, self._end, self._refused, self._peak_force = 0, 0.0, 0, 0.0
+        self._broken = ""
         self._speeds = np.zeros(len(self._map.speeds))
         self._commands: deque[_Command] = deque()
         self._active: _Command | None = None
@@ -261,6 +270,9 @@ class MujocoWorld:
             For speeds that are not finite, a duration that is not positive, and a stamp that is no number.
         UnknownNameError
             For speeds that the model does not have.
+        SimulationError
+            If speeds or forces are beyond reason, see :mod:`.mujoco_bounds`. The state is that before then,
+            and the world does not go on until it is reset.
         """
         length = finite_number(duration)
         if length is None or length <= 0:
@@ -268,6 +280,8 @@ class MujocoWorld:
         taken = None if stamp is None else finite_number(stamp)
         if stamp is not None and taken is None:
             raise InvalidValueError(f"The stamp of speeds is a time in seconds, not {stamp!r}.")
+        if self._broken:
+            raise SimulationError(self._broken)
         vector, given = self._map.vector(speeds)
         keep = self._is_finger & ~given
         vector[keep] = self._speeds[keep]
@@ -283,9 +297,40 @@ class MujocoWorld:
         if self._drive is not None:
             self._drive.update_limits(self._data)
         self._peak_force, self._state = 0.0, None
-        while self.time < self._end - _ROUNDING:
-            self._advance()
-            self._peak_force = max(self._peak_force, self._contacts.largest_force(self._data))
+        engine, warnings = mujoco(), list[str]()
+        handler = engine.get_mju_user_warning()
+        engine.set_mju_user_warning(warnings.append)  # else to the terminal, and to a file
+        try:
+            while self.time < self._end - _ROUNDING:
+                before = self._data.qpos.copy()
+                self._advance()
+                force = self._contacts.largest_force(self._data)
+                problem = self._find_unstable() if warnings else self._bounds.find_problem(self._data, force)
+                if problem:
+                    self._break_off(before, problem)
+                self._peak_force = max(self._peak_force, force)
+        finally:
+            engine.set_mju_user_warning(handler)
+
+    def _find_unstable(self) -> str:
+        """Return the part of the state of which MuJoCo warns that it is no number or huge."""
+        kinds = mujoco().mjtWarning
+        names = {"positions": kinds.mjWARN_BADQPOS, "speeds": kinds.mjWARN_BADQVEL}
+        names["accelerations"] = kinds.mjWARN_BADQACC
+        bad = [name for name, kind in names.items() if self._data.warning[int(kind)].number]
+        return f"{' and '.join(bad)} are no numbers, or beyond 1e10" if bad else ""
+
+    def _break_off(self, qpos: Array, problem: str) -> None:
+        """Go back to positions, and raise SimulationError."""
+        engine, data, now = mujoco(), self._data, self.time
+        data.qpos[:], data.qvel[:], data.qacc_warmstart[:] = qpos, 0.0, 0.0
+        engine.mj_forward(self._compiled, data)
+        self._broken = (
+            f"The simulation is not to be trusted: {problem} at {now:.3f} s. The state is that before. "
+            "A start without overlaps, or a smaller time step (step=), may help; reset() begins anew."
+        )
+        logger.warning(self._broken)
+        raise SimulationError(self._broken)
 
     def contacts(self) -> tuple[Contact, ...]:
         """Return the bodies of the robot that touch something else, and those of furniture that collide."""
@@ -330,14 +375,13 @@ class MujocoWorld:
         self._remark(f"gravity does not act on '{self.robot}': its servos are taken to carry the weight")
 
     def _exclude_overlaps(self, spec: Any, compiled: Any, seed: int) -> None:
-        """Exclude pairs of the robot with itself, and of furniture with itself, that overlap for good."""
-        found = mujoco_model.overlapping_pairs(compiled, self._coordinates, _SAMPLES, seed)
-        pairs = [pair for pair in found if self._is_robot(pair[0]) == self._is_robot(pair[1])]
-        for one, other in pairs:
-            spec.add_exclude(bodyname1=one, bodyname2=other)
+        """Exclude what overlaps by design, of the robot and of furniture."""
+        pairs = mujoco_model.exclude_overlaps(
+            spec, compiled, self.model, self._coordinates, self._is_robot, _SAMPLES, seed
+        )
         if pairs:
             self._remark(
-                "these pairs overlap at the default state or always, and do not collide: "
+                "these pairs overlap at the default state, or of the robot always, and do not collide there: "
                 + ", ".join(f"{a} with {b}" for a, b in pairs)
             )
 

@@ -10,6 +10,9 @@ import numpy.typing as npt
 from kineverse.geometry.results import DistanceResults
 from kineverse.lie import Array
 
+JAM = 0.5
+"""Cosine of the angle between a normal and the motion that it causes, below which a contact jams."""
+
 _PARALLEL = 1e-3
 """Least eigenvalue of directions of motion that are not parallel."""
 

@@ -104,6 +104,10 @@ class ObjectLimits:
             self._found[key] = np.flatnonzero(linked), *rows
         return self._found[key]
 
+    def link(self, moved: npt.NDArray[np.bool_]) -> npt.NDArray[np.bool_]:
+        """Return the flags of speeds that share rows with flagged ones, and of these."""
+        return moved | np.asarray(self._linked[moved].any(axis=0))
+
     def reset(self) -> None:
         """Forget what the last motion exceeded."""
         self._exceeded = np.zeros((2, len(self._positions.pattern)))

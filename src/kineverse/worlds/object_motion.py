@@ -13,6 +13,10 @@ way and that way out. The slacks s are zero unless the object is blocked; then t
 weights w are the squares of the speeds that coordinates give to points of bodies, so rotations and
 translations compare. The problem is linear in the neighbourhood of a configuration, and it is solved again
 where it led, until nothing changes (sequential quadratic programming).
+
+What the robot moves does not run through other furniture: gaps between furniture are rows of the same kind
+with slacks of more weight, so that the robot penetrates an object that something else blocks, and the object
+does not penetrate that.
 """
 
 from __future__ import annotations
@@ -35,7 +39,9 @@ from kineverse.model.frame_dependence import FrameDependence
 from kineverse.model.model_view import ModelView
 from kineverse.symbols import Symbol
 
-from .object_gaps import Gaps, align_motion, pair_keys, project_twists
+from .furniture_gaps import FurnitureContacts, FurnitureGaps
+from .furniture_overlaps import FurnitureOverlaps
+from .object_gaps import JAM, Gaps, align_motion, pair_keys, project_twists
 from .object_limits import ObjectLimits, Rows
 
 SKIN = 1e-6
@@ -57,8 +63,8 @@ _DEEP = 1e-4
 """Penetration of what does not yield, from which on its side is remembered [m]."""
 _RELEASE = 0.1
 """Largest speed out of a penetration that was there before a motion [m/s]."""
-_JAM = 0.5
-"""Cosine of the angle between a normal and the motion that it causes, below which a contact jams."""
+_FIRM = 100.0
+"""Weight of gaps between furniture beside those to the robot: it is the robot that penetrates."""
 
 Residual: TypeAlias = Callable[[], tuple[Array, Array]]
 """Function that returns the error of a hold at the present configuration, (6,), and its Jacobian (6, n)."""
@@ -69,8 +75,9 @@ class ObjectMotion:
 
     Parameters
     ----------
-    scene
-        Collision scene of the model; its poses are those of the last configuration.
+    overlaps
+        Overlaps of furniture in the collision scene of the model, whose poses are those of the last
+        configuration.
     speeds
         Speeds of objects.
     fingers
@@ -94,13 +101,14 @@ class ObjectMotion:
 
     def __init__(
         self,
-        scene: Scene,
+        overlaps: FurnitureOverlaps,
         speeds: Sequence[Symbol],
         fingers: Sequence[Symbol],
         is_robot: Callable[[str], bool],
         leave_out: Collection[str] = (),
     ) -> None:
-        self.scene, self._daqp = scene, _import_daqp()
+        scene: Scene = overlaps.scene
+        self.scene, self.overlaps, self._daqp = scene, overlaps, _import_daqp()
         model: ModelView = scene.model
         self.symbols, self.count = model.symbols, len(speeds)
         self.columns = (*speeds, *fingers)
@@ -122,6 +130,9 @@ class ObjectMotion:
         self._integrate = model.integrator(speeds, self.symbols)
         self._limits = ObjectLimits(model, speeds, is_robot, leave_out)
         self.skipped = self._limits.skipped
+        self._furniture = FurnitureContacts(
+            overlaps, speeds, self.group, self._evaluate_twists, self._limits.link
+        )
         self.place(self.q)
         self.weights = self._weigh()
 
@@ -145,8 +156,7 @@ class ObjectMotion:
 
     def _weigh(self) -> Array:
         """Return the squares of the largest speeds that columns give to points of bodies, at this place."""
-        self._evaluate_twists()
-        twists, table = self._twists.outputs[0], self.scene.collision_world.table
+        twists, table = self._evaluate_twists(), self.scene.collision_world.table
         weights = np.full(len(self.columns), _LIGHTEST)
         self._query(0.0)  # Sizes are known from the first query on.
         for k, body in enumerate(table.body.tolist()):
@@ -163,11 +173,13 @@ class ObjectMotion:
         self._penetrated.clear()
         self._limits.reset()
         self.place(q)
+        self.overlaps.begin()
         self.ignore()
 
     def place(self, q: Array) -> None:
         """Set the configuration."""
         self.q[:] = q
+        self._moved = True
         self.scene.update(self.q[self._inputs])
 
     def travel(self) -> Array:
@@ -228,8 +240,7 @@ class ObjectMotion:
         if not len(index):
             none = np.zeros(0)
             return Gaps(pairs, index, none, np.zeros((0, len(self.columns))), none.astype(bool))
-        self._evaluate_twists()
-        twists = self._twists.outputs[0]
+        twists = self._evaluate_twists()
         a, b = self.group[pairs.body_indices[index]].T
         normals, distances = pairs.normals[index], pairs.distances[index]
         rows = project_twists(normals, pairs.points_b[index], twists[b])
@@ -238,7 +249,7 @@ class ObjectMotion:
         for k in np.flatnonzero(distances < 0.0).tolist():
             of_a, of_b = twists[a[k], :, :n], twists[b[k], :, :n]
             point, of_object = (pairs.points_b, of_b) if of_b.any() else (pairs.points_a, of_a)
-            jammed[k] = align_motion(normals[k], point[index[k]], of_object) < _JAM
+            jammed[k] = align_motion(normals[k], point[index[k]], of_object) < JAM
         return Gaps(pairs, index, distances, rows, jammed)
 
     def _aims(self, gaps: Gaps, h: float) -> Array:
@@ -271,9 +282,26 @@ class ObjectMotion:
             for k in deep.tolist():
                 self._penetrated.setdefault(keys[k], gaps.pairs.normals[k].copy())
 
-    def _evaluate_twists(self) -> None:
-        self._twists.input[:] = self.q[self._twist_inputs]
-        self._twists()
+    def _evaluate_twists(self) -> Array:
+        """Return the spatial twists of groups of bodies (G, 6, all columns) at this place."""
+        if self._moved:
+            self._twists.input[:] = self.q[self._twist_inputs]
+            self._twists()
+            self._moved = False
+        twists: Array = self._twists.outputs[0]
+        return twists
+
+    def _measure_furniture(
+        self, v: Array, gaps: Gaps, pulled: tuple[Array, Array] | None
+    ) -> FurnitureGaps | None:
+        """Return the gaps between furniture, some of which moves; None if nothing does."""
+        n = self.count
+        rows = gaps.rows[:, :n] != 0.0
+        driven = rows[(gaps.distances < _DEEP) & ~gaps.jammed].any(axis=0)
+        if pulled is not None:
+            driven |= (pulled[1] != 0.0).any(axis=0)
+        moved = driven | rows.any(axis=0) | (v != 0.0)
+        return self._furniture.measure(driven, moved) if moved.any() else None
 
     def resolve(self, h: float, moved: float, residual: Residual | None = None) -> Array:
         """Move the objects after the robot has moved, and return their speeds (n,).
@@ -292,19 +320,22 @@ class ObjectMotion:
         if residual is None and not len(self.find_near(0.0)[1]):
             return v
         rates = self._limits.begin(start, h)
+        self._furniture.begin()
         for k in range(_ROUNDS + 1):
             gaps = self.measure_gaps(radius)
             pulled = None if residual is None else residual()
             limits, beyond = self._limits.position_rows(self.q, h, v)
-            aims = self._aims(gaps, h)
-            cost = self._cost(h * v, gaps, aims, pulled) + beyond / _HARD
+            aims, furniture = self._aims(gaps, h), self._measure_furniture(v, gaps, pulled)
+            cost = self._cost(h * v, gaps, aims, furniture, pulled) + beyond / _HARD
             better = cost <= least * (1.0 + 1e-9)
             if k == _ROUNDS:
                 break
             if better:
                 least, best = cost, v
                 self._note_penetrated(gaps)
-                found = self._solve(h, v, gaps, aims, rates, limits, pulled)
+                found = v
+                if furniture is not None:
+                    found = self._solve(h, v, gaps, aims, furniture, rates, limits, pulled)
             else:
                 # The gaps bend too much, as of bodies that are jammed: half of the way.
                 found = 0.5 * (best + v)
@@ -319,13 +350,24 @@ class ObjectMotion:
         self._limits.finish(self.q, h)
         return v
 
-    def _cost(self, way: Array, gaps: Gaps, aims: Array, pulled: tuple[Array, Array] | None) -> float:
+    def _cost(
+        self,
+        way: Array,
+        gaps: Gaps,
+        aims: Array,
+        furniture: FurnitureGaps | None,
+        pulled: tuple[Array, Array] | None,
+    ) -> float:
         """Return twice the cost of a motion by some way of the objects (n,)."""
         depths = np.minimum(gaps.distances - np.minimum(aims, 0.0), 0.0)[~gaps.jammed]
         moved = float(self.weights[: self.count] @ way**2)
         if pulled is not None:
             moved = _HELD * moved + float(pulled[0] @ pulled[0])
-        return moved + float(depths @ depths) / _SLACK
+        squares = float(depths @ depths)
+        if furniture is not None:
+            overlaps = _FIRM * np.minimum(furniture.distances, 0.0)
+            squares += float(overlaps @ overlaps)
+        return moved + squares / _SLACK
 
     def _solve(
         self,
@@ -333,6 +375,7 @@ class ObjectMotion:
         v: Array,
         gaps: Gaps,
         aims: Array,
+        furniture: FurnitureGaps,
         rates: Rows,
         limits: Rows,
         pulled: tuple[Array, Array] | None,
@@ -340,14 +383,7 @@ class ObjectMotion:
         """Return the speeds of one linearisation at speeds v."""
         n = self.count
         G, d = gaps.rows[:, :n], gaps.distances
-        moved = v != 0.0
-        if len(d):
-            moved |= (G != 0.0).any(axis=0)
-        if pulled is not None:
-            moved |= (pulled[1] != 0.0).any(axis=0)
-        if not moved.any():
-            return v
-        use, *concerned = self._limits.find_linked(moved)
+        use, *concerned = self._limits.find_linked(furniture.moved)
         H, f = np.diag(self.weights[use]), np.zeros(len(use))
         if pulled is not None:
             error, J = pulled[0] / h, pulled[1][:, use]
@@ -367,6 +403,13 @@ class ObjectMotion:
             # What is jammed moves nothing, and lets nothing move into it.
             np.minimum(wanted, 0.0, out=wanted, where=gaps.jammed)
             G, wanted = G[touching][:, use], wanted[touching]
+            parts.append((G, wanted, np.full(len(G), _UNBOUNDED)))
+        if len(furniture.distances):
+            G = furniture.rows
+            wanted = G @ v - furniture.distances / h
+            np.minimum(wanted, 0.0, out=wanted, where=furniture.jammed)
+            concern = (G[:, use] != 0.0).any(axis=1)
+            G, wanted = _FIRM * G[concern][:, use], _FIRM * wanted[concern]
             parts.append((G, wanted, np.full(len(G), _UNBOUNDED)))
         rows, least, most = (np.concatenate(each) for each in zip(*parts, strict=True))
         sense = np.full(len(rows), _SOFT, dtype=np.intc)

@@ -20,6 +20,9 @@ from .simple_bodies import PALE, STEEL, WOOD, box_shape, case, rod_shape, shift
 
 Point: TypeAlias = tuple[float, float]
 
+_CLEARANCE = 0.007
+"""Distance of the front edges of the walls behind those of the cupboard [m]."""
+
 
 @dataclass(frozen=True, kw_only=True)
 class FoldingDoor(Mechanism, document_kind="FoldingDoor"):
@@ -142,8 +145,11 @@ class FoldingDoor(Mechanism, document_kind="FoldingDoor"):
         grip = box_shape((grip_depth, grip_width, grip_thickness), (-grip_depth / 2, 0.0, 0.0), STEEL)
         side = self.size[1] / 2 - 2 * self.wall
         bar = rod_shape((0.0, side, 0.0), (0.0, side, self.arm), 0.008, STEEL)
+        depth, *front = self.size
+        # The walls end behind the ends of the panels, which turn inwards.
+        walls = case((depth - _CLEARANCE, front[0], front[1]), self.wall, PALE, (_CLEARANCE / 2, 0.0, 0.0))
         return {
-            "base": self.base(*case(self.size, self.wall, PALE)),
+            "base": self.base(*walls),
             "upper_panel": MechanismPart(
                 "base", (shift(ax, 0, az), rotation_about(Y, q), _on(self.upper_middle)), (leaf,)
             ),

@@ -52,10 +52,11 @@ class HingedDoor(Mechanism):
         )
 
     def posts(self) -> tuple[Shape, Shape]:
-        """Return the posts on both sides of the door."""
+        """Return the posts on both sides of the door, the first one clear of its corner that turns."""
         size = (self.thickness, 0.06, self.height)
         first, second = (
-            box_shape(size, (0.0, y, self.height / 2), PALE) for y in (-0.035, self.width + 0.035)
+            box_shape(size, (0.0, y, self.height / 2), PALE)
+            for y in (-0.035 - self.thickness, self.width + 0.035)
         )
         return first, second
 

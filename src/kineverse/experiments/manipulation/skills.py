@@ -129,9 +129,11 @@ def open_then_close(
 
         def act(watch: TrialWatch, target: float = target) -> Outcome:
             nonlocal session
-            made = () if session is None else session.made
+            earlier = session
             session = watch.open_session(world, DT)
-            session.made.extend(made)
+            if earlier is not None:
+                session.made.extend(earlier.made)
+                session.start = earlier.start
             return open_object(session, case.what, target=target, seed=case.seed)
 
         trials.append(case.run(skill, model, act))

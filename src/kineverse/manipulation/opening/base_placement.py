@@ -10,8 +10,8 @@ from kineverse.grasping import Grasp
 from kineverse.lie import Array
 from kineverse.symbols import Symbol
 
-NO_WAY = "no way to the handle"
-"""Reason of placements that are refused."""
+NO_WAY, NO_PLACE = "no way to the handle", "no free place of the base"
+"""Reasons of placements that are refused, and of bases that touch something."""
 _DIFFERENCE = 0.025
 """Difference of the values at the ends of a way to those of the way back [m], [rad]."""
 
@@ -72,7 +72,7 @@ class BasePlacement:
     @property
     def failure(self) -> str:
         """Class of the failure: ``"collision"`` if an arm reaches along the way, otherwise ``"reach"``."""
-        return "collision" if any(" at " in r or r == NO_WAY for r in self.reasons) else "reach"
+        return "collision" if any(" at " in r or r in (NO_WAY, NO_PLACE) for r in self.reasons) else "reach"
 
     @property
     def why(self) -> str:

@@ -18,13 +18,15 @@ from kineverse.manipulation.skill_arguments import (
     check_positive,
     check_target,
     choose_target,
+    choose_tolerance,
     explain_fixed,
     find_object_coordinate,
-    limit_tolerance,
 )
+from kineverse.manipulation.swept_motion import BlockedError, find_obstacle
 from kineverse.model.version_cache import cached_for_version
 from kineverse.symbols import Symbol
 from kineverse.worlds import Judge
+from kineverse.worlds.judge import JudgedOverlap
 
 from .approach_planner import Approach
 from .base_placement import BasePlacement
@@ -40,15 +42,13 @@ _PROOF = 200
 _MOST_GRASPS, _MOST_PUSHES = 4, 3
 _LATE = 1.0
 """Time before the end at which it counts as up [s]."""
-_OVERLAP = 1e-3
-"""Penetration from which on the reason says it [m]."""
 _MOST_SLIPS, _LEAST_PROGRESS = 2, 0.1
 """Number of slips from which on a grasp has to take an object further, by a share of the rest."""
 _HEIGHTS = 12
 """Number of values at which the height of an object is compared with that of the hand."""
 _LARGEST = ("limit_violation", "penetration", "grasp_error", "grasp_rotation", "jitter", "reversals")
 _SUMS = ("contact_losses", "distance", "hand_distance")
-_NAMED = {"limit_violation": "limit", "penetration": "penetrating"}
+_NAMED = {"limit": "limit_violation", "penetrating": "penetration", "penetration_from": "penetration"}
 """Measures of the parts of a run: the largest, or the sum; and what belongs to the largest."""
 
 
@@ -60,7 +60,7 @@ def open_object(
     hand: str | None = None,
     handle: str | None = None,
     seconds: float = 180.0,
-    tolerance: float = 0.02,
+    tolerance: float | None = None,
     placements: int = 600,
     seed: int = 0,
 ) -> Outcome:
@@ -71,7 +71,8 @@ def open_object(
     not lead to the target, the object is released on the way and grasped anew. Where no grasp leads on,
     such as at an oven door whose handle faces the floor, it is pushed. A base on two wheels drives to its
     place before the arm moves. One that cannot turn on the spot, or that begins in contact, is put there by a
-    reset of the world.
+    reset of the world. Nothing is moved where something is in the way of the object, see
+    :func:`.find_obstacle`.
 
     Parameters
     ----------
@@ -86,7 +87,8 @@ def open_object(
     seconds
         Largest time in the world [s].
     tolerance
-        Largest distance from the target [m], [rad].
+        Largest distance from the target [m], [rad]; by default 2 % of the way, and 20 mm at a limit, see
+        :func:`.choose_tolerance`.
     placements
         Largest number of sampled bases for one grasp.
     seed
@@ -96,8 +98,9 @@ def open_object(
     -------
     Outcome
         With ``measures``: those of :class:`.Judge`, ``placements``, ``grasps`` and ``slips`` (number of
-        grasps, and of those that the handle slipped out of), and ``failure``: ``"collision"``, ``"reach"``,
-        ``"time"`` or ``"other"`` if it was not done.
+        grasps, and of those that the handle slipped out of), ``tolerance``, ``peak_force`` [N] in a world
+        with forces, and ``failure``: ``"collision"``, ``"reach"``, ``"time"`` or ``"other"`` if it was not
+        done; ``free``, the value up to which the way is free, if something is in it.
 
     Raises
     ------
@@ -113,42 +116,52 @@ def open_object(
     if fixed and (target is None or check_target(target) != here):
         return Outcome(False, here, fixed, world.name, 0.0, 0, {"failure": "other"})
     goal = choose_target(model, coordinate, session.state, check_target(target))
-    tolerance = limit_tolerance(model, coordinate, tolerance)
+    tolerance = choose_tolerance(model, coordinate, session.state, goal, tolerance)
+    if not session.deviation(coordinate):  # an estimate is looked at before, see _Run
+        obstacle = find_obstacle(
+            model, coordinate, session.state, goal, robot=world.robot, start=session.start
+        )
+        if obstacle is not None:
+            return Outcome(False, here, str(obstacle), world.name, 0.0, 0, obstacle.measures)
     found = find_handle(model, coordinate, handle)
     gripper = find_gripper(model, world.robot, hand)
     opener = cached_for_version(
         model, ("opener", gripper.hand), lambda: Opener(model, gripper, session.state)
     )
+    session.peak_force = math.nan
     run = _Run(session, opener, found, goal, seconds, tolerance, placements, seed)
-    reason, kind = "", ""
+    reason, kind, measures = "", "", dict[str, Any]()
     try:
         run.perform()
     except SkillError as failure:
         reason, kind = str(failure), failure.kind
+        if isinstance(failure, BlockedError):
+            measures |= failure.obstacle.measures
     except (InfeasibleError, NotFiniteError) as error:
         reason, kind = f"The controller has no command: {error}", "other"
+    before = world.time
     session.stop()
-    value = float(world.state[coordinate])
-    done = not reason and abs(value - goal) <= tolerance
-    if not reason:
-        reason = (
-            f"'{coordinate}' is at {value:.3f}, as wanted{run.how}."
-            if done
-            else (f"'{coordinate}' ended at {value:.3f}, not at {goal:.3f}.")
-        )
-    judged = run.measures
-    overlap = judged["penetration"]
-    if overlap > _OVERLAP:
-        one, other = judged["penetrating"]
-        reason += f" On the way '{one}' and '{other}' overlapped by {1e3 * overlap:.0f} mm."
+    if world.time > before:
+        run.judge.update(world.state)
+    value, overlap = float(world.state[coordinate]), run.overlap
+    claimed = not reason and abs(float(session.state[coordinate]) - goal) <= tolerance
+    done = not reason and abs(value - goal) <= tolerance and overlap is None
+    if not reason and abs(value - goal) <= tolerance:
+        reason = f"'{coordinate}' is at {value:.4g}, as wanted ({goal:.4g} ± {tolerance:.2g}){run.how}."
+    elif not reason:
+        reason = f"'{coordinate}' ended at {value:.4g}, not at {goal:.4g} ± {tolerance:.2g}."
+    if overlap is not None:
+        kind = kind or "collision"
+        reason += f" {overlap}"
     reason = " ".join([*run.slips, reason])
-    measures: dict[str, Any] = {**judged, "placements": run.placements, "grasps": run.grasps}
+    measures |= {**run.measures, "placements": run.placements, "grasps": run.grasps, "tolerance": tolerance}
     measures |= {"pushed": run.pushed_from is not None, "resets": run.resets, "slips": len(run.slips)}
+    if not math.isnan(session.peak_force):
+        measures["peak_force"] = session.peak_force
     if not done:
         measures["failure"] = kind or "other"
-    return Outcome(
-        done, value, reason, world.name, world.time - run.begin, session.steps - run.first, measures
-    )
+    seconds, steps = world.time - run.begin, session.steps - run.first
+    return Outcome(done, value, reason, world.name, seconds, steps, measures, claimed)
 
 
 class _Run:
@@ -176,9 +189,13 @@ class _Run:
         self.slips: list[str] = []
         self._rest = math.inf
         self._earlier: list[Mapping[str, Any]] = []
+        self._overlaps: list[JudgedOverlap] = []
         self._approach = Approach()
         self._ways_back = [made for made in session.made if self._is_of_this(made)]
-        self.judge = Judge(self.model, session.world.robot, self.gripper, handle=handle.frame)
+        self.judge = Judge(
+            self.model, session.world.robot, self.gripper, handle.frame,
+            coordinate=handle.coordinate, start=session.start,
+        )  # fmt: skip
         self.judge.update(session.world.state)
         self.motion = HandMotion(
             session, self.gripper, handle, opener.search, opener.approaches, self.judge, self.begin + seconds,
@@ -192,12 +209,18 @@ class _Run:
         last = dict(found[-1])
         for name in _LARGEST:
             last[name] = max((m[name] for m in found if not math.isnan(m[name])), default=math.nan)
-        for name, what in _NAMED.items():
+        for what, name in _NAMED.items():
             last[what] = max(found, key=lambda m: float(m[name]))[what]
         for name in _SUMS:
             last[name] = sum(m[name] for m in found)
         last["excepted"] = tuple(dict.fromkeys(pair for m in found for pair in m["excepted"]))
         return last
+
+    @property
+    def overlap(self) -> JudgedOverlap | None:
+        """The deepest overlap that came on the way, also before a reset of the world; None without any."""
+        found = [*self._overlaps, *filter(None, (self.judge.overlap,))]
+        return max(found, key=lambda one: one.depth, default=None)
 
     @property
     def how(self) -> str:
@@ -209,6 +232,7 @@ class _Run:
     def perform(self) -> None:
         """Move the object to the target by grasps, and by pushes where none leads on, or raise SkillError."""
         self.motion.look()
+        self._check_way()
         self._check_start()
         self._check_height()
         failure = self._move_grasped()
@@ -235,6 +259,8 @@ class _Run:
                 # Grasps that lead on prove nothing about the reach of the arm.
                 kind = placement.failure if placement.failure != "reach" else "other"
                 self._move(placement)
+                if self.session.world.time > self.motion.until and self.left <= self.tolerance:
+                    break
         what = self.handle.coordinate
         return failure or SkillError(kind, f"After {self.grasps} grasps '{what}' is not at the target.")
 
@@ -254,15 +280,26 @@ class _Run:
             if error.kind == "time":
                 raise
             stall = error
-        self.motion.release(placement)
+        try:
+            self.motion.release(placement)
+        except SkillError as error:
+            # With the hand open, what is reached counts, though no time is left to take the hand away.
+            late = error.kind == "time" and self.session.phase == "retract"
+            if not late or self.left > self.tolerance:
+                raise
         if stall is not None and self.left > (1.0 - _LEAST_PROGRESS) * before:
             raise stall
         self._check_progress()
 
     @property
+    def here(self) -> float:
+        """Believed value of the object's coordinate [m], [rad]."""
+        return float(self.session.state[self.handle.coordinate])
+
+    @property
     def left(self) -> float:
         """Distance of the object from the target [m], [rad]."""
-        return abs(float(self.session.state[self.handle.coordinate]) - self.target)
+        return abs(self.here - self.target)
 
     def _push(self, failure: SkillError, attempt: int) -> None:
         """Push the object on where no grasp leads, or raise SkillError after the last attempt."""
@@ -273,6 +310,8 @@ class _Run:
             self._bring_base(fallback.approach)
             fallback.perform()
         except SkillError as error:
+            if self.session.untrusted:
+                raise
             late = error.kind == "time" and self.session.world.time > self.motion.until - _LATE
             if late or not fallback.begun or attempt + 1 == _MOST_PUSHES:
                 raise SkillError("time" if late else failure.kind, f"{failure} {error}") from error
@@ -291,6 +330,7 @@ class _Run:
             self.begin, self.resets = -gone, self.resets + 1
             self.motion.until = self.seconds - gone
             self._earlier.append(self.judge.measures)
+            self._overlaps += filter(None, (self.judge.overlap,))
             self.judge.reset()
             self.judge.update(session.world.state)
             self.motion.look()
@@ -306,6 +346,17 @@ class _Run:
                 f"It does not move on from {value:.3f} though it was pulled {len(self.slips)} times: it is "
                 "locked or jammed, or moves too hard for the force of the fingers.",
             )
+
+    def _check_way(self) -> None:
+        """Raise BlockedError if something is in the way of the object, as far as it is seen."""
+        state, coordinate = self.session.state, self.handle.coordinate
+        if self.session.deviation(coordinate):
+            session = self.session
+            obstacle = find_obstacle(
+                self.model, coordinate, state, self.target, robot=session.world.robot, start=session.start
+            )
+            if obstacle is not None:
+                raise BlockedError(obstacle)
 
     def _check_start(self) -> None:
         """Raise SkillError if the robot touches something before anything is done."""
@@ -384,6 +435,9 @@ class _Run:
         """Search a placement among the most sampled bases that are allowed, and count them."""
         session, search = self.session, self.opener.search
         session.phase = "place"
+        session.report_search(
+            f"places of the robot from which it leads from {self.here:.3f} to {self.target:.3f}"
+        )
         with session.timed("place"):
             try:
                 grasps = self.opener.grasps(self.handle, session.state, self.seed, slant)
@@ -396,6 +450,7 @@ class _Run:
                 accept=self._plan,
                 samples=samples,
                 seed=self.seed + self.grasps,
+                report=session.report_search,
             )
         self.placements += found.samples
         return found

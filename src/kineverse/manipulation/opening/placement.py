@@ -23,7 +23,7 @@ from kineverse.model.model_view import ModelView
 from kineverse.state import State
 from kineverse.symbols import Symbol
 
-from .base_placement import NO_WAY, BasePlacement
+from .base_placement import NO_PLACE, NO_WAY, BasePlacement
 from .hand_height import find_highest_passage, find_highest_reach
 from .hand_paths import TOLERANCE, HandPaths
 from .placement_samples import PlacementSamples
@@ -34,6 +34,8 @@ _STEP = 0.05
 """Distance of neighbouring values of the object along its way [m], [rad]."""
 _RANDOM_STATES = 24
 """Number of random states in which links that are always near to each other are sought."""
+_BESIDE = 0.1
+"""Largest change of each coordinate of the base in these states [m], [rad]."""
 _START_ITERATIONS = 30
 _CORRECTIONS = 6
 """Iterations from a configuration to one near it."""
@@ -44,6 +46,8 @@ _MIDDLES = (0.5, 0.5, 0.25, 0.5, 0.0)
 _WHOLE = 300
 """Number of bases after which a way to a part of the motion is taken, and after which the search ends if no
 arm has reached the handle anywhere: at the middle of its way, or at a quarter of it."""
+_NOWHERE = 300
+"""Number of bases after which the search ends if each one touched something wherever it was drawn."""
 _AROUND, _HERE = 0.6, 100
 """Distance of the hand from the handle up to which the base may stay [m], and the number of arms there."""
 _LEAST_SHARE = 0.2
@@ -99,12 +103,17 @@ class PlacementSearch:
         self._reach: float | None = None
 
     def _random_states(self, state: State) -> Iterator[State]:
-        """Yield states with random arms."""
+        """Yield states with random arms, and the base a little beside its place.
+
+        So what is always near is the robot's own or the floor, and not a wall that it stands at.
+        """
         random = np.random.default_rng(0)
         bounded = [s for s in self.moving if np.isfinite(self.model.limits(s)).all() and s not in self.base]
         lower, upper = np.array([self.model.limits(s) for s in bounded]).reshape(-1, 2).T
         for _ in range(_RANDOM_STATES):
-            yield state.updated(dict(zip(bounded, random.uniform(lower, upper).tolist(), strict=True)))
+            arm = dict(zip(bounded, random.uniform(lower, upper).tolist(), strict=True))
+            beside = random.uniform(-_BESIDE, _BESIDE, len(self.base)).tolist()
+            yield state.updated(arm | {s: state[s] + by for s, by in zip(self.base, beside, strict=True)})
 
     def find_too_high(self, state: State, coordinate: Symbol, values: Array) -> str:
         """Return why an object on its way is out of reach above the hand; empty if it is not.
@@ -137,6 +146,7 @@ class PlacementSearch:
         samples: int = 600,
         batch: int = 100,
         seed: int = 0,
+        report: Callable[[str], object] = lambda text: None,
     ) -> BasePlacement:
         """Return a placement from which the object can be moved from its value to a target, or towards it.
 
@@ -144,7 +154,8 @@ class PlacementSearch:
         target and the hand is near, so that it has just let go, the base may stay as well. All of them
         follow the way of the handle at once, and the straight ways to it and from it; those that arrive are
         checked for contacts, the quickest first. Where none of many bases arrives, the one with the longest
-        way is returned. The search ends early if no arm reaches the handle on its way.
+        way is returned. The search ends early if no arm reaches the handle on its way, or if the base touches
+        something at all of the first places.
 
         Parameters
         ----------
@@ -160,6 +171,8 @@ class PlacementSearch:
             Largest number of bases, and how many are tried at once.
         seed
             Seed of the samples.
+        report
+            Is called with a text on the progress after each batch.
 
         Raises
         ------
@@ -175,6 +188,9 @@ class PlacementSearch:
             whole = number * batch < min(_WHOLE, samples)
             found = search.take(whole)
             ended = number * batch >= samples or (not whole and not search.reached)
+            ended = ended or (number * batch >= _NOWHERE and search.nowhere)
+            if number and found is None and not ended:
+                report(search.nothing.why)
             if found is not None or ended or search.refused >= _MOST_REFUSED:
                 break
             self.paths.ease = self.samples.eases[number % len(self.samples.eases)]
@@ -230,6 +246,7 @@ class _Search:
     ) -> None:
         self.owner, self.state, self.grasps, self.random = owner, state, grasps, random
         self.begin, self.tried, self.reached = perf_counter(), 0, False
+        self.nowhere = bool(owner.base)
         self.accept, self.refused = accept, 0
         self.coordinate = grasps[0].handle.coordinate
         start = float(state[self.coordinate])
@@ -281,6 +298,12 @@ class _Search:
         stops = (middle, 0, self.last) if samples.stands(paths.ease) else (middle,)
         states = [self.state.updated({self.coordinate: float(self.values[k])}) for k in stops]
         Q, base = samples.draw(self.random, states, hands, outside, _STARTS, self.owner.bases)
+        if self.nowhere:
+            places = samples.find_places(Q, base)[::_STARTS]
+            self.nowhere = bool(self.owner.bases.find_touching(states, places).all())
+            if self.nowhere:
+                self.reasons[NO_PLACE] += len(places)
+                return
         self._keep(Q, base, choice, middle)
 
     def _keep(self, Q: Array, base: Array, choice: npt.NDArray[np.intp], middle: int) -> None:

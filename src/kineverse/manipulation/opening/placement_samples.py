@@ -141,6 +141,14 @@ class PlacementSamples:
                 array[:, columns.index(s)] = places[:, k]
         return Q, still
 
+    def find_places(self, Q: Array, still: Array) -> Array:
+        """Return the places of the base (N, 3) in arms (N, n) and values (N, m) of what stands."""
+        columns = [
+            Q[:, self.moving.index(s)] if s in self.moving else still[:, self.standing.index(s)]
+            for s in self.base
+        ]
+        return np.stack(columns, axis=1)
+
     def stay(self, random: np.random.Generator, state: State, count: int) -> tuple[Array, Array]:
         """Return arms (N, n) on a base that stays, (N, m): half of them as in a state, the others random."""
         kept = self._on_base | (random.random((count, 1)) < 0.5)

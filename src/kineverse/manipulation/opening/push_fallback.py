@@ -62,6 +62,7 @@ class PushFallback:
         """
         motion, session = self.motion, self.motion.session
         session.phase = "place"
+        session.report_search("starts of a push, as no grasp leads on")
         with session.timed("place"):
             state = session.state
             try:
@@ -83,6 +84,7 @@ class PushFallback:
                     seed=seed,
                     least=_LEAST_SHARE,
                     accept=self._plan,
+                    report=session.report_search,
                 )
             except InvalidValueError as error:
                 raise SkillError("reach", f"It cannot be pushed: {error}") from error
@@ -111,14 +113,10 @@ class PushFallback:
         """
         motion, session = self.motion, self.motion.session
         assert self.approach.trajectory is not None
-        motion.judge.allow(self.pushing.object_bodies)
         session.phase = "approach"
         motion.follow(self.approach.trajectory)
         self.begun = True
         before = abs(session.state[motion.handle.coordinate] - self.target)
-
-        def look(pushing: Pushing) -> None:
-            motion.judge.update(session.world.state, session.commands, pushing=session.phase == "push")
 
         outcome = push(
             session,
@@ -129,7 +127,7 @@ class PushFallback:
             pushing=self.pushing,
             plan=False,
             retreat=True,
-            on_step=look,
+            judge=motion.judge,
         )
         left = abs(session.state[motion.handle.coordinate] - self.target)
         if not outcome and left > (1.0 - _LEAST_SHARE / 2) * before:

@@ -29,6 +29,7 @@ from kineverse.geometry import Rule, Scene
 from kineverse.geometry.objects import Exclusion
 from kineverse.lie import Array
 from kineverse.manipulation.collision_rules import find_overlapping_links, furniture_rules, match_bodies
+from kineverse.manipulation.swept_motion import Obstacle, find_obstacle
 from kineverse.model.frame import is_of_robot
 from kineverse.model.frame_dependence import FrameDependence
 from kineverse.model.model_view import ModelView
@@ -191,6 +192,7 @@ class Pushing:
         self._hand = self.scene.bodies.index(self._hand_body())
         self._rates = ContactRates(slots, self._program.columns, self._hand)
         self._all = self.scene.watch(f"{self.robot}/*", "*", radius=0.0, moving=self.speeds)
+        self._swept: tuple[tuple[float, ...], Obstacle | None] = (), None
         self.choice = ContactChoice(self.surface)
         self.press = PushPress(dt, self.surface.sign)
         self.reset()
@@ -227,6 +229,17 @@ class Pushing:
         found = self._all()
         deep = [pair for pair in found if pair.distance < -_DEEPEST]
         return f"contact of {deep[0].a} and {deep[0].b}" if deep else ""
+
+    def find_obstacle(self, state: State) -> Obstacle | None:
+        """Return the first thing in the way of the object to its target; None if the way is free."""
+        others = tuple(v for s, v in state.items() if not is_of_robot(s.path, self.robot))
+        if others != self._swept[0]:  # roll-outs begin where the object is, with the robot elsewhere
+            found = find_obstacle(
+                self.model, self.coordinate, state, self.target,
+                robot=self.robot, rules=self.rules, leave_out=self.leave_out,
+            )  # fmt: skip
+            self._swept = others, found
+        return self._swept[1]
 
     def find_deviation(self, state: State, deviation: Callable[[Symbol], float]) -> float:
         """Return the standard deviation of gaps [m] at a state whose coordinates have deviations.

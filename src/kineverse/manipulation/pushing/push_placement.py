@@ -44,6 +44,10 @@ _DRAWS = 40
 """Number of times that a place is drawn at which the base touches nothing."""
 _MOST_UNMOVED, _MOST_NO_FURTHER = 60, 120
 """Numbers of roll-outs without motion of the object, and without more of it, after which none is expected."""
+_NOWHERE = 200
+"""Number of samples after which the search ends if none could be rolled out."""
+_REPORTED = 20
+"""Number of samples from one text on the progress to the next."""
 _NO_ROOM, _UNREACHED, _LATE = "too little room", "out of reach", "out of time"
 _CLASSES = {_UNREACHED: "reach", _LATE: "time"}
 _MOVED = 0.01
@@ -105,6 +109,7 @@ def find_push_start(
     seed: int = 0,
     least: float = 1.0,
     accept: Callable[[State], str] | None = None,
+    report: Callable[[str], object] = lambda text: None,
 ) -> PushStart:
     """Return a start state of the robot from which a push goes through in a roll-out of its own prediction.
 
@@ -113,7 +118,8 @@ def find_push_start(
     with the base where it stands, which has to be free. If the base touches nothing then, the arm is led out
     of collisions, and the push is rolled out. The first one without lost contacts and penetration is taken.
     The search ends early after 60 roll-outs none of which moves the object, or 120 that move it no further
-    than the best one before. Robots without a mobile base are sampled over their arms alone, at those points
+    than the best one before, and after 200 samples without a roll-out. Nothing is sampled where something is
+    in the way of the object. Robots without a mobile base are sampled over their arms alone, at those points
     that are within reach.
 
     Parameters
@@ -132,6 +138,8 @@ def find_push_start(
         Share of the motion from which on a start counts whose push goes the farthest, if none goes through.
     accept
         Further test of a start, such as a trial in a world: returns the reason against it, or nothing.
+    report
+        Is called with a text on the progress now and then.
 
     Raises
     ------
@@ -140,22 +148,28 @@ def find_push_start(
     """
     begin, worked, reasons = perf_counter(), working_seconds(), Counter[str]()
     samples, seed = as_count("samples", samples, 1), as_count("seed", seed, 0)
+    obstacle = pushing.find_obstacle(state)
+    if obstacle is not None:  # wherever the robot stands
+        reasons[f"{obstacle.body} at {obstacle.other}"] = 1
+        return PushStart(None, 0, reasons, 0, perf_counter() - begin)
     sampler = _Sampler(pushing, state, np.random.default_rng(seed))
     if sampler.unreachable:
         reasons[_UNREACHED] = sampler.unreachable
         return PushStart(None, sampler.unreachable, reasons, 0, perf_counter() - begin)
     here, furthest, since = state[pushing.coordinate], 0.0, 0
     parts: list[tuple[float, int, State, int]] = []
-    count = 0
+    count = rolled = 0
     while count < samples and working_seconds() - worked <= seconds:
-        if since >= (_MOST_NO_FURTHER if furthest else _MOST_UNMOVED):
+        if since >= (_MOST_NO_FURTHER if furthest else _MOST_UNMOVED) or (not rolled and count >= _NOWHERE):
             break
+        if count and count % _REPORTED == 0:
+            report(PushStart(None, count, reasons, 0, 0.0).why)
         count += 1
         start = sampler.sample()
         if isinstance(start, str):
             reasons[start] += 1
             continue
-        end = roll_out(pushing, start, steps)
+        end, rolled = roll_out(pushing, start, steps), rolled + 1
         problem, way = end.problem, abs(end.value - here)
         # Pushes that go through and are not accepted tell nothing about those to come.
         since = 0 if not problem or way > furthest + _MOVED else since + 1
@@ -196,7 +210,7 @@ def roll_out(pushing: Pushing, start: State, steps: int, tolerance: float = 0.01
     state, taken = start, 0
     pushing.reset()
     try:
-        problem = pushing.first_contact(state)
+        problem = pushing.first_contact(state) or str(pushing.find_obstacle(state) or "")
         while not problem and not pushing.done(state, tolerance):
             command = pushing.step(state)
             if pushing.losses:

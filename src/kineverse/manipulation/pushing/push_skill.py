@@ -3,13 +3,13 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Mapping
 from typing import Any
 
 import numpy as np
 
 from kineverse.errors import KineverseError
-from kineverse.geometry import Rule
+from kineverse.geometry import Rule, Scene
 from kineverse.geometry.objects import Exclusion
 from kineverse.grasping import find_gripper
 from kineverse.lie import Array
@@ -19,13 +19,15 @@ from kineverse.manipulation.session import Session
 from kineverse.manipulation.skill_arguments import (
     check_positive,
     check_target,
+    choose_tolerance,
     explain_fixed,
     find_object_coordinate,
-    limit_tolerance,
 )
+from kineverse.manipulation.swept_motion import find_obstacle
 from kineverse.planning import Path
 from kineverse.state import State
 from kineverse.symbols import Symbol
+from kineverse.worlds import Judge
 
 from .approach import plan_push_approach
 from .press import STILL
@@ -58,7 +60,7 @@ def push(
     bodies: str | Iterable[str] | None = None,
     object_frames: str | Iterable[str] | None = None,
     seconds: float = 30.0,
-    tolerance: float = 0.02,
+    tolerance: float | None = None,
     still: Iterable[Symbol | str] = (),
     rules: Iterable[Rule] = (),
     leave_out: Iterable[Exclusion] = (),
@@ -66,14 +68,15 @@ def push(
     plan: bool = True,
     retreat: bool = False,
     pushing: Pushing | None = None,
+    judge: Judge | None = None,
     on_step: Callable[[Pushing], object] | None = None,
 ) -> Outcome:
     """Push an articulated object to a value of its coordinate.
 
     The controller finds contact points and changes them where it is blocked. After some of them a path is
     planned to another one. Where the session's belief is an estimate, the robot first looks until it knows
-    the coordinate, and then feels for the object. What its limits hold is not pushed. The result is judged by
-    the world's truth.
+    the coordinate, and then feels for the object. What its limits hold is not pushed, nor is anything with
+    something in its way, see :func:`.find_obstacle`. The result is judged by the world's truth.
 
     Parameters
     ----------
@@ -90,7 +93,8 @@ def push(
     seconds
         Largest time in the world [s].
     tolerance
-        Largest distance from the target [m], [rad].
+        Largest distance from the target [m], [rad]; by default 2 % of the way, and 20 mm at a limit, see
+        :func:`.choose_tolerance`.
     still, rules, leave_out, logic
         As for :class:`.Pushing`.
     plan
@@ -99,15 +103,19 @@ def push(
         Whether the pusher is taken away from the object at the end.
     pushing
         A controller that was built before, for the same arguments.
+    judge
+        Judge that measures all steps; by default one of this push alone. It may have begun before.
     on_step
         Is called with the controller after each step, for drawings and recordings of its ``view``.
 
     Returns
     -------
     Outcome
-        With ``measures``: ``losses``, ``blocked``, ``contacts``, ``jammed``, ``planned``, ``jitter`` (largest
-        mean change of a speed from step to step while touching, [m/s], [rad/s]), and ``failure``:
-        ``"collision"``, ``"time"`` or ``"other"``, if it was not done.
+        With ``measures``: those of :class:`.Judge`, ``losses``, ``blocked``, ``contacts``, ``jammed``,
+        ``planned``, ``jitter`` (largest mean change of a speed from step to step while touching, [m/s],
+        [rad/s]), ``tolerance``, ``peak_force`` [N] in a world with forces, and ``failure``: ``"collision"``,
+        ``"time"`` or ``"other"``, if it was not done; ``free``, the value up to which the way is free, if
+        something is in it.
 
     Raises
     ------
@@ -117,12 +125,16 @@ def push(
     model, world = session.world.model, session.world
     coordinate = find_object_coordinate(world, what)
     seconds, target = check_positive("seconds", seconds), check_target(target)
-    tolerance = limit_tolerance(model, coordinate, tolerance)
+    if pushing is not None:
+        target = pushing.target
+    elif target is None:
+        target = find_shut_value(model, coordinate)
+    tolerance = choose_tolerance(model, coordinate, session.state, target, tolerance)
     first, begin = session.steps, world.time
 
-    def skip(done: bool, reason: str) -> Outcome:
+    def skip(done: bool, reason: str, failure: str = "other", **measures: Any) -> Outcome:
         """Return the outcome of a push that was not begun."""
-        measures = {} if done else {"failure": "other"}
+        measures |= {} if done else {"failure": failure}
         steps, passed = session.steps - first, world.time - begin
         return Outcome(done, world.state[coordinate], reason, world.name, passed, steps, measures)
 
@@ -136,12 +148,18 @@ def push(
         session.phase = "look"
         session.stop()
     if pushing is None:
-        target = find_shut_value(model, coordinate) if target is None else target
         if abs(session.state[coordinate] - target) <= tolerance / 2:
             done = abs(world.state[coordinate] - target) <= tolerance
             return skip(done, f"'{coordinate}' is there from the start")
         if fixed := explain_fixed(model, coordinate, session.state):
             return skip(False, fixed)
+        own = tuple(rules), tuple(leave_out)
+        obstacle = find_obstacle(
+            model, coordinate, session.state, target,
+            robot=world.robot, rules=own[0], leave_out=own[1], start=session.start,
+        )  # fmt: skip
+        if obstacle is not None:
+            return skip(False, str(obstacle), **obstacle.measures)
         if bodies is None:
             bodies = find_gripper(model, world.robot).bodies
         pushing = Pushing(
@@ -154,12 +172,21 @@ def push(
             object_frames=object_frames,
             dt=session.dt,
             still=still,
-            rules=rules,
-            leave_out=leave_out,
+            rules=own[0],
+            leave_out=own[1],
             logic=logic,
         )
+    elif (obstacle := pushing.find_obstacle(session.state)) is not None:
+        return skip(False, str(obstacle), **obstacle.measures)
     pushing.reset()
-    run = _Run(session, pushing, seconds, tolerance, plan, on_step)
+    session.peak_force = math.nan
+    measured = judge is None
+    if judge is None:
+        scene = Scene(model, rules=pushing.rules, leave_out=pushing.leave_out)
+        judge = Judge(model, world.robot, coordinate=coordinate, start=session.start, scene=scene)
+        judge.update(world.state)
+    judge.allow(pushing.object_bodies, pushing.pusher)
+    run = _Run(session, pushing, judge, seconds, tolerance, plan, on_step)
     try:
         failure = run.push()
         if retreat:
@@ -168,13 +195,17 @@ def push(
         failure = error
     except KineverseError as error:
         failure = SkillError("other", f"{type(error).__name__}: {error}")
-    session.stop()
-    value, measures = world.state[coordinate], run.measures()
-    done = abs(value - pushing.target) < tolerance
+    run.act({})
+    value, overlap = world.state[coordinate], judge.overlap
+    there = abs(value - target) < tolerance and not session.untrusted
+    done = there and overlap is None
+    measures = {**(judge.measures if measured else {}), **run.measures(), "tolerance": tolerance}
     if not done:
-        measures["failure"] = failure.kind
-    reason = f"'{coordinate}' is at {value:.3g}" if done else str(failure)
-    return Outcome(done, value, reason, world.name, run.time, run.steps, measures)
+        measures["failure"] = "collision" if there else failure.kind
+    reason = f"'{coordinate}' is at {value:.3g}" if there else str(failure)
+    if overlap is not None:
+        reason = f"{reason.removesuffix('.')}. {overlap}"
+    return Outcome(done, value, reason, world.name, run.time, run.steps, measures, done or run.claimed)
 
 
 class _End:
@@ -217,12 +248,14 @@ class _Run:
         self,
         session: Session,
         pushing: Pushing,
+        judge: Judge,
         seconds: float,
         tolerance: float,
         plan: bool,
         on_step: Callable[[Pushing], object] | None,
     ) -> None:
-        self._session, self._pushing, self._on_step = session, pushing, on_step
+        self._session, self._pushing, self._judge, self._on_step = session, pushing, judge, on_step
+        self.claimed = False
         self._seconds, self._tolerance, self._plan = seconds, tolerance, plan
         self._first, self._begin = session.steps, session.world.time
         self._approaches = 0
@@ -247,6 +280,7 @@ class _Run:
         end = _End(pushing, self._tolerance)
         while self.time < self._seconds:
             if end.reached(session.state):
+                self.claimed = True
                 return SkillError("other", "The estimate is at the target, and the world is not.")
             if pushing.choice.jammed >= _MOST_JAMMED:
                 return SkillError(
@@ -260,7 +294,7 @@ class _Run:
                 if problem:
                     return SkillError("collision", problem)
             if end.near:
-                session.stop()  # an object that has run on by itself is not followed
+                self.act({})  # an object that has run on by itself is not followed
                 continue
             self._step("push")
         where = "touching" if pushing.touching else "on the way to a contact"
@@ -279,10 +313,20 @@ class _Run:
             self._changes.append(np.abs(speeds - self._last))
         self._last = speeds if pushing.touching else None
         session.vectors = {} if pushing.view is None else pushing.view.vectors
-        session.act(command.speeds)
+        self.act(command.speeds)
         session.vectors = {}
         if self._on_step is not None:
             self._on_step(pushing)
+
+    def act(self, speeds: Mapping[Symbol, float]) -> None:
+        """Command speeds for one step, and judge it; none stop the robot, also where the world fails."""
+        session, before = self._session, self._session.world.time
+        if speeds:
+            session.act(speeds)
+        else:
+            session.stop()
+        if session.world.time > before:
+            self._judge.update(session.world.state, session.commands, pushing=self._pushing.touching)
 
     def _approach(self) -> str:
         """Plan a way to another contact point and follow it; return what prevents it."""
@@ -292,7 +336,7 @@ class _Run:
         self._approaches += 1
         session, pushing = self._session, self._pushing
         self.retreat()  # a way that begins with a contact cannot be planned
-        session.stop()
+        self.act({})
         path, point = plan_push_approach(pushing, session.state)
         if not path.found:
             return f"Blocked, and no path leads to a contact point. {path.why}"
@@ -310,7 +354,7 @@ class _Run:
         for wanted in trajectory.positions_at(times):
             here = session.state.vector(trajectory.symbols)
             rates = (wanted - here) * (1 / dt)
-            session.act({s.derivative(): float(v) for s, v in zip(trajectory.symbols, rates, strict=True)})
+            self.act({s.derivative(): float(v) for s, v in zip(trajectory.symbols, rates, strict=True)})
 
     def retreat(self) -> None:
         """Take the pusher away from the object."""
@@ -324,8 +368,9 @@ class _Run:
 
     def measures(self) -> dict[str, Any]:
         """Return figures of the push."""
-        pushing = self._pushing
+        pushing, force = self._pushing, self._session.peak_force
         return {
+            **({} if math.isnan(force) else {"peak_force": force}),
             "losses": pushing.losses,
             "blocked": pushing.choice.blocked,
             "contacts": pushing.choice.contacts,

@@ -88,7 +88,7 @@ def try_push(
     target: float = 0.0,
     steps: int = 1200,
     dt: float = 0.02,
-    tolerance: float = 0.02,
+    tolerance: float | None = None,
     place: bool = True,
     samples: int = 200,
     seed: int = 0,

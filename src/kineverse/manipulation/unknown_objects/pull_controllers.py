@@ -14,6 +14,7 @@ from kineverse.geometry import Scene
 from kineverse.lie import Array, adjoint, exp_se3, inverse
 from kineverse.manipulation.opening.hand_motion import HandMotion
 from kineverse.manipulation.opening.hand_paths import row_at
+from kineverse.manipulation.swept_motion import find_obstacle
 from kineverse.model.frame import WORLD
 from kineverse.model.model import Model
 from kineverse.model.model_view import ModelView
@@ -32,23 +33,25 @@ _BEYOND = 1.2
 _GAIN = 5.0
 """Rate at which errors of the hand's place on the part decay [1/s]."""
 _STRAIGHT = 0.035
-"""Way of the handle after which the likeliest joint counts as much as its normal for the direction [m]."""
+"""Way of the handle after which the likeliest joint counts as much as the first direction [m]."""
 _RAMP = 0.5
 """Time in which the pull begins [s]."""
 _STEP = 0.03
 """Way of the handle between two arms that are found for a learned joint [m]."""
 _QUICK = 0.5
 """Speed from which on joints take their whole part [m/s], [rad/s]."""
+_UNSURE = 0.01
+"""Depth from which on something is in the way along a learned joint, which is off by millimetres [m]."""
 _MARGIN = 0.002
 """Least distance of bodies while the part moves [m]."""
 
 
 class StraightPull:
-    """Pull along the outward normal of a handle, while the hand follows the part as it is seen.
+    """Pull straight at a handle, while the hand follows the part as it is seen.
 
-    The hand holds its place on the part, shifted ahead by speed / gain along the normal. So a part that does
-    not follow stops the hand after 4 mm, and the hand yields to any other motion of the part. The pull begins
-    slowly, as nothing is known of the direction.
+    The hand holds its place on the part, shifted ahead by speed / gain along the direction. So a part that
+    does not follow stops the hand after 4 mm, and the hand yields to any other motion of the part. The pull
+    begins slowly, as nothing is known of the direction.
 
     Parameters
     ----------
@@ -58,6 +61,8 @@ class StraightPull:
         Belief about the part.
     bar_T_hand
         Place (4, 4) of the hand on the handle.
+    direction
+        Direction (3,) of the pull in the axes of the handle; by default its outward normal x.
 
     Attributes
     ----------
@@ -65,8 +70,15 @@ class StraightPull:
         The likeliest joint, which leads the pull the more the further the part has moved.
     """
 
-    def __init__(self, motion: HandMotion, belief: PartBelief, bar_T_hand: Array) -> None:
+    def __init__(
+        self,
+        motion: HandMotion,
+        belief: PartBelief,
+        bar_T_hand: Array,
+        direction: tuple[float, float, float] = (1.0, 0.0, 0.0),
+    ) -> None:
         self.motion, self.belief, self.bar_T_hand = motion, belief, bar_T_hand
+        self._direction = motion.handle.pose[:3, :3] @ np.array(direction)
         model, unknown = motion.model, belief.unknown
         self._part_T_bar = np.asarray(model.fk(motion.handle.frame, unknown.frame)({}))
         hand, bar = model.fk(motion.gripper.hand), model.fk(motion.handle.frame)
@@ -84,7 +96,7 @@ class StraightPull:
         share = min(1.0, (session.world.time - self._begin) / _RAMP)
         speed = _FIRST_SPEED + min(1.0, way / _SPEED_UP) * (PULL_SPEED - _FIRST_SPEED)
         lead = share * speed / _GAIN
-        twist = np.concatenate([self.motion.handle.pose[:3, 0], np.zeros(3)])
+        twist = np.concatenate([self._direction, np.zeros(3)])
         if self.likely is not None:
             self.likely.project(self.belief.relative_pose)
             weight = way**2 / (way**2 + _STRAIGHT**2)
@@ -116,6 +128,8 @@ class LearnedPull:
     ----------
     coordinate, path
         Coordinate of the joint, and the part's path by it.
+    obstacle
+        What is in the way of the part along this joint; None if nothing is.
     """
 
     def __init__(
@@ -133,6 +147,11 @@ class LearnedPull:
         path.project(belief.relative_pose)
         belief.path = self.path = path
         end = path.start + path.direction * _BEYOND * opened
+        state = motion.session.state | State({self.coordinate: path.value})
+        self.obstacle = find_obstacle(
+            model, self.coordinate, state, path.start + path.direction * opened,
+            robot=motion.session.world.robot, least=_UNSURE,
+        )  # fmt: skip
         hand, bar = model.fk(motion.gripper.hand), model.fk(motion.handle.frame)
         hold = Hold(same_pose(bar @ bar_T_hand, hand), gain=_GAIN, name="grasp")
         twist = adjoint(inverse(model.fk(motion.handle.frame, unknown.frame)({}))) @ path.twist()
@@ -159,6 +178,12 @@ class LearnedPull:
         ways, reached = search.paths.follow(arm[None], base[None], np.array(hands)[None])
         self._arms = ways[0, : reached[0]] if reached[0] else arm[None]
         self._controller.set(self._speeds, np.zeros(len(arm)))
+
+    @property
+    def is_blocked(self) -> bool:
+        """Obstacle reached: True if the part is where its way ends before something."""
+        value = self.path.value
+        return self.obstacle is not None and self.path.direction * (value - self.obstacle.free) >= 0.0
 
     @property
     def ends(self) -> bool:

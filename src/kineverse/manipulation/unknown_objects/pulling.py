@@ -13,6 +13,7 @@ from kineverse.lie import Array, inverse
 from kineverse.manipulation.opening.hand_motion import HandMotion
 from kineverse.manipulation.outcome import SkillError
 from kineverse.manipulation.session import Session
+from kineverse.manipulation.swept_motion import BlockedError
 from kineverse.model.frame import is_of_robot
 from kineverse.model.model import Model
 
@@ -26,6 +27,11 @@ LEAST_OPENING = 0.08, math.radians(10.0)
 LOOKING, _HELD_LOOKING = 0.6, 1.0
 """Times of looks at a part that stands, and with the hand closed [s]."""
 _MOST_GRASPS = 3
+_DIRECTIONS = (
+    (1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, -1.0, 0.0), (0.0, 0.0, 1.0), (0.0, 0.0, -1.0),
+)  # fmt: skip
+"""Directions in which a part is pulled one after the other until it follows, in the axes of its handle: along
+its outward normal, to both sides across the bar, and to both ends along it."""
 _REFIT = 0.5
 """Time between two controllers for a learned joint [s]."""
 _FOLLOWS, _STALLED, _PATIENCE = 0.01, 0.004, 1.5
@@ -86,6 +92,7 @@ class PartPulling:
         self.start, self.begin = belief.relative_pose, self.session.world.time
         self._measures: dict[str, Any] = {"grasps": 0}
         self._reached = self.begin
+        self._direction, *self._others = _DIRECTIONS
         self.motion: HandMotion
 
     @property
@@ -139,8 +146,9 @@ class PartPulling:
         if opened < _FOLLOWS:
             raise SkillError(
                 "other",
-                f"'{self.part}' does not follow the hand: it moved by {1e3 * opened:.0f} mm. {why} It may "
-                "be fixed, locked, or need more force than the grip holds.",
+                f"'{self.part}' does not follow the hand, pulled outwards, to both sides, and to both ends "
+                f"of its handle: it moved by {1e3 * opened:.0f} mm. {why} It may be fixed, locked, or need "
+                "more force than the grip holds.",
             )
         words = f"{self._describe_opening('goes no further')} {why}"
         if opened >= LEAST_OPENING[0] or self.opening[1] >= LEAST_OPENING[1]:
@@ -173,7 +181,7 @@ class PartPulling:
         if not learning.poses:
             self.start = belief.relative_pose
         belief.begin_motion()
-        pull: StraightPull | LearnedPull = StraightPull(motion, belief, bar_T_hand)
+        pull: StraightPull | LearnedPull = StraightPull(motion, belief, bar_T_hand, self._direction)
         fitted, known = -math.inf, learning.learned is not None
         best, since = self.opening[0], self.session.world.time
         while True:
@@ -194,6 +202,9 @@ class PartPulling:
                     )  # fmt: skip
                 elif learning.likely is not None and isinstance(pull, StraightPull):
                     pull.likely = JointPath.of_fit(learning.likely, self.start)
+            if isinstance(pull, LearnedPull) and pull.obstacle is not None and pull.is_blocked:
+                self._let_go()
+                raise BlockedError(pull.obstacle)
             with session.timed("open"):
                 command = pull.step(way)
             motion.act(command.speeds)
@@ -210,6 +221,11 @@ class PartPulling:
                 best, since = way, now
                 self._reached = now
             elif now - since > (_ENDING if isinstance(pull, LearnedPull) and pull.ends else _PATIENCE):
+                if isinstance(pull, StraightPull) and way < _FOLLOWS and self._others:
+                    # It may slide to a side.
+                    self._direction, since = self._others.pop(0), now
+                    pull = StraightPull(motion, belief, bar_T_hand, self._direction)
+                    continue
                 return self._explain_stall(pull, command, part_T_hand)
 
     def _explain_stall(

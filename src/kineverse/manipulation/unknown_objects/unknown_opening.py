@@ -168,6 +168,8 @@ class _Run:
         self.measures: dict[str, Any] = {"grasps": 0}
         self.first_step, self.begin = session.steps, self.world.time
         names = [f for f in markers if f in self.world.model.frames]
+        joint = find_joint(self.world.model, self.part) if self.part in self.world.model.frames else None
+        self._moved = joint.coordinates[0] if joint is not None and joint.coordinates else None
         self._truth = compile(self.world.model.fk((names or [handle])[0]))
 
     def __call__(self) -> Outcome:
@@ -196,11 +198,14 @@ class _Run:
             reason += f" It is not open in truth: by {100 * way:.0f} cm and {math.degrees(turn):.0f}°."
         if learned is not None:
             reason = f"{reason} {self._report_joint(learned)}"
+        claimed = not kind
+        if (overlap := self.judge.overlap) is not None:
+            kind, reason = kind or "collision", f"{reason} {overlap}"
         if kind:
             self.measures["failure"] = kind
         return Outcome(
             not kind, turn if turns else way, reason, world.name, world.time - self.begin,
-            session.steps - self.first_step, {**self.judge.measures, **self.measures},
+            session.steps - self.first_step, {**self.judge.measures, **self.measures}, claimed,
         )  # fmt: skip
 
     def _true_pose(self) -> Array:
@@ -213,7 +218,9 @@ class _Run:
         """Open the part, and return how far, or raise SkillError."""
         session, unknown = self.session, self.unknown
         robot = self.world.robot
-        self.judge = Judge(self.world.model, robot, self.gripper, handle=unknown.handle.frame)
+        self.judge = Judge(
+            self.world.model, robot, self.gripper, unknown.handle.frame, coordinate=self._moved
+        )
         self.judge.update(self.world.state)
         self._prepare(unknown)
         self._look()
