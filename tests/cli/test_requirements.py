@@ -48,7 +48,6 @@ OPEN = ["kitchen", "--robot", "hsr", "--what", "kitchen/fridge_door"]
         (["open", *OPEN], "control,geometry"),
         (["push", *OPEN, "--world", "mujoco", "--record", "r.mcap"], "control,geometry,mjcf,recording"),
         (["close", *OPEN, "--view"], "control,geometry,view"),
-        (["open", "shelf.xml", *OPEN[1:]], "control,geometry,mjcf"),
         (["demo"], "control,geometry,view"),
         (["demo", "--headless"], "control,geometry"),
         (["demo", "--living"], "view"),
@@ -69,6 +68,15 @@ def test_commands_name_all_missing_extras_before_they_start(run, words: list[str
     assert (status, out) == (2, "")
     assert f"[{extras}]'" in err
     assert err.count("\n") == 1
+
+
+@pytest.mark.usefixtures("core_only")
+def test_a_file_of_mujoco_needs_its_extra_and_a_urdf_of_the_same_suffix_does_not(run, tmp_path: Path) -> None:
+    file = tmp_path / "shelf.xml"
+    for text, extras in (("<mujoco/>", "geometry,mjcf"), ('<robot name="r"/>', "geometry")):
+        file.write_text(text, "utf-8")
+        _, _, err = run("plan", file, "--to", "a=1")
+        assert f"[{extras}]'" in err
 
 
 @pytest.mark.usefixtures("no_compiler")

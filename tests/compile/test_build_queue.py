@@ -86,19 +86,13 @@ def test_an_interrupted_wait_leaves_the_job_to_others(monkeypatch: pytest.Monkey
     assert job.path
 
 
-@pytest.mark.parametrize(("work", "fails"), [("while :; do :; done", True), ("sleep 1.3; exit 3", False)])
-def test_the_time_of_the_processor_is_limited_and_not_that_of_waiting(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, work: str, fails: bool
-) -> None:
+def test_the_time_of_the_processor_is_limited(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     compiler = tmp_path / "cc"
-    compiler.write_text(f"#!/bin/sh\n{work}\n", "utf-8")
+    compiler.write_text("#!/bin/sh\nwhile :; do :; done\n", "utf-8")
     compiler.chmod(0o755)
     monkeypatch.setattr(build_queue, "TIME_LIMIT", 1)
     listener = Listener()
     job = request(tmp_path.name, Toolchain((str(compiler),), "none"), lambda: "", (), listener.note)
     assert job is not None
     assert job.wait(PATIENCE)
-    assert job.error is not None
-    assert job.error.startswith(
-        "the C compiler needed more than 1 s of processor time" if fails else "the C compiler failed (3)"
-    )
+    assert job.error == "the C compiler needed more than 1 s of processor time."

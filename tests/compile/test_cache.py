@@ -305,7 +305,7 @@ def test_without_any_folder_functions_are_interpreted(
     def no_folder() -> None:
         raise FileNotFoundError(errno.ENOENT, "No usable temporary directory found")
 
-    no_folder.cache_info = cache._private_folder.cache_info  # type: ignore[attr-defined]
+    no_folder.cache_info = lambda: SimpleNamespace(currsize=0)  # type: ignore[attr-defined]
     no_folder.cache_clear = cache._private_folder.cache_clear  # type: ignore[attr-defined]
     monkeypatch.setattr(cache, "_private_folder", no_folder)
     cache._open.cache_clear()

@@ -66,7 +66,8 @@ def test_the_figure_is_drawn(fig3, tmp_path, suffix):
 
 
 def test_without_matplotlib_the_extra_is_named(fig3, tmp_path, monkeypatch):
-    monkeypatch.setitem(sys.modules, "matplotlib.figure", None)
+    for module in ("matplotlib", "matplotlib.figure"):
+        monkeypatch.setitem(sys.modules, module, None)
     with pytest.raises(MissingDependencyError, match=r"pip install -e '.*\[figures\]'"):
         fig3.figure.save(tmp_path / "door.png")
 
@@ -160,7 +161,8 @@ def test_all_experiments_are_listed(capsys):
 
 @pytest.fixture
 def no_matplotlib(monkeypatch):
-    monkeypatch.setitem(sys.modules, "matplotlib.figure", None)
+    for module in ("matplotlib", "matplotlib.figure"):
+        monkeypatch.setitem(sys.modules, module, None)
 
 
 def test_reproduce_without_matplotlib_prints_tables_and_a_note(tmp_path, monkeypatch, capsys, no_matplotlib):
@@ -193,4 +195,4 @@ def test_an_unwritable_figure_is_reported_after_the_tables(tmp_path, monkeypatch
     assert main(["reproduce", "fig3"]) == 2
     out, err = capsys.readouterr()
     assert "no bound" in out
-    assert "cannot be written to 'fig3.png'" in err
+    assert "fig3.png cannot be written" in err

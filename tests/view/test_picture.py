@@ -1,7 +1,10 @@
 from __future__ import annotations
 
+import errno
+import os
 import struct
 import zlib
+from concurrent.futures import ThreadPoolExecutor
 
 import numpy as np
 import pytest
@@ -154,3 +157,28 @@ def test_picture_names_of_other_formats_are_refused(tmp_path):
     with pytest.raises(FormatError, match=r"written as \.png, not \.jpg"):
         write_png(tmp_path / "x.jpg", pixels)
     assert not (tmp_path / "x.jpg").exists()
+
+
+def test_a_picture_that_cannot_be_written_leaves_the_old_one(tmp_path, monkeypatch):
+    file = tmp_path / "picture.png"
+    write_png(file, np.zeros((2, 2, 3), np.uint8))
+    before = file.read_bytes()
+
+    def full(descriptor):
+        raise OSError(errno.ENOSPC, "No space left on device")
+
+    monkeypatch.setattr(os, "fsync", full)
+    with pytest.raises(FormatError, match=r"picture\.png cannot be written: No space left on device"):
+        write_png(file, np.ones((2, 2, 3), np.uint8))
+    assert file.read_bytes() == before
+    assert [path.name for path in tmp_path.iterdir()] == ["picture.png"]
+
+
+@pytest.mark.skipif(not hasattr(os, "mkfifo"), reason="there are no pipes with names")
+def test_a_picture_goes_through_a_pipe_that_stays_one(tmp_path):
+    os.mkfifo(tmp_path / "pipe.png")
+    with ThreadPoolExecutor(1) as pool:
+        read = pool.submit((tmp_path / "pipe.png").read_bytes)
+        write_png(tmp_path / "pipe.png", np.zeros((2, 2, 3), np.uint8))
+        assert read.result(60).startswith(b"\x89PNG")
+    assert (tmp_path / "pipe.png").is_fifo()

@@ -19,7 +19,7 @@ from kineverse.cli.arguments import (
     parse_length,
 )
 from kineverse.cli.output import colorize, format_cells, join_lines, show_activity, show_progress
-from kineverse.cli.requirements import is_mjcf, require
+from kineverse.cli.requirements import needs_mujoco, require
 from kineverse.errors import InvalidValueError, KineverseError, UnknownNameError, suggest
 from kineverse.expressions.printing import format_number
 from kineverse.model.body import Mesh
@@ -94,7 +94,7 @@ def run(arguments: argparse.Namespace) -> int:
         return _manage_cache(arguments)
     if not arguments.names:
         raise UnknownNameError("Name a model or a mesh file; see kineverse decompose --help.")
-    require("kineverse decompose", {"decomposition": True, "mjcf": any(map(is_mjcf, arguments.names))})
+    require("kineverse decompose", {"decomposition": True, "mjcf": any(map(needs_mujoco, arguments.names))})
     from kineverse.geometry.decomposition import decompose_all
 
     settings, limits, jobs = _settings(arguments)

@@ -17,7 +17,7 @@ from kineverse.cli.manipulate_output import PhaseLines, report_outcome
 from kineverse.cli.manipulate_setup import ManipulationScene, make_scene
 from kineverse.cli.manipulate_skills import grasp_object, open_as_unknown, push_object, skip_skill
 from kineverse.cli.output import show_activity
-from kineverse.cli.requirements import is_mjcf, require
+from kineverse.cli.requirements import needs_mujoco, require
 from kineverse.cli.view import (
     add_page_options,
     handle_interrupts,
@@ -217,7 +217,7 @@ def _check(arguments: argparse.Namespace, skill: str) -> None:
     extras = {
         "control": True,
         "geometry": True,
-        "mjcf": arguments.world == "mujoco" or any(map(is_mjcf, models)),
+        "mjcf": arguments.world == "mujoco" or any(map(needs_mujoco, models)),
         "recording": arguments.record is not None,
         "view": arguments.view,
     }

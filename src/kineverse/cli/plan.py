@@ -26,7 +26,7 @@ from kineverse.cli.plan_arguments import (
     parse_request,
 )
 from kineverse.cli.plan_output import path_to_json, print_path
-from kineverse.cli.requirements import is_mjcf, require
+from kineverse.cli.requirements import needs_mujoco, require
 from kineverse.cli.view import (
     add_page_options,
     handle_interrupts,
@@ -181,7 +181,7 @@ def run(arguments: argparse.Namespace) -> int:
     if arguments.model is None:
         raise InvalidValueError("MODEL comes first, before options that take several words, such as --to.")
     models = (arguments.model, arguments.robot or "")
-    extras = {"geometry": True, "mjcf": any(map(is_mjcf, models)), "view": arguments.view}
+    extras = {"geometry": True, "mjcf": any(map(needs_mujoco, models)), "view": arguments.view}
     require("kineverse plan", extras, compiler=True)
     start = parse_request(arguments.start, "--from", read_files=True)
     goal = parse_request(arguments.to, "--to")

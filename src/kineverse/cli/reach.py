@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any
 
 from kineverse.cli.arguments import add_model_options, load_model, parse_assignments, parse_value
 from kineverse.cli.plan_arguments import add_robot_option, include_robot
-from kineverse.cli.requirements import is_mjcf, require
+from kineverse.cli.requirements import needs_mujoco, require
 from kineverse.cli.view import list_mesh_problems, print_mesh_problems
 from kineverse.errors import InvalidValueError
 from kineverse.expressions.printing import format_number
@@ -78,7 +78,7 @@ def run(arguments: argparse.Namespace) -> int:
     # Parsed before the model is loaded, so that a typing error is reported at once.
     require(
         "kineverse reach",
-        {"control": True, "geometry": arguments.collisions, "mjcf": is_mjcf(arguments.model)},
+        {"control": True, "geometry": arguments.collisions, "mjcf": needs_mujoco(arguments.model)},
     )
     assigned = parse_assignments(arguments.assignments, "--from")
     numbers = parse_pose(arguments.pose)

@@ -22,6 +22,8 @@ MODULES: Mapping[str, str] = MappingProxyType(
 )
 """The module of each extra that is not in the core, and without which the extra is of no use."""
 
+_HEAD = 1 << 16  # of a file, in which its root element begins [byte]
+
 
 def require(what: str, extras: Mapping[str, bool], compiler: bool = False) -> None:
     """Raise if something is missing, and name all of it with how to install it.
@@ -57,9 +59,15 @@ def require(what: str, extras: Mapping[str, bool], compiler: bool = False) -> No
         raise (MissingDependencyError if missing else CompileError)(". ".join(sentences))
 
 
-def is_mjcf(model: str) -> bool:
-    """Return True for the name of a file that only MuJoCo reads."""
-    return model.lower().endswith((".xml", ".mjcf"))
+def needs_mujoco(model: str) -> bool:
+    """Return True for the path of a file that only MuJoCo reads."""
+    from kineverse.formats.file_formats import is_mjcf
+
+    try:
+        with open(model, "rb") as file:
+            return is_mjcf(model, file.read(_HEAD))
+    except (OSError, ValueError):
+        return False
 
 
 def _is_installed(extra: str) -> bool:

@@ -20,7 +20,7 @@ from kineverse.cli.arguments import (
     parse_length,
 )
 from kineverse.cli.output import colorize, format_cells, join_lines, show_activity, show_progress
-from kineverse.cli.requirements import is_mjcf, require
+from kineverse.cli.requirements import needs_mujoco, require
 from kineverse.cli.view import add_page_options, handle_interrupts, page_options, print_address
 from kineverse.errors import InvalidValueError, KineverseError, UnknownNameError, suggest
 from kineverse.expressions.printing import format_number
@@ -97,7 +97,7 @@ def run(arguments: argparse.Namespace) -> int:
         return _manage_cache(arguments)
     if arguments.model is None:
         raise UnknownNameError("Name a model, before --links; see kineverse spheres --help.")
-    require("kineverse spheres", {"geometry": True, "mjcf": is_mjcf(arguments.model)})
+    require("kineverse spheres", {"geometry": True, "mjcf": needs_mujoco(arguments.model)})
     from kineverse.planning.spheres.sphere_cover import MOST, check_cover_settings
 
     protrusion = None if arguments.protrusion is None else parse_length(arguments.protrusion)

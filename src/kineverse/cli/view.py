@@ -23,7 +23,7 @@ from kineverse.cli.arguments import (
 from kineverse.cli.info import is_gallery_list, print_articulations, print_models
 from kineverse.cli.output import show_progress
 from kineverse.cli.plan_arguments import add_robot_option, include_robot
-from kineverse.cli.requirements import is_mjcf, require
+from kineverse.cli.requirements import needs_mujoco, require
 from kineverse.errors import InvalidValueError
 
 if TYPE_CHECKING:
@@ -119,7 +119,7 @@ def run(arguments: argparse.Namespace) -> int:
     extras = {
         "geometry": near is not None or arguments.decomposed,
         "figures": arguments.plot is not None,
-        "mjcf": is_mjcf(arguments.model),
+        "mjcf": needs_mujoco(arguments.model),
         "view": arguments.picture is None and arguments.plot is None,
     }
     require("kineverse view", extras)

@@ -11,7 +11,8 @@ from typing import Any, TypeAlias
 import numpy as np
 import numpy.typing as npt
 
-from kineverse.compile.c_library import NO_COMPILER, SourceLibrary
+from kineverse.compile.c_library import SourceLibrary
+from kineverse.compile.toolchain import NO_COMPILER
 from kineverse.errors import CompileError
 
 from . import broadphase
@@ -131,9 +132,8 @@ class ObjectPlacement:
 
     def __init__(self, table: ObjectTable) -> None:
         if not collision_library.prepare(wait=True):
-            raise CompileError(
-                f"Distances in other compiled code need compiled C, and {self.error or NO_COMPILER}."
-            )
+            reason = collision_library.error or NO_COMPILER
+            raise CompileError(f"Distances in other compiled code need compiled C, and {reason}.")
         self._table = table
         self._struct = _Struct.from_buffer_copy(_bind_table(table).struct)
         self.poses, self.positions = table.poses.copy(), table.position.copy()
