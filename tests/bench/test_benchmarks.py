@@ -39,13 +39,13 @@ PARTS = ("geometry", "inverse_kinematics", "examples", "document", "edit", "moti
 def rows_of_markdown(text):
     """Return the first cells of a table, without numbers and the names of files."""
     (table,) = find_tables(text)
-    return {re.sub(r"[\w.]+\.(urdf|kv\.json)|\d+(\s\d+)*", "#", row[0]) for row in table.rows}
+    return {re.sub(r"[\w.]+\.(urdf|kv\.json)|\d[\d,]*(\s\d+)*", "#", row[0]) for row in table.rows}
 
 
 def documented_rows(name):
-    """Return the rows of a benchmark in docs/benchmarks.md."""
+    """Return the rows of a benchmark in docs/benchmarks.md; none of 'examples', which needs other people's robots."""
     blocks = {block.name: block.text for block in find_blocks(DOCS / "benchmarks.md")}
-    return rows_of_markdown(blocks[f"bench-{name}"])
+    return rows_of_markdown(blocks[f"bench-{name}"]) if name != "examples" else set()
 
 
 @pytest.fixture
@@ -86,7 +86,7 @@ def test_a_benchmark_measures_all_installed_peers_and_its_rows_are_documented(na
         assert len(measurement.samples) in (1, tiny.rounds, tiny.processes)
     assert result.comparisons
     measured, documented = rows_of_markdown(benchmark_to_markdown(result)), documented_rows(name)
-    assert measured <= documented
+    assert name == "examples" or measured <= documented
     if HAS_PEERS:
         assert name in PARTS or measured == documented
         # Pinocchio has no closed loops, no search for what is near, and no filters.

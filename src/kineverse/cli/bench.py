@@ -74,6 +74,7 @@ def run(arguments: argparse.Namespace) -> int:
     if arguments.markdown:
         for result in bench.run_benchmarks(names, settings):
             print(f"## {result.name}: {result.work}\n\n{benchmark_to_markdown(result)}\n", flush=True)
+            print("".join(f"- not measured: {line}\n" for line in result.missing), end="")
         return 0
     print(_format_machine(here), flush=True)
     print(f"\n{RATIO_NOTE}")
