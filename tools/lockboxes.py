@@ -13,6 +13,7 @@ library's own check or the simulation refuses. The exit status is 1 if anything 
 from __future__ import annotations
 
 import argparse
+import math
 import sys
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, replace
@@ -91,11 +92,12 @@ class Slider:
 
 @dataclass(frozen=True)
 class Box:
-    """Sliders by name, where they are, and where some of them are to be."""
+    """Sliders by name, where they are, where some of them are to be, and how the model states the locks."""
 
     sliders: Mapping[str, Slider]
     start: State
     goal: State
+    form: str = "one"
 
     def thresholds(self, name: str) -> list[float]:
         """Return the thresholds of a slider, sorted."""
@@ -176,19 +178,33 @@ def draw_box(seed: int) -> Box:
     while box.is_stopped(start):
         start = {name: place(name) for name in names}
     wanted = rng.choice(names, 1 + int(rng.random() < 0.3), replace=False).tolist()
-    return Box(sliders, start, {name: place(name) for name in wanted})
+    goal = {name: place(name) for name in wanted}
+    return Box(sliders, start, goal, str(rng.choice(["one", "two", "where", "product"])))
 
 
 def make_model(box: Box) -> kv.Model:
     """Return the model of a box."""
     q = {name: kv.position(name) for name in box.sliders}
+
+    def speed_limit(condition: Beyond | Joined | None) -> kv.Expression | float:
+        if condition is None:
+            return 1.0
+        if box.form == "product" and isinstance(condition, Joined) and condition.every:
+            product = math.prod(c.expression(q) for c in condition.conditions)
+            return 0.7 * (1 - product if condition.negated else product)
+        open_ = condition.expression(q)
+        return kv.where(open_, 1.0, 0.0) if box.form == "where" else open_
+
     model = kv.Model()
     with model.edit() as edit:
         for name, slider in box.sliders.items():
             edit.constrain(f"{name} range", slider.lower, q[name], slider.upper)
-            lower = -1.0 if slider.falls is None else -slider.falls.expression(q)
-            upper = 1.0 if slider.rises is None else slider.rises.expression(q)
-            edit.constrain(f"{name} lock", lower, q[name].derivative(), upper)
+            speed, rises, falls = q[name].derivative(), speed_limit(slider.rises), speed_limit(slider.falls)
+            if box.form == "two":
+                edit.constrain(f"{name} rises", -2, speed, rises)
+                edit.constrain(f"{name} falls", -falls, speed, 2)
+            else:
+                edit.constrain(f"{name} lock", -falls, speed, rises)
             if slider.stop:
                 stop, condition = slider.stop
                 bound = kv.where(condition.expression(q), slider.upper + 1.0, stop)
