@@ -8,7 +8,7 @@ from functools import wraps
 from typing import Concatenate, ParamSpec, Protocol, TypeVar
 
 
-class CallLock(_thread.RLock):
+class CallLock(_thread.RLock):  # type: ignore[misc]  # final for type checkers only
     """Lock of an object's methods, which may call each other; its copies and pickles are other locks."""
 
     def __reduce__(self) -> tuple[type[CallLock], tuple[()]]:

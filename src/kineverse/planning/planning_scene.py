@@ -248,7 +248,8 @@ class PlanningScene:
                 return self.no_path(q, usable, begin)
             ways = self._ways(first.q, [goal.q for goal in usable], given, ends, around and roadmap is None)
             for k, (turn, variants) in enumerate(ways):
-                self.set_bounds(q, ends, still, turn=turn)
+                if len(ways) > 1:
+                    self.set_bounds(q, ends, still, turn=turn)
                 search = partial(
                     self._connect, first.q, variants, manifold, touching,
                     begin=begin, edges=edges, roadmap=roadmap, optimize=optimize, asked=seconds,

@@ -13,9 +13,7 @@ from .manifold import Manifold
 from .obstacles import Floats32
 
 RANGE = 1.0
-"""Largest length of an edge of a tree [rad], [m]."""
-_FEWEST_EDGES = 2000
-"""Edges of a straight way to a goal that is so far away that edges are longer."""
+"""Largest length of an edge of a tree [rad], [m]; longer where a goal is thousands of them away."""
 _MOST_NODES = 200_000
 MOST_EDGES = 1 << 40
 """Number of edges of a search that only its time ends."""
@@ -79,9 +77,6 @@ class RrtConnect:
             Largest number of edges that are tried.
         """
         s = self._setup(seconds, seed, resolution)
-        if self._manifold is None and len(goals):
-            nearest = float(np.linalg.norm(goals.astype(float) - starts[0], axis=1).min())
-            s.range = max(RANGE, nearest / _FEWEST_EDGES)
         s.nodes, s.most_edges = _MOST_NODES, edges
         count = self._code.kineverse_rrt_connect(
             ctypes.addressof(s), starts.ctypes.data, len(starts), goals.ctypes.data, len(goals),

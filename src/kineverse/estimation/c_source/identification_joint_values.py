@@ -185,7 +185,7 @@ static void slide(const Problem *p, Answer *a, double *memory) {
   Motion *m = &a->head->motion;
   double most = slides ? INFINITY : 0.0, *turned = memory;
   memory = turned + 9 * p->count;
-  for (int64_t turn = 0; turn < p->sliding_turns && most > p->slid; turn++) {
+  for (int64_t turn = 0; turn < p->sliding_turns && most > p->slid && !look_at_clock(&watch); turn++) {
     double normal[81] = {0}, change[9] = {0};
     Apart apart;
     take_apart(p, a, &apart, memory);

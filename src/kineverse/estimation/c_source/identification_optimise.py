@@ -262,7 +262,7 @@ static void believe_as(Problem *p, const Head *head) {
 static int64_t settle(const Problem *p, Motion *now, Observation **here, Observation **there, int64_t steps,
                       double *best) {
   double damping = 0.0, before = 0.0;
-  for (int64_t i = 0; i < steps; i++) {
+  for (int64_t i = 0; i < steps && !look_at_clock(&watch); i++) {
     double gain = 0.0, trial = NAN;
     Motion next;
     if (move(p, now, *here, damping, &next, *there, &gain)) trial = look_at_all(p, &next, *there);

@@ -1,5 +1,7 @@
 """C text of evidence and of the stages of identification, and the complete source."""
 
+from kineverse.compile.interruption import WATCH
+
 from .identification_algebra import ALGEBRA
 from .identification_joint_values import JOINT_RANGES, MIRRORED_VALUES, SLIDING_POINT
 from .identification_linearise import LINEARISE, LOG_DETERMINANT_GRADIENT
@@ -156,6 +158,7 @@ EXPORT int64_t memory_of(const Problem *p) {
 
 /* Every stage begins with the errors as they are, and with what is in its answer; returns free memory. */
 static double *begin_stage(Problem *p, double *memory, double *answer, Answer *a) {
+  watch_begin(&watch, INFINITY);
   lay(p, answer, a);
   believe_as(p, a->head);
   soften(p, p->softer, memory);
@@ -173,7 +176,7 @@ static double *widen_until_settled(Problem *p, Answer *a, Apart *apart, double *
     if (turn < p->turns) slide(p, a, memory);
     rest = take_apart(p, a, apart, memory);
     for (int i = 0; i < n; i++) most = fmax(most, fabs(log(fmax(wide[i], p->narrowest) / before[i])));
-    if (turn == p->turns || (believed && most < p->settled)) return rest;
+    if (turn == p->turns || (believed && most < p->settled) || look_at_clock(&watch)) return rest;
     believed = 1;
     a->head->marginal = 1.0;
     for (int i = 0; i < n; i++) {
@@ -272,8 +275,9 @@ EXPORT void rate(const Problem *problem, int64_t sizes, const double *factors, c
   Answer a;
   Apart apart;
   int64_t numbers = problem->count * problem->rows * problem->rows;
+  watch_begin(&watch, INFINITY);
   lay(problem, answer, &a);
-  for (int64_t i = 0; i < sizes; i++) {
+  for (int64_t i = 0; i < sizes && !look_at_clock(&watch); i++) {
     double place = factors[2 * i] * factors[2 * i], turn = factors[2 * i + 1] * factors[2 * i + 1];
     for (int64_t k = 0; parts && k < numbers; k++)
       a.covariances[k] = place * parts[k] + turn * parts[numbers + k];
@@ -284,8 +288,12 @@ EXPORT void rate(const Problem *problem, int64_t sizes, const double *factors, c
 """
 
 
+# Stages end early if a handler of signals has raised an exception; then nobody looks at the answer.
+_WATCHED = WATCH + "static _Thread_local Watch watch;\n"
+
 IDENTIFICATION_SOURCE = (
-    ALGEBRA
+    _WATCHED
+    + ALGEBRA
     + LINEARISE
     + LOG_DETERMINANT_GRADIENT
     + NEWTON_STEP

@@ -13,6 +13,7 @@ from weakref import WeakKeyDictionary
 
 import numpy as np
 
+from kineverse.compile.interruption import raise_signal
 from kineverse.lie import Array
 
 from . import ambiguities, maximum_likelihood, optimise, range_prior
@@ -269,6 +270,7 @@ def _run(
     memory = _memory.reserve(library.code.memory_of(where))
     addresses = (array.ctypes.data for array in (memory, buffer.numbers, *results))
     stage(where, *given, *addresses)
+    raise_signal()
 
 
 def _evaluate_evidence(

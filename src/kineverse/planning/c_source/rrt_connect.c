@@ -222,6 +222,9 @@ static long long branch(Walk *k, const Tree *t, int j, int backwards, float *out
   return count;
 }
 
+/* Edges of the straight way to a goal that is so far away that edges are longer than usual. */
+#define FAR_EDGES 2000
+
 /* Search a path from any start to any goal; write its configurations (room, n) and return their number. Without a
    path those from a start to the node nearest to a goal are written, and the status says why. */
 EXPORTED long long kineverse_rrt_connect(Search *s, const float *starts, long long start_count, const float *goals,
@@ -233,7 +236,6 @@ EXPORTED long long kineverse_rrt_connect(Search *s, const float *starts, long lo
   Random random = (Random)s->seed * 0x2545f4914f6cdd1dULL + 0x9e3779b97f4a7c15ULL;
   Walk k;
   float sample[MOST_COORDINATES];
-  const float range = (float)s->range;
   long long count = -1, best = 0;
   float best_gap = INFINITY;
   s->iterations = s->edges = 0;
@@ -248,6 +250,8 @@ EXPORTED long long kineverse_rrt_connect(Search *s, const float *starts, long lo
     nearest(&trees[1], n, starts + i * n, &away);
     if (away < best_gap) best_gap = away, best = i;
   }
+  if (!s->projection) s->range = fmax(s->range, best_gap / FAR_EDGES);
+  const float range = (float)s->range;
   /* The straight way first. */
   int grown = 0;
   s->status = TIME_IS_UP;
