@@ -188,6 +188,23 @@ def test_landmarks_correct_the_drift_of_odometry(model):
     assert np.abs(doors).max() < 0.02
 
 
+def test_turns_of_base_and_turntable_are_counted():
+    """Both turn on, the base with an odometry that drifts; controllers and integrators count the turns."""
+    model, body, plate = kv.Model(), box(0.1, 0.1, 0.1), kv.position("plate")
+    with model.edit() as edit:
+        edit.apply(kv.articulations.OmniBase(name="rover/base", parent="world", child="rover/carrier"))
+        edit.add_frame("rover/camera", "rover/carrier", kv.translation(0, 0, 1), body=body)
+        edit.add_frame("post", "world", kv.translation(1.5, -1.5, 0.5), body=body)
+        edit.add_frame("turntable", "world", kv.translation(1, 1, 0.5) @ kv.rotation_z(plate), body=body)
+    world, belief = start(model, f"{NOISE},odometry=30mm/m,turn=3deg")
+    symbols = [model.symbol("rover/base/angle"), model.symbol("plate")]
+    turning = {"rover/base/angle:velocity": 4.0, "plate:velocity": -4.0}
+    for _ in range(5):
+        state = run(world, belief, 50, lambda _: turning)
+        np.testing.assert_allclose(state.vector(symbols), world.truth.vector(symbols), atol=0.3)
+    assert np.abs(state.vector(symbols)).min() > 6 * np.pi
+
+
 def test_drift_without_landmarks_is_said(model):
     sensors = Sensors(position=0.003, orientation=0.01, odometry=0.03, turn=0.05, marked=("door_leaf",))
     world, belief = start(model, sensors, door=0.7)
