@@ -72,6 +72,12 @@ def test_the_other_branch_is_the_mirror_image():
         np.testing.assert_allclose(there, mirrored, rtol=0, atol=1e-11)
 
 
+@pytest.mark.parametrize("rounding", [1e-13, -1e-13])
+def test_of_two_branches_that_are_equally_near_rounding_does_not_choose(rounding):
+    bars = four_bar(home={"coupler": rounding, "rocker": rounding})
+    assert bars.rates.carried(coupler)({"crank": 0.0}) > 0
+
+
 @pytest.mark.parametrize("side", [1, -1])
 def test_home_says_which(side):
     home = {"crank": 0.3, "coupler": 0.6 * side, "rocker": 1.4 * side}

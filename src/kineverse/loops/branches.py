@@ -26,6 +26,8 @@ def find_branches(
 ) -> tuple[list[Array], float]:
     """Search solutions from several starts; return them, the nearest first, and the smallest residual.
 
+    Of those that are equally near, the one with the largest first unknown that differs comes first.
+
     Parameters
     ----------
     equations
@@ -63,8 +65,20 @@ def find_branches(
         x = x - 2 * np.pi * turns
         if all(_distance(x, other, angles) > _SAME for other in found):
             found.append(x)
-    found.sort(key=lambda x: (float(np.linalg.norm(x - near)), x.tolist()))
+    if found:
+        # Mirror images are equally near, and rounding, which processors do differently, must not number them.
+        keys = [np.linalg.norm(np.array(found) - near, axis=1), *-np.array(found).T]
+        order = np.lexsort([_rank_distinct(key) for key in reversed(keys)])
+        found = [found[k] for k in order]
     return found, float(smallest)
+
+
+def _rank_distinct(values: Array) -> npt.NDArray[np.intp]:
+    """Return the ranks of values (n,), equal ones for those that differ by no more than rounding."""
+    order = np.argsort(values)
+    ranks = np.empty(len(values), dtype=np.intp)
+    ranks[order] = np.concatenate([[0], np.cumsum(np.diff(values[order]) > _SAME)])
+    return ranks
 
 
 def find_nearest_closed(equations: Equations, near: Array, u: Array) -> tuple[Array, float]:
