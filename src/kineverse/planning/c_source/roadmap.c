@@ -491,6 +491,7 @@ static long long search_roadmap(Query *s, float *path, long long room) {
     }
     s->reached[0] = s->reached[1] = 0;
   }
+  if (r->status != FOUND && s->w.watch.over == LATE) watch_begin(&s->w.watch, 0.1 * r->seconds);
   if (r->status != FOUND)
     do outcome = search_round(s, r->seconds, 1, &met);
     while (outcome > 0 && !path_is_certain(s, met) && !s->w.watch.over);
