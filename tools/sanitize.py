@@ -48,7 +48,7 @@ def find_libraries() -> list[str] | None:
     found = []
     for name in ("libasan.so", "libubsan.so"):
         path = subprocess.run(
-            ["gcc", f"-print-file-name={name}"], capture_output=True, text=True
+            ["gcc", f"-print-file-name={name}"], capture_output=True, text=True, encoding="utf-8"
         ).stdout.strip()
         if not os.path.isabs(path):
             return None
@@ -60,10 +60,10 @@ def environment(folder: Path, libraries: list[str]) -> dict[str, str]:
     """Return an environment in which all C is built with sanitizers, with files in a folder."""
     compiler, preloaded = folder / "sanitizing-gcc", folder / "preloaded.so"
     report = f"log_path={folder}/report"
-    compiler.write_text(COMPILER)
+    compiler.write_text(COMPILER, encoding="utf-8")
     compiler.chmod(compiler.stat().st_mode | stat.S_IXUSR)
     build = ["gcc", "-shared", "-fPIC", "-x", "c", "-", "-o", str(preloaded)]
-    subprocess.run(build, input=PRELOADED, text=True, check=True)
+    subprocess.run(build, input=PRELOADED, text=True, encoding="utf-8", check=True)
     source = os.pathsep.join(filter(None, (str(ROOT / "src"), os.environ.get("PYTHONPATH"))))
     return {
         **os.environ,
@@ -101,7 +101,9 @@ def find_warnings() -> list[str]:
     for name, library in libraries.values():
         flags = (*FLOATING_POINT_FLAGS, "-std=gnu11", "-O1", *WARNINGS)
         command = ["gcc", *flags, "-fsyntax-only", "-x", "c", "-"]
-        result = subprocess.run(command, input=library._source, text=True, capture_output=True)
+        result = subprocess.run(
+            command, input=library._source, text=True, encoding="utf-8", capture_output=True
+        )
         if result.returncode:
             reports.append(f"{name}:\n{result.stderr}")
     return reports
@@ -168,7 +170,9 @@ def main(arguments: list[str]) -> int:
         if short:
             command = [sys.executable, __file__, "--inside"]
         status = subprocess.run(command, env=environment(Path(name), libraries), cwd=ROOT).returncode
-        reports += [path.read_text(errors="replace") for path in sorted(Path(name).glob("report.*"))]
+        reports += [
+            path.read_text(encoding="utf-8", errors="replace") for path in sorted(Path(name).glob("report.*"))
+        ]
     print(*reports, sep="\n")
     print(f"{len(reports)} reports of compiler and sanitizers.")
     # 1: some tests have failed, by themselves.

@@ -32,7 +32,9 @@ def run_command(command: str, needs_data: bool) -> str:
     words = [sys.executable, "-m", *shlex.split(command), "--markdown"]
     with tempfile.TemporaryDirectory() as empty:
         folder = DATA if needs_data else empty
-        return subprocess.run(words, check=True, stdout=subprocess.PIPE, text=True, cwd=folder).stdout
+        return subprocess.run(
+            words, check=True, stdout=subprocess.PIPE, text=True, encoding="utf-8", cwd=folder
+        ).stdout
 
 
 def write_printed(printed: str, tables: Iterable[DocumentedTable]) -> None:
