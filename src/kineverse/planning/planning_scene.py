@@ -235,7 +235,7 @@ class PlanningScene:
         joints that turn fully also go the long way round.
         """
         begin, worked = perf_counter(), working_seconds()
-        given, ends = ends, np.array([self.space.equivalents(end, q, most=1)[0] for end in ends])
+        given, ends = ends, np.array([self.space.nearest_turn(end, q) for end in ends])
         self.set_bounds(q, ends, still)
         manifold = self.manifold(holds)
         with self.checker.excepting(touching):

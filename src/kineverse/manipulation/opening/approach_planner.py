@@ -110,8 +110,9 @@ class ApproachPlanner:
                 return Approach("no way for the base, with the arm as it is or compact")
             places, tuck, arms = found
         planner.place(state.updated(base))
+        here = arms.vector(planner.symbols)
         end = np.array([wanted[s] for s in planner.symbols])
-        path = planner.plan(arms.vector(planner.symbols), end, seconds=seconds, seed=seed)
+        path = planner.plan(here, planner.space.nearest_turn(end, here), seconds=seconds, seed=seed)
         if not path.found:
             return Approach(path.why)
         return Approach("", path.trajectory(), tuck, places, base)
@@ -163,7 +164,7 @@ class ApproachPlanner:
         planner.place(state)
         here = state.vector(planner.symbols)
         for row in self._find_compact(state)[:_MOST_TUCKED]:
-            path = planner.plan(here, row, seconds=_TUCKING)
+            path = planner.plan(here, planner.space.nearest_turn(row, here), seconds=_TUCKING)
             if path.found:
                 trajectory = path.trajectory()
                 # Joints that turn without end may arrive whole turns away from the wanted values.

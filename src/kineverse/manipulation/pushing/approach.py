@@ -57,7 +57,9 @@ def plan_push_approach(
         states = [state.updated(dict(zip(planner.symbols, q, strict=True))) for q in found.tolist()]
         facing = np.array([-normal @ axis(at_goal) for at_goal in states])
         good = found[facing > math.cos(_TILT)]
-        path = planner.plan(None, good if len(good) else found, seconds=seconds, seed=seed)
+        here = state.vector(planner.symbols)
+        ends = [planner.space.nearest_turn(q, here) for q in (good if len(good) else found)]
+        path = planner.plan(None, ends, seconds=seconds, seed=seed)
         if path.found:
             break
     if path is None:
