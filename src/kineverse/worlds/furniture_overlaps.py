@@ -25,7 +25,7 @@ import numpy.typing as npt
 
 from kineverse.errors import NoSolutionError
 from kineverse.geometry import Scene
-from kineverse.geometry.collision_filter import apply_rules
+from kineverse.geometry.collision_filter import adjacent_pairs, apply_rules
 from kineverse.geometry.prepared_query import (
     PairFlags,
     PreparedQuery,
@@ -78,7 +78,8 @@ class FurnitureOverlaps:
     strict
         Whether the default state excuses meshes alone. A primitive shape that is in the way there is in the
         way. A mesh is its hull, which fills a cupboard: where one overlaps something at the start or by
-        default, any depth is allowed.
+        default, any depth is allowed. So it is for bodies that overlap at the start and are joined by an
+        articulation with limits, such as a cross in its fork.
     """
 
     def __init__(self, scene: Scene, robot: str, *, strict: bool = False) -> None:
@@ -92,6 +93,9 @@ class FurnitureOverlaps:
         self._default, self._play = design
         if strict:
             self._default = {pair: d for pair, d in self._default.items() if self._has_mesh(pair)}
+        self._joined = adjacent_pairs(scene.model, scene.bodies)
+        self._made_so = np.zeros_like(self._joined, dtype=bool)
+        self._free = self._move_without_limits()
         self._allow(self._default)
         scene.update(scene.model.default_state())
 
@@ -151,7 +155,8 @@ class FurnitureOverlaps:
             return np.zeros(len(found))
         codes = self.encode(found)
         place = np.minimum(np.searchsorted(self._codes, codes), len(self._codes) - 1)
-        return np.where(self._codes[place] == codes, self._allowed[place], 0.0)
+        allowed = np.where(self._codes[place] == codes, self._allowed[place], 0.0)
+        return np.where(self._made_so[tuple(found.body_indices.T)], math.inf, allowed)
 
     def _allow(self, depths: dict[int, float]) -> None:
         """Set the allowances from the largest depths by default and at the start."""
@@ -160,6 +165,11 @@ class FurnitureOverlaps:
         self._allowed = np.array([depths[pair] + self._play.get(pair, 0.0) for pair in pairs])
         if self._strict:
             self._allowed[[self._has_mesh(pair) for pair in pairs]] = math.inf
+            self._made_so[:] = False
+            for one, other in self.excepted:
+                i, j = (self.scene.collision_world.body_index(b) for b in (one, other))
+                joined = self._joined[i, j] and not self._free.moves_between(one, other)
+                self._made_so[i, j] = self._made_so[j, i] = joined
 
     def _sample(self) -> tuple[dict[int, float], dict[int, float]]:
         """Return the depths by default, and the play of shapes that overlap everywhere, by pair of shapes."""
