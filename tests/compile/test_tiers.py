@@ -233,7 +233,7 @@ def test_functions_stay_interpreted_if_the_compiler_hangs(
     script = f"(echo $$ > {group}; while :; do sleep 0.1; done) & wait"
     monkeypatch.setenv("CC", broken_compiler(tmp_path, script))
     monkeypatch.setenv("KINEVERSE_CACHE_DIR", str(tmp_path / "libraries"))
-    monkeypatch.setattr(build_queue, "TIME_LIMIT", 0.3)
+    monkeypatch.setattr(build_queue, "_WALL_LIMIT", 0.3)
     with pytest.raises(kv.errors.CompileError, match="more than"):
         kv.compile(a * b * 8.5, tier="c", wait=True)
     if group.exists():
