@@ -118,7 +118,9 @@ def test_errors_of_a_template_name_file_line_and_element(write, line: str, messa
 @pytest.mark.usefixtures("needs_xacro")
 def test_arguments_that_a_template_does_not_have_are_refused(write, tmp_path: Path):
     with pytest.raises(FormatError, match=r'it has no argument "sied"\. Its arguments: side\.'):
-        kv.load(write(STRONG, SIDE, ONE_LEG), arguments={"sied": "left"})
+        kv.load(
+            write(STRONG, SIDE, ONE_LEG, '<link name="$(eval side + side)"/>'), arguments={"sied": "left"}
+        )
     (tmp_path / "r.urdf").write_text('<robot name="r"><link name="l"/></robot>')
     with pytest.raises(InvalidValueError, match="takes no arguments such as side"):
         kv.load(tmp_path / "r.urdf", arguments={"side": "left"})

@@ -148,9 +148,14 @@ class _Expansion:
         def evaluate_substitution(text: str, context: dict[str, Any]) -> str:
             check_expression(text, substitution_args.SubstitutionException)
             known = context.get("arg", {})
-            given = {name: substitution_args.convert_value(known[name], "auto") for name in known}
+
+            def argument(name: str) -> object:
+                return substitution_args.convert_value(known[name], "auto")
+
+            # Only those that it names, so that a misspelt argument of the user is still found.
+            given = {name: argument(name) for name in re.findall(r"\w+", text) if name in known}
             names = {k: v for k, v in substitution_args._eval_dict.items() if not k.startswith("_")}
-            own = {"arg": given.__getitem__, "dirname": lambda: os.path.dirname(xacro.filestack[-1])}
+            own = {"arg": argument, "dirname": lambda: os.path.dirname(xacro.filestack[-1])}
             basic = substitution_args._eval_dict["__builtins__"]
             return str(eval(text.strip(), {"__builtins__": basic}, given | names | own))
 
