@@ -34,7 +34,12 @@ _INNER_TYPES = (
 )
 # By name rather than by prefix, because data have keys such as f_max.
 _FORBIDDEN_ATTRIBUTES = frozenset(
-    ("format", "format_map", "mro", *(name for kind in _INNER_TYPES for name in dir(kind) if "_" in name))
+    (
+        "format",
+        "format_map",
+        "mro",
+        *(name for kind in _INNER_TYPES for name in dir(kind) if "_" in name and not name.startswith("_")),
+    )
 )
 _FORBIDDEN_FUNCTIONS = ("type", "vars")
 
