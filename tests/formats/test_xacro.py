@@ -102,7 +102,7 @@ def test_packages_are_found_as_those_of_meshes(write, tmp_path: Path, monkeypatc
         ("<link name=\"${load_yaml('/etc/hostname')}\"/>", "line 3, <link>: .*leads out of the root"),
         ('<link name="${[x.__class__ for x in [1]]}"/>', "line 3, <link>: the name '__class__' is not allowed"),
         ('<link name="$(eval open)"/>', "line 3, <link>: .*name 'open' is not defined"),
-        ('<xacro:include filename="r.urdf.xacro"/>', "lead back to themselves without end"),
+        ('<xacro:include filename="r.urdf.xacro"/>', "nest too deeply, or without end"),
         ("<link>", "r.urdf.xacro.*: mismatched tag"),
         ('<link name="$(arg hand)"/>', 'line 3, <link>: it needs the argument "hand", .*: hand:=VALUE'),
         ("<link name=\"${'a' * 10**11}\"/>", "line 3, <link>: it takes more than 4 GiB of memory"),
@@ -167,6 +167,13 @@ def test_what_is_taken_for_a_package_opens_no_further_files(write, tmp_path: Pat
     lines = [f'<xacro:include filename="$(find x)/{path}"/>' for path in ("urdf/leg.xacro", "secret.xacro")]
     with pytest.raises(FormatError, match=r"line 4, <xacro:include>: .*leads out of the root"):
         kv.load(write(*lines))
+
+
+@pytest.mark.usefixtures("needs_xacro")
+def test_a_template_has_the_encoding_that_it_declares(write):
+    path = write(SIDE, '<link name="tür"/>')
+    path.write_bytes(f'<?xml version="1.0" encoding="iso-8859-1"?>{path.read_text()}'.encode("iso-8859-1"))
+    assert list(kv.load(path).frames) == ["tür"]
 
 
 @pytest.mark.usefixtures("needs_xacro")

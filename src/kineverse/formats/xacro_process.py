@@ -9,15 +9,17 @@ or types, and no lambda. Files are opened below the root of the description and 
 from __future__ import annotations
 
 import ast
+import io
 import os
 import re
 import types
 from collections.abc import Callable, Mapping
+from pathlib import Path
 from typing import Any
 
 from kineverse.errors import FormatError, summarize_error
 
-from .files import MAX_BYTES
+from .files import MAX_BYTES, read_file
 from .isolation import MEMORY
 from .resource_paths import find_package, may_open, named_folders
 from .root_folder import is_below, outside_root_error
@@ -58,7 +60,7 @@ def expand(path: str, root: str, arguments: Mapping[str, str]) -> dict[str, Any]
         if len(text) > MAX_BYTES:
             raise FormatError(f"it expands to more than {MAX_BYTES} characters, the most that is read.")
     except RecursionError:
-        found["error"] = f"{expansion.where()}: macros or includes lead back to themselves without end."
+        found["error"] = f"{expansion.where()}: macros or includes nest too deeply, or without end."
     except Exception as error:  # xacro raises all kinds of exceptions
         found["error"] = f"{expansion.where()}: {_reason(error)}"
     return found
@@ -182,6 +184,8 @@ class _Expansion:
                 except xacro.XacroException:
                     xacro.filestack.pop()  # as xacro itself does, for optional files
                     raise
+                # As bytes, of which the XML says the encoding.
+                inp = io.BytesIO(read_file(Path(str(filename))))
             return parse(inp, filename)
 
         def checked_yaml(filename: str) -> Any:
