@@ -46,6 +46,11 @@ def test_python_m_kineverse_is_the_command():
             "kineverse info has no use for 'pr2'. 'kineverse info --help' says what it takes.",
         ),
         (
+            ("info", "r.urdf.xacro", "side:=left"),
+            "kineverse info takes the arguments of a template with its path, in quotes: "
+            "'robot.urdf.xacro side:=left'.",
+        ),
+        (
             ("fk", "kitchen", "fridge_door_handle"),
             "There is no frame 'fridge_door_handle'. Did you mean 'kitchen/fridge_door_handle' or "
             "'kitchen/oven_door_handle' or 'kitchen/fridge_lower_drawer_handle'?",

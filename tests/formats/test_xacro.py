@@ -102,10 +102,12 @@ def test_packages_are_found_as_those_of_meshes(write, tmp_path: Path, monkeypatc
         ("<link name=\"${load_yaml('/etc/hostname')}\"/>", "line 3, <link>: .*leads out of the root"),
         ('<link name="${[x.__class__ for x in [1]]}"/>', "line 3, <link>: the name '__class__' is not allowed"),
         ('<link name="$(eval open)"/>', "line 3, <link>: .*name 'open' is not defined"),
-        ('<xacro:include filename="r.urdf.xacro"/>', "lead back to themselves without end"),
+        ('<xacro:include filename="r.urdf.xacro"/>', "nest too deeply, or without end"),
         ("<link>", "r.urdf.xacro.*: mismatched tag"),
+        ('<link name="$(arg hand)"/>', 'line 3, <link>: it needs the argument "hand", .*: hand:=VALUE'),
+        ("<link name=\"${'a' * 10**11}\"/>", "line 3, <link>: it takes more than 4 GiB of memory"),
     ],
-    ids=["name", "parameters", "outside", "yaml", "class", "open", "circle", "XML"],
+    ids=["name", "parameters", "outside", "yaml", "class", "open", "circle", "XML", "argument", "memory"],
 )  # fmt: skip
 @pytest.mark.sampled(3)
 def test_errors_of_a_template_name_file_line_and_element(write, line: str, message: str):
@@ -116,10 +118,47 @@ def test_errors_of_a_template_name_file_line_and_element(write, line: str, messa
 @pytest.mark.usefixtures("needs_xacro")
 def test_arguments_that_a_template_does_not_have_are_refused(write, tmp_path: Path):
     with pytest.raises(FormatError, match=r'it has no argument "sied"\. Its arguments: side\.'):
-        kv.load(write(STRONG, SIDE, ONE_LEG), arguments={"sied": "left"})
+        kv.load(
+            write(STRONG, SIDE, ONE_LEG, '<link name="$(eval side + side)"/>'), arguments={"sied": "left"}
+        )
     (tmp_path / "r.urdf").write_text('<robot name="r"><link name="l"/></robot>')
     with pytest.raises(InvalidValueError, match="takes no arguments such as side"):
         kv.load(tmp_path / "r.urdf", arguments={"side": "left"})
+
+
+@pytest.mark.usefixtures("needs_xacro")
+def test_a_template_may_use_arguments_undeclared_and_include_what_is_not_there(write):
+    lines = [
+        '<xacro:include filename="other/none.xacro" optional="true"/>',
+        '<xacro:include filename="leg.xacro"/>',
+        '<link name="$(arg side)"/>',
+    ]
+    assert list(kv.load(write(*lines), arguments={"side": "left"}).frames) == ["left"]
+
+
+@pytest.mark.usefixtures("needs_xacro")
+def test_links_of_an_installed_workspace_lead_to_its_sources(
+    write, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+):
+    lines = [
+        '<xacro:include filename="$(find r_description)/urdf/leg.xacro"/>',
+        '<xacro:include filename="more.xacro"/>',
+    ]
+    source = write(*lines)
+    (source.parent / "more.xacro").write_text(f'<robot {XMLNS}><link name="more"/></robot>')
+    installed = tmp_path / "install" / "share" / "r_description"
+    (installed / "urdf").mkdir(parents=True)
+    (installed / "package.xml").write_text("<package><name>r_description</name></package>")
+    for file in source.parent.iterdir():
+        (installed / "urdf" / file.name).symlink_to(file)
+    monkeypatch.setenv("AMENT_PREFIX_PATH", str(tmp_path / "install"))
+    assert list(kv.load(installed / "urdf" / source.name).frames) == ["more"]
+    other = tmp_path / "mine" / "other.urdf.xacro"
+    other.parent.mkdir()
+    other.write_text(
+        f'<robot {XMLNS}><xacro:include filename="$(find r_description)/urdf/more.xacro"/></robot>'
+    )
+    assert list(kv.load(other).frames) == ["more"]
 
 
 @pytest.mark.usefixtures("needs_xacro")
@@ -128,6 +167,13 @@ def test_what_is_taken_for_a_package_opens_no_further_files(write, tmp_path: Pat
     lines = [f'<xacro:include filename="$(find x)/{path}"/>' for path in ("urdf/leg.xacro", "secret.xacro")]
     with pytest.raises(FormatError, match=r"line 4, <xacro:include>: .*leads out of the root"):
         kv.load(write(*lines))
+
+
+@pytest.mark.usefixtures("needs_xacro")
+def test_a_template_has_the_encoding_that_it_declares(write):
+    path = write(SIDE, '<link name="tür"/>')
+    path.write_bytes(f'<?xml version="1.0" encoding="iso-8859-1"?>{path.read_text()}'.encode("iso-8859-1"))
+    assert list(kv.load(path).frames) == ["tür"]
 
 
 @pytest.mark.usefixtures("needs_xacro")
@@ -162,7 +208,8 @@ def test_without_xacro_the_extra_is_named(write, monkeypatch: pytest.MonkeyPatch
 @pytest.mark.parametrize(
     "text",
     ["1 + 2 * x", "-x ** 2", "a if b else c", "x[0]['k']", "[i * 2 for i in range(3)]", "{'a': 1}", "f'{x}_link'",
-     "math.sin(pi / 2)", "', '.join(names)", "config.joints.first", "'%s' % x", "not a and b or c", " x ", "_x + 1"],
+     "math.sin(pi / 2)", "', '.join(names)", "config.joints.first", "'%s' % x", "not a and b or c", " x ", "_x + 1",
+     "joint.f_max + joint.co_axial"],
 )  # fmt: skip
 def test_expressions_of_arithmetic_texts_and_data_are_allowed(text: str):
     check_expression(text, ValueError)

@@ -218,6 +218,11 @@ def _parse_arguments(words: Sequence[str]) -> argparse.Namespace:
     if unknown:
         sub: argparse.ArgumentParser = arguments.command
         word = unknown[0].partition("=")[0]
+        if ":=" in unknown[0]:
+            raise UnknownNameError(
+                f"{sub.prog} takes the arguments of a template with its path, in quotes: "
+                f"'robot.urdf.xacro {unknown[0]}'."
+            )
         if not word.startswith("-"):
             raise UnknownNameError(
                 f"{sub.prog} has no use for {word!r}. '{sub.prog} --help' says what it takes."

@@ -276,12 +276,17 @@ def _outside_package(uri: str, folder: Folder, root: str) -> FormatError | None:
     return None if bound is not None else outside_root_error(uri, root)
 
 
-def declared_folders() -> Iterator[str]:
-    """Yield the real paths of the folders of packages and models in environment variables."""
+def named_folders() -> Iterator[str]:
+    """Yield the folders of packages and models in environment variables."""
     for variables, inside in ((_WORKSPACES, ""), (_PREFIXES, "share"), (_MODELS, "")):
         for variable in variables:
             for place in split_path_variable(variable):
-                yield os.path.realpath(os.path.join(place, inside))
+                yield os.path.abspath(os.path.join(place, inside))
+
+
+def declared_folders() -> Iterator[str]:
+    """Yield the real paths of the folders of packages and models in environment variables."""
+    return map(os.path.realpath, named_folders())
 
 
 def _inside(uri: str, text: str) -> list[str]:

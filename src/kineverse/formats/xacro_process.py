@@ -9,20 +9,40 @@ or types, and no lambda. Files are opened below the root of the description and 
 from __future__ import annotations
 
 import ast
+import io
 import os
 import re
+import types
 from collections.abc import Callable, Mapping
+from pathlib import Path
 from typing import Any
 
 from kineverse.errors import FormatError, summarize_error
 
-from .resource_paths import find_package, may_open
+from .files import MAX_BYTES, read_file
+from .isolation import MEMORY
+from .resource_paths import find_package, may_open, named_folders
 from .root_folder import is_below, outside_root_error
 from .xml_reader import abbreviate, quote
 
 _FORBIDDEN_NODES = (ast.Lambda, ast.NamedExpr, ast.Await, ast.Yield, ast.YieldFrom)
-_FORBIDDEN_ATTRIBUTES = frozenset(("format", "format_map", "mro"))
-_FORBIDDEN_PREFIXES = ("_", "gi_", "cr_", "ag_", "f_", "tb_", "co_")
+_INNER_TYPES = (
+    types.FrameType,
+    types.CodeType,
+    types.TracebackType,
+    types.GeneratorType,
+    types.CoroutineType,
+    types.AsyncGeneratorType,
+)
+# By name rather than by prefix, because data have keys such as f_max.
+_FORBIDDEN_ATTRIBUTES = frozenset(
+    (
+        "format",
+        "format_map",
+        "mro",
+        *(name for kind in _INNER_TYPES for name in dir(kind) if "_" in name and not name.startswith("_")),
+    )
+)
 _FORBIDDEN_FUNCTIONS = ("type", "vars")
 
 
@@ -33,11 +53,14 @@ def expand(path: str, root: str, arguments: Mapping[str, str]) -> dict[str, Any]
     expansion = _Expansion(xacro, path, root)
     found: dict[str, Any] = {"remarks": expansion.remarks}
     try:
-        document = xacro.process_file(path, mappings=dict(arguments))
-        expansion.check_arguments(arguments)
-        found["text"] = document.toxml()
+        given = _Arguments(arguments)
+        document = xacro.process_file(path, mappings=given)
+        expansion.check_arguments(arguments, given.used)
+        found["text"] = text = document.toxml()
+        if len(text) > MAX_BYTES:
+            raise FormatError(f"it expands to more than {MAX_BYTES} characters, the most that is read.")
     except RecursionError:
-        found["error"] = f"{expansion.where()}: macros or includes lead back to themselves without end."
+        found["error"] = f"{expansion.where()}: macros or includes nest too deeply, or without end."
     except Exception as error:  # xacro raises all kinds of exceptions
         found["error"] = f"{expansion.where()}: {_reason(error)}"
     return found
@@ -55,11 +78,27 @@ def check_expression(text: str, allowed: type[Exception]) -> None:
     """
     for node in ast.walk(ast.parse(text.strip(), mode="eval")):
         name = node.attr if isinstance(node, ast.Attribute) else node.id if isinstance(node, ast.Name) else ""
-        wrong = name.startswith(_FORBIDDEN_PREFIXES if isinstance(node, ast.Attribute) else "__")
-        if wrong or (isinstance(node, ast.Attribute) and name in _FORBIDDEN_ATTRIBUTES):
+        is_attribute = isinstance(node, ast.Attribute)
+        if is_attribute and name in _FORBIDDEN_ATTRIBUTES:
+            raise allowed(
+                f"the name {name!r} is not allowed in an expression after a dot; a key is ['{name}']"
+            )
+        if name.startswith("_" if is_attribute else "__"):
             raise allowed(f"the name {name!r} is not allowed in an expression")
         if isinstance(node, _FORBIDDEN_NODES):
             raise allowed(f"a {type(node).__name__.lower()} is not allowed in an expression")
+
+
+class _Arguments(dict[str, str]):
+    """Arguments of a template, with the names of those that it uses, which it need not declare."""
+
+    def __init__(self, given: Mapping[str, str]) -> None:
+        super().__init__(given)
+        self.used: set[str] = set()
+
+    def __getitem__(self, name: str) -> str:
+        self.used.add(name)
+        return super().__getitem__(name)
 
 
 class _Expansion:
@@ -90,10 +129,10 @@ class _Expansion:
         ]
         return ", ".join(part for part in parts if part)
 
-    def check_arguments(self, given: Mapping[str, str]) -> None:
-        """Raise an error for arguments that the template does not declare."""
+    def check_arguments(self, given: Mapping[str, str], used: set[str]) -> None:
+        """Raise an error for arguments that the template neither declares nor uses."""
         self._failed = None
-        unknown = [name for name in given if name not in self._declared]
+        unknown = [name for name in given if name not in self._declared | used]
         if unknown:
             known = ", ".join(sorted(self._declared)) or "none"
             raise FormatError(f"it has no argument {quote(unknown[0])}. Its arguments: {known}.")
@@ -115,9 +154,15 @@ class _Expansion:
 
         def evaluate_substitution(text: str, context: dict[str, Any]) -> str:
             check_expression(text, substitution_args.SubstitutionException)
-            given = {k: substitution_args.convert_value(v, "auto") for k, v in context.get("arg", {}).items()}
+            known = context.get("arg", {})
+
+            def argument(name: str) -> object:
+                return substitution_args.convert_value(known[name], "auto")
+
+            # Only those that it names, so that a misspelt argument of the user is still found.
+            given = {name: argument(name) for name in re.findall(r"\w+", text) if name in known}
             names = {k: v for k, v in substitution_args._eval_dict.items() if not k.startswith("_")}
-            own = {"arg": given.__getitem__, "dirname": lambda: os.path.dirname(xacro.filestack[-1])}
+            own = {"arg": argument, "dirname": lambda: os.path.dirname(xacro.filestack[-1])}
             basic = substitution_args._eval_dict["__builtins__"]
             return str(eval(text.strip(), {"__builtins__": basic}, given | names | own))
 
@@ -134,7 +179,13 @@ class _Expansion:
 
         def checked_parse(inp: Any, filename: str | None = None) -> Any:
             if inp is None:
-                self._check_file(str(filename))
+                try:
+                    self._check_file(str(filename))
+                except xacro.XacroException:
+                    xacro.filestack.pop()  # as xacro itself does, for optional files
+                    raise
+                # As bytes, of which the XML says the encoding.
+                inp = io.BytesIO(read_file(Path(str(filename))))
             return parse(inp, filename)
 
         def checked_yaml(filename: str) -> Any:
@@ -152,13 +203,17 @@ class _Expansion:
 
     def _check_file(self, path: str) -> None:
         """Check that a file may be opened."""
-        real = os.path.realpath(path)
+        plain, real = os.path.normpath(path), os.path.realpath(path)
         # What is taken for a package that is not there opens nothing.
         inside = any(is_below(real, package) for package in self._found)
+        # As for package://, links are followed in the folders that the user names: an installed workspace is
+        # full of links to its sources.
+        if not inside and os.path.realpath(plain) == real:
+            inside = any(is_below(plain, folder) for folder in named_folders())
         if not inside and not may_open(path, self._root, self._folder):
             raise outside_root_error(path, self._root)
         if not os.path.isfile(real):
-            raise FormatError(f"there is no file {quote(path)}.")
+            raise self._xacro.XacroException(f"there is no file {quote(path)}.", exc=FileNotFoundError())
 
     def _find_package(self, name: str) -> str:
         """Return the folder of a package, as ``package://`` finds it."""
@@ -169,7 +224,7 @@ class _Expansion:
                 self._remark(f"there is no package {quote(name)}; {folder} is taken for it.")
             else:
                 self._found.add(os.path.realpath(folder))
-            self._packages[name] = os.path.realpath(folder)
+            self._packages[name] = os.path.abspath(folder)
         return self._packages[name]
 
     def _keep_places(self) -> None:
@@ -223,6 +278,10 @@ def _reason(error: Exception) -> str:
     inner = getattr(error, "exc", None)
     if isinstance(inner, FormatError):
         return str(inner)
+    if isinstance(inner or error, MemoryError):
+        return f"it takes more than {MEMORY >> 30} GiB of memory."
+    if type(inner).__name__ == "ArgException":
+        return f"it needs the argument {quote(str(inner))}, which has no default here: {inner}:=VALUE."
     text = str(error)
     if isinstance(error, FormatError):
         return text

@@ -6,6 +6,8 @@ other twice, thirty deep, draws a billion parts, so the size is computed before 
 
 from __future__ import annotations
 
+import importlib
+import io
 import json
 import struct
 import zipfile
@@ -31,15 +33,13 @@ class _Part:
     is_written: bool = True
 
 
-def expanded_size(path: Path, enough: float) -> float:
+def expanded_size(path: Path) -> float:
     """Return by how much a mesh file would be larger with all that it draws written out [bytes].
 
     Parameters
     ----------
     path
         The file.
-    enough
-        Size that is of interest; for a file that can certainly not exceed it, it is not computed, and 0.
 
     Raises
     ------
@@ -48,15 +48,12 @@ def expanded_size(path: Path, enough: float) -> float:
     """
     kind = path.suffix.lower()
     if kind == ".dae":
-        content = path.read_bytes()
-        once = content.count(b"instance_geometry") + content.count(b"instance_controller")
-        if b"instance_node" not in content and once * (len(content) + _NODE_BYTES) <= enough:
-            return 0.0
-        return _total(dict(_collada_parts(ElementTree.fromstring(content))))
-    if kind == ".3mf" and zipfile.is_zipfile(path):
-        with zipfile.ZipFile(path) as packed:
-            models = [packed.read(name) for name in packed.namelist() if name.lower().endswith(".model")]
-        return _total({k: v for m in models for k, v in _threemf_parts(ElementTree.fromstring(m))})
+        return _collada_size(path.read_bytes())
+    if kind == ".zae":
+        return max(map(_collada_size, _packed(path, ".dae")), default=0.0)
+    if kind == ".3mf":
+        models = map(ElementTree.fromstring, _packed(path, ".model"))
+        return _total({key: part for model in models for key, part in _threemf_parts(model)})
     if kind in (".gltf", ".glb"):
         return _total(dict(_gltf_parts(_gltf_header(path))))
     return 0.0
@@ -86,14 +83,33 @@ def _total(parts: Mapping[object, _Part]) -> float:
     return sizes.get(None, 0.0) - sum(part.size for part in parts.values() if part.is_written)
 
 
+def _packed(path: Path, ending: str) -> list[bytes]:
+    """Return the contents of the files in an archive whose names have an ending."""
+    if not zipfile.is_zipfile(path):
+        return []
+    with zipfile.ZipFile(path) as packed:
+        return [packed.read(name) for name in packed.namelist() if name.lower().endswith(ending)]
+
+
 def _tag(element: ElementTree.Element) -> str:
-    return element.tag.rpartition("}")[2]
+    tag = element.tag
+    return tag.rpartition("}")[2] if isinstance(tag, str) else ""  # that of a comment is no text for lxml
+
+
+def _collada_size(content: bytes) -> float:
+    """Return :func:`expanded_size` of a COLLADA, parsed as pycollada does it, in any encoding."""
+    try:
+        parse = importlib.import_module("collada.xmlutil").createElementTree
+    except (ImportError, AttributeError):  # older versions use this one
+        parse = ElementTree.parse
+    return _total(dict(_collada_parts(parse(io.BytesIO(content)).getroot())))
 
 
 def _collada_parts(root: ElementTree.Element) -> Iterator[tuple[object, _Part]]:
     """Yield the nodes and geometries of a COLLADA, and as None all of its scenes."""
     whole = _Part(0.0)
-    for element in root.iter():
+    elements = list(root.iter())  # kept, since lxml makes each anew otherwise, with another id
+    for element in elements:
         tag = _tag(element)
         if tag in ("geometry", "controller"):
             text = float(sum(len(e.text or "") for e in element.iter()))

@@ -162,7 +162,7 @@ def _check_packing(file: MeshFile) -> None:
 def _check_expansion(file: MeshFile) -> None:
     """Raise OSError for meshes that draw so much, so often, that it would be larger than what is read."""
     try:
-        size = expanded_size(file.path, LARGEST_FILE)
+        size = expanded_size(file.path)
     except ValueError as error:
         raise OSError(f"{file.path} is not read: {error}") from None
     if size > LARGEST_FILE:
