@@ -86,6 +86,24 @@ def test_estimate_after_loss_has_the_turn_nearest_to_the_prediction():
     assert estimates[-1].state["q"] == pytest.approx(21.5, abs=0.2)
 
 
+@pytest.mark.parametrize(("ratio", "turns"), [(-1.5, 2), (1 / 3, 3)])
+def test_turns_that_no_gear_tells_are_those_nearest_to_the_prediction_after_loss(ratio, turns):
+    """A gear beside its driver stands as before after several turns."""
+    model = make_pinion()
+    with model.edit() as edit:
+        edit.add_frame("gear", "world", kv.translation(0, 0.3, 0) @ kv.rotation_z(ratio * kv.position("q")))
+    frames = ["pinion", "gear"]
+    tracker = Tracker(model, frames, process="static", outliers=True, lost_after=3)
+    assert tracker.periodic == {model.symbol("q")}
+    observer, far = NoisyObserver(model, frames), 3.0 * turns * np.pi
+    for k in range(30):
+        tracker.update(observer({"q": far * k / 29}), at=DT * k, commands={"q:velocity": far / 29 / DT})
+    estimates = [tracker.update(observer({"q": far + 0.8}), at=4.0 + DT * k) for k in range(6)]
+    assert any(estimate.lost for estimate in estimates)
+    assert estimates[-1].state["q"] == pytest.approx(far + 0.8, abs=0.2)
+    assert tracker.rebuild().estimate.state["q"] == pytest.approx(far + 0.8, abs=0.2)
+
+
 def test_late_measurements_and_copies_keep_the_turn():
     tracker = Tracker(MODEL, ["pinion"], lag=0.5, process="velocity")
     observer = NoisyObserver(MODEL, ["pinion"])

@@ -58,6 +58,21 @@ def test_equal_points_count_once_and_straight_ones_are_no_corners() -> None:
     assert len(round_corners([[1.0, 2.0]] * 3).points) == 1
 
 
+def test_points_that_count_once_or_lie_on_a_line_keep_their_deviation() -> None:
+    corner, same = [1, 0], [1 + 1e-13, 0]
+    for points, deviation in (
+        ([[0, 0], corner, same, [1, 1], [2, 1]], [0, 0.2, 0.0, 0.2, 0]),
+        ([[0, 0], [0.9, 0], corner, [1, 1], [2, 1]], [0, 0.0, 0.2, 0.2, 0]),
+    ):
+        path = round_corners(points, deviation)
+        away = np.linalg.norm(path.points - points[deviation.index(0.0, 1)], axis=1)
+        assert away.min() < 1e-9
+        assert path.reach[away.argmin() - 1] == 0
+    # A deviation beside the end is no reason to stop before it.
+    path = round_corners([[0, 0], corner, [1, 1], [1, 1 + 1e-13], [1, 1]], [0, 0.2, 0, 0, 0])
+    np.testing.assert_allclose(path.deviation, [0.2])
+
+
 def test_blends_are_halved_until_they_are_valid() -> None:
     points = np.array([[0.0, 0], [1, 0], [1, 1], [0, 1]])
     asked: list[int] = []

@@ -16,7 +16,7 @@ for a step ξ in the tangent space. Only the prediction needs the joint Gaussian
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence, Set
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -66,13 +66,13 @@ class ConstantVelocity:
 
     Attributes
     ----------
-    periodic
-        Periodic coordinates, whose values are wrapped.
+    periods
+        Periods of coordinates, whose changes are wrapped [rad].
     """
 
     def __init__(self, layout: Layout, process_model: ProcessModel) -> None:
         self._layout, self._process_model = layout, process_model
-        self.periodic: Set[Symbol] = frozenset()
+        self.periods: Mapping[Symbol, float] = {}
         by_size: dict[tuple[int, int], list[int]] = {}
         for number, group in enumerate(layout.groups):
             size = len(group.t), len(process_model.speeds_of(number))
@@ -194,8 +194,8 @@ class ConstantVelocity:
         """Return the tangent step between two states of a group, and its transport."""
         change = end - start
         for k, x in enumerate(self._layout.groups[number].coordinates):
-            if x in self.periodic:
-                change[k] = math.remainder(change[k], 2 * math.pi)
+            if x in self.periods:
+                change[k] = math.remainder(change[k], self.periods[x])
         if self._process_model.flow(number) is None:
             return change, None
         target = start + change

@@ -10,7 +10,7 @@ ridge also predict the same; the ridge covariance covers them, so they are merge
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -212,7 +212,7 @@ class MergeCriterion:
     def should_merge(
         self,
         inputs: Array,
-        periodic: frozenset[Symbol],
+        periods: Mapping[Symbol, float],
         group: CoordinateGroup,
         one: Candidate,
         other: Candidate,
@@ -223,8 +223,8 @@ class MergeCriterion:
         ----------
         inputs
             Values of the inputs.
-        periodic
-            Periodic coordinates.
+        periods
+            Periods of coordinates [rad].
         group
             The group.
         one, other
@@ -237,7 +237,7 @@ class MergeCriterion:
         if any(float(e @ e) >= _SAME_PREDICTION**2 for e, _ in errors.values()):
             return False
         number = self._layout.groups.index(group)
-        apart = self._difference(group, other.belief, one.belief, inputs, periodic)
+        apart = self._difference(group, other.belief, one.belief, inputs, periods)
         most = _NEAR**2 * len(apart)
         if float(apart @ other.belief.information[group.block] @ apart) < most:
             return True
@@ -258,12 +258,12 @@ class MergeCriterion:
         here: InformationState,
         there: InformationState,
         inputs: Array,
-        periodic: frozenset[Symbol],
+        periods: Mapping[Symbol, float],
     ) -> Array:
         """Return the tangent step between the states of two beliefs, to first order."""
         change = there.x[group.x] - here.x[group.x]
         for k, x in enumerate(group.coordinates):
-            if x in periodic:
-                change[k] = math.remainder(change[k], 2 * math.pi)
+            if x in periods:
+                change[k] = math.remainder(change[k], periods[x])
         basis = self._process_model.basis(self._layout.groups.index(group), here.x[group.x], inputs)
         return np.linalg.pinv(basis) @ change

@@ -186,7 +186,7 @@ def make_initial_belief(
     """
     tangent_space, limits = update_step.layout.tangent_space, update_step.limits
     x = initial_point(model, tangent_space, limits, values.coordinates)
-    update_step.periodic, update_step.counted = find_turning_coordinates(update_step, x, inputs)
+    update_step.periods, update_step.counted = find_turning_coordinates(update_step, x, inputs)
     usual = initial_deviations(tangent_space, limits, update_step.periodic)
     belief = InitialBelief(x, usual).with_values(update_step, values)
     update_step.unobservable.deviations = belief.deviations

@@ -25,34 +25,51 @@ _MOST_STARTS = 32
 # Initial points are at most this many deviations from the given one.
 _FARTHEST = 5.5
 _SAME = 1e-9
+# Turns after which gears may stand as before: a gear of ratio p/q does so after q turns.
+_MOST_TURNS = 12
 # Relative positions between limits at which predictions are sampled.
 _SAMPLES = (0.125, 0.375, 0.625, 0.875)
 
 
 def find_turning_coordinates(
     update_step: UpdateStep, x: Array, inputs: Array
-) -> tuple[frozenset[Symbol], frozenset[Symbol]]:
-    """Return the coordinates without limits whose full turn changes no predicted observation, or only some.
+) -> tuple[dict[Symbol, float], frozenset[Symbol]]:
+    """Return coordinates without limits of which full turns change no predicted observation, or only some.
 
-    The latter are angles whose turn is observed elsewhere, such as that of a pinion by the place of its rack.
+    The former have the angle after which nothing changes [rad]: several turns where gears are observed. The
+    latter are angles whose turn is observed elsewhere, such as that of a pinion by the place of its rack.
     """
     layout, limits = update_step.layout, update_step.limits
-    periodic, counted = [], []
+    periods: dict[Symbol, float] = {}
+    counted = []
     for i in np.flatnonzero(np.isinf(limits.lower) & np.isinf(limits.upper)).tolist():
-        there = x.copy()
-        there[i] += 2 * math.pi
-        try:
-            before, after = (update_step.residuals.evaluate(at, inputs) for at in (x, there))
-        except KineverseError:  # the loop does not close there
-            continue
-        with np.errstate(invalid="ignore"):  # where the model is not finite
-            is_same = np.abs(_difference(layout, before, after)) < _SAME * (1 + np.abs(x).max())
+
+        def turned(turns: int, i: int = i) -> Array:
+            there = x.copy()
+            there[i] += turns * math.tau
+            return update_step.residuals.evaluate(there, inputs)
+
+        def is_same_after(turns: int, before: Array) -> npt.NDArray[np.bool_]:
+            with np.errstate(invalid="ignore"):  # where the model is not finite
+                change = np.abs(_difference(layout, before, turned(turns)))
+            return np.asarray(change < _SAME * (1 + np.abs(x).max()))
+
         coordinate = layout.tangent_space.coordinates[i]
-        if is_same.all():
-            periodic.append(coordinate)
-        elif coordinate not in layout.tangent_space.by_speeds and _turns_some(layout, i, before, is_same):
-            counted.append(coordinate)
-    return frozenset(periodic), frozenset(counted)
+        try:
+            before = turned(0)
+            is_same = is_same_after(1, before)
+            if is_same.all():
+                periods[coordinate] = math.tau
+                continue
+            if coordinate not in layout.tangent_space.by_speeds and _turns_some(layout, i, before, is_same):
+                counted.append(coordinate)
+            # Most coordinates are no angles: one look is enough for all numbers of turns.
+            if is_same_after(math.lcm(*range(1, _MOST_TURNS + 1)), before).all():
+                turns = next(k for k in range(2, _MOST_TURNS + 1) if is_same_after(k, before).all())
+                periods[coordinate] = turns * math.tau
+        except (KineverseError, StopIteration):  # the loop does not close there, or it is no number of turns
+            continue
+    return periods, frozenset(counted)
 
 
 def _difference(layout: Layout, before: Array, after: Array) -> Array:
@@ -170,8 +187,9 @@ def _offsets(update_step: UpdateStep, first: InformationState, i: int, is_ambigu
     coordinate = update_step.layout.tangent_space.coordinates[i]
     if coordinate in update_step.layout.tangent_space.by_speeds:
         return [0.0]
-    if coordinate in update_step.periodic:
-        return [0.0, math.pi / 2, math.pi, -math.pi / 2]
+    if (period := update_step.periods.get(coordinate)) is not None:
+        count = min(round(period / _SPACING), _MOST_STARTS)
+        return [math.remainder(k / count, 1.0) * period for k in range(count)]
     low, high = update_step.limits.lower[i], update_step.limits.upper[i]
     if not math.isfinite(high - low):
         return [0.0]

@@ -72,8 +72,9 @@ class UpdateStep:
 
     Attributes
     ----------
-    periodic
-        Periodic coordinates: no observation tells their turn, so they keep the one nearest to the prediction.
+    periods
+        Angles of coordinates after which all observations are the same [rad]: none tells the turn, so that it
+        is the one nearest to the prediction.
     counted
         Coordinates whose turn is observed by some observations and not by others.
     velocity
@@ -109,7 +110,7 @@ class UpdateStep:
         self.inlier_solver = (
             NativeInlierSolver(layout, self.native, outliers) if self.native and outliers else None
         )
-        self.periodic: frozenset[Symbol] = frozenset()
+        self.periods: Mapping[Symbol, float] = {}
         self.counted: frozenset[Symbol] = frozenset()
         if self.native:
             native_library.prepare()
@@ -118,6 +119,11 @@ class UpdateStep:
     def is_native(self) -> bool:
         """True if unambiguous updates run in compiled C."""
         return self.native is not None and self.native.is_ready
+
+    @property
+    def periodic(self) -> frozenset[Symbol]:
+        """Coordinates of which a single turn changes no observation."""
+        return frozenset(x for x, period in self.periods.items() if period == math.tau)
 
     def update(self, mixture: GaussianSum, reading: Measurements, inputs: Array) -> StepResult:
         """Update all components with a reading; see :meth:`.map_update.MapSolver.update`."""
@@ -143,7 +149,7 @@ class UpdateStep:
             return StepResult(after, result.nis, result.dof, (), result.rounds)
         first = self._candidate(result.belief, None, result.nis, result.dof, unexplained, inputs)
         after, best = after.select(
-            [first, *candidates], partial(self.merge_criterion.should_merge, inputs, self.periodic)
+            [first, *candidates], partial(self.merge_criterion.should_merge, inputs, self.periods)
         )
         for number, candidate in enumerate(best):
             if candidate:
@@ -295,7 +301,7 @@ class UpdateStep:
         """
         if self.velocity is not None:
             result = self._inflated(belief, range(len(self.layout.groups))).copy()
-            self.velocity.periodic = self.periodic
+            self.velocity.periods = self.periods
             self.velocity.predict(result, inputs, dt, speeds, noise)
             moments = [m for one in result.speeds if one for m in (one.mean, one.gain, one.covariance)]
             _require_finite(result.numbers, *moments)
@@ -376,10 +382,10 @@ class UpdateStep:
 
         Integrators, controllers and gears count turns, though nothing that is observed tells them.
         """
-        for x in self.periodic:
+        for x, period in self.periods.items():
             i = self.layout.tangent_space.coordinates.index(x)
             for belief in mixture.beliefs:
-                belief.x[i] -= math.tau * round((belief.x[i] - predicted[i]) / math.tau)
+                belief.x[i] -= period * round((belief.x[i] - predicted[i]) / period)
 
     def _update_mixture(self, mixture: GaussianSum, reading: Measurements, inputs: Array) -> StepResult:
         """Update all components and keep the best candidates."""
@@ -401,7 +407,7 @@ class UpdateStep:
             candidates += new
             rounds = max(rounds, count)
         after, best = mixture.select(
-            candidates, partial(self.merge_criterion.should_merge, inputs, self.periodic)
+            candidates, partial(self.merge_criterion.should_merge, inputs, self.periods)
         )
         nis = np.array([c.nis[n] if c else 0.0 for n, c in enumerate(best)])
         dof = np.array([c.dof[n] if c else 0.0 for n, c in enumerate(best)])

@@ -183,7 +183,7 @@ class Tracker:
     @property
     def periodic(self) -> frozenset[Symbol]:
         """Coordinates whose turn no observation tells; it is the one nearest to the prediction."""
-        return self._update_step.periodic
+        return frozenset(self._update_step.periods)
 
     @property
     def constraints(self) -> tuple[str, ...]:
@@ -269,13 +269,13 @@ class Tracker:
 
     def _turns_from(self, other: Tracker) -> Array:
         """Return the whole turns of periodic coordinates to those of another tracker (n,) [rad]."""
-        theirs, mine = other.estimate.state, self._now.mixture.best.x
-        return np.array(
-            [
-                math.tau * round((theirs[x] - at) / math.tau) if x in self.periodic and x in theirs else 0.0
-                for x, at in zip(self.symbols, mine.tolist(), strict=True)
-            ]
-        )
+        theirs, mine = other.estimate.state, self._now.mixture.best.x.copy()
+        turns = np.zeros(len(mine))
+        for k, x in enumerate(self.symbols):
+            if x in self._update_step.periods and x in theirs:
+                period = self._update_step.periods[x]
+                turns[k] = period * round((theirs[x] - mine[k]) / period)
+        return turns
 
     @one_at_a_time
     def reset(

@@ -130,8 +130,13 @@ def round_corners(
     if not (allowed >= 0).all():
         raise InvalidValueError(f"deviation= is a distance from 0, not {allowed}.")
     keep = _find_distinct(polyline)
+    # Of points that count once, the strictest deviation counts; and the path ends at the last one.
+    allowed = np.minimum.reduceat(np.broadcast_to(allowed, polyline.shape[:1]), keep)
+    allowed[[0, -1]] = 0.0
+    keep[1:][-1:] = len(polyline) - 1
     if len(keep) > 2 and allowed.any():
-        keep = keep[_find_corners(polyline[keep])]
+        corners = _find_corners(polyline[keep], allowed)
+        keep, allowed = keep[corners], allowed[corners]
     kept = polyline[keep]
     directions, lengths = _segments(kept)
     if len(kept) == 1:
@@ -140,9 +145,8 @@ def round_corners(
     turns = _find_turns(kept, directions, lengths)
     room = lengths / 2
     room[[0, -1]] = lengths[[0, -1]]  # no blend takes the other half
-    inner = np.broadcast_to(allowed, polyline.shape[:1])[keep][1:-1]
     reach = np.minimum(room[:-1], room[1:])
-    reach = np.where(turns, np.minimum(reach, 4 * inner / np.where(turns, turn, 1.0)), 0.0)
+    reach = np.where(turns, np.minimum(reach, 4 * allowed[1:-1] / np.where(turns, turn, 1.0)), 0.0)
     path = _frozen(kept, directions, lengths, reach)
     return path if valid is None else _shrink(path, valid, resolution)
 
@@ -177,16 +181,15 @@ def _find_distinct(points: Array) -> npt.NDArray[np.intp]:
     for k in range(1, len(points)):
         if np.linalg.norm(points[k] - points[kept[-1]]) > apart:
             kept.append(k)
-    if len(kept) > 1:
-        kept[-1] = len(points) - 1 if np.linalg.norm(points[-1] - points[kept[-1]]) <= apart else kept[-1]
     return np.array(kept)
 
 
-def _find_corners(points: Array) -> npt.NDArray[np.intp]:
+def _find_corners(points: Array, allowed: Array) -> npt.NDArray[np.intp]:
     """Return the indices of points (N, n), no two equal in a row, without those on a line with others.
 
     A curve of many points turns at none of them, so that the line between the ends of a straight part
-    decides. On a path that never turns all count.
+    decides. On a path that never turns all count. So do points to which the path has to come nearer than to
+    an end of their line, by the deviations that are allowed (N,).
     """
     turns = _find_turns(points, *_segments(points))
     if not turns.any():
@@ -200,7 +203,8 @@ def _find_corners(points: Array) -> npt.NDArray[np.intp]:
         direction = chord / max(length, np.finfo(float).tiny)
         off = np.linalg.norm(inner - (inner @ direction)[:, None] * direction, axis=1)
         straight = off.max(initial=0.0) <= _STRAIGHT * length + _rounding(points)
-        kept.append(np.array([last]) if straight else np.arange(first + 1, last + 1))
+        near = allowed[first + 1 : last].min(initial=np.inf) < allowed[[first, last]].max()
+        kept.append(np.array([last]) if straight and not near else np.arange(first + 1, last + 1))
     return np.concatenate(kept)
 
 
