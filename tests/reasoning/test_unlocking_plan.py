@@ -392,7 +392,7 @@ def test_plan_is_data_for_json():
 
 @pytest.mark.parametrize("value", [0.1, 1.5])
 def test_a_parameter_has_no_other_value_at_the_start(value):
-    model = three_sliders(a=B > kv.parameter("threshold", 0.7))
+    model = three_sliders(a=kv.parameter("threshold", 0.7) < B)
     plan = plan_unlocking(model, {"a": 1}, {"threshold": 0.7})
     assert plan.verdict == "found"
     for ask in (

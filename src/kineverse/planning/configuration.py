@@ -140,7 +140,7 @@ class PlanningSpace:
         return tuple(s for s, stays in zip(self.symbols, bounded, strict=True) if not stays)
 
     def nearest_turn(self, q: Array, start: Array) -> Array:
-        """Return the configuration (n,) that is q but for full turns of joints, and the nearest to a start."""
+        """Return the configuration (n,) that is q but for full turns of joints, nearest to a start."""
         return np.asarray(self.equivalents(q, start, most=1)[0])
 
     def equivalents(self, q: Array, start: Array, most: int = 32, turn: float = HALF_TURN) -> Array:
