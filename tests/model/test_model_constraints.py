@@ -316,6 +316,8 @@ def test_limits_of_a_symbol_are_the_tightest() -> None:
         (-1.5 * (b < 0.3), 1.5 * ((b < 0.3) | (a > 0.2))),
         (-np.exp(-b) + a, np.sin(3 * b) * a + 2),
         (-2, kv.spline(b, [0.0, 0.5, 1.0], [1.0, 3.0, 2.0])),
+        (-kv.maximum(a, b - 1), kv.maximum(0.3 * a, 2 - b)),
+        (kv.minimum(a, -b), kv.clip(a + b, 0.5, 2.5)),
     ],
 )
 def test_limits_at_any_state_are_within_those_at_all(low, high) -> None:

@@ -390,6 +390,19 @@ def test_plan_is_data_for_json():
     }
 
 
+@pytest.mark.parametrize("value", [0.1, 1.5])
+def test_a_parameter_has_no_other_value_at_the_start(value):
+    model = three_sliders(a=kv.parameter("threshold", 0.7) < B)
+    plan = plan_unlocking(model, {"a": 1}, {"threshold": 0.7})
+    assert plan.verdict == "found"
+    for ask in (
+        lambda state: plan_unlocking(model, {"a": 1}, state),
+        lambda state: plan_violations(model, plan, state),
+    ):
+        with pytest.raises(InvalidValueError, match=f"is 0.7 in the model and {value} in the state"):
+            ask({"threshold": value})
+
+
 @pytest.mark.parametrize(
     ("goal", "options", "error", "text"),
     [

@@ -33,6 +33,8 @@ from .taylor import (
     taylor_constant,
     taylor_divide,
     taylor_hull,
+    taylor_maximum,
+    taylor_minimum,
     taylor_multiply,
     taylor_negate,
     taylor_polynomial,
@@ -274,8 +276,7 @@ def _step(term: Term, args: list[TaylorSeries]) -> TaylorSeries:
         periodic, knots, pieces = term.data
         return _piecewise(periodic, knots, pieces, args[0])
     if op in (ca.OP_FMIN, ca.OP_FMAX):
-        a, b = args if op == ca.OP_FMIN else args[::-1]
-        return a if a[0][1] <= b[0][0] else b if b[0][1] <= a[0][0] else taylor_hull(a, b)
+        return taylor_minimum(*args) if op == ca.OP_FMIN else taylor_maximum(*args)
     if op == "select":
         truth, yes, no = args
         if truth[0][0] >= 0.5 or truth[0][1] < 0.5:

@@ -126,7 +126,7 @@ def taylor_unary(op: int, a: TaylorSeries) -> TaylorSeries:
     if op == ca.OP_FABS and (a[0][0] >= 0 or a[0][1] <= 0):
         return a if a[0][0] >= 0 else taylor_negate(a)
     if op == ca.OP_FABS:
-        return taylor_hull(a, taylor_negate(a))
+        return _with_value(taylor_hull(a, taylor_negate(a)), value)
     return (value,)
 
 
@@ -154,6 +154,20 @@ def taylor_arctan2(y: TaylorSeries, x: TaylorSeries) -> TaylorSeries:
 def taylor_hull(a: TaylorSeries, b: TaylorSeries) -> TaylorSeries:
     """Return the hulls of the values and slopes of two functions that meet."""
     return tuple(interval_hull(x, y) for x, y in list(zip(a, b, strict=False))[:2])
+
+
+def taylor_minimum(a: TaylorSeries, b: TaylorSeries) -> TaylorSeries:
+    """Return the series of the smaller one of f and g."""
+    if a[0][1] <= b[0][0]:
+        return a
+    if b[0][1] <= a[0][0]:
+        return b
+    return _with_value(taylor_hull(a, b), (min(a[0][0], b[0][0]), min(a[0][1], b[0][1])))
+
+
+def taylor_maximum(a: TaylorSeries, b: TaylorSeries) -> TaylorSeries:
+    """Return the series of the larger one of f and g."""
+    return taylor_negate(taylor_minimum(taylor_negate(a), taylor_negate(b)))
 
 
 def taylor_polynomial(coefficients: tuple[float, ...], x: TaylorSeries) -> TaylorSeries:

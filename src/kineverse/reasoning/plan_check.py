@@ -8,11 +8,11 @@ from typing import TYPE_CHECKING
 from kineverse.intervals.arithmetic import RealInterval
 from kineverse.model.constraint import Constraint
 from kineverse.model.model_view import ModelView
-from kineverse.state import StateLike, as_state
+from kineverse.state import StateLike
 from kineverse.symbols import Symbol
 
 from .constraint_ranges import NOTHING, SLOW, ConstraintRanges
-from .point_evaluation import default_point, settle_point, value_at
+from .point_evaluation import settle_point, start_point, value_at
 
 if TYPE_CHECKING:
     from .unlocking_plan import UnlockingPlan, UnlockingStep
@@ -44,9 +44,8 @@ def plan_violations(model: ModelView, plan: UnlockingPlan, state: StateLike | No
         Positions at the start, as they were given to the planner.
     """
     ranges = ConstraintRanges(model)
-    point = default_point(model)
-    if state is not None:
-        point |= dict(as_state(state, model.symbols))
+    point = start_point(model, state)
+    settle_point(model, point)
     for row in ranges.rows.values():
         point = {**{s: s.value or 0.0 for s in row.symbols if s not in point}, **point}
     found: list[str] = []

@@ -7,9 +7,10 @@ from collections.abc import Mapping
 from functools import lru_cache
 
 from kineverse.compile import CompiledFunction, compile  # noqa: A004
-from kineverse.errors import NoSolutionError
+from kineverse.errors import InvalidValueError, NoSolutionError
 from kineverse.expressions.expression import Expression
 from kineverse.model.model_view import ModelView
+from kineverse.state import StateLike, as_state
 from kineverse.symbols import Symbol
 
 from .boxes import IntervalBox
@@ -33,6 +34,27 @@ def default_point(model: ModelView) -> dict[Symbol, float]:
     point = dict(model.default_state())
     settle_point(model, point)
     return point
+
+
+def start_point(model: ModelView, state: StateLike | None) -> dict[Symbol, float]:
+    """Return the positions at a start: those of a state, and the default ones of what it lacks.
+
+    Raises
+    ------
+    InvalidValueError
+        For a parameter with another value than its own, since locks are read with that.
+    """
+    point = dict(model.default_state())
+    if state is None:
+        return point
+    given = as_state(state, model.symbols)
+    for symbol, value in given.items():
+        if symbol.value is not None and value != symbol.value:
+            raise InvalidValueError(
+                f"The parameter '{symbol}' is {symbol.value:g} in the model and {value:g} in the state. "
+                "Locks are read with the value in the model: leave it out of the state, or edit the model."
+            )
+    return point | dict(given)
 
 
 def settle_point(model: ModelView, point: dict[Symbol, float]) -> bool:

@@ -13,11 +13,12 @@ from typing import TYPE_CHECKING, TypeAlias
 
 from kineverse.intervals.arithmetic import REALS, RealInterval
 from kineverse.model.model_view import ModelView
-from kineverse.state import StateLike, as_state
+from kineverse.state import StateLike
 from kineverse.symbols import Symbol
 
 from .boxes import Interval
 from .constraint_ranges import BESIDE, NOTHING, ConstraintRanges
+from .point_evaluation import start_point
 
 if TYPE_CHECKING:
     from .unlocking_plan import UnlockingPlan
@@ -73,9 +74,7 @@ def refutation_gaps(model: ModelView, plan: UnlockingPlan, state: StateLike | No
     known = plan.invariant
     if known is None:
         return ["there is no set of positions that no move leaves"]
-    given = dict(model.default_state())
-    if state is not None:
-        given |= dict(as_state(state, model.symbols))
+    given = start_point(model, state)
     start = {s: given.get(s, 0.0) for s in known.coordinates}
     check = _InvarianceCheck(ConstraintRanges(model), known, frozenset(plan.still), start)
     return list(check.run(plan.goal))

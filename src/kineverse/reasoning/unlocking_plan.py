@@ -13,7 +13,7 @@ from kineverse._checks import finite_number
 from kineverse.errors import InvalidValueError
 from kineverse.expressions.printing import format_number
 from kineverse.model.model_view import ModelView
-from kineverse.state import StateLike, as_state
+from kineverse.state import StateLike
 from kineverse.symbols import Symbol
 
 from .boxes import Interval
@@ -23,6 +23,7 @@ from .interlock import Interlock, Interlocks, Undecided
 from .move_rules import MoveRule, make_rules, relevant_rules
 from .move_search import MoveSearch, MoveSearchResult, Verdict, find_circle
 from .plan_check import plan_violations
+from .point_evaluation import start_point
 from .refutation import InvariantSet, Region, refutation_gaps
 
 BUDGET = 10.0
@@ -206,7 +207,8 @@ def plan_unlocking(
     UnknownNameError
         For names that are no degrees of freedom.
     InvalidValueError
-        For a goal beyond its limits, no goal, a number that is not finite, or a budget that is not positive.
+        For a goal beyond its limits, no goal, a number that is not finite, a budget that is not positive, or
+        a parameter in the state with another value than its own.
     """
     if not (isinstance(budget, int | float) and budget > 0):
         raise InvalidValueError(f"The budget of a plan is a positive time in seconds, not {budget!r}.")
@@ -219,9 +221,7 @@ def plan_unlocking(
     known = interlocks(model) if found is None else found
     end = perf_counter() + budget
     coordinates, rules = relevant_rules(make_rules(model, known), goals)
-    given = dict(model.default_state())
-    if state is not None:
-        given |= dict(as_state(state, model.symbols))
+    given = start_point(model, state)
     start = {s: _clip(float(given.get(s, 0.0)), limits.get(s, Interval())) for s in coordinates}
 
     def search(some: Sequence[MoveRule]) -> tuple[CellGraph, MoveSearchResult]:
