@@ -144,7 +144,7 @@ class Judge:
         self._scene_values = self._indices(self._scene.inputs)
         self._coordinate, self._start = coordinate, start
         self._penetrations = self._scene.watch(self._own, radius=0.0)
-        self._furniture = FurnitureOverlaps(self._scene, robot, strict=True)
+        self._furniture = FurnitureOverlaps(self._scene, robot)
         self._first_overlapping: tuple[tuple[str, str], ...] = ()
         self._gripping: dict[str, set[str]] = {}
         self._touches: PreparedQuery | None = None
