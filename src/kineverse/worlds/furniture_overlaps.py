@@ -3,8 +3,9 @@
 Shapes of furniture overlap in many models and mean nothing by it: a drawer in a solid box, a hinge in its
 frame. What counts is what was not there at the start. Shapes overlap from 0.5 mm on, and:
 
-- Two bodies that overlap at the start, and between which all that moves has limits, are *made to overlap* if
-  they are joined by an articulation, or overlap in all of 200 random states. They count no more at all.
+- Two bodies that overlap at the start are *made to overlap*, and count no more at all, if an articulation
+  with limits joins them, or if they overlap in all of 200 random states. Where something between them has no
+  limits, the depth must not grow in these states either: a rod may turn in its sleeve, no door in its box.
 - Of two other shapes that overlap at the start, the depth beyond the one at the start counts.
 - A mesh is its hull, which fills a cupboard. Where one overlaps something at the start or at the default
   state, that pair of shapes counts no more.
@@ -184,23 +185,36 @@ class FurnitureOverlaps:
         scene, model = self.scene, self.scene.model
         home = model.default_state()
         scene.update(home)
-        default = list(self._measure())
+        default = self._measure()
         limited = ~flag_relatively_moving(model, scene.bodies, self._without_limits())
         always = limited & adjacent_pairs(model, scene.bodies).astype(bool)
+        most = {
+            pair: math.inf if limited[pair] else depth + OVERLAP
+            for pair, depth in self._deepest(default).items()
+            if not always[pair]
+        }
         samples = StateSamples(model, count=_SAMPLES)
         columns = {s: samples.values_of(s) for s in scene.inputs if not self._is_of_robot(s.path)}
-        others = {pair for pair in map(self._owners, default) if limited[pair] and not always[pair]}
         for k in range(samples.size):
-            if not others:
+            if not most:
                 break
             try:
                 scene.update(home.updated({s: float(values[k]) for s, values in columns.items()}))
             except NoSolutionError:  # a loop does not close there
                 continue
-            others &= {self._owners(code) for code in self._measure()}
-        for i, j in others:
+            here = self._deepest(self._measure())
+            most = {pair: depth for pair, depth in most.items() if 0.0 < here.get(pair, 0.0) <= depth}
+        for i, j in most:
             always[i, j] = always[j, i] = True
         return [code for code in default if self._has_mesh(code)], always
+
+    def _deepest(self, depths: dict[int, float]) -> dict[tuple[int, int], float]:
+        """Return the largest depths [m] by pair of bodies, of those by pair of shapes."""
+        found: dict[tuple[int, int], float] = {}
+        for code, depth in depths.items():
+            pair = self._owners(code)
+            found[pair] = max(depth, found.get(pair, 0.0))
+        return found
 
     def _without_limits(self) -> list[Symbol]:
         """Return the speeds of the coordinates of furniture without limits."""
