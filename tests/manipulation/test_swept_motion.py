@@ -130,6 +130,20 @@ def test_what_overlaps_at_the_start_may_do_so_and_no_deeper() -> None:
     assert find_obstacle(model, drawer, at(model, drawer=0.3), 0.0, start=at(model)) is None
 
 
+@pytest.mark.parametrize("inset", [0.002, 0.0])
+def test_a_door_whose_edge_is_in_its_carcass_opens_within_limits(inset: float) -> None:
+    """Its hinge is in the middle of the panel, so that the edge gets deeper as it turns."""
+    model, door = Model(), kv.position("door")
+    with model.edit() as edit:
+        edit.add_frame("carcass", "world", np.eye(4), body=box(0.4, 0.6, 0.5, at=(1.2, 0, 0.75)))
+        turned = kv.translation(0.991 + inset, 0.3, 0.75) @ kv.rotation_z(-door)
+        edit.add_frame("panel", "carcass", turned, body=box(0.018, 0.6, 0.4, at=(0, -0.3, 0)))
+        edit.constrain("door/range", -1.5, door, 1.5)
+    assert find_obstacle(model, door, at(model), 1.5) is None
+    # A face that only touches the carcass is no edge that is in it.
+    assert (find_obstacle(model, door, at(model), -1.0) is None) == (inset > 0)
+
+
 def test_skills_say_what_is_in_the_way_and_move_nothing() -> None:
     model = kv.load("hsr")
     model.include("shelf_drawers", prefix="shelf")

@@ -1,4 +1,4 @@
-"""Law: furniture that a robot moves stops at other furniture, and overlaps only where it is made so."""
+"""Law: furniture that a robot moves stops at other furniture, and overlaps only where it did at the start."""
 
 from __future__ import annotations
 
@@ -8,8 +8,9 @@ from pusher import gripper, pusher, solid
 
 import kineverse as kv
 from kineverse.geometry import Rule, Scene
-from kineverse.model.body import Box
-from kineverse.worlds import KinematicWorld
+from kineverse.manipulation.swept_motion import find_obstacle
+from kineverse.model.body import Box, Cylinder
+from kineverse.worlds import Judge, KinematicWorld
 from kineverse.worlds.furniture_overlaps import OVERLAP, FurnitureOverlaps
 
 
@@ -44,7 +45,7 @@ def test_a_door_may_not_turn_into_its_own_box():
     assert excess(overlaps, door=-0.5) > 0.1
 
 
-def test_shapes_that_overlap_in_all_of_their_range_are_made_so():
+def test_bodies_that_overlap_in_all_of_their_range_are_made_so():
     model = cupboard(0.0, 1.0)
     with model.edit() as edit:
         edit.add_frame("knob", "panel", np.eye(4), solid(Box((0.05, 0.05, 0.05)), (0.0, 0.005, 0)))
@@ -61,26 +62,66 @@ def distance(model: kv.Model, one: str, other: str, q: float) -> float:
     return scene.distance(one, other).distance
 
 
-def test_a_drawer_goes_back_into_a_solid_box_and_no_deeper():
+def chest(lower: float | None, upper: float | None, *, carried: bool = True) -> kv.Model:
+    """Build a solid box of 0.4 m with a solid drawer of 0.4 m in it that is pulled out along x."""
     model, q = kv.Model(), kv.position("drawer")
     with model.edit() as edit:
         edit.add_frame(
             "robot/base", "world", kv.translation(kv.position("robot/x"), 0, 9), solid(Box((0.1,) * 3))
         )
-        edit.add_frame("box", "world", np.eye(4), solid(Box((0.4, 0.9, 0.9))))
-        edit.add_frame("drawer", "box", kv.translation(q, 0, 0), solid(Box((0.2, 0.3, 0.3)), (-0.2, 0, 0)))
-        edit.constrain("drawer/range", -0.3, q, 0.05)
+        edit.add_frame("box", "world", np.eye(4), solid(Box((0.4, 0.5, 0.3))))
+        parent = "box" if carried else "world"
+        edit.add_frame("drawer", parent, kv.translation(q, 0, 0), solid(Box((0.4, 0.4, 0.2)), (-0.01, 0, 0)))
+        if lower is not None:
+            edit.constrain("drawer/range", lower, q, upper)
+    return model
+
+
+def begin(model: kv.Model, **values: float) -> FurnitureOverlaps:
     overlaps = FurnitureOverlaps(Scene(model), "robot")
-    overlaps.scene.update(model.default_state() | {"drawer": -0.2})
-    assert overlaps.scene.distance("box", "drawer").distance > 0.05
+    overlaps.scene.update(model.default_state() | values)
     overlaps.begin()
-    assert all(excess(overlaps, drawer=q) == 0.0 for q in np.linspace(-0.2, 0.0, 9))
-    assert excess(overlaps, drawer=0.02) == pytest.approx(0.02)
-    # What overlapped at the start may as far as it did.
-    overlaps.scene.update(model.default_state() | {"drawer": 0.03})
-    overlaps.begin()
-    assert excess(overlaps, drawer=0.03 + 0.9 * OVERLAP) == 0.0
-    assert excess(overlaps, drawer=0.04) == pytest.approx(0.01)
+    return overlaps
+
+
+@pytest.mark.parametrize(("upper", "carried"), [(0.4, True), (0.4, False), (0.45, True)])
+def test_a_drawer_goes_back_into_a_solid_box_that_it_is_partly_in(upper, carried):
+    overlaps = begin(chest(0.0, upper, carried=carried), drawer=0.3)
+    assert all(excess(overlaps, drawer=q) == 0.0 for q in np.linspace(0.3, 0.0, 7))
+    assert overlaps.excepted == (("box", "drawer"),)
+
+
+def test_what_is_apart_at_the_start_may_not_overlap_though_it_does_by_default():
+    overlaps = begin(chest(0.0, 0.45), drawer=0.42)
+    assert overlaps.excepted == ()
+    assert excess(overlaps, drawer=0.40) == pytest.approx(0.01)
+    # Nor does a touch of less than what counts excuse anything.
+    overlaps = begin(chest(0.0, 0.45), drawer=0.41 - 0.9 * OVERLAP)
+    assert excess(overlaps, drawer=0.40) == pytest.approx(0.01)
+    # An earlier start, as before it was opened, does.
+    overlaps.scene.update(overlaps.scene.model.default_state() | {"drawer": 0.42})
+    overlaps.begin(overlaps.scene.model.default_state())
+    assert excess(overlaps, drawer=0.40) == 0.0
+
+
+def test_without_limits_the_depth_at_the_start_is_allowed():
+    overlaps = begin(chest(None, None), drawer=0.35)
+    assert excess(overlaps, drawer=0.35 - 0.9 * OVERLAP) == 0.0
+    assert excess(overlaps, drawer=0.33) == pytest.approx(0.02)
+
+
+def test_what_is_made_to_overlap_does_not_count_and_a_rod_may_turn_in_its_sleeve():
+    model, slide, turn = kv.Model(), kv.position("slide"), kv.position("turn")
+    with model.edit() as edit:
+        edit.add_frame("sleeve", "world", np.eye(4), solid(Cylinder(0.05, 0.2)))
+        moved = kv.translation(0, 0, slide) @ kv.rotation_z(turn)
+        edit.add_frame("rod", "sleeve", moved, solid(Cylinder(0.03, 0.9)))
+        edit.constrain("slide/range", -0.2, slide, 0.2)
+    overlaps = begin(model)
+    number = [overlaps.scene.bodies.index(name) for name in ("sleeve", "rod")]
+    assert not overlaps.counting[*number]
+    assert not len(overlaps.watch(model.speeds).pairs)
+    assert excess(overlaps, slide=0.2, turn=9.0) == 0.0
 
 
 def test_pairs_that_a_rule_excepts_do_not_overlap():
@@ -183,6 +224,26 @@ def test_furniture_pushes_other_furniture_as_far_as_that_can_move():
     assert states[-1]["room/drawer"] == pytest.approx(0.37, abs=OVERLAP)
     assert states[-1]["room/flap"] == 0.0
     assert deepest(model, states, "room/drawer", "room/flap") < OVERLAP
+
+
+def test_a_pushed_drawer_goes_back_into_a_solid_box_only_if_it_is_partly_in_it():
+    """The world holds what the check before a motion allows, and the judge sees what the world does."""
+    for start, end in ((0.3, 0.0), (0.44, 0.41)):
+        model = chest(0.0, 0.45)
+        with model.edit() as edit:
+            base = np.eye(4)
+            edit.add_frame("robot/ball", "robot/base", base, solid(Box((0.02, 0.02, 0.02)), (0, 0, -9)))
+        state = model.default_state() | {"robot/x": 0.24 + start, "drawer": start}
+        world, judge = KinematicWorld(model, "robot"), Judge(model, "robot")
+        world.reset(state)
+        judge.update(world.state)
+        for _ in range(40):
+            world.apply({"robot/x:velocity": -0.5}, 0.02, stamp=world.time)
+            judge.update(world.state)
+        assert world.state["drawer"] == pytest.approx(end, abs=2 * OVERLAP)
+        assert (find_obstacle(model, model.symbol("drawer"), state, 0.0, robot="robot") is None) == (end == 0)
+        overlap = judge.overlap
+        assert overlap is None or "robot/ball" in (overlap.a, overlap.b)
 
 
 def test_a_ball_that_pushes_near_the_hinge_does_not_throw_the_door_through_a_board():

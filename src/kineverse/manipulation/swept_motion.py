@@ -164,8 +164,8 @@ class _Sweep:
     ) -> None:
         self._model, self._robot = model, robot
         self._scene = Scene(model, rules=rules, leave_out=leave_out)
-        self._overlaps = FurnitureOverlaps(self._scene, robot, strict=True)
-        self._queries: dict[Symbol, tuple[PreparedQuery, FrameDependence]] = {}
+        self._overlaps = FurnitureOverlaps(self._scene, robot)
+        self._queries: dict[tuple[Symbol, bytes], tuple[PreparedQuery, FrameDependence]] = {}
         self.start: State | None = None
 
     def find(
@@ -175,11 +175,11 @@ class _Sweep:
         scene, start = self._scene, float(state[coordinate])
         if start == target or coordinate not in scene.inputs:
             return None
+        scene.update(state)
+        self._overlaps.begin(*(() if self.start is None else (self.start,)))
         query, motion = self._query(coordinate)
         if not len(query.pairs):
             return None
-        scene.update(state)
-        self._overlaps.begin(*(() if self.start is None else (self.start,)))
         values = self._divide(coordinate, state, start, target)
         for k in self._find_near(query, coordinate, values):
             found = query(0.0)
@@ -216,10 +216,12 @@ class _Sweep:
         return replace(found, carrier=carriers[0]) if carriers else found
 
     def _query(self, coordinate: Symbol) -> tuple[PreparedQuery, FrameDependence]:
-        if coordinate not in self._queries:
+        """Return the query for what a coordinate moves and counts since the begin, and its motion."""
+        key = coordinate, self._overlaps.counting.tobytes()
+        if key not in self._queries:
             motion = FrameDependence(self._model, [coordinate])
-            self._queries[coordinate] = self._overlaps.watch([coordinate]), motion
-        return self._queries[coordinate]
+            self._queries[key] = self._overlaps.watch([coordinate]), motion
+        return self._queries[key]
 
     def _find_near(self, query: PreparedQuery, coordinate: Symbol, values: Array) -> Iterator[int]:
         """Place the scene at the values at which anything of the object touches, and yield their indices."""

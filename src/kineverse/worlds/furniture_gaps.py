@@ -132,8 +132,8 @@ class FurnitureContacts:
         return np.array([k for k, code in enumerate(codes) if code in self._met], dtype=np.intp)
 
     def _query(self, moved: Flags) -> PreparedQuery:
-        """Return the query for what some coordinates move."""
-        key = moved.tobytes()
+        """Return the query for what some coordinates move, and counts since the start."""
+        key = moved.tobytes() + self._overlaps.counting.tobytes()
         if key not in self._queries:
             speeds = [v for v, flag in zip(self._speeds, moved.tolist(), strict=True) if flag]
             self._queries[key] = self._overlaps.watch(speeds)

@@ -1,18 +1,20 @@
-"""Overlaps of furniture that a motion made, beside those that are there by design.
+"""Overlaps of furniture that a motion made, beside those that were there at the start.
 
 Shapes of furniture overlap in many models and mean nothing by it: a drawer in a solid box, a hinge in its
-frame. So two shapes overlap as far as their depth exceeds an allowance, which is the larger one of
+frame. What counts is what was not there at the start. Shapes overlap from 0.5 mm on, and:
 
-- their depth at the start,
-- their depth at the default state, so that a drawer may go back into its box.
+- Two bodies that overlap at the start are *made to overlap*, and count no more at all, if an articulation
+  with limits joins them, or if they overlap in all of 200 random states. Where something between them has no
+  limits, the depth must not grow in these states either: a rod may turn in its sleeve, no door in its box.
+- Of two other shapes that overlap at the start, the depth beyond the one at the start counts.
+- A mesh is its hull, which fills a cupboard. Where one overlaps something at the start or at the default
+  state, that pair of shapes counts no more.
+- Everything else counts, a door and its own frame included, but for pairs of bodies that a rule of the scene
+  or of the model excepts.
 
-Two shapes that overlap at the start or by default, and in all of 200 random states within limits, are made
-so. Where all that moves them relative to each other has limits, any depth is allowed; else that at the start
-or by default, and the least one of all states on top: a corner that turns in its place changes the depth.
-Two shapes that are apart at the start and by default may not overlap at all, whatever the other states.
-
-All pairs of shapes that objects move relative to each other count, also those of a door with its own frame,
-but for pairs of bodies that a rule of the scene or of the model excepts.
+Skills that look at the way, the kinematic world, judges, and the execution of unlocking plans share this
+rule. The default state excuses nothing but hulls: a drawer that stands fully out of a solid box at the start
+is in its way.
 """
 
 from __future__ import annotations
@@ -36,14 +38,13 @@ from kineverse.geometry.results import DistanceResult, DistanceResults
 from kineverse.lie import Array
 from kineverse.model.body import Mesh
 from kineverse.model.frame import is_of_robot
-from kineverse.model.frame_dependence import FrameDependence
 from kineverse.model.sampling import StateSamples
 from kineverse.model.version_cache import cached_for_version
 from kineverse.state import StateLike
 from kineverse.symbols import Symbol
 
 OVERLAP = 5e-4
-"""Depth beyond the allowance from which on furniture overlaps [m]: less is a matter of shapes that rest."""
+"""Depth from which on furniture overlaps, at the start and beyond the allowance [m]: less is resting."""
 
 _SAMPLES = 200
 
@@ -65,7 +66,7 @@ class Overlap(NamedTuple):
 
 
 class FurnitureOverlaps:
-    """Overlaps of furniture in a scene, beside those that are there by design.
+    """Overlaps of furniture in a scene, beside those that were there at the start.
 
     The start is the default state until :meth:`begin` is called.
 
@@ -75,54 +76,54 @@ class FurnitureOverlaps:
         Collision scene of the model. The constructor leaves it at the default state.
     robot
         Prefix of the robot, which is no furniture; none if empty.
-    strict
-        Whether the default state excuses meshes alone. A primitive shape that is in the way there is in the
-        way. A mesh is its hull, which fills a cupboard: where one overlaps something at the start or by
-        default, any depth is allowed. So it is for bodies that overlap at the start and are joined by an
-        articulation with limits, such as a cross in its fork.
+
+    Attributes
+    ----------
+    counting
+        (B, B) flags of pairs of bodies of which some depth counts: the others overlap as they like.
     """
 
-    def __init__(self, scene: Scene, robot: str, *, strict: bool = False) -> None:
-        self.scene, self.robot, self._strict = scene, robot, strict
+    def __init__(self, scene: Scene, robot: str) -> None:
+        self.scene, self.robot = scene, robot
         self._objects = [v for v in scene.model.speeds if not self._is_of_robot(v.path)]
+        self.counting = np.ones((len(scene.bodies),) * 2, dtype=bool)
         self._query = self.watch(self._objects)
         # Scenes without rules of their own find the same.
         plain = len(scene.rules) == len(Scene(scene.model).rules)
-        key = ("furniture overlaps", robot)
-        design = cached_for_version(scene.model, key, self._sample) if plain else self._sample()
-        self._default, self._play = design
-        if strict:
-            self._default = {pair: d for pair, d in self._default.items() if self._has_mesh(pair)}
-        self._joined = adjacent_pairs(scene.model, scene.bodies)
-        self._made_so = np.zeros_like(self._joined, dtype=bool)
-        self._free = self._move_without_limits()
-        self._allow(self._default)
+        key = ("furniture overlaps", robot, *scene.bodies, len(scene.collision_world.objects))
+        self._by_default, self._always = (
+            cached_for_version(scene.model, key, self._sample) if plain else self._sample()
+        )
         scene.update(scene.model.default_state())
+        self.begin()
 
     def watch(self, moving: list[Symbol], radius: float = 0.0) -> PreparedQuery:
-        """Return the query for the near pairs of shapes of furniture that some speeds move relatively."""
-        scene = self.scene
+        """Return the query for the near pairs of shapes of furniture that some speeds move relatively.
+
+        Bodies that are made to overlap are left out, as of now.
+        """
+        scene, counting = self.scene, self.counting.copy()
 
         def choose() -> PairFlags:
             bodies = scene.bodies
             furniture = np.array([not self._is_of_robot(b) for b in bodies], dtype=bool)
             flags = apply_rules(np.ones((len(bodies),) * 2, dtype=np.uint8), bodies, scene.rules)
             moved = flag_relatively_moving(scene.model, bodies, moving)
-            return np.asarray(flags * moved * flag_between(furniture, furniture))
+            return np.asarray(flags * moved * flag_between(furniture, furniture) * counting)
 
         return PreparedQuery(scene.collision_world, choose, radius, per_shape=True)
 
     def begin(self, *earlier: StateLike) -> None:
         """Take the state of the scene as the start; what overlaps in earlier states may do so as well."""
-        depths, here = dict(self._default), self._depths()
+        self._depths = self._measure()
         values = self.scene.collision_world.values
         for state in earlier:
             self.scene.update(state)
-            _deepen(depths, self._depths())
+            for pair, depth in self._measure().items():
+                self._depths[pair] = max(depth, self._depths.get(pair, 0.0))
         if earlier:
             self.scene.update(values)
-        _deepen(depths, here)
-        self._allow(depths)
+        self._allow()
 
     def find(self, least: float = OVERLAP) -> list[Overlap]:
         """Return the overlaps at the state of the scene beyond the allowance, the largest excess first.
@@ -145,9 +146,9 @@ class FurnitureOverlaps:
     @property
     def excepted(self) -> tuple[tuple[str, str], ...]:
         """Pairs of bodies with an allowance."""
-        bodies, owners = self.scene.bodies, self.scene.collision_world.table.body
-        pairs = (self._decode(code) for code in self._codes.tolist())
-        return tuple(dict.fromkeys((bodies[owners[i]], bodies[owners[j]]) for i, j in pairs))
+        bodies = self.scene.bodies
+        pairs = (self._owners(code) for code in self._codes.tolist())
+        return tuple(dict.fromkeys((bodies[i], bodies[j]) for i, j in pairs))
 
     def allowances(self, found: DistanceResults) -> Array:
         """Return the depths that are allowed to pairs of shapes (K,) [m]."""
@@ -156,59 +157,75 @@ class FurnitureOverlaps:
         codes = self.encode(found)
         place = np.minimum(np.searchsorted(self._codes, codes), len(self._codes) - 1)
         allowed = np.where(self._codes[place] == codes, self._allowed[place], 0.0)
-        return np.where(self._made_so[tuple(found.body_indices.T)], math.inf, allowed)
+        return np.where(self.counting[tuple(found.body_indices.T)], allowed, math.inf)
 
-    def _allow(self, depths: dict[int, float]) -> None:
-        """Set the allowances from the largest depths by default and at the start."""
-        pairs = sorted(depths)
-        self._codes: Indices = np.array(pairs, dtype=np.int64)
-        self._allowed = np.array([depths[pair] + self._play.get(pair, 0.0) for pair in pairs])
-        if self._strict:
-            self._allowed[[self._has_mesh(pair) for pair in pairs]] = math.inf
-            self._made_so[:] = False
-            for one, other in self.excepted:
-                i, j = (self.scene.collision_world.body_index(b) for b in (one, other))
-                joined = self._joined[i, j] and not self._free.moves_between(one, other)
-                self._made_so[i, j] = self._made_so[j, i] = joined
+    def _allow(self) -> None:
+        """Set the allowances from the depths at the start."""
+        depths = dict.fromkeys(self._by_default, math.inf)
+        made_so = np.zeros_like(self.counting)
+        for code, depth in self._depths.items():
+            depths[code] = math.inf if self._has_mesh(code) else depth
+            one, other = self._owners(code)
+            if self._always[one, other]:
+                made_so[one, other] = made_so[other, one] = True
+        self._codes: Indices = np.array(sorted(depths), dtype=np.int64)
+        self._allowed = np.array([depths[code] for code in sorted(depths)])
+        # Bodies all of whose shapes have any depth count no more, too.
+        free = np.zeros(self.counting.shape, dtype=int)
+        for code in self._codes[np.isinf(self._allowed)].tolist():
+            free[self._owners(code)] += 1
+        shapes = np.bincount(self.scene.collision_world.table.body, minlength=len(free))
+        self.counting = ~(made_so | (free + free.T >= np.outer(shapes, shapes)))
 
-    def _sample(self) -> tuple[dict[int, float], dict[int, float]]:
-        """Return the depths by default, and the play of shapes that overlap everywhere, by pair of shapes."""
+    def _sample(self) -> tuple[list[int], npt.NDArray[np.bool_]]:
+        """Return the pairs of shapes with a mesh that overlap by default, and (B, B) flags of bodies.
+
+        These are the bodies that are made to overlap if they do so at the start.
+        """
         scene, model = self.scene, self.scene.model
         home = model.default_state()
         scene.update(home)
-        found, default = self._query(), self._depths()
-        bodies = dict(zip(default, found.body_indices.tolist(), strict=True))
-        least = dict(default)
+        default = self._measure()
+        limited = ~flag_relatively_moving(model, scene.bodies, self._without_limits())
+        always = limited & adjacent_pairs(model, scene.bodies).astype(bool)
+        most = {
+            pair: math.inf if limited[pair] else depth + OVERLAP
+            for pair, depth in self._deepest(default).items()
+            if not always[pair]
+        }
         samples = StateSamples(model, count=_SAMPLES)
         columns = {s: samples.values_of(s) for s in scene.inputs if not self._is_of_robot(s.path)}
         for k in range(samples.size):
-            if not least:
+            if not most:
                 break
             try:
                 scene.update(home.updated({s: float(values[k]) for s, values in columns.items()}))
             except NoSolutionError:  # a loop does not close there
                 continue
-            here = self._depths()
-            least = {pair: min(depth, here[pair]) for pair, depth in least.items() if pair in here}
-        free = self._move_without_limits()
-        for pair in least:
-            one, other = (scene.bodies[k] for k in bodies[pair])
-            if not free.moves_between(one, other):
-                least[pair] = math.inf
-        return default, least
+            here = self._deepest(self._measure())
+            most = {pair: depth for pair, depth in most.items() if 0.0 < here.get(pair, 0.0) <= depth}
+        for i, j in most:
+            always[i, j] = always[j, i] = True
+        return [code for code in default if self._has_mesh(code)], always
 
-    def _move_without_limits(self) -> FrameDependence:
-        """Return what the coordinates of furniture without limits move."""
+    def _deepest(self, depths: dict[int, float]) -> dict[tuple[int, int], float]:
+        """Return the largest depths [m] by pair of bodies, of those by pair of shapes."""
+        found: dict[tuple[int, int], float] = {}
+        for code, depth in depths.items():
+            pair = self._owners(code)
+            found[pair] = max(depth, found.get(pair, 0.0))
+        return found
+
+    def _without_limits(self) -> list[Symbol]:
+        """Return the speeds of the coordinates of furniture without limits."""
         model = self.scene.model
-        free = [
-            s for s in (v.position for v in self._objects) if not all(map(math.isfinite, model.limits(s)))
-        ]
-        return FrameDependence(model, [s.derivative() for s in free])
+        return [v for v in self._objects if not all(map(math.isfinite, model.limits(v.position)))]
 
-    def _depths(self) -> dict[int, float]:
+    def _measure(self) -> dict[int, float]:
         """Return the depths of the pairs of shapes that overlap at the state of the scene [m]."""
         found = self._query()
-        return dict(zip(self.encode(found).tolist(), (-found.distances).tolist(), strict=True))
+        pairs = zip(self.encode(found).tolist(), (-found.distances).tolist(), strict=True)
+        return {code: depth for code, depth in pairs if depth > OVERLAP}
 
     def encode(self, found: DistanceResults) -> Indices:
         """Return a number for each pair of shapes (K,)."""
@@ -219,15 +236,14 @@ class FurnitureOverlaps:
         """Return the indices of both shapes of a pair."""
         return divmod(code, len(self.scene.collision_world.objects))
 
+    def _owners(self, code: int) -> tuple[int, int]:
+        """Return the indices of the bodies of a pair of shapes, the smaller one first."""
+        i, j = self.scene.collision_world.table.body[list(self._decode(code))].tolist()
+        return min(i, j), max(i, j)
+
     def _has_mesh(self, code: int) -> bool:
         objects = self.scene.collision_world.objects
         return any(isinstance(objects[k].shape.geometry, Mesh) for k in self._decode(code))
 
     def _is_of_robot(self, name: str) -> bool:
         return bool(self.robot) and is_of_robot(name, self.robot)
-
-
-def _deepen(depths: dict[int, float], others: dict[int, float]) -> None:
-    """Raise depths to other ones, by pair of shapes."""
-    for pair, depth in others.items():
-        depths[pair] = max(depth, depths.get(pair, 0.0))

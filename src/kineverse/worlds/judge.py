@@ -5,8 +5,8 @@
   of a speed. A limit of a speed that depends on the state, such as a lock, is violated if it was at the
   begin and at the end of a step.
 - *penetration*: largest depth of any pair of bodies, furniture among itself included, but for the excepted
-  pairs, which are listed. Of furniture that overlaps by design, it is the depth beyond what is allowed by
-  :class:`.FurnitureOverlaps`.
+  pairs, which are listed. Of furniture that overlapped at the start, it is the depth beyond what is allowed
+  by :class:`.FurnitureOverlaps`.
 - *overlap*: a penetration beyond 0.5 mm that came on the way.
 - *contact losses*: number of times that the robot touched the object and then did not, while pushing.
 - *grasp error*: largest motion of the held body in the hand since the hold began, in the middle between the
@@ -104,8 +104,8 @@ class Judge:
     ----------
     excepted
         Pairs of bodies whose penetration does not count: those of the robot that overlap at the begin of the
-        run, and those of the gripper with the handle; and pairs of furniture that overlap by design, whose
-        penetration counts as far as it exceeds what :class:`.FurnitureOverlaps` allows.
+        run, and those of the gripper with the handle; and pairs of furniture that overlapped at the start,
+        whose penetration counts as far as it exceeds what :class:`.FurnitureOverlaps` allows.
 
     Raises
     ------
@@ -144,7 +144,7 @@ class Judge:
         self._scene_values = self._indices(self._scene.inputs)
         self._coordinate, self._start = coordinate, start
         self._penetrations = self._scene.watch(self._own, radius=0.0)
-        self._furniture = FurnitureOverlaps(self._scene, robot, strict=True)
+        self._furniture = FurnitureOverlaps(self._scene, robot)
         self._first_overlapping: tuple[tuple[str, str], ...] = ()
         self._gripping: dict[str, set[str]] = {}
         self._touches: PreparedQuery | None = None

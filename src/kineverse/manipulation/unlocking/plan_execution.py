@@ -246,7 +246,7 @@ class _OverlapJudge:
         self.depth, self.pair = 0.0, ("", "")
         if _has_shapes(world.model):
             self._scene = Scene(world.model)
-            self._overlaps = FurnitureOverlaps(self._scene, "", strict=True)
+            self._overlaps = FurnitureOverlaps(self._scene, "")
             self._scene.update(world.state)
             self._overlaps.begin()
 
