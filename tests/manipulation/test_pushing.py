@@ -13,7 +13,10 @@ import kineverse as kv
 from kineverse.articulations import OmniBase
 from kineverse.control.contact_slots import ContactSlots
 from kineverse.errors import InvalidValueError, UnknownNameError
+from kineverse.experiments.manipulation.robots import SHIPPED
+from kineverse.experiments.table1_push.objects import SHIPPED_KITCHEN, make_push_setup
 from kineverse.geometry import Scene
+from kineverse.grasping import find_gripper
 from kineverse.manipulation.outcome import Outcome
 from kineverse.manipulation.pushing import push_placement, push_program
 from kineverse.manipulation.pushing.approach import plan_push_approach
@@ -242,6 +245,27 @@ def test_push_with_physics_is_gentle(sensors: Sensors | None) -> None:
     assert not outcome
     assert "does not move" in outcome.reason
     assert 1.0 < max(forces) < 100.0
+
+
+@pytest.mark.long
+@pytest.mark.parametrize("robot", ["fetch", "hsr", "pr2"])
+def test_heavy_robot_presses_a_drawer_that_sticks_with_some_100_newtons(robot: str) -> None:
+    pytest.importorskip("mujoco")
+    setup = make_push_setup(SHIPPED[robot], SHIPPED_KITCHEN, "sink left upper drawer")
+    hand = find_gripper(setup.model, robot).bodies
+    pushing = Pushing(setup.model, setup.what, hand, setup.start, target=0.0)
+    start = find_push_start(pushing, setup.start).state
+    assert start is not None
+    world, forces = MujocoWorld(setup.model, robot, door_friction={setup.what: 2e4}), []
+    world.reset(start)
+    session = Session(world, on_step=lambda session: forces.append(world.peak_force))
+    outcome = push(session, setup.what, pushing=pushing, plan=False)
+    assert not outcome
+    assert "N, it stays at 0.39" in outcome.reason
+    touching = [force for force in forces if force > 1.0]
+    assert 30.0 < np.median(touching) < 110.0
+    assert np.percentile(touching, 95) < 130.0
+    assert outcome.measures["peak_force"] == max(forces) < 300.0
 
 
 def test_object_that_no_camera_sees_is_not_pushed() -> None:

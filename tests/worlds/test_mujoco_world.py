@@ -434,6 +434,7 @@ def test_wrong_arguments_are_refused() -> None:
     for options, words in (
         ({"step": 0.0}, "'step' of a world is a positive number"),
         ({"grip": -1.0}, "'grip'"),
+        ({"press": 0.0}, "'press'"),
         ({"timeout": math.nan}, "'timeout'"),
         ({"delay": -0.1}, "'delay'"),
         ({"grasp": "glue"}, "'friction' or 'tie', not 'glue'"),

@@ -6,8 +6,14 @@ A servo is a spring and a damper on a set point q_s that moves with the speed v,
 
 with the inertial forces of the acceleration of v. It is critically damped with the bandwidth w. I is the
 largest inertia about the joint in sampled configurations: with that of one configuration, such as a stretched
-arm, a joint would be too soft in others. The set point stays near the joint, so that a servo that something
-stops does not wind up. v reaches the commanded speed with an acceleration that the effort allows.
+arm, a joint would be too soft in others. v reaches the commanded speed with an acceleration that the effort
+allows.
+
+Spring and damper correct what the inertial forces leave, and press on what stops the robot. So they have a
+limit of their own, the force ``press`` at a slide and ``press`` times the longest lever at a hinge, and the
+set point stays so near the joint that the spring alone does not exceed it: a servo that something stops does
+not wind up. What presses on a robot at rest is held by each joint between it and the floor, so the weakest
+of them limits the force, and the two slides of a base do it together.
 """
 
 from __future__ import annotations
@@ -34,7 +40,7 @@ from .mujoco_coordinates import MujocoCoordinates
 BANDWIDTH = 80.0
 """Bandwidth w [1/s]: a robot stands still some 50 ms after its speeds are zero."""
 _LEAD = 0.05
-"""Largest distance of a set point from its joint [m], [rad]."""
+"""Largest distance of a set point from its joint [m], [rad]; less for a servo of much inertia."""
 _ARMATURE = 0.1
 """Part of the largest inertia that is added to a joint as that of its motor."""
 _ACCELERATION, _TRACTION = 20.0, 6.0
@@ -152,6 +158,8 @@ class JointServos:
         Time step of the simulation [s].
     bandwidth
         w [1/s].
+    press
+        Largest force of spring and damper at the farthest point that a joint moves [N].
     seed
         Seed of the sampled configurations.
     remark
@@ -174,6 +182,7 @@ class JointServos:
         model: ModelView,
         step: float,
         bandwidth: float,
+        press: float,
         seed: int,
         remark: Callable[[str], None],
     ) -> None:
@@ -186,10 +195,12 @@ class JointServos:
         inertia = sampled_inertia(compiled, coordinates, self._dof, seed)
         accelerations: list[float] = []
         forces: list[float] = []
-        weight = _sampled_weight(compiled, coordinates, self._dof, seed)
+        weight, lever = _sampled_loads(compiled, coordinates, self._dof, seed)
         raised: list[str] = []
         assumed, effort = [], stated_effort(model)
         base = base_coordinates(model)
+        sliding = [spec.joint(s.path).type == engine.mjtJoint.mjJNT_SLIDE for s in driven]
+        self._base = np.array([s in base and k for s, k in zip(driven, sliding, strict=True)], dtype=bool)
         for symbol, i in zip(driven, inertia.tolist(), strict=True):
             joint, armature = spec.joint(symbol.path), 0.0 if symbol in base else _ARMATURE * i
             joint.armature += armature
@@ -197,10 +208,9 @@ class JointServos:
             i += armature
             force = effort.get(symbol, 0.0)
             if not force > 0:
-                slides = joint.type == engine.mjtJoint.mjJNT_SLIDE
-                force = i * (_TRACTION if symbol in base and slides else _ACCELERATION)
+                force = i * (_TRACTION if self._base[len(forces)] else _ACCELERATION)
                 assumed.append(f"{symbol} {force:.3g}")
-            elif force < (load := float(weight[len(accelerations)])):
+            elif force < (load := float(weight[len(forces)])):
                 raised.append(f"{symbol} {force:g} to {load:.3g}")
                 force = load
             forces.append(force)
@@ -214,12 +224,15 @@ class JointServos:
             servo.forcelimited, servo.forcerange = True, (-force, force)
         self._acceleration: Array = np.array(accelerations)
         self.efforts = dict(zip(driven, forces, strict=True))
+        # What moves no shape presses on nothing.
+        self._press, self._presses = press, np.where(lever > 0, press * lever, math.inf)
         largest, smallest = (f(inertia) if len(inertia) else 0.0 for f in (np.max, np.min))
         remark(
             f"servos of bandwidth {bandwidth:g}/s drive {len(driven)} coordinates, with the largest "
             f"inertia of {_CONFIGURATIONS} configurations ({smallest:.2g} to {largest:.3g} kg m² or kg) and "
             f"the effort of the model; joints have {_ARMATURE:g} of it as armature"
         )
+        remark(f"what stops a servo is pressed with {press:g} N at most, as far as its effort goes")
         if raised:
             remark(f"the effort is raised where it is less than the weight, [N], [N m]: {', '.join(raised)}")
         if assumed:
@@ -235,6 +248,7 @@ class JointServos:
         self._upper: Array = np.where(limited, compiled.jnt_range[joints, 1], np.inf)
         self._compiled, self._product = compiled, np.zeros(compiled.nv)
         self._stiffness: Array = compiled.actuator_gainprm[self._actuators, 0].copy()
+        self._lead = np.minimum(_LEAD, self._presses / self._stiffness)
 
     def reset(self, data: Any) -> None:
         """Set all set points to the present positions."""
@@ -248,14 +262,23 @@ class JointServos:
         change = np.clip(rates - self._rates, -most, most)
         self._rates = self._rates + change
         self._target += self._step * self._rates
-        np.clip(self._target, q - _LEAD, q + _LEAD, out=self._target)
+        np.clip(self._target, q - self._lead, q + self._lead, out=self._target)
         np.clip(self._target, self._lower, self._upper, out=self._target)
-        control = self._target + self._ahead * self._rates
+        # The servo is τ = kp (u - q) - kv q̇, and 2/w = kv/kp.
+        damped = q + self._ahead * data.qvel[self._dof]
+        control = damped + self._limit(self._target + self._ahead * self._rates - damped)
         if change.any():
             mujoco().mj_mulM(self._compiled, data, self._product, self._ties @ (change / self._step))
             control += (self._ties.T @ self._product) / self._stiffness
-        # The servo is τ = kp (u - q) - kv q̇, and 2/w = kv/kp.
         data.ctrl[self._actuators] = control
+
+    def _limit(self, feedback: Array) -> Array:
+        """Return the part of a feedback, (n,) in units of the set points, that the limits of forces allow."""
+        forces = np.clip(self._stiffness * feedback, -self._presses, self._presses)
+        pushed = float(np.linalg.norm(forces[self._base]))
+        if pushed > self._press:
+            forces[self._base] *= self._press / pushed
+        return forces / self._stiffness
 
 
 def sampled_inertia(compiled: Any, coordinates: MujocoCoordinates, dofs: Array, seed: int) -> Array:
@@ -275,15 +298,30 @@ def sampled_inertia(compiled: Any, coordinates: MujocoCoordinates, dofs: Array, 
     return largest
 
 
-def _sampled_weight(compiled: Any, coordinates: MujocoCoordinates, dofs: Array, seed: int) -> Array:
-    """Return the largest force of gravity on each joint in sampled configurations (n,) [N], [N m]."""
+def _sampled_loads(
+    compiled: Any, coordinates: MujocoCoordinates, dofs: Array, seed: int
+) -> tuple[Array, Array]:
+    """Return the largest force of gravity on each joint, and the way of the farthest point that it moves.
+
+    Both are the largest in sampled configurations, (n,): [N], [N m], and [m/m], [m/rad].
+    """
     engine, data, random = mujoco(), mujoco().MjData(compiled), np.random.default_rng(seed)
-    move, largest = coordinates.sampler(), np.zeros(len(dofs))
+    move, columns = coordinates.sampler(), np.ascontiguousarray(coordinates.followers[:, dofs])
+    weights, levers = np.zeros(len(dofs)), np.zeros(len(dofs))
+    slide, turn = np.zeros((3, compiled.nv)), np.zeros((3, compiled.nv))
+    roots = compiled.body_rootid[compiled.dof_bodyid[dofs]]
+    own = np.flatnonzero(np.isin(compiled.body_rootid[compiled.geom_bodyid], roots)).tolist()
     for _ in range(_CONFIGURATIONS):
         move(data, random)
         engine.mj_forward(compiled, data)
-        np.maximum(largest, np.abs(data.qfrc_gravcomp @ coordinates.followers[:, dofs]), out=largest)
-    return largest
+        np.maximum(weights, np.abs(data.qfrc_gravcomp @ columns), out=weights)
+        for geom in own:
+            body = int(compiled.geom_bodyid[geom])
+            engine.mj_jac(compiled, data, slide, turn, data.geom_xpos[geom], body)
+            ways = np.linalg.norm(slide @ columns, axis=0)
+            ways += compiled.geom_rbound[geom] * np.linalg.norm(turn @ columns, axis=0)
+            np.maximum(levers, ways, out=levers)
+    return weights, levers
 
 
 def base_coordinates(model: ModelView) -> set[Symbol]:

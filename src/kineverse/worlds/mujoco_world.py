@@ -78,6 +78,9 @@ class MujocoWorld:
         Friction of furniture by coordinate [N], [N m], in place of that of the model.
     bandwidth
         Bandwidth of the servos [1/s].
+    press
+        Force with which a servo presses at most on what stops it [N], at the farthest point that it moves.
+        The default is what two fingers of 50 N hold by friction: a robot pushes as strongly as it pulls.
     floor
         Whether there is a floor at z = 0, if no furniture and nothing of the robot reaches below it at first.
     seed
@@ -113,10 +116,11 @@ class MujocoWorld:
         leave_out: Iterable[str] = (),
         door_friction: Mapping[Symbol, float] | Mapping[str, float] | None = None,
         bandwidth: float = BANDWIDTH,
+        press: float = 100.0,
         floor: bool = True,
         seed: int = 0,
     ) -> None:
-        positive = {"step": step, "grip": grip, "timeout": timeout, "bandwidth": bandwidth}
+        positive = {"step": step, "grip": grip, "timeout": timeout, "bandwidth": bandwidth, "press": press}
         for field, value in (*positive.items(), ("friction", friction), ("delay", delay)):
             number = finite_number(value)
             if number is None or number < 0 or (field in positive and not number):
@@ -170,7 +174,7 @@ class MujocoWorld:
                 f"no servo drives {', '.join(idle)}: each is not the position of one joint in MuJoCo"
             )
         self._servos = JointServos(
-            spec, compiled, self._coordinates, driven, model, self._step, bandwidth, seed, self._remark
+            spec, compiled, self._coordinates, driven, model, self._step, bandwidth, press, seed, self._remark
         )
         self._compiled = mujoco_model.compile_world(spec)
         moving = np.flatnonzero(self._compiled.body_weldid).tolist()

@@ -283,10 +283,12 @@ class _Run:
                 self.claimed = True
                 return SkillError("other", "The estimate is at the target, and the world is not.")
             if pushing.choice.jammed >= _MOST_JAMMED:
+                force = session.peak_force
+                strength = "" if math.isnan(force) else f" with up to {force:.0f} N"
                 return SkillError(
                     "collision",
-                    f"The object does not move: pushed at {pushing.choice.jammed} points, it stays at "
-                    f"{session.state[pushing.coordinate]:.3g}. It may be locked, jammed or blocked.",
+                    f"The object does not move: pushed at {pushing.choice.jammed} points{strength}, it stays "
+                    f"at {session.state[pushing.coordinate]:.3g}. It may be locked, jammed or blocked.",
                 )
             if pushing.choice.blocked - blocked >= _MOST_BLOCKED and self._plan:
                 blocked = pushing.choice.blocked
