@@ -11,7 +11,7 @@ from kineverse.manipulation.articulated_objects import (
     find_shut_value,
     select_objects,
 )
-from kineverse.manipulation.skill_arguments import limit_tolerance
+from kineverse.manipulation.skill_arguments import choose_tolerance
 from kineverse.model.body import Body, Box, Shape
 from kineverse.model.operations import SetBody
 
@@ -70,4 +70,7 @@ def test_locked_doors_are_found_with_their_whole_range(name):
     (door,) = (one for one in find_articulated_objects(model) if one.coordinate.path.endswith("/door"))
     assert (door.shut, door.opened) == (0.0, 1.9)
     assert find_shut_value(model, door.coordinate) == 0.0
-    assert limit_tolerance(model, door.coordinate, 0.02) == 0.02
+    (key,) = {*model.degrees_of_freedom} - {door.coordinate}
+    for free in ({key: model.limits(key)[1]}, {door.coordinate: 0.5}):
+        state = kv.State({**model.default_state(), **free})
+        assert choose_tolerance(model, door.coordinate, state, door.opened) == 0.02
