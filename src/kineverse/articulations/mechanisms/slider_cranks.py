@@ -182,7 +182,7 @@ class PedalBin(Mechanism, document_kind="PedalBin"):
             "rod": MechanismPart(
                 "base",
                 (shift(hinge - self.lever, 0.0, floor / 2), translation_along(Z, lift)),
-                (rod_shape((0.0, 0.0, 0.0), (0.0, 0.0, self.height - floor / 2 - 0.001), 0.004, STEEL),),
+                (rod_shape((0.0, 0.0, 0.0), (0.0, 0.0, self.height - floor / 2), 0.004, STEEL),),
             ),
             "lid": MechanismPart(
                 "base",
