@@ -49,12 +49,12 @@ def ackermann(scene: SceneBuilder) -> None:
     """Show a car: it goes where its front wheels point, each on its own circle about one centre."""
     _floor(scene)
     length, track, radius = 0.5, 0.34, 0.075
-    car = box((0.78, 0.26, 0.09), (0.25, 0, 0.13), RED) + box((0.3, 0.23, 0.1), (0.19, 0, 0.22), WHITE)
+    car = box((0.78, 0.2, 0.09), (0.25, 0, 0.13), RED) + box((0.3, 0.23, 0.1), (0.19, 0, 0.22), WHITE)
     car += box((0.02, 0.2, 0.06), (0.345, 0, 0.22), DARK) + box((0.24, 0.24, 0.055), (0.2, 0, 0.225), DARK)
     for side in (1, -1):
         car += disc(0.025, 0.02, (0.64, side * 0.09, 0.14), (1, 0, 0), WHITE)
     car += rod((0, -0.15, radius), (0, 0.15, radius), 0.014) + rod(
-        (length, -0.14, radius), (length, 0.14, radius), 0.014
+        (length, -0.12, radius), (length, 0.12, radius), 0.014
     )
     scene.joint(Ackermann, "car", car, wheelbase=length, steering=0.5, steering_speed=1.0, speed=1.0)
     rolled = scene.position("car/drive") / radius

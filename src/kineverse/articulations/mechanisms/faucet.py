@@ -88,7 +88,7 @@ class Faucet(Mechanism, document_kind="Faucet"):
                 "base",
                 (shift(z=self.height), rotation_about(Z, self.q("turn")), rotation_about(Y, self.q("lift"))),
                 (
-                    rod_shape((0.0, 0.0, 0.0), (0.0, 0.0, 0.03), 0.022, STEEL),
+                    rod_shape((0.0, 0.0, -0.005), (0.0, 0.0, 0.03), 0.022, STEEL),
                     rod_shape((0.0, 0.0, 0.022), (-0.12, 0.0, 0.035), 0.007, STEEL),
                 ),
             ),

@@ -161,14 +161,15 @@ class DeskLamp(Mechanism, document_kind="DeskLamp"):
         """Return foot, arms, bars, elbow and head."""
         lean, rise = self.q("lower"), self.q("upper")
         first, second, off = self.lower_arm, self.upper_arm, self.offset
-        foot = 0.05
-        upright = (rod_shape((0.0, 0.0, 0.0), (0.0, 0.0, first), 0.006, STEEL),)
-        level = (rod_shape((0.0, 0.0, 0.0), (second, 0.0, 0.0), 0.006, STEEL),)
+        foot, side, wide = 0.05, 0.0075, 0.027
+        # The upper arm and its bar pass the lower ones on the other side of the elbow.
+        upright = (rod_shape((0.0, -side, 0.0), (0.0, -side, first), 0.006, STEEL),)
+        level = (rod_shape((0.0, side, 0.0), (second, side, 0.0), 0.006, STEEL),)
         up, out = rotation_about(Y, lean), rotation_about(Y, -rise)
         return {
             "base": self.base(
                 rod_shape((0.0, 0.0, -foot), (0.0, 0.0, -foot / 2), 0.1, DARK),
-                box_shape((0.02 + off, 0.02, foot), (off / 2, 0.0, -foot / 4), DARK),
+                box_shape((0.02 + off, wide, foot), (off / 2, 0.0, -foot / 4), DARK),
             ),
             "lower_arm": MechanismPart("base", (up,), upright),
             "lower_bar": MechanismPart("base", (shift(off), up), upright),
@@ -176,8 +177,8 @@ class DeskLamp(Mechanism, document_kind="DeskLamp"):
                 "lower_arm",
                 (shift(z=first), rotation_about(Y, -lean)),
                 (
-                    box_shape((0.02 + off, 0.012, 0.02), (off / 2, 0.0, 0.0), RED),
-                    box_shape((0.02, 0.012, 0.02 + off), (0.0, 0.0, off / 2), RED),
+                    box_shape((0.02 + off, wide, 0.02), (off / 2, 0.0, 0.0), RED),
+                    box_shape((0.02, wide, 0.02 + off), (0.0, 0.0, off / 2), RED),
                 ),
             ),
             "upper_arm": MechanismPart("elbow", (out,), level),
@@ -186,7 +187,7 @@ class DeskLamp(Mechanism, document_kind="DeskLamp"):
                 "upper_arm",
                 (shift(second), rotation_about(Y, rise)),
                 (
-                    box_shape((0.02, 0.012, 0.02 + off), (0.0, 0.0, off / 2), RED),
+                    box_shape((0.02, wide, 0.02 + off), (0.0, 0.0, off / 2), RED),
                     rod_shape((0.0, 0.0, 0.0), (0.0, 0.0, -0.05), 0.05, PALE),
                 ),
             ),
