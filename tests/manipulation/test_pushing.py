@@ -249,7 +249,7 @@ def test_push_with_physics_is_gentle(sensors: Sensors | None) -> None:
 
 @pytest.mark.long
 @pytest.mark.parametrize("robot", ["fetch", "hsr", "pr2"])
-def test_heavy_robot_presses_a_drawer_that_sticks_with_some_100_newtons(robot: str) -> None:
+def test_heavy_robot_presses_a_drawer_that_sticks_with_some_120_newtons(robot: str) -> None:
     pytest.importorskip("mujoco")
     setup = make_push_setup(SHIPPED[robot], SHIPPED_KITCHEN, "sink left upper drawer")
     hand = find_gripper(setup.model, robot).bodies
@@ -263,8 +263,8 @@ def test_heavy_robot_presses_a_drawer_that_sticks_with_some_100_newtons(robot: s
     assert not outcome
     assert "N, it stays at 0.39" in outcome.reason
     touching = [force for force in forces if force > 1.0]
-    assert 30.0 < np.median(touching) < 110.0
-    assert np.percentile(touching, 95) < 130.0
+    assert 30.0 < np.median(touching) < 130.0
+    assert np.percentile(touching, 95) < 160.0
     assert outcome.measures["peak_force"] == max(forces) < 300.0
 
 

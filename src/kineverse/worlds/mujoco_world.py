@@ -116,7 +116,7 @@ class MujocoWorld:
         leave_out: Iterable[str] = (),
         door_friction: Mapping[Symbol, float] | Mapping[str, float] | None = None,
         bandwidth: float = BANDWIDTH,
-        press: float = 100.0,
+        press: float = 120.0,
         floor: bool = True,
         seed: int = 0,
     ) -> None:
