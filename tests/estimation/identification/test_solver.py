@@ -275,7 +275,7 @@ def test_identify_without_a_compiler_agrees(family: str, monkeypatch: pytest.Mon
     fast = identify(seen.parent, seen.child, noise=seen.covariance)
     with monkeypatch.context() as patched:
         patched.setattr(library, "_code", None)
-        patched.setattr(library, "_failed", True)
+        patched.setattr(library, "error", "there is none")
         slow = identify(seen.parent, seen.child, noise=seen.covariance)
         assert not solver.is_native
         best = slow.best

@@ -90,7 +90,7 @@ def test_unknown_noise_in_c_agrees_with_numpy(monkeypatch: pytest.MonkeyPatch) -
     families = ["prismatic", "revolute"]
     fast = identify(seen.parent, seen.child, families=families)
     monkeypatch.setattr(library, "_code", None)
-    monkeypatch.setattr(library, "_failed", True)
+    monkeypatch.setattr(library, "error", "there is none")
     slow = identify(seen.parent, seen.child, families=families)
     assert slow.noise == pytest.approx(fast.noise, rel=1e-3)
     for fit in slow:
