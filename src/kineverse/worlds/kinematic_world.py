@@ -1,10 +1,11 @@
 """World without forces: what a robot touches gives way along the normal, and a held body follows the hand.
 
-It takes speeds of the robot alone. An object stands still unless a body of the robot would penetrate it;
-then it moves by the least that its limits, speed limits and locks allow, see :mod:`.object_motion`. So
-objects can be pushed and not dragged, have no inertia, and nothing falls. What cannot give way is penetrated,
-and :meth:`KinematicWorld.contacts` reports it; so is furniture that never moves. What the robot moves stops
-at other furniture, beyond the overlaps of the start, see :mod:`.furniture_overlaps`. The robot goes exactly where its speeds lead, also beyond its limits.
+It takes speeds of the robot alone. An object stands still unless a body of the robot would penetrate it; then
+it moves by the least that its limits, speed limits and locks allow, see :mod:`.object_motion`. So objects can
+be pushed and not dragged, have no inertia, and nothing falls. What cannot give way is penetrated, and
+:meth:`KinematicWorld.contacts` reports it; so is furniture that never moves. What the robot moves stops at
+other furniture, beyond the overlaps of the start, see :mod:`.furniture_overlaps`. The robot goes exactly
+where its speeds lead, also beyond its limits.
 """
 
 from __future__ import annotations
