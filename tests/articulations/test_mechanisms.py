@@ -90,7 +90,7 @@ def test_mechanism_limits_are_constraints(mechanism: Mechanism) -> None:
                 ]
                 inside = model.violations({**home, q: end - sign * 0.01 * width})
                 assert f"{q}/position" not in [v.name for v in inside]
-        slowest, fastest = model.limits(q.derivative())
+        slowest, fastest = model.limits(q.derivative(), home)
         if np.isfinite(fastest):
             assert [v.excess for v in model.violations({**home, q.derivative(): fastest + 1})] == [1.0]
             assert not model.violations({**home, q.derivative(): slowest}) or mechanism.locks()
