@@ -18,6 +18,8 @@ from pathlib import Path
 
 ROOT = Path(__file__).parents[1]
 PACKAGES = ("compile", "geometry", "planning", "estimation", "control")
+REPORTED = 86
+"""Status of a process that ends with a report; one about undefined behaviour may be printed."""
 WARNINGS = ("-Wall", "-Wextra", "-Werror", "-Wno-unused-function")  # shared headers have functions for others
 
 # What is compiled once and run once is compiled faster than it is optimised.
@@ -72,8 +74,9 @@ def environment(folder: Path, libraries: list[str]) -> dict[str, str]:
         "KINEVERSE_CACHE_DIR": str(folder / "cache"),
         "LD_PRELOAD": ":".join([str(preloaded), *libraries]),
         # Python keeps memory until it ends, and preloaded.so comes before the sanitizer.
-        "ASAN_OPTIONS": f"detect_leaks=0:verify_asan_link_order=0:allocator_may_return_null=1:{report}",
-        "UBSAN_OPTIONS": f"print_stacktrace=1:{report}",
+        "ASAN_OPTIONS": "detect_leaks=0:verify_asan_link_order=0:allocator_may_return_null=1:"
+        f"exitcode={REPORTED}:{report}",
+        "UBSAN_OPTIONS": f"print_stacktrace=1:exitcode={REPORTED}:{report}",
         # Arrays have an end of their own each.
         "PYTHONMALLOC": "malloc",
     }
@@ -165,7 +168,17 @@ def main(arguments: list[str]) -> int:
     short = arguments == ["--short"]
     reports = [] if short else find_warnings()
     with tempfile.TemporaryDirectory(prefix="kineverse-sanitizers-") as name:
-        command = [sys.executable, "-m", "pytest", "-q", "--assert=plain", "-p", "no:cacheprovider"]
+        # Reports are printed below the streams of Python.
+        command = [
+            sys.executable,
+            "-m",
+            "pytest",
+            "-q",
+            "--assert=plain",
+            "--capture=sys",
+            "-p",
+            "no:cacheprovider",
+        ]
         command += arguments or [str(ROOT / "tests" / package) for package in PACKAGES]
         if short:
             command = [sys.executable, __file__, "--inside"]
@@ -176,7 +189,10 @@ def main(arguments: list[str]) -> int:
     print(*reports, sep="\n")
     print(f"{len(reports)} reports of compiler and sanitizers.")
     # 1: some tests have failed, by themselves.
-    return int(bool(reports) or status not in ((0,) if short else (0, 1)))
+    ended = status not in ((0,) if short else (0, 1))
+    if ended:
+        print(f"The tests ended before their end, with status {status}: the last report is above.")
+    return int(bool(reports) or ended)
 
 
 if __name__ == "__main__":

@@ -46,11 +46,13 @@ _TYPES = r"""
 #ifdef KINEVERSE_FLOAT
 typedef float Real;
 typedef int Bits;
+typedef unsigned UnsignedBits;
 #define REAL(x) x##f
 #define W (REGISTER / 4)
 #else
 typedef double Real;
 typedef long long Bits;
+typedef unsigned long long UnsignedBits;
 #define REAL(x) x
 #define W (REGISTER / 8)
 #endif
@@ -68,6 +70,7 @@ typedef long long Bits;
 
 typedef Real V __attribute__((vector_size(REGISTER)));
 typedef Bits I __attribute__((vector_size(REGISTER)));
+typedef UnsignedBits U __attribute__((vector_size(REGISTER)));
 typedef Real Unaligned __attribute__((vector_size(REGISTER), aligned(sizeof(Real)), may_alias));
 typedef Real Aligned __attribute__((vector_size(REGISTER), may_alias));
 
@@ -95,6 +98,10 @@ INLINE V select_(I mask, V a, V b) { return (V)((mask & (I)a) | (~mask & (I)b));
 INLINE V truth(I mask) { return (V)(mask & ONE); }
 INLINE V magnitude(V x) { return (V)((I)x & ~SIGN); }
 INLINE V with_sign_of(V x, V s) { return (V)(((I)x & ~SIGN) | ((I)s & SIGN)); }
+/* Of bits that may overflow, which signed numbers must not. */
+INLINE I add_bits(I a, I b) { return (I)((U)a + (U)b); }
+INLINE I subtract_bits(I a, I b) { return (I)((U)a - (U)b); }
+INLINE I shift_left(I a, int n) { return (I)((U)a << n); }
 INLINE I is_true(V x) { return x != splat(REAL(0.0)); }
 """
 

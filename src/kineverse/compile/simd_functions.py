@@ -102,8 +102,8 @@ INLINE void sincos_(V x, V *sine, V *cosine) {
   V c = fused(z, cosine_polynomial(z), splat(REAL(1.0)));
   I odd = -(quadrant & 1);
   V a = select_(odd, c, s), b = select_(odd, s, c);
-  *sine = (V)((I)a ^ ((quadrant & 2) << (int)(8 * sizeof(Real) - 2)));
-  *cosine = (V)((I)b ^ (((quadrant + 1) & 2) << (int)(8 * sizeof(Real) - 2)));
+  *sine = (V)((I)a ^ shift_left(quadrant & 2, 8 * sizeof(Real) - 2));
+  *cosine = (V)((I)b ^ shift_left(add_bits(quadrant, splat_bits(1)) & 2, 8 * sizeof(Real) - 2));
   if (__builtin_expect(any(magnitude(x) > splat(LARGEST_ANGLE)), 0)) sincos_lanes(&x, sine, cosine);
 }
 
@@ -203,7 +203,7 @@ INLINE V expm1_reduced(V x, V *k) {
 
 INLINE V power_of_two(V k) {
   I exponent = (I)(k + splat(6755399441055744.0)) & splat_bits(0x7ff);
-  return (V)(((exponent + splat_bits(1023)) & splat_bits(0x7ff)) << 52);
+  return (V)shift_left((exponent + splat_bits(1023)) & splat_bits(0x7ff), 52);
 }
 
 APART V exp_lanes(V x, V r) {
@@ -251,9 +251,9 @@ APART V log_lanes(V x, V r) {
 
 /* x = 2^k m with m around 1; log m = 2 artanh(s), s = (m - 1) / (m + 1). */
 INLINE V log_(V x) {
-  I bits = (I)x - splat_bits(0x3fe6a09e667f3bcdLL);
+  I bits = subtract_bits((I)x, splat_bits(0x3fe6a09e667f3bcdLL));
   I k = bits >> 52;
-  V m = (V)((I)x - (k << 52)), f = m - splat(1.0);
+  V m = (V)subtract_bits((I)x, shift_left(k, 52)), f = m - splat(1.0);
   V exponent = (V)(k + (I)splat(6755399441055744.0)) - splat(6755399441055744.0);
   V s = f / (f + splat(2.0)), z = s * s;
   /* (2 artanh(s) / s - 2) / s^2 on |s| <= 0.1716: 1.2e-18 */
