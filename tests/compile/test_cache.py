@@ -222,7 +222,7 @@ def test_the_end_of_the_process_ends_the_compiler(tmp_path: Path, end: str) -> N
     compiler = tmp_path / "cc"
     alive = tmp_path / "alive"
     # The number of its group is the fifth in what the system says of a process.
-    write = f"cut -d' ' -f5 /proc/$$/stat > {alive}"
+    write = f"cut -d' ' -f5 /proc/$$/stat > {alive}.$$; mv {alive}.$$ {alive}"
     compiler.write_text(f"#!/bin/sh\n({write}; while :; do sleep 0.1; done) & wait\n")
     compiler.chmod(0o755)
     program = f"""

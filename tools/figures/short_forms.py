@@ -6,6 +6,7 @@ Each returns the tables of the command's report. Several tables of one command s
 from __future__ import annotations
 
 import math
+import os
 from collections.abc import Iterable
 from functools import cache
 from pathlib import Path
@@ -17,9 +18,9 @@ import kineverse as kv
 from kineverse.cli.reproduce import format_report
 from kineverse.experiments.report import Figure, Report, ReportTable
 
-from .pages import ROOT, Table, find_titled_tables
+from .pages import Table, find_titled_tables
 
-DATA = ROOT.parent / "shared" / "data"
+DATA = Path(os.environ.get("KINEVERSE_TEST_DATA") or os.devnull).absolute()
 """Other people's models and recordings, see ``tests/DATA.md``."""
 
 Tables = list[tuple[str, Table]]
@@ -202,7 +203,6 @@ def lockbox() -> Tables:
     )
 
 
-def missing_data(folder: str) -> Path | None:
-    """Return the folder of data that is not there; None if it is, or if none is named."""
-    place = DATA / folder
-    return place if folder and not place.exists() else None
+def has_data(folder: str) -> bool:
+    """Return whether there is a folder of other people's data."""
+    return (DATA / folder).exists()
