@@ -71,7 +71,7 @@ def test_degrees_of_freedom_are_those_of_the_other_parsers():
         counts = {int(text.partition("=")[2]) for text in said if text.startswith(("nv=", "dof="))}
         if isinstance(expected, int) and counts:
             # A planar joint has two coordinates in yourdfpy.
-            planar = sum(joint.kind == "planar" for joint in read_urdf(FOLDER / file).joints)
+            planar = sum(joint.kind == "planar" for joint in read_urdf(published_path(file)).joints)
             assert {expected, expected - planar} & counts, file
 
 
