@@ -179,7 +179,7 @@ def main(arguments: list[str]) -> int:
             "-p",
             "no:cacheprovider",
         ]
-        # Decomposition limits the address space of a process without C of ours; sanitizers need more than that.
+        # Decomposition limits the memory of a process without C of ours; sanitizers need more than that.
         command += ["--ignore-glob=*decompos*"]
         command += arguments or [str(ROOT / "tests" / package) for package in PACKAGES]
         if short:
