@@ -17,7 +17,7 @@ from kineverse.bench.harness import ProgramError, has_peer, run_program
 from kineverse.bench.large_models import READERS, count_reruns, make_large_model
 from kineverse.bench.reaching import ARMS
 from kineverse.cli.bench import benchmark_to_markdown
-from kineverse.compile.toolchain import require_compiler
+from kineverse.cli.requirements import require
 
 sys.path.append(str(Path(__file__).parents[2] / "tools"))
 
@@ -129,7 +129,7 @@ def test_a_benchmark_that_needs_a_compiler_is_left_out_without_one(tiny, monkeyp
     monkeypatch.setenv("PATH", str(tmp_path))
 
     def measure(settings):
-        require_compiler("Planning")
+        require("Planning", {}, compiler=True)
 
     monkeypatch.setattr("kineverse.bench.measure_planning.measure", measure)
     (result,) = run_benchmarks(["planning"], tiny)

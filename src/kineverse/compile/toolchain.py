@@ -20,8 +20,6 @@ import sys
 from collections.abc import Sequence
 from dataclasses import dataclass
 
-from kineverse.errors import CompileError
-
 logger = logging.getLogger(__name__)
 
 # Flags with which C and interpreter agree to the last bit. No -ffast-math, which also deletes checks for NaN;
@@ -107,18 +105,6 @@ def toolchain() -> Toolchain | None:
     None if there is none, which is logged once.
     """
     return _find(os.environ.get("CC", ""), os.environ.get("PATH", os.defpath))
-
-
-def require_compiler(what: str) -> None:
-    """Raise if there is no C compiler, for what cannot do without.
-
-    Raises
-    ------
-    CompileError
-        "Planning needs a C compiler, and there is none ...", with how to install one.
-    """
-    if toolchain() is None:
-        raise CompileError(f"{what} needs a C compiler, and {NO_COMPILER}.")
 
 
 def optimisation_level(instructions: int) -> str | None:

@@ -177,13 +177,8 @@ class UpdateStep:
         groups: list[int],
     ) -> list[Candidate]:
         """Return candidates from restarts beside states where the measurement Jacobian vanishes."""
-        candidates = []
-        for start in self.stationary_points.restart_states(before, result.belief, groups, inputs):
-            try:
-                candidates.append(self._update_from(start, reading, inputs, groups))
-            except KineverseError:  # the restart fails
-                continue
-        return candidates
+        starts = self.stationary_points.restart_states(before, result.belief, groups, inputs)
+        return [one for start in starts for one in self._restart_from(start, reading, inputs, groups)]
 
     def _try_other_turns(
         self,
@@ -197,7 +192,7 @@ class UpdateStep:
 
         The orientation of a pinion has a minimum on each turn. The place of its rack tells which is least.
         """
-        candidates = []
+        candidates: list[Candidate] = []
         for x in self.counted:
             i = self.layout.tangent_space.coordinates.index(x)
             number = next(n for n, group in enumerate(self.layout.groups) if i in group.x)
@@ -218,11 +213,17 @@ class UpdateStep:
                 start = before.copy()
                 there = place[group.x]
                 move_origin(start, number, group, there, there - before.x[group.x], None)
-                try:
-                    candidates.append(self._update_from(start, reading, inputs, [number]))
-                except KineverseError:  # the restart fails
-                    continue
+                candidates += self._restart_from(start, reading, inputs, [number])
         return candidates
+
+    def _restart_from(
+        self, start: InformationState, reading: Measurements, inputs: Array, groups: list[int]
+    ) -> list[Candidate]:
+        """Return the candidate of a restart from a state; none if the restart fails."""
+        try:
+            return [self._update_from(start, reading, inputs, groups)]
+        except KineverseError:
+            return []
 
     def _update_from(
         self, start: InformationState, reading: Measurements, inputs: Array, groups: list[int]
