@@ -1,0 +1,108 @@
+"""Programs and functions that end in time, whatever they do."""
+
+from __future__ import annotations
+
+import multiprocessing
+import os
+import re
+import signal
+import subprocess
+import sys
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from multiprocessing.connection import Connection
+from pathlib import Path
+from typing import Any
+
+ROOT = Path(__file__).resolve().parents[2]
+_MODEL_VARIABLES = ("KINEVERSE_MODEL_PATH", "KINEVERSE_PACKAGE_PATH", "KINEVERSE_ROOT", "ROS_PACKAGE_PATH")
+
+
+def import_path() -> list[str]:
+    """Return the folders from which this checkout is imported, whatever is installed."""
+    return [str(ROOT / name) for name in ("src", "studies") if (ROOT / name).is_dir()]
+
+
+def environment(changes: Mapping[str, str] | None = None) -> dict[str, str]:
+    """Return an environment in which this checkout is imported, and only models that ship are found."""
+    kept = {name: value for name, value in os.environ.items() if name not in _MODEL_VARIABLES}
+    path = os.pathsep.join(import_path())
+    quiet = {"OPENBLAS_NUM_THREADS": "1", "COLUMNS": "100", "NO_COLOR": "1", "PYTHONHASHSEED": "0"}
+    return {**kept, **quiet, "PYTHONPATH": path, **(changes or {})}
+
+
+def run(
+    words: Sequence[str], seconds: float, cwd: Path, changes: Mapping[str, str] | None = None
+) -> tuple[int, str, str]:
+    """Run a program; return its status, 124 if it had to be ended, and what it printed."""
+    with subprocess.Popen(
+        list(words),
+        cwd=cwd,
+        env=environment(changes),
+        stdin=subprocess.DEVNULL,
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
+        encoding="utf-8",
+        errors="replace",
+        start_new_session=True,
+    ) as process:
+        try:
+            out, err = process.communicate(timeout=seconds)
+        except subprocess.TimeoutExpired:
+            os.killpg(process.pid, signal.SIGKILL)  # with its children
+            process.communicate()
+            return 124, "", f"ended after {seconds:g} s"
+    return process.returncode, out, err
+
+
+def neutral(text: str, *folders: Path) -> str:
+    """Return a text without the places of this checkout, of Python, and of some folders."""
+    places = {str(folder): "TMP" for folder in folders}
+    places |= {str(Path(sys.executable).parent): "BIN", str(ROOT): "ROOT"}
+    for place, name in places.items():
+        text = text.replace(place, name)
+    return re.sub(r" at 0x[0-9a-f]+", "", text)
+
+
+def each(function: Callable[[Any], Any], items: Iterable[Any], seconds: float) -> Iterator[Any]:
+    """Yield the results for some items, in another process; the text ``too long`` where one takes too long.
+
+    What raises becomes the text of the exception.
+    """
+    context = multiprocessing.get_context("spawn")
+    worker: Any = None
+    for item in items:
+        if worker is None:
+            here, there = context.Pipe()
+            worker = context.Process(target=_serve, args=(there, function), daemon=True)
+            worker.start()
+            there.close()
+            here.recv()  # it has imported what it needs
+        here.send(item)
+        try:
+            result = here.recv() if here.poll(seconds) else None
+        except EOFError:
+            result = "the process ended"
+        if result is None or not worker.is_alive():
+            worker.kill()
+            worker = None
+        yield "too long" if result is None else result
+    if worker is not None:
+        here.close()
+        worker.join(5)
+        worker.kill()
+
+
+def _serve(pipe: Connection, function: Callable[[Any], Any]) -> None:
+    for name in _MODEL_VARIABLES:
+        os.environ.pop(name, None)
+    pipe.send("ready")
+    while True:
+        try:
+            item = pipe.recv()
+        except EOFError:
+            return
+        try:
+            result = function(item)
+        except Exception as error:  # a verdict as well
+            result = f"{type(error).__name__}: {error}"
+        pipe.send(result)
