@@ -15,10 +15,11 @@ from inventory.names import short
 
 def commands(data: Path | None) -> dict[str, Any]:
     """Return all commands, and their options and arguments: ``command`` and ``command --option``."""
-    return dict(_describe([]))
+    return dict(describe([]))
 
 
-def _describe(words: list[str]) -> Iterator[tuple[str, Any]]:
+def describe(words: list[str]) -> Iterator[tuple[str, Any]]:
+    """Yield a command, its options and arguments, and the commands below it."""
     parser, text = ask_for_help(words)
     name = " ".join(words) or "kineverse"
     if parser is None:  # it prints its help without a parser
@@ -37,7 +38,7 @@ def _describe(words: list[str]) -> Iterator[tuple[str, Any]]:
                 )
     for sub in sorted(below):
         if not words or parser is not None:
-            yield from _describe([*words, sub])
+            yield from describe([*words, sub])
 
 
 def _option(parser: argparse.ArgumentParser, action: argparse.Action) -> dict[str, Any]:
