@@ -33,7 +33,7 @@ test: $(VENV)/test.installed
 	$(BIN)/mypy --num-workers $(JOBS)
 	$(BIN)/lint-imports --no-logo
 	@# Tests start commands by the dozen: each would compile the package anew where Python is told to keep nothing.
-	$(BIN)/python -m compileall -q -j $(JOBS) src tests
+	$(BIN)/python -m compileall -q -j $(JOBS) src studies tests
 	@# To have the values in a failed assertion printed takes each worker 13 s: only what fails is run with it, again.
 	@# The tests of a file share what takes long to make, so that they stay in one process.
 	$(BIN)/python -m pytest -q -n $(JOBS) --dist loadfile --no-loadscope-reorder --assert=plain $(ARGS) || \
@@ -57,11 +57,11 @@ $(BIN)/python:
 	    echo "Kineverse needs Python 3.11 or newer, and $(PYTHON) is not: make PYTHON=/path/to/python"; exit 1; }
 	$(PYTHON) -m venv $(VENV)
 
-# The package goes in last and as it lies here, so that an edit needs no second installation.
-$(VENV)/demo.installed: $(DEMO) pyproject.toml | $(BIN)/python
+# The package and its studies go in last and as they lie here, so that an edit needs no second installation.
+$(VENV)/demo.installed: $(DEMO) pyproject.toml studies/pyproject.toml | $(BIN)/python
 	@echo "Installing into $(VENV); this takes a minute, once."
 	@$(INSTALL_FILES)
-	$(INSTALL) --no-build-isolation --editable .
+	$(INSTALL) --no-build-isolation --editable . --editable studies
 	@touch $@
 
 $(VENV)/test.installed: requirements/peers.txt requirements/test.txt $(VENV)/demo.installed | $(BIN)/python

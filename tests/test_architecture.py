@@ -35,6 +35,11 @@ def test_the_tree_is_that_of_the_sources() -> None:
     assert block == runpy.run_path(str(ROOT / "tools" / "source_tree.py"))["tree"]()
 
 
+def test_the_package_does_not_import_its_studies() -> None:
+    sources = sorted((ROOT / "src").rglob("*.py"))
+    assert [path for path in sources if "kineverse_studies" in path.read_text("utf-8")] == []
+
+
 @pytest.mark.parametrize("package", ["formats", "geometry", "view"])
 def test_private_attributes_of_expressions_are_read_by_no_package_above(package: str) -> None:
     private = {slot for slot in kv.Expression.__slots__ if not slot.startswith("__")}

@@ -18,7 +18,7 @@ from pathlib import Path
 import pytest
 
 from kineverse.cli import main
-from kineverse.cli.main import COMMANDS, make_parser
+from kineverse.cli.main import COMMANDS, find_added_commands, load_command, make_parser
 from markdown_examples import ROOT, agree, examples
 from test_examples import SCRIPTS
 
@@ -126,7 +126,7 @@ def test_the_kitchen_in_motion_serves_its_page(at_the_root, pages, capsys):
 def test_commands_in_help_texts_parse(capsys):
     """Each line that begins with ``kineverse`` below a heading "examples"."""
     shown = [make_parser().format_help()]
-    for name in COMMANDS:
+    for name in [*COMMANDS, *find_added_commands()]:
         assert main([name, "--help"]) == 0
         shown.append(capsys.readouterr().out)
     lines = [
@@ -144,7 +144,7 @@ def test_inline_commands_of_the_docs_parse(page, capsys):
     """Commands in the text, which need not be whole: command and options exist."""
     for said in re.findall(r"`kineverse\s([^`]+)`", page.read_text(encoding="utf-8")):
         command, *words = said.split()
-        assert command in COMMANDS, said
+        assert command in COMMANDS or command in find_added_commands(), said
         assert main([command, "--help"]) == 0
         options = set(re.findall(r"(?<![\w-])--?[a-z][a-z-]*", capsys.readouterr().out))
         assert {word for word in words if word.startswith("-")} <= options, said
@@ -157,7 +157,7 @@ def test_targets_extras_and_tests_that_pages_name_exist(page):
     for target in re.findall(r"^make ([a-z]+)|`make ([a-z]+)", text, re.M):
         assert f"\n{''.join(target)}:" in makefile
     project = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))["project"]
-    for extras in re.findall(r"pip install [^`\n]*\[([a-z,]+)\]", text):
+    for extras in re.findall(r"pip install [^`\n]*'\.\[([a-z,]+)\]", text):
         assert set(extras.split(",")) <= set(project["optional-dependencies"])
     for path in re.findall(r"^pytest (tests/\S+)", text, re.M):
         assert (ROOT / path).exists()
@@ -166,4 +166,4 @@ def test_targets_extras_and_tests_that_pages_name_exist(page):
 def _parsed(command: str) -> None:
     words = shlex.split(re.split(r"\s{3,}| [|>]", command)[0])[1:]
     with suppress(SystemExit) if "--help" in words else nullcontext():
-        make_parser().parse_args(words)
+        make_parser({words[0]: load_command(words[0])}).parse_args(words)

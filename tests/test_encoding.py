@@ -45,7 +45,7 @@ def test_calls_without_an_encoding_are_found() -> None:
 def test_every_text_has_its_encoding() -> None:
     found = [
         f"{path.relative_to(ROOT)}:{call.lineno}: {ast.unparse(call)[:80]}"
-        for folder in ("src", "tools", "examples")
+        for folder in ("src", "studies", "tools", "examples")
         for path in sorted((ROOT / folder).rglob("*.py"))
         for call in unsaid_encodings(ast.parse(path.read_text("utf-8")))
     ]

@@ -13,8 +13,8 @@ from pathlib import Path
 import pytest
 
 import kineverse as kv
-from kineverse.bench.measure_examples import EXAMPLES
 from kineverse.formats.locate import locate_model
+from kineverse_studies.bench.measure_examples import EXAMPLES
 from markdown_examples import ROOT, agree
 
 FOLDER = ROOT / "examples"

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 import shutil
 import subprocess
 import sys
@@ -12,12 +13,14 @@ from pathlib import Path
 import pytest
 
 from kineverse import _extras
-from kineverse._extras import DISTRIBUTION, install_command, requirements
+from kineverse._extras import DISTRIBUTION, install_command, install_studies, requirements
+from kineverse._version import __version__
 
 ROOT = Path(__file__).parents[1]
 EXTRAS = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))["project"][
     "optional-dependencies"
 ]
+STUDIES = tomllib.loads((ROOT / "studies" / "pyproject.toml").read_text(encoding="utf-8"))["project"]
 HERE = Path(sys.executable)
 
 
@@ -57,15 +60,31 @@ def test_install_command_of_an_installed_copy_lists_the_extra(tmp_path):
     program = (
         f"import sys; sys.path.insert(0, {str(place)!r})\n"
         "from kineverse._extras import install_command\n"
-        "print(install_command('figures')); print(install_command('bench'))"
+        "print(install_command('figures')); print(install_command('geometry'))"
     )
     said = subprocess.run(
         [sys.executable, "-I", "-c", program], capture_output=True, text=True, check=True, cwd=tmp_path
     ).stdout.splitlines()
     assert said[0] == f"{pip()} install '{EXTRAS['figures'][0]}'"
-    assert f" '{EXTRAS['bench'][0]}' " in said[1]
-    assert '; (python_version < "3.12" and' in said[1]
+    assert f" '{EXTRAS['geometry'][0]}' " in said[1]
     assert "extra" not in said[1]
+
+
+def test_requirements_keep_other_markers():
+    declared = ['pybullet>=3; (python_version < "3.12" and sys_platform == "linux") and extra == \'peers\'']
+    assert requirements("peers", declared) == [
+        'pybullet>=3; (python_version < "3.12" and sys_platform == "linux")'
+    ]
+
+
+def test_install_command_of_the_studies(tmp_path, monkeypatch):
+    monkeypatch.chdir(ROOT)
+    assert install_studies().endswith(" install -e ./studies")
+    assert install_studies("peers").endswith(" install -e './studies[peers]'")
+    monkeypatch.chdir(tmp_path)
+    assert install_studies() == f"{pip()} install -e {ROOT / 'studies'}"
+    monkeypatch.setattr(_extras, "__file__", str(tmp_path / "a" / "kineverse" / "_extras.py"))
+    assert install_studies("peers") == f"{pip()} install 'kineverse-studies[peers]'"
 
 
 def test_install_command_without_metadata_asks_for_a_checkout(tmp_path, monkeypatch):
@@ -83,6 +102,11 @@ def test_requirements_of_each_extra_are_in_the_metadata(extra):
     ]
 
 
+def test_studies_have_the_version_of_the_package_and_need_it():
+    assert STUDIES["version"] == __version__
+    assert STUDIES["dependencies"] == [f"{DISTRIBUTION}=={__version__}"]
+
+
 def test_every_missing_extra_names_the_same_install_command():
     """No message names the distribution to pip, and each names an extra that there is."""
     named = set()
@@ -91,8 +115,10 @@ def test_every_missing_extra_names_the_same_install_command():
         assert f"{DISTRIBUTION}[" not in text, file
         named |= {extra for extra in EXTRAS if f'install_command("{extra}")' in text}
         named |= {extra for extra in EXTRAS if f"install_command('{extra}')" in text}
-    assert named >= {"figures", "geometry", "decomposition", "mjcf", "view", "exchange", "bench", "recording"}
+    assert named >= {"figures", "geometry", "decomposition", "mjcf", "view", "exchange", "recording"}
     for page in [ROOT / "README.md", *sorted((ROOT / "docs").glob("*.md"))]:
         text = page.read_text(encoding="utf-8")
         assert f"{DISTRIBUTION}[" not in text, page
         assert "pip install '." not in text.replace("pip install -e '.", ""), page
+        for extra in re.findall(r"/studies\[(\w+)\]", text):
+            assert extra in STUDIES["optional-dependencies"], page

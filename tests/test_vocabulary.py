@@ -15,7 +15,8 @@ import kineverse as kv
 from kineverse._gc import no_collection
 from kineverse._synonyms import RENAMED
 
-SRC = Path(__file__).parents[1] / "src"
+ROOT = Path(__file__).parents[1]
+SOURCES = {"": ROOT / "src" / "kineverse", "studies.": ROOT / "studies" / "kineverse_studies"}
 CLAUSE = re.compile(
     r"(What|Who|Whose|Whom|Whoever|Whatever|Whether|Where|Wherever|How|However|Which|When|Why|That|If)\b"
 )
@@ -24,8 +25,7 @@ TWINS = {"lie", "spatial"}
 
 INTERFACES = {
     "cli": {"add_arguments", "main", "run"},
-    "bench": {"measure", "main"},
-    "experiments": {"run"},
+    "studies": {"add_arguments", "main", "measure", "run"},
 }
 """Functions that every command, benchmark or experiment has, since they are called by that name."""
 
@@ -34,10 +34,11 @@ INTERFACES = {
 def trees() -> dict[str, ast.Module]:
     with no_collection():
         return {
-            ".".join(path.relative_to(SRC / "kineverse").with_suffix("").parts): ast.parse(
+            prefix + ".".join(path.relative_to(folder).with_suffix("").parts): ast.parse(
                 path.read_text("utf-8")
             )
-            for path in sorted((SRC / "kineverse").rglob("*.py"))
+            for prefix, folder in SOURCES.items()
+            for path in sorted(folder.rglob("*.py"))
         }
 
 

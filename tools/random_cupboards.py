@@ -24,9 +24,9 @@ from pathlib import Path
 import coal
 import numpy as np
 
-from kineverse.experiments.manipulation.robots import SHIPPED
 from kineverse.manipulation import Outcome, Session, open_object
 from kineverse.manipulation.pushing.trials import try_push
+from kineverse.manipulation.robot_sources import SHIPPED
 from kineverse.worlds import KinematicWorld
 
 ROBOTS = ("hsr", "pr2", "fetch")

@@ -18,8 +18,11 @@ WIDTH = 118
 
 def tree() -> str:
     """Return one paragraph for each package: its name, its subject and its modules."""
+    return _draw(ROOT / "src" / "kineverse") + _draw(ROOT / "studies" / "kineverse_studies")
+
+
+def _draw(source: Path) -> str:
     lines: list[str] = []
-    source = ROOT / "src" / "kineverse"
     folders = [source, *sorted(p.parent for p in source.rglob("__init__.py") if p.parent != source)]
     for folder in folders:
         depth = len(folder.relative_to(source).parts)

@@ -9,8 +9,8 @@ import numpy as np
 
 import kineverse as kv
 from kineverse.estimation import Fit, IdentificationResult, ObservedPose, Outliers, Tracker, identify
-from kineverse.experiments.plots import AXIAL_FAMILIES
 from kineverse.model.frame import WORLD
+from kineverse.view.plots import AXIAL_FAMILIES
 from kineverse.view.triangle_mesh import Floats
 
 from .gating import OutlierGate

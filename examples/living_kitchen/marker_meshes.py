@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from kineverse.estimation import Fit
-from kineverse.experiments.plots import AXIAL_FAMILIES, axis_covariances
+from kineverse.view.plots import AXIAL_FAMILIES, axis_covariances
 from kineverse.view.triangle_mesh import Floats, TriangleMesh, normalize_rows
 
 MARKER, THICK = 0.18, 0.02

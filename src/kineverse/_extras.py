@@ -12,6 +12,9 @@ from pathlib import Path
 
 DISTRIBUTION = "kineverse-articulation"
 
+STUDIES = "kineverse-studies"
+"""Distribution with benchmarks and experiments, ``studies/`` in a checkout."""
+
 _EXTRA = re.compile(r"""(?:\s*and\s*)?extra\s*==\s*["'](?P<name>[^"']+)["']""")
 
 
@@ -35,6 +38,16 @@ def install_command(*extras: str) -> str:
     if not wanted:  # the package is not installed, but on the path
         return f"{_pip()} install -e '.[{extra}]' in a checkout"
     return f"{_pip()} install {' '.join(map(shlex.quote, wanted))}"
+
+
+def install_studies(*extras: str) -> str:
+    """Return the command that installs the benchmarks and experiments, with some of their extras."""
+    extra = f"[{','.join(extras)}]" if extras else ""
+    here = checkout(Path(__file__))
+    if here is None or not (here / "studies").is_dir():
+        return f"{_pip()} install {shlex.quote(STUDIES + extra)}"
+    folder = _relative_to_cwd(here / "studies")
+    return f"{_pip()} install -e {shlex.quote((folder if os.path.isabs(folder) else f'./{folder}') + extra)}"
 
 
 def checkout(module: Path) -> Path | None:

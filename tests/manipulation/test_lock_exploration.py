@@ -10,12 +10,6 @@ from hypothesis import strategies as st
 import kineverse as kv
 from hypothesis_profiles import attempts
 from kineverse.errors import InvalidValueError, UnknownNameError
-from kineverse.experiments.lockbox.exhaustive_search import can_be_opened
-from kineverse.experiments.lockbox.systematic_search import (
-    LockboxTrials,
-    count_systematic_tries,
-    permute_parts,
-)
 from kineverse.gallery.lockboxes import (
     THESIS,
     Condition,
@@ -30,6 +24,12 @@ from kineverse.manipulation import PartMover, Session, explore_locks
 from kineverse.manipulation.unlocking.lock_hypothesis import Enclosure, KeySide, LockHypothesis
 from kineverse.reasoning import plan_unlocking
 from kineverse.worlds import MechanismWorld
+from kineverse_studies.experiments.lockbox.exhaustive_search import can_be_opened
+from kineverse_studies.experiments.lockbox.systematic_search import (
+    LockboxTrials,
+    count_systematic_tries,
+    permute_parts,
+)
 
 COUNT = 4
 LIMITS = Enclosure((0.0,) * COUNT, (1.0,) * COUNT)

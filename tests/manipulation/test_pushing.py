@@ -13,8 +13,6 @@ import kineverse as kv
 from kineverse.articulations import OmniBase
 from kineverse.control.contact_slots import ContactSlots
 from kineverse.errors import InvalidValueError, UnknownNameError
-from kineverse.experiments.manipulation.robots import SHIPPED
-from kineverse.experiments.table1_push.objects import SHIPPED_KITCHEN, make_push_setup
 from kineverse.geometry import Scene
 from kineverse.grasping import find_gripper
 from kineverse.manipulation.outcome import Outcome
@@ -29,10 +27,12 @@ from kineverse.manipulation.pushing.push_program import PushNumbers
 from kineverse.manipulation.pushing.push_skill import push
 from kineverse.manipulation.pushing.trials import try_push
 from kineverse.manipulation.pushing.vectors import move_point
+from kineverse.manipulation.robot_sources import SHIPPED
 from kineverse.manipulation.session import Session
 from kineverse.manipulation.tracked_belief import TrackedBelief
 from kineverse.model.body import Body, Box, Pose, Shape
 from kineverse.worlds import KinematicWorld, MujocoWorld, Sensors
+from kineverse_studies.experiments.table1_push.objects import SHIPPED_KITCHEN, make_push_setup
 
 PUSHER = "robot/finger"
 TIP = kv.array([0.0, 0.0, 0.0])

@@ -6,10 +6,10 @@ import pytest
 
 import kineverse as kv
 from kineverse.errors import InvalidValueError, UnknownNameError
-from kineverse.experiments.lockbox.exhaustive_search import can_be_opened
 from kineverse.gallery.lockboxes import THESIS, draw_tangled_lockbox, make_lockbox_model, make_rings
 from kineverse.manipulation import execute_unlocking
 from kineverse.worlds import MechanismWorld
+from kineverse_studies.experiments.lockbox.exhaustive_search import can_be_opened
 
 A, B, C = map(kv.position, "abc")
 

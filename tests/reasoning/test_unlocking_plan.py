@@ -8,7 +8,6 @@ from lockbox_oracle import box_graph
 
 import kineverse as kv
 from kineverse.errors import InvalidValueError, UnknownNameError
-from kineverse.experiments.lockbox.exhaustive_search import can_be_opened
 from kineverse.gallery.lockboxes import (
     THESIS,
     draw_lockbox,
@@ -18,6 +17,7 @@ from kineverse.gallery.lockboxes import (
 )
 from kineverse.reasoning import Interval, interlocks, plan_unlocking, plan_violations, refutation_gaps
 from kineverse.reasoning.move_search import MoveSearch
+from kineverse_studies.experiments.lockbox.exhaustive_search import can_be_opened
 
 A, B, C = map(kv.position, "abc")
 

@@ -24,7 +24,7 @@ from scipy.spatial.transform import Rotation
 
 import kineverse as kv
 from kineverse.estimation import identify, pose_covariance
-from kineverse.experiments.plots import axis_covariances
+from kineverse.view.plots import axis_covariances
 
 STEP = 1.0 / 12.0
 

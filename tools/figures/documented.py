@@ -6,7 +6,7 @@ from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from functools import partial
 
-from kineverse.bench import BENCHMARKS
+from kineverse_studies.bench import BENCHMARKS
 
 from . import short_forms
 from .rules import EXTREME, TIME, ByRow, Count, CountOf, Key, Largest, Mean, Rule, Same, Share, Unchecked

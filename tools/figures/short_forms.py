@@ -15,8 +15,8 @@ from typing import Any
 import numpy as np
 
 import kineverse as kv
-from kineverse.cli.reproduce import format_report
-from kineverse.experiments.report import Figure, Report, ReportTable
+from kineverse_studies.commands.reproduce import format_report
+from kineverse_studies.experiments.report import Figure, Report, ReportTable
 
 from .pages import Table, find_titled_tables
 
@@ -50,9 +50,9 @@ def tables_of(*tables: ReportTable) -> Tables:
 @cache
 def fig4() -> Tables:
     """Track few configurations, with one seed, and without times and mechanisms."""
-    from kineverse.experiments.fig4.accuracy import measure_errors
-    from kineverse.experiments.fig4.consistency import measure_consistency
-    from kineverse.experiments.fig4.protocol import make_observed_model
+    from kineverse_studies.experiments.fig4.accuracy import measure_errors
+    from kineverse_studies.experiments.fig4.consistency import measure_consistency
+    from kineverse_studies.experiments.fig4.protocol import make_observed_model
 
     scene = make_observed_model(kv.load("kitchen"))
     errors = measure_errors(scene, range(1), FIG4_CONFIGURATIONS, _quiet)
@@ -63,8 +63,13 @@ def fig4() -> Tables:
 @cache
 def fig4_authors() -> Tables:
     """Track few configurations of the authors' kitchen by the papers' filter, and by two of its variants."""
-    from kineverse.experiments.fig4.accuracy import VARIANTS, Errors, measure_variants, simulate_observations
-    from kineverse.experiments.fig4.protocol import LEVELS, make_observed_model, run_published
+    from kineverse_studies.experiments.fig4.accuracy import (
+        VARIANTS,
+        Errors,
+        measure_variants,
+        simulate_observations,
+    )
+    from kineverse_studies.experiments.fig4.protocol import LEVELS, make_observed_model, run_published
 
     model = DATA / "iai_kitchen" / "iai_kitchen" / "urdf_obj" / "IAI_kitchen.urdf"
     scene = make_observed_model(kv.load(model))
@@ -79,9 +84,9 @@ def fig4_authors() -> Tables:
 
 
 def _fig4_tables(scene: Any, errors: Any, variants: Any = None, consistency: Any = None) -> Tables:
-    from kineverse.experiments.fig4.accuracy import FILTERS
-    from kineverse.experiments.fig4.report import Fig4Results, make_tables
-    from kineverse.experiments.fig4.timing import Duration
+    from kineverse_studies.experiments.fig4.accuracy import FILTERS
+    from kineverse_studies.experiments.fig4.report import Fig4Results, make_tables
+    from kineverse_studies.experiments.fig4.timing import Duration
 
     untimed = dict.fromkeys(FILTERS, Duration(math.nan, math.nan, math.nan, 0))
     results = Fig4Results(
@@ -102,7 +107,7 @@ def _fig4_tables(scene: Any, errors: Any, variants: Any = None, consistency: Any
 @cache
 def sturm() -> Tables:
     """Classify all recordings, reduced to 20 poses each."""
-    from kineverse.experiments import Options, reproduce
+    from kineverse_studies.experiments import Options, reproduce
 
     return as_tables(reproduce("sturm", options=Options(quick=True, data=DATA / "sturm_tracks")))
 
@@ -110,8 +115,8 @@ def sturm() -> Tables:
 @cache
 def sturm_statements() -> Tables:
     """Identify the shortest recording by all of its poses."""
-    from kineverse.experiments.sturm.noise_statements import answer_statements, statement_table
-    from kineverse.experiments.sturm.recordings import read_labelled_pairs
+    from kineverse_studies.experiments.sturm.noise_statements import answer_statements, statement_table
+    from kineverse_studies.experiments.sturm.recordings import read_labelled_pairs
 
     pairs = read_labelled_pairs(DATA / "sturm_tracks")
     shortest = min(pairs, key=lambda one: len(one[2].child_poses))
@@ -121,8 +126,8 @@ def sturm_statements() -> Tables:
 @cache
 def stream_tracking() -> Tables:
     """Track two streams of 45 s."""
-    from kineverse.experiments.stream.report import make_report
-    from kineverse.experiments.stream.tracking import make_streams, run_trackers
+    from kineverse_studies.experiments.stream.report import make_report
+    from kineverse_studies.experiments.stream.tracking import make_streams, run_trackers
 
     model = kv.load("kitchen")
     streams = make_streams(model, range(STREAMS), _quiet, STREAM_SECONDS)
@@ -132,8 +137,8 @@ def stream_tracking() -> Tables:
 @cache
 def stream_monitoring() -> Tables:
     """Monitor one stream of a minute of each kind."""
-    from kineverse.experiments.stream.monitoring import measure_monitoring
-    from kineverse.experiments.stream.report import monitoring_table
+    from kineverse_studies.experiments.stream.monitoring import measure_monitoring
+    from kineverse_studies.experiments.stream.report import monitoring_table
 
     return tables_of(monitoring_table(measure_monitoring(kv.load("kitchen"), seeds=1, minutes=1.0)))
 
@@ -141,8 +146,8 @@ def stream_monitoring() -> Tables:
 @cache
 def joint_types() -> Tables:
     """Identify the first cases."""
-    from kineverse.experiments.joint_types.answers import identify_cases
-    from kineverse.experiments.joint_types.report import report_answers
+    from kineverse_studies.experiments.joint_types.answers import identify_cases
+    from kineverse_studies.experiments.joint_types.report import report_answers
 
     return as_tables(report_answers(identify_cases(TYPE_CASES, _quiet, workers=1)))
 
@@ -150,8 +155,8 @@ def joint_types() -> Tables:
 @cache
 def estimation_grid() -> Tables:
     """Fit few samples of each cell."""
-    from kineverse.experiments.estimation_grid.fits import fit_all, make_quick_grid
-    from kineverse.experiments.estimation_grid.report import report_grid
+    from kineverse_studies.experiments.estimation_grid.fits import fit_all, make_quick_grid
+    from kineverse_studies.experiments.estimation_grid.report import report_grid
 
     return as_tables(report_grid(fit_all(make_quick_grid(), GRID_SAMPLES, _quiet, workers=1)))
 
@@ -159,8 +164,8 @@ def estimation_grid() -> Tables:
 @cache
 def kitchen(what: str) -> Tables:
     """Open and close one object of the shipped kitchen, with the last robot."""
-    from kineverse.experiments.kitchens import KitchenJob, report_trials, run_kitchen
-    from kineverse.experiments.manipulation.robots import find_robots
+    from kineverse_studies.experiments.kitchens import KitchenJob, report_trials, run_kitchen
+    from kineverse_studies.experiments.manipulation.robots import find_robots
 
     trials = run_kitchen(KitchenJob("kitchen", find_robots((), None)[-1], only=what))
     return as_tables(report_trials(trials, ["kitchen"]))
@@ -169,10 +174,10 @@ def kitchen(what: str) -> Tables:
 @cache
 def pushes() -> Tables:
     """Push the fridge door shut with the last robot."""
-    from kineverse.experiments.manipulation.robots import find_robots
-    from kineverse.experiments.table1_push import PushJob, run_push
-    from kineverse.experiments.table1_push.objects import SHIPPED_KITCHEN
-    from kineverse.experiments.table1_push.report import make_push_report
+    from kineverse_studies.experiments.manipulation.robots import find_robots
+    from kineverse_studies.experiments.table1_push import PushJob, run_push
+    from kineverse_studies.experiments.table1_push.objects import SHIPPED_KITCHEN
+    from kineverse_studies.experiments.table1_push.report import make_push_report
 
     job = PushJob(find_robots((), None)[-1], SHIPPED_KITCHEN, None, "fridge door")
     return as_tables(make_push_report(run_push(job), seed=0))
@@ -181,7 +186,7 @@ def pushes() -> Tables:
 @cache
 def lockbox() -> Tables:
     """Open the first random box, plan the first of each kind, and explore the first with unknown locks."""
-    from kineverse.experiments.lockbox import (
+    from kineverse_studies.experiments.lockbox import (
         KINDS,
         list_explorer_jobs,
         list_planner_jobs,
@@ -190,7 +195,11 @@ def lockbox() -> Tables:
         run_explorer,
         run_planner,
     )
-    from kineverse.experiments.lockbox.unknown_locks import list_unknown_jobs, make_unknown_table, run_unknown
+    from kineverse_studies.experiments.lockbox.unknown_locks import (
+        list_unknown_jobs,
+        make_unknown_table,
+        run_unknown,
+    )
 
     explored = run_explorer(list_explorer_jobs(LOCKBOXES, 0, quick=False)[0])
     jobs = list_planner_jobs(LOCKBOXES, 0, quick=False)

@@ -104,8 +104,8 @@ class RobotDemo:
     """
 
     def __init__(self, arguments: argparse.Namespace) -> None:
-        from kineverse.experiments.manipulation.robots import find_robots
         from kineverse.manipulation import find_articulated_objects
+        from kineverse.manipulation.robot_sources import find_robot
         from kineverse.planning.bindings import request_planner
         from kineverse.worlds import Sensors
 
@@ -118,7 +118,7 @@ class RobotDemo:
             raise InvalidValueError(f"--seed is a number from 0 on, not {self._seed}.")
         noise = NOISE if arguments.noise is None else arguments.noise
         self._sensors = None if noise == "none" else Sensors.parse(noise)
-        self._robot = find_robots([arguments.robot or ROBOT])[0]
+        self._robot = find_robot(arguments.robot or ROBOT)
         if arguments.headless:
             check_picture_path(arguments.picture)
         request_planner()

@@ -155,8 +155,7 @@ def write_results(
     """Write the requested picture and document, and return their paths."""
     fit = learned.fit
     if arguments.picture:
-        from kineverse.experiments.plots import SIZE, draw_fit
-        from kineverse.experiments.report import Figure
+        from kineverse.view.plots import SIZE, Figure, draw_fit
 
         title = f"{pair.child} in {pair.parent}: {learned.found}"
         picture = Figure(lambda c: draw_fit(c, fit, pair.relative, title), SIZE)

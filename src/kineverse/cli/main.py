@@ -8,14 +8,17 @@ import os
 import re
 import signal
 import sys
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
-from types import ModuleType
-from typing import Any, Protocol, TextIO
+from dataclasses import dataclass
+from importlib.metadata import EntryPoint, entry_points
+from traceback import walk_tb
+from types import MappingProxyType, ModuleType
+from typing import Any, Protocol, TextIO, cast
 
+from kineverse._extras import STUDIES, install_command, install_studies
 from kineverse._version import __version__
 from kineverse.cli import (
-    bench,
     convert,
     decompose,
     demo,
@@ -26,15 +29,21 @@ from kineverse.cli import (
     manipulate,
     plan,
     reach,
-    reproduce,
     spheres,
     unlock,
     validate,
     view,
 )
 from kineverse.cli.output import join_lines
+from kineverse.cli.requirements import MODULES
 from kineverse.cli.streams import safe_streams
-from kineverse.errors import FormatError, KineverseError, UnknownNameError, suggest
+from kineverse.errors import (
+    FormatError,
+    KineverseError,
+    MissingDependencyError,
+    UnknownNameError,
+    suggest,
+)
 
 
 class CommandModule(Protocol):
@@ -67,13 +76,19 @@ COMMANDS: dict[str, CommandModule] = {
         spheres,
         fit,
         demo,
-        bench,
-        reproduce,
     ),
 }
 
+ENTRY_POINTS = "kineverse.commands"
+"""Group of entry points by which other distributions add commands; each names a :class:`CommandModule`."""
+
+STUDY_COMMANDS = ("bench", "reproduce")
+"""Commands of the distribution of studies, which need not be installed."""
+
 ERROR, INTERRUPTED, PIPE_CLOSED = 2, 130, 141
 """Exit statuses: the request failed; Ctrl-C; the output pipe was closed (128 and the signal's number)."""
+
+_PACKAGE = __name__.partition(".")[0]
 
 _NEGATIVE_VALUE = re.compile(r"-\s*(\d|\.\d|(pi|π|inf|nan)\b)")
 
@@ -137,7 +152,7 @@ def _run(words: Sequence[str]) -> int:
     """Run the command of some words and return its status; print the reason of a failure."""
     try:
         if not set(words) - {"-v", "--verbose"}:
-            make_parser().print_help()
+            make_parser(_list_added_commands()).print_help()
             return 0
         arguments = _parse_arguments(words)
         with _log_warnings_to(sys.stderr, arguments.verbose):
@@ -152,7 +167,26 @@ def _run(words: Sequence[str]) -> int:
     except (KineverseError, OSError) as error:
         print(f"kineverse: {format_error(error)}", file=sys.stderr)
         return ERROR
+    except ImportError as error:
+        reason = _explain_import(error)
+        if reason is None:
+            raise
+        print(f"kineverse: {reason}", file=sys.stderr)
+        return ERROR
     return status
+
+
+def _explain_import(error: ImportError) -> str | None:
+    """Return why a module of others cannot be imported, with the extra that it belongs to; None for ours."""
+    if (error.name or _PACKAGE).partition(".")[0] == _PACKAGE:
+        return None
+    importers = [error.name or ""]
+    importers += [str(frame.f_globals.get("__name__")) for frame, _ in walk_tb(error.__traceback__)]
+    modules = {name.partition(".")[0] for name in importers}
+    extra = next((extra for extra, module in MODULES.items() if module in modules), None)
+    if extra is None:
+        return f"{join_lines(error)}. 'pip check' says what is installed in part."
+    return f"The extra '{extra}' is not installed completely ({join_lines(error)}): {install_command(extra)}"
 
 
 @contextmanager
@@ -175,8 +209,52 @@ def _end_by_exception(enabled: bool) -> Iterator[None]:
             signal.signal(number, handler)
 
 
-def make_parser() -> argparse.ArgumentParser:
-    """Return the parser of the whole command line."""
+def find_added_commands() -> Mapping[str, EntryPoint]:
+    """Return the entry points of commands that other distributions add, by name, without importing them."""
+    found = {point.name: point for point in entry_points(group=ENTRY_POINTS)}
+    return {name: found[name] for name in sorted(found) if name not in COMMANDS}
+
+
+def load_command(name: str) -> CommandModule:
+    """Return a command of this package, or import one that another distribution adds.
+
+    Raises
+    ------
+    UnknownNameError
+        If there is no such command, with similar ones.
+    MissingDependencyError
+        If its distribution is not installed, or cannot be imported.
+    """
+    if name in COMMANDS:
+        return COMMANDS[name]
+    added = find_added_commands()
+    if name not in added:
+        if name in STUDY_COMMANDS:
+            raise MissingDependencyError(
+                f"'kineverse {name}' is a command of {STUDIES}, which is not installed: {install_studies()}"
+            )
+        raise UnknownNameError(f"There is no command {name!r}. {_suggest_command(name, added)}")
+    point = added[name]
+    distribution = point.dist.name if point.dist else point.value
+    try:
+        command = point.load()
+    except Exception as error:  # somebody else's code
+        reason = join_lines(error) or "no reason given"
+        raise MissingDependencyError(
+            f"'kineverse {name}' is a command of {distribution}, and {point.value} cannot be imported "
+            f"({type(error).__name__}: {reason}). Install {distribution} again."
+        ) from error
+    lacking = [part for part in ("HELP", "add_arguments", "run") if not hasattr(command, part)]
+    if lacking:
+        raise MissingDependencyError(
+            f"'kineverse {name}' is a command of {distribution}, and {point.value} has no "
+            f"{', '.join(lacking)}. Install {distribution} again."
+        )
+    return cast(CommandModule, command)
+
+
+def make_parser(added: Mapping[str, CommandModule] = MappingProxyType({})) -> argparse.ArgumentParser:
+    """Return the parser of the whole command line, with commands that other distributions add."""
     top = argparse.ArgumentParser(
         prog="kineverse",
         description="View, move and query articulation models.",
@@ -186,7 +264,7 @@ def make_parser() -> argparse.ArgumentParser:
     top.add_argument("--version", action="version", version=f"kineverse {__version__}")
     top.add_argument("-v", "--verbose", action="store_true", help="print more messages on standard error")
     commands = top.add_subparsers(title="commands", metavar="COMMAND", required=True)
-    for name, command in COMMANDS.items():
+    for name, command in {**COMMANDS, **added}.items():
         summary, _, description = command.HELP.partition("\n")
         sub = commands.add_parser(
             name,
@@ -210,11 +288,14 @@ def _parse_arguments(words: Sequence[str]) -> argparse.Namespace:
         For a command or an option that does not exist, with similar ones.
     """
     name = next((word for word in words if not word.startswith("-")), None)
-    if name is not None and name not in COMMANDS:
-        raise UnknownNameError(f"There is no command {name!r}. {_suggest_command(name)}")
+    # Other distributions are asked for an unknown name and for the list of commands only: that takes 20 ms.
+    if name is None:
+        added = _list_added_commands()
+    else:
+        added = {} if name in COMMANDS else {name: load_command(name)}
     # A leading space tells argparse that -30deg, -pi/2 or -1e-3 is a value and no option.
     words = [f" {word}" if _NEGATIVE_VALUE.match(word) else word for word in words]
-    arguments, unknown = make_parser().parse_known_args(words)
+    arguments, unknown = make_parser(added).parse_known_args(words)
     if unknown:
         sub: argparse.ArgumentParser = arguments.command
         word = unknown[0].partition("=")[0]
@@ -232,13 +313,40 @@ def _parse_arguments(words: Sequence[str]) -> argparse.Namespace:
     return arguments
 
 
-def _suggest_command(name: str) -> str:
+@dataclass(frozen=True)
+class _ListedCommand:
+    """Command of another distribution in the list of commands, which is not imported for that."""
+
+    HELP: str
+
+    def add_arguments(self, parser: argparse.ArgumentParser) -> None:
+        """Declare nothing."""
+
+    def run(self, arguments: argparse.Namespace) -> int:
+        """Do nothing: only ``--help`` lists the command."""
+        return ERROR
+
+
+def _list_added_commands() -> dict[str, CommandModule]:
+    added = find_added_commands()
+    listed: dict[str, CommandModule] = {
+        name: _ListedCommand(f"command of {point.dist.name if point.dist else point.value}")
+        for name, point in added.items()
+    }
+    for name in STUDY_COMMANDS:
+        if name not in listed:
+            listed[name] = _ListedCommand(f"command of {STUDIES}, which is not installed")
+    return listed
+
+
+def _suggest_command(name: str, added: Iterable[str]) -> str:
     """Return advice on a command that does not exist."""
     from kineverse.formats.locate import shipped_models
 
     if name in shipped_models() or os.path.exists(name):
         return f"It is a model or file: 'kineverse info {name}' says what it consists of."
-    return f"{suggest(name, COMMANDS, 'command')} 'kineverse --help' says what each does."
+    known = dict.fromkeys([*COMMANDS, *added, *STUDY_COMMANDS])
+    return f"{suggest(name, known, 'command')} 'kineverse --help' says what each does."
 
 
 def format_error(error: BaseException) -> str:

@@ -89,8 +89,9 @@ def make_scene(arguments: argparse.Namespace, skill: str) -> ManipulationScene:
         If something cannot be loaded; for unknown names, values out of limits, and a coordinate that is not
         an object's.
     """
-    from kineverse.experiments.manipulation.robots import SHIPPED, remove_unusable_shapes
+    from kineverse.geometry.exclusions import remove_unusable_shapes
     from kineverse.manipulation.articulated_objects import find_shut_value
+    from kineverse.manipulation.robot_sources import SHIPPED
     from kineverse.manipulation.skill_arguments import choose_tolerance, explain_fixed
     from kineverse.view.sliders import infer_units
 

@@ -224,7 +224,7 @@ def _read_trajectory(arguments: argparse.Namespace, model: ModelView) -> Traject
 def _write_plot(arguments: argparse.Namespace, recording: RunRecording | None) -> int:
     if recording is None:
         raise InvalidValueError("--plot is for recordings (.mcap); a model does not change over time")
-    from kineverse.experiments.report import Figure
+    from kineverse.view.plots import Figure
     from kineverse.worlds.recording_plot import plot_recording
 
     Figure(lambda canvas: plot_recording(recording, canvas), (11.0, 7.0)).save(Path(arguments.plot))

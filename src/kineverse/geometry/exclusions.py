@@ -7,8 +7,10 @@ from collections.abc import Mapping, Sequence
 from importlib.util import find_spec
 
 from kineverse.errors import FormatError, InvalidValueError, MissingDependencyError, summarize_error
-from kineverse.model.body import Geometry, Mesh
+from kineverse.model.body import Body, Geometry, Mesh
+from kineverse.model.model import Model
 from kineverse.model.model_view import ModelView
+from kineverse.model.operations import Override, SetBody
 
 from .broadphase import Flags
 from .collision_filter import Rule, adjacent_pairs, allowed_pairs, read_rules
@@ -54,6 +56,18 @@ def label_unusable_shapes(model: ModelView, problems: Mapping[tuple[str, int], s
         stays = count[name] < len(collision_shapes(model.bodies[name]))
         found.setdefault(f"shape {number} of {name}" if stays else name, why)
     return found
+
+
+def remove_unusable_shapes(model: Model) -> tuple[str, ...]:
+    """Remove shapes whose files are missing, and return their labels with the reasons."""
+    unusable = find_unusable_shapes(model)
+    with model.edit() as edit:
+        for name in dict.fromkeys(name for name, _ in unusable):
+            body = model.bodies[name]
+            # The shapes that collide are those for the eye if there are no others.
+            left = tuple(s for k, s in enumerate(collision_shapes(body)) if (name, k) not in unusable)
+            edit.apply(Override(SetBody(name, Body(left, left, body.inertia))))
+    return tuple(f"{name}: {why}" for name, why in label_unusable_shapes(model, unusable).items())
 
 
 def _find_problem(geometry: Geometry) -> str:

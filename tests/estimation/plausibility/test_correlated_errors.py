@@ -22,7 +22,8 @@ from kineverse.estimation.identification.observations import check_observations
 from kineverse.estimation.plausibility.correlation import CorrelationSettings
 from kineverse.estimation.plausibility.known_motion import KnownJoint
 from kineverse.estimation.plausibility.known_residuals import compute_residuals
-from kineverse.experiments.stream.observations import (
+from kineverse.lie import exp_so3
+from kineverse_studies.experiments.stream.observations import (
     DOOR,
     FRAMES,
     ORIENTATION,
@@ -31,7 +32,6 @@ from kineverse.experiments.stream.observations import (
     correlated_errors,
     simulate_stream,
 )
-from kineverse.lie import exp_so3
 
 Array = npt.NDArray[np.float64]
 

@@ -1,0 +1,1 @@
+"""Studies of Kineverse: benchmarks with peers, and the experiments of the papers."""

@@ -1,0 +1,130 @@
+"""Pairs within a distance in Bullet."""
+
+from __future__ import annotations
+
+import itertools
+from typing import Any
+
+from kineverse.lie import Array, to_quaternion
+from kineverse_studies.bench.clutter import (
+    BOX_SIZE,
+    CAPSULE_SIZE,
+    CENTRE,
+    LINK_LENGTH,
+    LINKS,
+    RADIUS,
+    Clutter,
+)
+
+from .clutter_search import PairDistances
+
+_LINKS_PER_BODY = 100
+"""Number of boxes in one body, as Bullet limits the number of links."""
+
+
+class BulletSearch:
+    """Search with Bullet's getClosestPoints of the arm and bodies with the boxes as links."""
+
+    def __init__(self, clutter: Clutter) -> None:
+        import pybullet
+
+        self._bullet: Any = pybullet
+        self._client = pybullet.connect(pybullet.DIRECT)
+        shapes = [_create_link_shape(pybullet, clutter, link, self._client) for link in range(LINKS)]
+        links = [[0.0, 0.0, LINK_LENGTH if link else 0.0] for link in range(LINKS)]
+        axes = [list(clutter.axis(link)) for link in range(LINKS)]
+        self._arm = _create_body(pybullet, shapes, links, None, axes, self._client)
+        boxes = [
+            pybullet.createCollisionShape(
+                pybullet.GEOM_BOX, halfExtents=(size / 2).tolist(), physicsClientId=self._client
+            )
+            for size in clutter.sizes
+        ]
+        self._bodies = create_static_bodies(pybullet, boxes, clutter.poses, self._client)
+        self._joints = list(range(LINKS))
+        self.results: list[Any] = []
+
+    def update(self, angles: Array) -> None:
+        """Set the joint angles."""
+        rows = angles[:, None].tolist()
+        self._bullet.resetJointStatesMultiDof(
+            self._arm, self._joints, targetValues=rows, physicsClientId=self._client
+        )
+
+    def query(self) -> object:
+        """Search for pairs within the radius."""
+        closest_points, arm, client = self._bullet.getClosestPoints, self._arm, self._client
+        self.results = [closest_points(arm, body, RADIUS, physicsClientId=client) for body in self._bodies]
+        return self.results
+
+    def distances(self) -> PairDistances:
+        """Return the pairs of the last search, with distances [m]."""
+        for contact in itertools.chain(*self.results):
+            yield f"link{contact[3]}", f"box{self._bodies[contact[2]] + contact[4]}", contact[8]
+
+    def __del__(self) -> None:
+        self._bullet.disconnect(self._client)
+
+
+def create_static_bodies(pybullet: Any, shapes: list[int], poses: Array, client: int) -> dict[int, int]:
+    """Create static bodies of shapes at poses, (N, 3, 4) or larger, each shape a link.
+
+    Returns
+    -------
+    Index of the shape of the first link, by body.
+    """
+    bodies = {}
+    for first in range(0, len(shapes), _LINKS_PER_BODY):
+        some = slice(first, first + _LINKS_PER_BODY)
+        positions, turns = poses[some, :3, 3].tolist(), xyzw_quaternions(poses[some])
+        bodies[_create_body(pybullet, shapes[some], positions, turns, None, client)] = first
+    return bodies
+
+
+def _create_link_shape(pybullet: Any, clutter: Clutter, link: int, client: int) -> int:
+    kind = clutter.kind(link)
+    at = {"collisionFramePosition": list(CENTRE), "physicsClientId": client}
+    if kind == "box":
+        half = [edge / 2 for edge in BOX_SIZE]
+        return int(pybullet.createCollisionShape(pybullet.GEOM_BOX, halfExtents=half, **at))
+    if kind == "capsule":
+        radius, length = CAPSULE_SIZE
+        return int(pybullet.createCollisionShape(pybullet.GEOM_CAPSULE, radius=radius, height=length, **at))
+    return int(
+        pybullet.createCollisionShape(pybullet.GEOM_MESH, vertices=clutter.corners[link].tolist(), **at)
+    )
+
+
+def _create_body(
+    pybullet: Any,
+    shapes: list[int],
+    positions: list[list[float]],
+    quaternions: list[list[float]] | None,
+    axes: list[list[int]] | None,
+    client: int,
+) -> int:
+    """Create a chain of revolute links, or static links if there are no axes."""
+    count, nothing, upright = len(shapes), [0.0, 0.0, 0.0], [0.0, 0.0, 0.0, 1.0]
+    fixed, turning = pybullet.JOINT_FIXED, pybullet.JOINT_REVOLUTE
+    return int(
+        pybullet.createMultiBody(
+            baseMass=0,
+            linkMasses=[0.0 if axes is None else 1.0] * count,
+            linkCollisionShapeIndices=shapes,
+            linkVisualShapeIndices=[-1] * count,
+            linkPositions=positions,
+            linkOrientations=quaternions or [upright] * count,
+            linkInertialFramePositions=[nothing] * count,
+            linkInertialFrameOrientations=[upright] * count,
+            linkParentIndices=[0] * count if axes is None else list(range(count)),
+            linkJointTypes=[fixed if axes is None else turning] * count,
+            linkJointAxis=axes or [[0, 0, 1]] * count,
+            physicsClientId=client,
+        )
+    )
+
+
+def xyzw_quaternions(poses: Array) -> list[list[float]]:
+    """Return (x, y, z, w) of (N, 3, 4) or larger poses."""
+    quaternions: list[list[float]] = to_quaternion(poses[:, :3, :3]).tolist()
+    return quaternions

@@ -1,0 +1,149 @@
+"""CasADi graph of the robot at many points, as CasADi's map in C and as numpy operations."""
+
+from __future__ import annotations
+
+import subprocess
+from collections.abc import Callable, Mapping, Sequence
+from pathlib import Path
+from types import MappingProxyType
+from typing import Any
+
+import casadi as ca
+import numpy as np
+
+from kineverse.compile import compiler_information
+from kineverse.errors import CompileError
+from kineverse.lie import Array
+from kineverse_studies.bench.workloads import BenchmarkRobot
+
+COMPILER_FLAGS = ("-O3", "-march=native", "-fPIC", "-shared")
+"""Flags for the C code of a map, which is faster than a map over the C code of the function."""
+
+
+def make_casadi_function(robot: BenchmarkRobot) -> Any:
+    """Return pose and Jacobian of the robot's frame as a CasADi function with common subexpressions shared.
+
+    CasADi stores columns first, numpy rows first, so the outputs are transposed.
+    """
+    pose, jacobian = robot.model.fk(robot.frame), robot.model.jacobian(robot.frame)
+    inputs = ca.vertcat(*(symbol.casadi for symbol in robot.chain))
+    outputs = [ca.densify(pose.casadi.T), ca.densify(jacobian.casadi.T)]
+    return ca.Function("pose_and_jacobian", [inputs], ca.cse(outputs))
+
+
+def compile_map(function: Any, rows: int, folder: Path) -> Any:
+    """Return the map of a function over rows, compiled in a folder.
+
+    Raises
+    ------
+    CompileError
+        If the compiler fails.
+    """
+    mapped = function.map(rows)
+    generator = ca.CodeGenerator("map.c")
+    generator.add(mapped)
+    source, library = folder / "map.c", folder / "map.so"
+    source.write_text(generator.dump(), encoding="utf-8")
+    compiler = compiler_information().compiler or "cc"
+    command = [compiler, *COMPILER_FLAGS, str(source), "-o", str(library), "-lm"]
+    done = subprocess.run(command, capture_output=True, encoding="utf-8", errors="replace", check=False)
+    if done.returncode:
+        raise CompileError(f"CasADi's map cannot be compiled: {done.stderr.strip().splitlines()[0]}")
+    return ca.external(mapped.name(), str(library))
+
+
+class BoundMap:
+    """CasADi map bound to its input and output memory.
+
+    Parameters
+    ----------
+    function
+        CasADi map.
+    points
+        Input, a row for each point.
+    outputs
+        Output arrays.
+    """
+
+    def __init__(self, function: Any, points: Array, outputs: tuple[Array, ...]) -> None:
+        self._references = function, points, outputs
+        self._buffer, self._run = function.buffer()
+        self._buffer.set_arg(0, points.reshape(-1).data)
+        for k, output in enumerate(outputs):
+            self._buffer.set_res(k, output.reshape(-1).data)
+
+    def __call__(self) -> None:
+        """Evaluate at all points."""
+        self._run()
+
+
+CHUNK_SIZE = 1024
+"""Number of points of a chunk: columns stay in the cache, and numpy's overhead is small."""
+
+NUMPY_OPERATIONS: Mapping[int, Callable[..., Any]] = MappingProxyType(
+    {
+        ca.OP_ADD: np.add,
+        ca.OP_SUB: np.subtract,
+        ca.OP_MUL: np.multiply,
+        ca.OP_DIV: np.divide,
+        ca.OP_NEG: np.negative,
+        ca.OP_INV: np.reciprocal,
+        ca.OP_SQ: np.square,
+        ca.OP_TWICE: lambda x, out: np.multiply(x, 2.0, out=out),
+        ca.OP_SQRT: np.sqrt,
+        ca.OP_SIN: np.sin,
+        ca.OP_COS: np.cos,
+        ca.OP_ASSIGN: lambda x, out: np.copyto(out, x),
+    }
+)
+"""Numpy functions of CasADi's operations, as far as joints with one coordinate need them."""
+
+
+class NumpyGraph:
+    """CasADi function of one vector, evaluated with numpy at many points.
+
+    Parameters
+    ----------
+    function
+        Function with scalar instructions only, such as one of ``SX``.
+
+    Raises
+    ------
+    CompileError
+        If it contains an operation that is not in :data:`NUMPY_OPERATIONS`.
+    """
+
+    def __init__(self, function: Any) -> None:
+        self._columns = np.zeros((function.sz_w(), CHUNK_SIZE))
+        self._steps: list[tuple[int, Any, list[int], list[int]]] = []
+        for k in range(function.n_instructions()):
+            code = function.instruction_id(k)
+            if code == ca.OP_CONST:
+                argument = function.instruction_constant(k)
+            elif code in (ca.OP_INPUT, ca.OP_OUTPUT):
+                argument = None
+            elif code in NUMPY_OPERATIONS:
+                argument = NUMPY_OPERATIONS[code]
+            else:
+                raise CompileError(f"numpy is not told what CasADi's operation {code} is.")
+            places = function.instruction_input(k), function.instruction_output(k)
+            self._steps.append((code, argument, *places))
+
+    def __call__(self, points: Array, outputs: Sequence[Array]) -> None:
+        """Evaluate at all rows of points, shape (N, n), and write to outputs, each of N rows."""
+        flat = [output.reshape(len(points), -1) for output in outputs]
+        for first in range(0, len(points), CHUNK_SIZE):
+            some = slice(first, first + CHUNK_SIZE)
+            self._evaluate(points[some].T.copy(), [output[some].T for output in flat])
+
+    def _evaluate(self, inputs: Array, outputs: Sequence[Array]) -> None:
+        columns = list(self._columns[:, : inputs.shape[1]])
+        for code, argument, read, written in self._steps:
+            if code == ca.OP_INPUT:
+                np.copyto(columns[written[0]], inputs[read[1]])
+            elif code == ca.OP_OUTPUT:
+                np.copyto(outputs[written[0]][written[1]], columns[read[0]])
+            elif code == ca.OP_CONST:
+                columns[written[0]].fill(argument)
+            else:
+                argument(*[columns[place] for place in read], out=columns[written[0]])

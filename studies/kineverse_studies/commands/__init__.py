@@ -1,0 +1,1 @@
+"""Commands ``kineverse bench`` and ``kineverse reproduce``, found by entry points."""

@@ -1,0 +1,150 @@
+"""``kineverse reproduce``: the papers' experiments."""
+
+from __future__ import annotations
+
+import argparse
+import json
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from kineverse.cli.output import format_markdown, format_table, show_progress
+from kineverse.cli.requirements import require
+from kineverse.errors import MissingDependencyError, UnknownNameError
+from kineverse.expressions.printing import format_number
+
+if TYPE_CHECKING:
+    from kineverse_studies.experiments import Report, ReportTable
+
+HELP = """reproduce an experiment of the papers, with tables and a figure
+
+examples:
+  kineverse reproduce --list
+  kineverse reproduce fig3
+  kineverse reproduce fig3 --figure door.svg
+  kineverse reproduce estimation-grid --quick
+  kineverse reproduce sturm --data sturm_tracks
+  kineverse reproduce kitchens --seed 100 --count 50 --robot hsr
+  kineverse reproduce fig3 --json"""
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """Declare the options."""
+    parser.add_argument("name", metavar="NAME", nargs="?", help="name of an experiment, see --list")
+    parser.add_argument("--list", action="store_true", help="list the experiments and exit")
+    parser.add_argument("--quick", action="store_true", help="reduced experiment, in seconds")
+    parser.add_argument("--data", metavar="FOLDER", type=Path, help="folder of the recordings that it needs")
+    parser.add_argument("--model", metavar="MODEL", help="name or path of its model")
+    parser.add_argument("--seed", metavar="N", type=int, default=0, help="first seed (0)")
+    parser.add_argument("--count", metavar="N", type=int, help="number of seeds or repetitions")
+    parser.add_argument(
+        "--robot",
+        metavar="ROBOT",
+        action="append",
+        default=[],
+        help="name or path of a robot; may be given several times",
+    )
+    parser.add_argument("--processes", metavar="N", type=int, help="number of processes (cores)")
+    parser.add_argument("--world", default="kinematic", help="kinematic (the default), mujoco, or both")
+    parser.add_argument(
+        "--noise",
+        metavar="NOISE",
+        help="noise of the sensors, such as 3mm+3mm/m,0.5deg,30Hz (none: the truth)",
+    )
+    parser.add_argument("--record", metavar="FOLDER", type=Path, help="folder for a recording of each trial")
+    figure = parser.add_mutually_exclusive_group()
+    figure.add_argument(
+        "--figure",
+        metavar="FILE",
+        type=Path,
+        help="file of the figure (NAME.png; with --json, --markdown: none)",
+    )
+    figure.add_argument("--no-figure", action="store_true", help="draw nothing")
+    form = parser.add_mutually_exclusive_group()
+    form.add_argument("--json", action="store_true", help="one JSON object on standard output")
+    form.add_argument("--markdown", action="store_true", help="tables in Markdown on standard output")
+
+
+def run(arguments: argparse.Namespace) -> int:
+    """Run the experiment, print its tables, write its figure."""
+    from kineverse_studies.experiments import EXPERIMENTS, Options, reproduce
+    from kineverse_studies.experiments.registry import PLANNED, REQUIRED_EXTRAS
+
+    if arguments.list:
+        listing = dict(EXPERIMENTS)
+        print(
+            json.dumps(listing, indent=2)
+            if arguments.json
+            else format_table(("name", "about"), listing.items())
+        )
+        return 0
+    if arguments.name is None:
+        raise UnknownNameError(f"Name an experiment. There are: {', '.join(EXPERIMENTS)}.")
+    options = Options(
+        quick=arguments.quick,
+        data=arguments.data,
+        model=arguments.model,
+        seed=arguments.seed,
+        count=arguments.count,
+        robot=tuple(arguments.robot),
+        processes=arguments.processes,
+        world=arguments.world,
+        noise=arguments.noise,
+        record=arguments.record,
+    )
+    needed = REQUIRED_EXTRAS.get(arguments.name, ())
+    extras = {
+        "control": "control" in needed,
+        "figures": arguments.figure is not None,
+        "geometry": "geometry" in needed,
+        "mjcf": "geometry" in needed and arguments.world != "kinematic",
+        "recording": arguments.record is not None,
+    }
+    require(f"kineverse reproduce {arguments.name}", extras, compiler=arguments.name in PLANNED)
+    report = reproduce(arguments.name, show_progress, options)
+    if arguments.figure is not None and (arguments.json or arguments.markdown):
+        _save_figures(report, arguments.figure)
+    if arguments.json:
+        answer = {
+            "name": report.name,
+            "title": report.title,
+            "figure": arguments.figure and str(arguments.figure),
+            **report.numbers,
+        }
+        print(json.dumps(answer, indent=2, allow_nan=False))
+        return 0
+    print(format_report(report, arguments.markdown), flush=True)
+    if arguments.no_figure or arguments.markdown:
+        return 0
+    try:
+        paths = _save_figures(report, arguments.figure or Path(f"{report.name}.png"))
+    except MissingDependencyError as error:
+        if arguments.figure:
+            raise
+        print(f"\nThere is no figure. {error}")
+    else:
+        names = ", ".join(map(str, paths))
+        print(f"\nThe figures are in {names}." if len(paths) > 1 else f"\nThe figure is in {names}.")
+    return 0
+
+
+def _save_figures(report: Report, requested: Path) -> list[Path]:
+    """Write the figure, and the further pictures beside it; return their paths."""
+    paths = {requested: report.figure}
+    for name, picture in report.pictures.items():
+        paths[requested.with_name(f"{requested.stem}-{name}{requested.suffix}")] = picture
+    for path, figure in paths.items():
+        figure.save(path)
+    return list(paths)
+
+
+def format_report(report: Report, markdown: bool = False) -> str:
+    """Return a report as tables, plain ones or in Markdown."""
+    title = f"# {report.title}" if markdown else report.title
+    return "\n\n".join([title, *(_format_report_table(table, markdown) for table in report.tables)])
+
+
+def _format_report_table(table: ReportTable, markdown: bool) -> str:
+    rows = [[cell if isinstance(cell, str) else format_number(cell) for cell in row] for row in table.rows]
+    if markdown:
+        return f"## {table.title}\n\n{format_markdown(table.head, rows)}"
+    return f"{table.title}\n{format_table(table.head, rows, '>' * len(table.head))}"

@@ -1,0 +1,327 @@
+"""``lockbox``: boxes of parts that lock each other, opened by trends, by plans, and with unknown locks.
+
+The boxes are that of the thesis behind the 2020 paper, random ones, and the Chinese rings.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass
+from time import process_time
+from typing import Literal, TypeAlias
+
+import numpy as np
+
+from kineverse.gallery.lockboxes import (
+    THESIS,
+    Lockbox,
+    draw_lockbox,
+    draw_tangled_lockbox,
+    make_lockbox_model,
+    make_rings,
+)
+from kineverse.reasoning import interlocks, plan_unlocking, plan_violations
+from kineverse.view.plots import Figure
+from kineverse_studies.experiments.manipulation.trial_pool import run_jobs
+from kineverse_studies.experiments.registry import Options, Progress
+from kineverse_studies.experiments.report import Report, ReportTable
+
+from .exhaustive_search import can_be_opened
+from .figure import FIGURE_SIZE, draw_boxes
+from .recordings import record_thesis_box
+from .unknown_locks import (
+    UnknownLockResult,
+    list_unknown_jobs,
+    list_unknown_numbers,
+    make_unknown_table,
+    run_unknown,
+)
+from .unlocking_runs import LOCK_RULES, Rule, UnlockingRun, run_unlocking
+
+OPTIONS = ("quick", "seed", "count", "processes", "record")
+
+COUNT, QUICK_COUNT = 1000, 4
+"""Number of random boxes without negations; half as many have some, a tenth is for each ablation."""
+NEGATED = 0.25
+_STEPS_A_PART = 40
+_LARGEST, _LARGEST_NEGATED = 100, 40
+_ABLATED = (10, 40)
+_SMALL = 7
+"""Largest number of parts of boxes on which plans are compared with exhaustive search."""
+
+Kind: TypeAlias = Literal["monotone", "negated", "tangled", "rings"]
+KINDS: dict[Kind, str] = {
+    "monotone": "& and |",
+    "negated": "&, | and ~",
+    "tangled": "any conditions",
+    "rings": "Chinese rings",
+}
+
+
+@dataclass(frozen=True, slots=True)
+class ExplorerJob:
+    """Random box that a controller opens."""
+
+    parts: int
+    seed: int
+    negated: float
+    rule: Rule
+
+
+@dataclass(frozen=True, slots=True)
+class ExplorerResult:
+    """Opening of a random box; ``solvable`` is False if a plan refutes it, and None if none decides it."""
+
+    job: ExplorerJob
+    run: UnlockingRun
+    solvable: bool | None
+
+
+@dataclass(frozen=True, slots=True)
+class PlannerJob:
+    """Box for which a plan is made."""
+
+    kind: Kind
+    parts: int
+    seed: int
+
+
+@dataclass(frozen=True, slots=True)
+class PlannerResult:
+    """Plan of a box.
+
+    Attributes
+    ----------
+    verdict, moves
+        Verdict, and number of moves.
+    wrong
+        True if the constraints contradict the plan, or exhaustive search the verdict.
+    reading, planning
+        CPU times of reading the interlocks and of planning [s].
+    """
+
+    job: PlannerJob
+    verdict: str
+    moves: int
+    wrong: bool
+    reading: float
+    planning: float
+
+
+def run(progress: Progress, options: Options) -> Report:
+    """Open boxes by trends and plan their opening; ``quick`` takes few and small boxes."""
+    count = options.count or (QUICK_COUNT if options.quick else COUNT)
+    if options.record is not None:
+        record_thesis_box(options.record)
+    thesis = {rule: run_unlocking(THESIS, rule) for rule in LOCK_RULES}
+    explored = run_jobs(
+        run_explorer,
+        list_explorer_jobs(count, options.seed, options.quick),
+        progress,
+        "lockbox",
+        "box",
+        options.processes,
+    )
+    planned = run_jobs(
+        run_planner,
+        list_planner_jobs(count, options.seed, options.quick),
+        progress,
+        "lockbox",
+        "plan",
+        options.processes,
+    )
+    unknown = run_jobs(
+        run_unknown,
+        list_unknown_jobs(count, options.seed),
+        progress,
+        "lockbox",
+        "exploration",
+        options.processes,
+    )
+    return make_lockbox_report(thesis, explored, planned, unknown, options.seed)
+
+
+def list_explorer_jobs(count: int, seed: int, quick: bool) -> list[ExplorerJob]:
+    """Return the random boxes for each rule; the numbers of parts are spread over their range."""
+    largest, largest_negated = (15, 10) if quick else (_LARGEST, _LARGEST_NEGATED)
+    jobs = [ExplorerJob(_spread(k, largest), seed + k, 0.0, "and") for k in range(count)]
+    half = range(math.ceil(count / 2))
+    jobs += [ExplorerJob(_spread(k, largest_negated), seed + k, NEGATED, "and") for k in half]
+    for rule in LOCK_RULES:
+        for parts in _ABLATED[: 1 if quick else None]:
+            share = NEGATED if rule == "undemanded" else 0.0
+            jobs += [ExplorerJob(parts, seed + k, share, rule) for k in range(math.ceil(count / 10))]
+    return jobs
+
+
+def list_planner_jobs(count: int, seed: int, quick: bool) -> list[PlannerJob]:
+    """Return the boxes to plan."""
+    jobs = [PlannerJob("monotone", 10 if quick else 50, seed + k) for k in range(math.ceil(count / 10))]
+    jobs += [PlannerJob("negated", 10 if quick else 30, seed + k) for k in range(math.ceil(count / 2))]
+    small = range(count if quick else 10 * count)
+    jobs += [PlannerJob("tangled", 2 + k % (_SMALL - 1), seed + k) for k in small]
+    return jobs + [PlannerJob("rings", n, 0) for n in range(1, 6 if quick else 13)]
+
+
+def _spread(k: int, largest: int) -> int:
+    return 5 + 37 * k % (largest - 4)
+
+
+def run_explorer(job: ExplorerJob) -> list[ExplorerResult]:
+    """Open one random box."""
+    box = draw_lockbox(job.parts, job.seed, negated=job.negated)
+    found = run_unlocking(box, job.rule, 400 + _STEPS_A_PART * job.parts)
+    solvable: bool | None = True
+    if job.negated and not found.done:
+        verdict = plan_unlocking(make_lockbox_model(box, None), box.goal).verdict
+        solvable = {"found": True, "refuted": False}.get(verdict)
+    return [ExplorerResult(job, found, solvable)]
+
+
+def run_planner(job: PlannerJob) -> list[PlannerResult]:
+    """Plan the opening of one box, and check the plan."""
+    box = _draw(job)
+    model = make_lockbox_model(box, None)
+    begin = process_time()
+    found = interlocks(model)
+    read = process_time()
+    plan = plan_unlocking(model, box.goal, found=found)
+    end = process_time()
+    wrong = bool(plan_violations(model, plan))
+    if job.kind == "tangled":
+        wrong = wrong or (plan.verdict == "found") != can_be_opened(box)
+    if job.kind == "rings":
+        wrong = wrong or len(plan.steps) != (2 ** (job.parts + 1) - 1) // 3
+    return [PlannerResult(job, plan.verdict, len(plan.steps), wrong, read - begin, end - read)]
+
+
+def _draw(job: PlannerJob) -> Lockbox:
+    if job.kind == "rings":
+        return make_rings(job.parts)
+    if job.kind == "tangled":
+        return draw_tangled_lockbox(job.parts, job.seed)
+    return draw_lockbox(job.parts, job.seed, negated=NEGATED if job.kind == "negated" else 0.0)
+
+
+def make_lockbox_report(
+    thesis: dict[Rule, UnlockingRun],
+    explored: Sequence[ExplorerResult],
+    planned: Sequence[PlannerResult],
+    unknown: Sequence[UnknownLockResult],
+    seed: int,
+) -> Report:
+    """Return the report on explorer, planner and unknown locks."""
+    groups: dict[tuple[Rule, bool], list[ExplorerResult]] = {}
+    for one in explored:
+        groups.setdefault((one.job.rule, bool(one.job.negated)), []).append(one)
+    plans = {kind: [p for p in planned if p.job.kind == kind] for kind in KINDS}
+    ablated: dict[tuple[Rule, int], list[UnlockingRun]] = {}
+    for one in explored:
+        if one.job.parts in _ABLATED:
+            ablated.setdefault((one.job.rule, one.job.parts), []).append(one.run)
+    numbers = {
+        "seed": seed,
+        "thesis": {rule: one.as_data() for rule, one in thesis.items()},
+        "explorer": [
+            {
+                "rule": rule,
+                "negated": negated,
+                "opened": sum(r.run.done for r in own),
+                "of": sum(r.solvable is True for r in own),
+                "failed": [(r.job.parts, r.job.seed) for r in own if r.solvable and not r.run.done],
+            }
+            for (rule, negated), own in groups.items()
+        ],
+        "planner": [
+            {
+                "boxes": kind,
+                "number": len(own),
+                **{v: sum(p.verdict == v for p in own) for v in ("found", "refuted", "undecided")},
+                "wrong": [(p.job.parts, p.job.seed) for p in own if p.wrong],
+                "planning_s": [p.planning for p in own],
+            }
+            for kind, own in plans.items()
+        ],
+        "unknown locks": list_unknown_numbers(unknown),
+    }
+    return Report(
+        "lockbox",
+        "Lockboxes opened by trends, plans of their opening, and unknown locks",
+        (
+            _thesis_table(thesis),
+            make_explorer_table(groups),
+            make_planner_table(plans),
+            make_unknown_table(unknown),
+        ),
+        numbers,
+        Figure(lambda canvas: draw_boxes(canvas, ablated), FIGURE_SIZE),
+    )
+
+
+def _thesis_table(runs: dict[Rule, UnlockingRun]) -> ReportTable:
+    rows = tuple(
+        (LOCK_RULES[rule], "yes" if one.done else "no", one.steps, ", ".join(one.order))
+        for rule, one in runs.items()
+    )
+    return ReportTable("The lockbox of the thesis", ("trends", "opened", "steps", "order of the parts"), rows)
+
+
+def make_explorer_table(groups: dict[tuple[Rule, bool], list[ExplorerResult]]) -> ReportTable:
+    """Return the table of boxes that a controller opens, by rule of trends and whether locks are negated."""
+    rows: list[tuple[float | str, ...]] = []
+    for (rule, negated), own in groups.items():
+        solvable = [r for r in own if r.solvable]
+        steps = [r.run.steps for r in solvable if r.run.done]
+        cpu = [1e6 * t for r in solvable for t in r.run.cpu]
+        rows.append(
+            (
+                LOCK_RULES[rule],
+                "&, |, ~" if negated else "&, |",
+                _format_parts(r.job.parts for r in own),
+                f"{len(steps)} of {len(solvable)}",
+                f"{np.median(steps):.0f}" if steps else "",
+                f"{np.median(cpu):.0f}" if cpu else "",
+            )
+        )
+    head = ("trends", "locks", "parts", "opened", "steps (median)", "CPU of a step [µs]")
+    return ReportTable("Random boxes that can be opened", head, tuple(rows))
+
+
+def _format_parts(parts: Iterable[int]) -> str:
+    numbers = sorted(parts)
+    return str(numbers[0]) if numbers[0] == numbers[-1] else f"{numbers[0]} to {numbers[-1]}"
+
+
+def make_planner_table(plans: dict[Kind, list[PlannerResult]]) -> ReportTable:
+    """Return the table of plans by kind of box."""
+    rows: list[tuple[float | str, ...]] = []
+    for kind, own in plans.items():
+        counts = [sum(p.verdict == v for p in own) for v in ("found", "refuted", "undecided")]
+        times = sorted(1e3 * p.planning for p in own)
+        reading = sorted(1e3 * p.reading for p in own)
+        rows.append(
+            (
+                KINDS[kind],
+                _format_parts(p.job.parts for p in own),
+                *counts,
+                sum(p.wrong for p in own),
+                max(p.moves for p in own),
+                f"{np.median(times):.3g}",
+                f"{times[-1]:.3g}",
+                f"{np.median(reading):.3g}",
+            )
+        )
+    head = (
+        "boxes",
+        "parts",
+        "found",
+        "refuted",
+        "undecided",
+        "wrong",
+        "moves (most)",
+        "planning [ms]",
+        "(longest)",
+        "reading locks [ms]",
+    )
+    return ReportTable("Plans, checked by constraints and exhaustive search", head, tuple(rows))

@@ -1,0 +1,54 @@
+"""Streams of a door: the short form of ``kineverse reproduce stream``."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from typing import Any
+
+import numpy as np
+import pytest
+
+import kineverse as kv
+from kineverse_studies.experiments.stream.observations import StreamErrors, correlated_errors
+from kineverse_studies.experiments.stream.report import make_report
+from kineverse_studies.experiments.stream.tracking import make_streams, run_trackers, summarize_trackers
+
+MODEL = kv.load("kitchen")
+
+
+def no_progress(items: Iterable[Any], what: str, unit: str) -> Iterable[Any]:
+    return items
+
+
+@pytest.fixture(scope="module")
+def tracked():
+    return run_trackers(MODEL, make_streams(MODEL, range(2), no_progress, duration=15.0), no_progress)
+
+
+def test_errors_are_correlated_as_stated():
+    errors = correlated_errors(40_000, (4,), np.random.default_rng(0), StreamErrors())
+    assert errors.std() == pytest.approx(1.0, abs=0.03)
+    for lag in (1, 10):
+        correlation = np.mean(errors[lag:] * errors[:-lag])
+        assert correlation == pytest.approx(0.7 * 0.95**lag, abs=0.04)
+
+
+@pytest.mark.long
+def test_trackers_follow_the_door_and_are_never_silently_lost(tracked):
+    summaries = {summary.name: summary for summary in summarize_trackers(tracked)}
+    textbook, velocity = summaries["textbook"], summaries["velocity"]
+    for name in ("position", "velocity"):
+        assert summaries[name].silently_lost < 1.0
+        # Less than 1 while the door is shut, at its limit.
+        assert 0.3 < summaries[name].nees < 1.5
+    assert velocity.moving < 1.1 * textbook.moving
+    assert velocity.resting < 1.05 * textbook.resting
+    assert velocity.moving < 0.9 * summaries["position"].moving
+
+
+def test_report_has_a_row_for_each_filter(tracked, tmp_path):
+    report = make_report(tracked, [])
+    assert [row[0] for row in report.tables[0].rows] == ["position", "velocity", "textbook"]
+    assert report.numbers["tracking"][2]["mean_time"] is None
+    report.figure.save(tmp_path / "stream.png")
+    assert (tmp_path / "stream.png").stat().st_size > 10_000
