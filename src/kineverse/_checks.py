@@ -16,11 +16,6 @@ def real_number(value: Any) -> float:
     """Return a real number as a float, NaN and infinities included.
 
     Unlike ``float``, it raises for text, complex numbers, arrays of one or more elements, and masked values.
-
-    Raises
-    ------
-    TypeError, ValueError, OverflowError
-        For values that are not real numbers.
     """
     if type(value) is float:
         return value
@@ -43,13 +38,7 @@ def finite_number(value: Any) -> float | None:
 
 
 def as_tolerance(given: float, subject: str = "A tolerance") -> float:
-    """Return a tolerance as a float; messages begin with the subject.
-
-    Raises
-    ------
-    InvalidValueError
-        For negative numbers and values that are not finite numbers.
-    """
+    """Return a tolerance as a float; messages begin with the subject."""
     tolerance = finite_number(given)
     if tolerance is None or tolerance < 0:
         raise InvalidValueError(f"{subject} is a finite number from 0, not {given!r}.")
@@ -57,13 +46,7 @@ def as_tolerance(given: float, subject: str = "A tolerance") -> float:
 
 
 def as_count(name: str, given: int, least: int) -> int:
-    """Return a keyword argument as an integer.
-
-    Raises
-    ------
-    InvalidValueError
-        For a number below the least, and what is no integer.
-    """
+    """Return a keyword argument as an integer."""
     count = None if isinstance(given, bool) or not hasattr(given, "__index__") else index(given)
     if count is None or count < least:
         raise InvalidValueError(f"{name}= is an integer of at least {least}, not {given!r}.")
@@ -71,24 +54,7 @@ def as_count(name: str, given: int, least: int) -> int:
 
 
 def as_entries(argument: str, given: Any, kinds: type | tuple[type, ...], wanted: str) -> tuple[Any, ...]:
-    """Return the entries of an argument that takes one value or several.
-
-    Parameters
-    ----------
-    argument
-        Name of the argument, as in ``move=``.
-    given
-        A value, or an iterable of values.
-    kinds
-        Types of values.
-    wanted
-        What the argument takes, for the message.
-
-    Raises
-    ------
-    InvalidValueError
-        For anything else.
-    """
+    """Return the entries of an argument that takes one value or several."""
     if isinstance(given, kinds):
         return (given,)
     if isinstance(given, Iterable) and not isinstance(given, str | bytes):
@@ -99,12 +65,6 @@ def as_entries(argument: str, given: Any, kinds: type | tuple[type, ...], wanted
 
 
 def check_flag(name: str, given: object) -> None:
-    """Check that a keyword argument is True or False, since a text such as 'no' counts as true.
-
-    Raises
-    ------
-    InvalidValueError
-        For other values.
-    """
+    """Check that a keyword argument is True or False, since a text such as 'no' counts as true."""
     if not isinstance(given, bool | np.bool_):
         raise InvalidValueError(f"{name}= is True or False, not {given!r}.")

@@ -23,11 +23,6 @@ def install_command(*extras: str) -> str:
 
     The package is on no index, so pip cannot find it by name. A checkout is installed again, editable, with
     the extras; for other installations, the requirements of the extras are installed.
-
-    Parameters
-    ----------
-    extras
-        Some of ``[project.optional-dependencies]``, such as ``figures``.
     """
     extra = ",".join(extras)
     here = checkout(Path(__file__))

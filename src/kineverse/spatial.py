@@ -232,13 +232,7 @@ def translation(
 def _components(
     what: str, names: tuple[str, ...], given: tuple[ExpressionLike | None, ...]
 ) -> tuple[Expression, ...]:
-    """Return the numbers that are given one by one, or as a single vector.
-
-    Raises
-    ------
-    ShapeError
-        For more or fewer, and for arrays among them.
-    """
+    """Return the numbers that are given one by one, or as a single vector."""
     wanted = (
         f"{what} is given as {len(names)} numbers {', '.join(names)} or as one vector of "
         f"shape ({len(names)},) alone"

@@ -24,21 +24,11 @@ from .limits import limit_constraints
 
 @dataclass(frozen=True, kw_only=True)
 class PlacedOperation(Operation):
-    """Base of operations with a name and an origin in a parent frame.
+    """Base of operations with a name and an origin in a parent frame."""
 
-    Attributes
-    ----------
-    name
-        Name of the articulation and, if it has one coordinate, of its degree of freedom.
-    parent
-        Parent frame.
-    origin
-        Pose of the articulation in the parent frame.
-    """
-
-    name: str
-    parent: str
-    origin: TransformLike = Pose()
+    name: str  # name of the articulation and, if it has one coordinate, of its degree of freedom
+    parent: str  # parent frame
+    origin: TransformLike = Pose()  # pose of the articulation in the parent frame
 
     def __post_init__(self) -> None:
         self.check_texts("name", "parent")
@@ -65,26 +55,14 @@ class PlacedOperation(Operation):
         return split_words(self.document_kind)
 
     def check_lengths(self, *fields: str) -> None:
-        """Check that fields are positive lengths [m].
-
-        Raises
-        ------
-        InvalidValueError
-            If one is not positive.
-        """
+        """Check that fields are positive lengths [m]."""
         for field in fields:
             check_joint_number(
                 getattr(self, field), f"The {field} of the {self.noun} '{self.name}'", positive=True
             )
 
     def check_texts(self, *fields: str) -> None:
-        """Check that fields are names.
-
-        Raises
-        ------
-        InvalidValueError
-            If one is no text, or empty.
-        """
+        """Check that fields are names."""
         for field in fields:
             given = getattr(self, field)
             if not isinstance(given, str) or not given:
@@ -92,13 +70,7 @@ class PlacedOperation(Operation):
                 raise InvalidValueError(f"{what} is a path like 'kitchen/door', not {given!r}.")
 
     def check_names(self, model: ReadRecorder, frames: Iterable[str]) -> None:
-        """Check that the names of the articulation and of its frames are free.
-
-        Raises
-        ------
-        DuplicateNameError
-            If one is taken.
-        """
+        """Check that the names of the articulation and of its frames are free."""
         wanted: list[tuple[str, str, Container[str]]] = [("an articulation", self.name, model.articulations)]
         wanted += [("a frame", frame, model.frames) for frame in frames]
         for what, name, names in wanted:
@@ -257,13 +229,7 @@ class OneDofJoint(OneAxisMotion):
 
 
 def check_axis(axis: AxisLike, name: str) -> Vector3:
-    """Return the axis of a joint as a tuple of numbers.
-
-    Raises
-    ------
-    InvalidValueError
-        If it is not three numbers, or has no direction.
-    """
+    """Return the axis of a joint as a tuple of numbers."""
     try:
         x, y, z = map(real_number, axis)
     except (TypeError, ValueError, OverflowError):
@@ -275,13 +241,7 @@ def check_axis(axis: AxisLike, name: str) -> Vector3:
 
 
 def check_position_expression(expression: object, what: str) -> Expression:
-    """Return a scalar expression of positions after checking that it is one.
-
-    Raises
-    ------
-    InvalidValueError
-        If it is no expression, not a scalar, or depends on speeds.
-    """
+    """Return a scalar expression of positions after checking that it is one."""
     if not isinstance(expression, Expression):
         raise InvalidValueError(f"{what} is an expression, not {expression!r}.")
     if expression.shape:
@@ -293,13 +253,7 @@ def check_position_expression(expression: object, what: str) -> Expression:
 
 
 def check_joint_number(number: object, what: str, *, positive: bool = False) -> float:
-    """Return a finite number after checking that it is one.
-
-    Raises
-    ------
-    InvalidValueError
-        If it is no finite number, or not positive although required.
-    """
+    """Return a finite number after checking that it is one."""
     try:
         value = real_number(number)
     except (TypeError, ValueError, OverflowError):

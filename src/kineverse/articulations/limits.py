@@ -39,13 +39,7 @@ FREE = Limits()
 
 
 def check_limits(given: object, what: str) -> None:
-    """Check that limits are given as :class:`Limits`.
-
-    Raises
-    ------
-    InvalidValueError
-        If they are not.
-    """
+    """Check that limits are given as :class:`Limits`."""
     if not isinstance(given, Limits):
         raise InvalidValueError(f"{what} is kv.Limits(lower, upper, velocity), not {given!r}.")
 
@@ -57,13 +51,7 @@ def limit_constraints(
     upper: ExpressionLike | None,
     velocity: float | None,
 ) -> Iterator[tuple[str, Constraint]]:
-    """Yield the constraints ``name/position`` and ``name/velocity``, if there are such limits.
-
-    Raises
-    ------
-    InvalidValueError
-        For limits that leave nothing between them or are NaN, and for a negative speed.
-    """
+    """Yield the constraints ``name/position`` and ``name/velocity``, if there are such limits."""
     if (lower is not None or upper is not None) and q.symbols:
         try:
             position_range = Constraint.from_expressions(
@@ -80,13 +68,7 @@ def limit_constraints(
 
 
 def check_speed_limit(limit: object, what: str) -> float | None:
-    """Return the limit of a speed as a number, None if it is absent or infinite.
-
-    Raises
-    ------
-    InvalidValueError
-        If it is negative, NaN, or no number.
-    """
+    """Return the limit of a speed as a number, None if it is absent or infinite."""
     if limit is None:
         return None
     try:

@@ -68,7 +68,6 @@ class Transmission(OneAxisMotion):
         return f"The driver of the {self.noun} '{self.name}'"
 
     def _find_driver(self, model: ReadRecorder) -> Expression:
-        """Return the position of the driver in a model."""
         if isinstance(self.driver, Expression):
             return self.driver
         try:

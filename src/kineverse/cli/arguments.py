@@ -49,15 +49,7 @@ def add_set_option(parser: argparse.ArgumentParser, what: str = "a position") ->
 
 
 def parse_assignments(texts: Iterable[str], option: str = "--set") -> dict[str, float]:
-    """Return values by name from texts like ``kitchen/fridge_door=30deg``, given by an option.
-
-    Raises
-    ------
-    InvalidValueError
-        If a text is not an assignment, or the value is not a finite number.
-    DuplicateNameError
-        If a name has two values.
-    """
+    """Return values by name from texts like ``kitchen/fridge_door=30deg``, given by an option."""
     values: dict[str, float] = {}
     for text in texts:
         # A name may contain an equals sign, a value does not.
@@ -84,13 +76,7 @@ def unit_kind(text: str) -> str | None:
 
 
 def parse_length(text: str) -> float:
-    """Return the number [m] of a text such as ``0.05``, ``5cm``, ``2 mm``.
-
-    Raises
-    ------
-    InvalidValueError
-        If the text is not a length, or not finite.
-    """
+    """Return the number [m] of a text such as ``0.05``, ``5cm``, ``2 mm``."""
     match = _VALUE_PATTERN.fullmatch(text.strip())
     if match is None or match["unit"] not in LENGTHS or match["pi"]:
         raise InvalidValueError(f"{text.strip()!r} is not a length; write a number of m (0.05), or 5cm, 2mm")
@@ -98,13 +84,7 @@ def parse_length(text: str) -> float:
 
 
 def parse_value(text: str) -> float:
-    """Return the number [rad] or [m] of a text such as ``0.3``, ``-pi/2``, ``1.5pi``, ``30deg``, ``12 cm``.
-
-    Raises
-    ------
-    InvalidValueError
-        If the text is not a value, or not finite.
-    """
+    """Return the number [rad] or [m] of a text such as ``0.3``, ``-pi/2``, ``1.5pi``, ``30deg``, ``12 cm``."""
     match = _VALUE_PATTERN.fullmatch(text.strip())
     if match is None or not (match["number"] or match["pi"]) or (match["times"] and not match["number"]):
         raise InvalidValueError(
@@ -179,13 +159,7 @@ def add_model_options(
 
 
 def load_model(arguments: argparse.Namespace, source: str, prefix: str | None = None) -> kv.Model:
-    """Load a model with the options of the command line.
-
-    Raises
-    ------
-    KineverseError
-        If it cannot be loaded.
-    """
+    """Load a model with the options of the command line."""
     import kineverse as kv
 
     return kv.load(source, prefix, root=arguments.root, strict=arguments.strict, loops=arguments.loops)
@@ -196,17 +170,7 @@ ALTERNATIVE_UNITS = {"rad": ("deg",), "m": ("cm", "mm")}
 
 
 def find_limit_notes(model: ModelView, values: Mapping[str, float], texts: Iterable[str]) -> list[str]:
-    """Return a line for each violated limit or constraint, and for each angle above 2π without a unit.
-
-    Parameters
-    ----------
-    model
-        The model.
-    values
-        Values of all symbols of the model, by name [rad], [m].
-    texts
-        Arguments of ``--set``.
-    """
+    """Return a line for each violated limit or constraint, and for each angle above 2π without a unit."""
     import kineverse as kv
     from kineverse.view.sliders import infer_units
 

@@ -127,17 +127,7 @@ def _save_model(model: kv.Model, arguments: argparse.Namespace) -> SaveResult:
 
 
 def check_writable(target: str, source: str, force: bool = False) -> None:
-    """Check that a file can be written, before the model is loaded.
-
-    Raises
-    ------
-    FormatError
-        If no format of that suffix is written, the folder does not exist, or the path is not a regular file.
-    DuplicateNameError
-        If the target is the source, or another file and ``force`` is False.
-    UnknownNameError
-        If the target exists and the source does not.
-    """
+    """Check that a file can be written, before the model is loaded."""
     from kineverse.formats.locate import locate_model
     from kineverse.model.registry import writable_suffixes
 

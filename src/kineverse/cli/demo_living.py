@@ -187,7 +187,6 @@ def _camera() -> Camera:
 
 
 def _contents(model: kv.Model) -> str:
-    """Return a table of the models."""
     rows = []
     for name in MODELS:
         inside = f"{name}/"

@@ -38,13 +38,7 @@ _LONGEST_REASON = 100
 
 
 class ProgressLine:
-    """Line of progress on standard error: rewritten while an object is handled, if that is a terminal.
-
-    Parameters
-    ----------
-    count
-        Number of all objects.
-    """
+    """Line of progress on standard error: rewritten while an object is handled, if that is a terminal."""
 
     def __init__(self, count: int) -> None:
         self._count, self._number, self._shown = count, 0, 0.0

@@ -62,13 +62,7 @@ def add_arguments(parser: argparse._ArgumentGroup) -> None:
 
 
 def run(arguments: argparse.Namespace) -> int:
-    """Let the robot open and close objects; return 0 if all of it was done, 1 if not, 130 after Ctrl-C.
-
-    Raises
-    ------
-    KineverseError
-        For wrong options, and extras that are missing.
-    """
+    """Let the robot open and close objects; return 0 if all of it was done, 1 if not, 130 after Ctrl-C."""
     demo = RobotDemo(arguments)
     finished = False
     with handle_interrupts(), ExitStack() as stack:
@@ -85,23 +79,7 @@ def run(arguments: argparse.Namespace) -> int:
 
 
 class RobotDemo:
-    """Robot that opens and closes objects of the kitchen.
-
-    Parameters
-    ----------
-    arguments
-        Options of the command line.
-
-    Attributes
-    ----------
-    reports
-        Reports on the objects so far.
-
-    Raises
-    ------
-    KineverseError
-        For wrong options, and extras that are missing.
-    """
+    """Robot that opens and closes objects of the kitchen."""
 
     def __init__(self, arguments: argparse.Namespace) -> None:
         from kineverse.manipulation import find_articulated_objects

@@ -22,27 +22,13 @@ CHECKED_PER_RANGE = 5
 
 @dataclass(frozen=True, slots=True)
 class ExerciseResult:
-    """Result of an exercise.
+    """Result of an exercise."""
 
-    Attributes
-    ----------
-    freedoms
-        Number of degrees of freedom.
-    poses
-        Number of frame poses computed.
-    rate
-        Frame poses per second.
-    violations
-        Number of constraints violated inside the ranges.
-    problems
-        Texts for these constraints, and for frames whose poses are not finite and rigid.
-    """
-
-    freedoms: int
-    poses: int
-    rate: float
-    violations: int
-    problems: list[str]
+    freedoms: int  # number of degrees of freedom
+    poses: int  # number of frame poses computed
+    rate: float  # frame poses per second
+    violations: int  # number of constraints violated inside the ranges
+    problems: list[str]  # texts for these constraints, and for frames whose poses are not finite and rigid
 
 
 def exercise_model(model: ModelView) -> ExerciseResult:

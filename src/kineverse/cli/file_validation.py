@@ -27,37 +27,17 @@ VALID, INVALID, UNREADABLE = 0, 1, 2
 
 @dataclass(frozen=True)
 class ValidationResult:
-    """Findings in one file.
+    """Findings in one file."""
 
-    Attributes
-    ----------
-    name
-        Name or path as given.
-    format
-        Format of the file; empty if unknown.
-    model
-        Loaded model; None if the file cannot be read, for the reason in ``error``.
-    facts
-        Header of a document: its ``version``, and ``sha256``, the hash of its content.
-    remarks
-        Reader warnings: content left out or interpreted.
-    faults
-        Mistakes that a strict reader refuses.
-    problems
-        Problems of the model.
-    strict
-        True if remarks count as problems.
-    """
-
-    name: str
-    format: str = ""
-    model: kv.Model | None = None
+    name: str  # name or path as given
+    format: str = ""  # format of the file; empty if unknown
+    model: kv.Model | None = None  # loaded model; None if the file cannot be read, for the reason in error
     error: KineverseError | OSError | None = None
-    facts: Mapping[str, int | str] = field(default_factory=dict)
-    remarks: Sequence[str] = ()
-    faults: Sequence[str] = ()
+    facts: Mapping[str, int | str] = field(default_factory=dict)  # header of a document
+    remarks: Sequence[str] = ()  # reader warnings: content left out or interpreted
+    faults: Sequence[str] = ()  # mistakes that a strict reader refuses
     problems: Sequence[ModelProblem] = ()
-    strict: bool = False
+    strict: bool = False  # True if remarks count as problems
 
     @property
     def status(self) -> int:
@@ -94,23 +74,7 @@ def validate_file(
     root: str | None = None,
     loops: LoopTreatment = "solve",
 ) -> ValidationResult:
-    """Validate a file; mistakes in it are returned, not raised.
-
-    Parameters
-    ----------
-    name
-        Name of a shipped model, or path of a file.
-    meshes
-        True to check that mesh files exist.
-    strict
-        True if remarks count as problems.
-    contacts
-        True to search for bodies that penetrate each other at the default state.
-    root
-        Folder that meshes and included files must lie in; by default the file's package or repository.
-    loops
-        Treatment of closed loops, see :func:`kineverse.load`.
-    """
+    """Validate a file; mistakes in it are returned, not raised."""
     language = ""
     with collect_warnings() as remarks:
         try:

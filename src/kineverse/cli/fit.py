@@ -112,13 +112,7 @@ def run(arguments: argparse.Namespace) -> int:
 
 
 def parse_noise(text: str) -> tuple[float, float | None]:
-    """Return the standard deviations [m], [rad] of a text such as ``3mm,1deg``, or ``3mm`` for positions.
-
-    Raises
-    ------
-    InvalidValueError
-        If the text is not of this form.
-    """
+    """Return the standard deviations [m], [rad] of a text such as ``3mm,1deg``, or ``3mm`` for positions."""
     first, comma, second = text.partition(",")
     try:
         position = parse_length(first)
@@ -134,13 +128,7 @@ def parse_noise(text: str) -> tuple[float, float | None]:
 
 
 def check_noise(stated: tuple[float, float | None], pair: RecordedPair) -> ObservationNoise:
-    """Return the stated noise of the observations of a pair.
-
-    Raises
-    ------
-    InvalidValueError
-        If the noise of orientations is missing.
-    """
+    """Return the stated noise of the observations of a pair."""
     from kineverse.estimation.recordings import ObservationNoise
 
     position, orientation = stated

@@ -254,11 +254,6 @@ def make_joint_model(pair: RecordedPair, fit: Fit) -> Model:
     """Return a model with the joint, and shapes of its axis, the child and the observed positions.
 
     If only positions are observed, the child's axes are those of its parent at joint value 0.
-
-    Raises
-    ------
-    InvalidValueError
-        If only positions are observed and the part moves freely, as then there is no joint.
     """
     if fit.family == "free" and fit.motion.rows == 3:
         raise InvalidValueError(

@@ -216,15 +216,7 @@ def find_added_commands() -> Mapping[str, EntryPoint]:
 
 
 def load_command(name: str) -> CommandModule:
-    """Return a command of this package, or import one that another distribution adds.
-
-    Raises
-    ------
-    UnknownNameError
-        If there is no such command, with similar ones.
-    MissingDependencyError
-        If its distribution is not installed, or cannot be imported.
-    """
+    """Return a command of this package, or import one that another distribution adds."""
     if name in COMMANDS:
         return COMMANDS[name]
     added = find_added_commands()
@@ -278,15 +270,7 @@ def make_parser(added: Mapping[str, CommandModule] = MappingProxyType({})) -> ar
 
 
 def _parse_arguments(words: Sequence[str]) -> argparse.Namespace:
-    """Parse the arguments of the command line.
-
-    Raises
-    ------
-    SystemExit
-        After printing a usage error, or help.
-    UnknownNameError
-        For a command or an option that does not exist, with similar ones.
-    """
+    """Parse the arguments of the command line."""
     name = next((word for word in words if not word.startswith("-")), None)
     # Other distributions are asked for an unknown name and for the list of commands only: that takes 20 ms.
     if name is None:

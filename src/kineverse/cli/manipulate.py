@@ -50,17 +50,9 @@ examples:
 
 
 class ManipulationCommand(NamedTuple):
-    """One of the three commands.
+    """One of the three commands."""
 
-    Attributes
-    ----------
-    skill
-        Its name.
-    HELP
-        Its help.
-    """
-
-    skill: str
+    skill: str  # its name
     HELP: str
 
     def add_arguments(self, parser: argparse.ArgumentParser) -> None:

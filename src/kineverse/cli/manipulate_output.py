@@ -23,13 +23,7 @@ if TYPE_CHECKING:
 
 
 class PhaseLines:
-    """Lines on standard error, one for each phase that begins.
-
-    Parameters
-    ----------
-    scene
-        The scene.
-    """
+    """Lines on standard error, one for each phase that begins."""
 
     def __init__(self, scene: ManipulationScene) -> None:
         self._scene, self._phase = scene, ""

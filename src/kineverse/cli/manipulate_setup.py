@@ -36,59 +36,24 @@ _RING, _RINGS, _DIRECTIONS = 0.25, 16, 12
 
 @dataclass(frozen=True)
 class ManipulationScene:
-    """Robot and furniture before a skill.
+    """Robot and furniture before a skill."""
 
-    Attributes
-    ----------
-    model
-        Model of both.
-    robot
-        Prefix of the robot.
-    coordinate
-        Coordinate of the object.
-    unit
-        Its unit, ``rad``, ``m``, or nothing.
-    start
-        State of everything.
-    target
-        Wanted value [m], [rad].
-    gripper
-        Gripper that is used; None if the robot has none.
-    why
-        Why there is no gripper.
-    pusher
-        Bodies that may push.
-    stays
-        Whether the start of the robot was given, so that it is not placed elsewhere.
-    fixed
-        Why the object cannot move at the start; empty if it can.
-    tolerance
-        Distance from the target within which the object is there [m], [rad].
-    """
-
-    model: kv.Model
-    robot: str
-    coordinate: kv.Symbol
-    unit: str
-    start: kv.State
-    target: float
-    gripper: Gripper | None
-    why: str
-    pusher: tuple[str, ...]
-    stays: bool
-    fixed: str
-    tolerance: float
+    model: kv.Model  # model of both
+    robot: str  # prefix of the robot
+    coordinate: kv.Symbol  # coordinate of the object
+    unit: str  # its unit, rad, m, or nothing
+    start: kv.State  # state of everything
+    target: float  # wanted value [m], [rad]
+    gripper: Gripper | None  # gripper that is used; None if the robot has none
+    why: str  # why there is no gripper
+    pusher: tuple[str, ...]  # bodies that may push
+    stays: bool  # whether the start of the robot was given, so that it is not placed elsewhere
+    fixed: str  # why the object cannot move at the start; empty if it can
+    tolerance: float  # distance from the target within which the object is there [m], [rad]
 
 
 def make_scene(arguments: argparse.Namespace, skill: str) -> ManipulationScene:
-    """Load the model, put the robot into it, and return everything before a skill begins.
-
-    Raises
-    ------
-    KineverseError
-        If something cannot be loaded; for unknown names, values out of limits, and a coordinate that is not
-        an object's.
-    """
+    """Load the model, put the robot into it, and return everything before a skill begins."""
     from kineverse.geometry.exclusions import remove_unusable_shapes
     from kineverse.manipulation.articulated_objects import find_shut_value
     from kineverse.manipulation.robot_sources import SHIPPED
@@ -154,14 +119,7 @@ def make_scene(arguments: argparse.Namespace, skill: str) -> ManipulationScene:
 def _parse_other_positions(
     texts: list[str], model: kv.Model, coordinate: kv.Symbol, standing: Mapping[kv.Symbol, float]
 ) -> dict[kv.Symbol, float]:
-    """Return the values of ``--set``, of anything but the coordinate that is to change.
-
-    Raises
-    ------
-    KineverseError
-        For what cannot be read, unknown names, values out of limits, the coordinate itself, and a place that
-        is given already.
-    """
+    """Return the values of ``--set``, of anything but the coordinate that is to change."""
     given = {model.symbol(name): value for name, value in parse_assignments(texts).items()}
     if coordinate in given:
         raise InvalidValueError(f"--set {coordinate}: --from VALUE says where it is at the start.")
@@ -197,13 +155,7 @@ def _open_from(shut: float, lower: float, upper: float) -> float:
 
 
 def _check_unit(option: str, text: str | None, coordinate: kv.Symbol, unit: str) -> None:
-    """Check that a value has a unit of lengths or of angles as its coordinate has; it may have none.
-
-    Raises
-    ------
-    InvalidValueError
-        If it has another one.
-    """
+    """Check that a value has a unit of lengths or of angles as its coordinate has; it may have none."""
     written = (text or "").strip()
     stated = "m" if written.endswith("m") else "rad" if written.endswith(("deg", "°", "rad")) else unit
     if unit and stated != unit:
@@ -214,13 +166,7 @@ def _check_unit(option: str, text: str | None, coordinate: kv.Symbol, unit: str)
 
 
 def _choose_prefix(arguments: argparse.Namespace, source: str, model: kv.Model) -> tuple[str | None, str]:
-    """Return the prefix to include a robot with, None for its own, and the one that its names then have.
-
-    Raises
-    ------
-    InvalidValueError
-        If names of the model would count as the robot's.
-    """
+    """Return the prefix to include a robot with, None for its own, and the one that its names then have."""
     from kineverse.model.frame import WORLD
 
     alone = load_model(arguments, source)
@@ -244,13 +190,7 @@ def _choose_prefix(arguments: argparse.Namespace, source: str, model: kv.Model) 
 
 
 def _add_base(model: kv.Model, robot: str) -> None:
-    """Put a robot on an omnidirectional base.
-
-    Raises
-    ------
-    InvalidValueError
-        If it has a base.
-    """
+    """Put a robot on an omnidirectional base."""
     import numpy as np
 
     from kineverse.articulations import OmniBase
@@ -269,13 +209,7 @@ def _add_base(model: kv.Model, robot: str) -> None:
 
 
 def _stand_free(model: kv.Model, robot: str, state: kv.State, base: Sequence[kv.Symbol]) -> kv.State:
-    """Return the state with the base of a robot where it touches nothing, the nearest of some places.
-
-    Raises
-    ------
-    InvalidValueError
-        If it touches something everywhere, or has no base that could be placed.
-    """
+    """Return the state with the base of a robot where it touches nothing, the nearest of some places."""
     from kineverse.manipulation.start_state import find_free_state
 
     found, problem = find_free_state(model, robot, _list_places(state, base), -_DEEPEST)
@@ -301,13 +235,7 @@ def _list_places(state: kv.State, base: Sequence[kv.Symbol]) -> Iterator[kv.Stat
 
 
 def _find_coordinate(model: kv.Model, name: str, robot: str) -> kv.Symbol:
-    """Return the coordinate of a name, which is one of an object.
-
-    Raises
-    ------
-    UnknownNameError, InvalidValueError
-        If there is no such coordinate; if it is the robot's, or depends on others.
-    """
+    """Return the coordinate of a name, which is one of an object."""
     objects = [str(s) for s in model.degrees_of_freedom if not str(s).startswith(f"{robot}/")]
     if name.startswith(f"{robot}/"):
         raise InvalidValueError(
@@ -325,13 +253,7 @@ def _find_coordinate(model: kv.Model, name: str, robot: str) -> kv.Symbol:
 def _find_pusher(
     model: kv.Model, robot: str, hand: str | None, skill: str
 ) -> tuple[Gripper | None, str, tuple[str, ...]]:
-    """Return the gripper, or why there is none, and the bodies that push.
-
-    Raises
-    ------
-    UnknownNameError
-        For a hand that does not exist, or cannot grasp what is to be grasped.
-    """
+    """Return the gripper, or why there is none, and the bodies that push."""
     from kineverse.grasping import find_gripper
 
     if hand is not None and skill == "push":

@@ -171,13 +171,7 @@ def push_object(
 def _find_gripper_and_handle(
     arguments: argparse.Namespace, scene: ManipulationScene
 ) -> tuple[Gripper, Handle] | str:
-    """Return the gripper, and the handle that is named or the best one, which is printed; or why not.
-
-    Raises
-    ------
-    UnknownNameError
-        For a named handle that the object does not have.
-    """
+    """Return the gripper, and the handle that is named or the best one, which is printed; or why not."""
     from kineverse.geometry import Scene
     from kineverse.grasping import find_handle
 

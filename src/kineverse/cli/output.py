@@ -40,20 +40,7 @@ Align = Literal["<", ">"]
 def format_table(
     head: Sequence[str], rows: Iterable[Sequence[str]], align: str = "", width: int | None = None
 ) -> str:
-    """Return rows of cells as lines with aligned columns.
-
-    Parameters
-    ----------
-    head
-        Titles of the columns.
-    rows
-        Cells.
-    align
-        ``<`` or ``>`` for each column; ``<`` if missing.
-    width
-        Width of the screen; the terminal's if None. If the table is wider, its first column is cut in the
-        middle, where names of frames differ least. In a pipe nothing is cut.
-    """
+    """Return rows of cells as lines with aligned columns."""
     cells = [list(head), *([cell.translate(_NO_LINES) for cell in row] for row in rows)]
     sides: list[str] = [align[k] if k < len(align) else "<" for k in range(len(head))]
     widths = [max(len(row[k]) for row in cells) for k in range(len(head))]
@@ -104,19 +91,7 @@ Item = TypeVar("Item")
 def show_progress(
     items: Iterable[Item], what: str, unit: str = "", total: int | None = None
 ) -> Iterator[Item]:
-    """Yield the items, with a bar on standard error if that is a terminal.
-
-    Parameters
-    ----------
-    items
-        Items to yield.
-    what
-        Activity, printed in front of the bar.
-    unit
-        Unit of the items.
-    total
-        Number of items, if they have no length.
-    """
+    """Yield the items, with a bar on standard error if that is a terminal."""
     if not sys.stderr.isatty():
         yield from items
         return

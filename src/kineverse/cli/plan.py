@@ -144,35 +144,17 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 @dataclass(frozen=True)
 class _Problem:
-    """Planning problem.
-
-    Attributes
-    ----------
-    model
-        The model.
-    planner
-        The planner, placed at the start.
-    state
-        State at the start, but for what ``--from`` says of frames.
-    start, goal
-        What the options say.
-    holds
-        Targets of ``--along``.
-    start_tasks, goal_tasks
-        Poses of frames at both ends.
-    grips
-        Holds along the path; None for those that depend on the start.
-    """
+    """Planning problem."""
 
     model: kv.Model
-    planner: Planner
-    state: kv.State
-    start: Request
+    planner: Planner  # planner, placed at the start
+    state: kv.State  # state at the start, but for what --from says of frames
+    start: Request  # what the options say
     goal: Request
-    holds: list[FrameTarget]
-    start_tasks: list[Hold]
+    holds: list[FrameTarget]  # targets of --along
+    start_tasks: list[Hold]  # poses of frames at both ends
     goal_tasks: list[Hold]
-    grips: list[Hold | None]
+    grips: list[Hold | None]  # holds along the path; None for those that depend on the start
 
 
 def run(arguments: argparse.Namespace) -> int:

@@ -23,24 +23,12 @@ _BASE = ("x", "y", "angle")
 
 @dataclass(frozen=True)
 class FrameTarget:
-    """Wanted pose of a frame: ``A@B``, ``A@B+X,Y,Z`` or ``A@X,Y,Z``, with or without ``:MASK``.
-
-    Attributes
-    ----------
-    frame
-        The frame.
-    target
-        The other frame; the world for numbers.
-    numbers
-        Position, or position and roll, pitch, yaw, in the other frame [m], [rad]; empty for its own pose.
-    mask
-        Directions, see :meth:`.Planner.hold`.
-    """
+    """Wanted pose of a frame: ``A@B``, ``A@B+X,Y,Z`` or ``A@X,Y,Z``, with or without ``:MASK``."""
 
     frame: str
-    target: str
-    numbers: tuple[float, ...]
-    mask: str
+    target: str  # other frame; the world for numbers
+    numbers: tuple[float, ...]  # position, or position and roll, pitch, yaw, in the other frame [m], [rad]
+    mask: str  # directions, see Planner.hold
 
     @property
     def directions(self) -> set[str]:
@@ -50,30 +38,14 @@ class FrameTarget:
 
 @dataclass
 class Request:
-    """Words of an option: values by name, frames with their targets, names of states.
+    """Words of an option: values by name, frames with their targets, names of states."""
 
-    Attributes
-    ----------
-    values
-        Values of coordinates by name [m], [rad].
-    targets
-        Poses of frames.
-    names
-        Other words, which name states of the SRDF.
-    """
-
-    values: dict[str, float] = field(default_factory=dict)
-    targets: list[FrameTarget] = field(default_factory=list)
-    names: list[str] = field(default_factory=list)
+    values: dict[str, float] = field(default_factory=dict)  # values of coordinates by name [m], [rad]
+    targets: list[FrameTarget] = field(default_factory=list)  # poses of frames
+    names: list[str] = field(default_factory=list)  # other words, which name states of the SRDF
 
     def resolve(self, states: Mapping[str, Mapping[str, float]], option: str) -> None:
-        """Replace names by the values of these states; values that are given win.
-
-        Raises
-        ------
-        UnknownNameError
-            For a name that is no state.
-        """
+        """Replace names by the values of these states; values that are given win."""
         for name in self.names:
             if name not in states:
                 hint = suggest(name, states, "state") if states else "Names of states need --srdf."
@@ -85,22 +57,7 @@ class Request:
 
 
 def parse_request(words: Iterable[str], option: str, read_files: bool = False) -> Request:
-    """Return what the words of an option ask for.
-
-    Parameters
-    ----------
-    words
-        The words.
-    option
-        Name of the option, for messages.
-    read_files
-        True to take names that end with ``.json`` for files of values.
-
-    Raises
-    ------
-    KineverseError
-        For a word that cannot be read.
-    """
+    """Return what the words of an option ask for."""
     found, assignments = Request(), []
     for word in words:
         if "=" in word:
@@ -116,13 +73,7 @@ def parse_request(words: Iterable[str], option: str, read_files: bool = False) -
 
 
 def parse_frame_target(word: str, option: str) -> FrameTarget:
-    """Return the pose of a frame from ``A@B``, ``A@B+X,Y,Z`` or ``A@X,Y,Z``, see :class:`FrameTarget`.
-
-    Raises
-    ------
-    InvalidValueError
-        For another text.
-    """
+    """Return the pose of a frame from ``A@B``, ``A@B+X,Y,Z`` or ``A@X,Y,Z``, see :class:`FrameTarget`."""
     frame, _, rest = word.partition("@")
     where, _, mask = rest.partition(":")
     mask = mask.replace(",", " ")
@@ -150,13 +101,7 @@ def add_robot_option(parser: argparse.ArgumentParser) -> None:
 
 
 def include_robot(arguments: argparse.Namespace, model: kv.Model) -> tuple[str, dict[kv.Symbol, float]]:
-    """Put the robot of ``--robot`` into a model, and return its prefix and the place of its base by symbol.
-
-    Raises
-    ------
-    KineverseError
-        If it cannot be loaded or placed.
-    """
+    """Put the robot of ``--robot`` into a model, and return its prefix and the place of its base by symbol."""
     source, place = parse_robot(arguments.robot)
     before, frames = {*model.articulations}, {*model.frames}
     names = model.include(source, root=arguments.root, strict=arguments.strict, loops=arguments.loops)
@@ -175,13 +120,7 @@ class Place(NamedTuple):
 
 
 def parse_robot(text: str) -> tuple[str, Place | None]:
-    """Return the source of a robot and its place from ``ROBOT@X,Y,ANGLE`` or ``ROBOT@X,Y,Z,ANGLE``.
-
-    Raises
-    ------
-    InvalidValueError
-        For another number of numbers.
-    """
+    """Return the source of a robot and its place from ``ROBOT@X,Y,ANGLE`` or ``ROBOT@X,Y,Z,ANGLE``."""
     source, at, place = text.rpartition("@")
     if not at:
         return text, None
@@ -210,20 +149,6 @@ def place_robot(
     """Put a robot to a place, and return the values of the coordinates of its mobile base.
 
     A robot without such a base is moved with its root; then there are no values.
-
-    Parameters
-    ----------
-    model
-        The model, which has the robot.
-    joints, frames
-        Articulations and frames of the robot.
-    place
-        The place; None to leave it where it is.
-
-    Raises
-    ------
-    InvalidValueError
-        For a height of a mobile base, and a base with other coordinates.
     """
     if place is None:
         return {}
@@ -260,13 +185,7 @@ def _move_roots(model: kv.Model, roots: Iterable[str], place: Place) -> None:
 
 
 def make_hold(model: kv.Model, given: FrameTarget) -> Hold:
-    """Return the hold that a target stands for.
-
-    Raises
-    ------
-    KineverseError
-        For frames that the model does not have, and other masks.
-    """
+    """Return the hold that a target stands for."""
     import kineverse as kv
     from kineverse.control import Hold
     from kineverse.planning.manifold import hold_frames
@@ -287,11 +206,6 @@ def make_grip(
     """Return a hold along a path, as the start says; else of frames as they are at a state.
 
     Without a state it is None where the start says nothing.
-
-    Raises
-    ------
-    InvalidValueError
-        For numbers that the start does not have, and other masks.
     """
     from kineverse.planning.manifold import hold_frames
 
@@ -337,13 +251,7 @@ def choose_coordinates(
 
 
 def _read_values(path: str) -> dict[str, float]:
-    """Return values by name from a JSON object, or from its part ``positions``.
-
-    Raises
-    ------
-    FormatError
-        If the file is none.
-    """
+    """Return values by name from a JSON object, or from its part ``positions``."""
     try:
         document = json.loads(Path(path).read_text(encoding="utf-8"))
     except ValueError as error:

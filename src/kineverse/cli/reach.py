@@ -129,13 +129,7 @@ def run(arguments: argparse.Namespace) -> int:
 
 
 def parse_pose(words: list[str]) -> list[float] | None:
-    """Return the 3 or 6 numbers of a pose, None for the name of a frame.
-
-    Raises
-    ------
-    InvalidValueError
-        For another number of words, or what is no number.
-    """
+    """Return the 3 or 6 numbers of a pose, None for the name of a frame."""
     if len(words) == 1:
         return None
     if len(words) not in (3, 6):

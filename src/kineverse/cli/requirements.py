@@ -26,24 +26,7 @@ _HEAD = 1 << 16  # of a file, in which its root element begins [byte]
 
 
 def require(what: str, extras: Mapping[str, bool], compiler: bool = False) -> None:
-    """Raise if something is missing, and name all of it with how to install it.
-
-    Parameters
-    ----------
-    what
-        What needs it, such as ``kineverse open``.
-    extras
-        Extras by name, with whether they are needed.
-    compiler
-        True if a C compiler is needed.
-
-    Raises
-    ------
-    MissingDependencyError
-        If extras are missing, and maybe the compiler.
-    CompileError
-        If only the compiler is missing.
-    """
+    """Raise if something is missing, and name all of it with how to install it."""
     from kineverse.compile.toolchain import NO_COMPILER, toolchain
 
     missing = [extra for extra, needed in extras.items() if needed and not _is_installed(extra)]

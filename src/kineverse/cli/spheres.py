@@ -53,25 +53,13 @@ WRONG_SHAPE = 1
 
 @dataclass
 class LinkCover:
-    """Cover of the shapes of a link.
-
-    Attributes
-    ----------
-    items
-        The shapes.
-    cover
-        Their cover, in the frame of the link; None if there is none.
-    error
-        Why there is none.
-    seconds
-        Computation time [s]; 0 for a cover that was cached.
-    """
+    """Cover of the shapes of a link."""
 
     link: str
-    items: Sequence[CollisionObject]
-    cover: SphereCover | None = None
-    error: str = ""
-    seconds: float = 0.0
+    items: Sequence[CollisionObject]  # shapes
+    cover: SphereCover | None = None  # their cover, in the frame of the link; None if there is none
+    error: str = ""  # why there is none
+    seconds: float = 0.0  # computation time [s]; 0 for a cover that was cached
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:

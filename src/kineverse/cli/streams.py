@@ -104,13 +104,7 @@ def unwrap_stream(stream: TextIO) -> TextIO:
 
 @contextlib.contextmanager
 def safe_streams() -> Iterator[None]:
-    """Let standard output and standard error escape control characters, and replace what they cannot encode.
-
-    Raises
-    ------
-    FormatError
-        If standard output is closed.
-    """
+    """Let standard output and standard error escape control characters, and replace what they cannot encode."""
     out, err = sys.stdout, sys.stderr
     if out is None or err is None:
         _fill_descriptors()

@@ -43,13 +43,7 @@ def find_contacts(model: ModelView) -> Sequence[DistanceResult] | None:
 
 
 def find_penetrations(model: ModelView) -> Iterator[ModelProblem]:
-    """Yield the pairs of bodies that penetrate each other at the default state.
-
-    Raises
-    ------
-    MissingDependencyError
-        If the extra ``geometry`` is not installed.
-    """
+    """Yield the pairs of bodies that penetrate each other at the default state."""
     import_coal()
     for pair in find_contacts(model) or ():
         if pair.distance < -CONTACT_DEPTH:
@@ -87,51 +81,23 @@ class ConstraintSummary:
 
 @dataclass(frozen=True, slots=True)
 class ModelSummary:
-    """Contents of a model, for printing and JSON.
+    """Contents of a model, for printing and JSON."""
 
-    Attributes
-    ----------
-    name
-        Name or path of the model, as given.
-    frames
-        Parents of the frames, by name.
-    freedoms, constraints
-        Degrees of freedom and constraints.
-    low, high, extent
-        Bounding box of all shapes at the default state [m].
-    mass
-        Mass of all bodies [kg].
-    shapes
-        Number of visual shapes.
-    problems
-        Frames of shapes that cannot be loaded.
-    unplaced
-        Frames whose poses at the default state are not finite; the box leaves them out.
-    interlocks
-        Interlocks between coordinates.
-    touched_as_seen
-        Bodies without collision shapes; distances to them are to hulls of their visual shapes.
-    contacts
-        Pairs that touch at the default state, deepest first; None if unknown.
-    sha256
-        Hash of the content if the model is a document, else empty.
-    """
-
-    name: str
-    frames: dict[str, str]
-    freedoms: list[DofSummary]
+    name: str  # name or path of the model, as given
+    frames: dict[str, str]  # parents of the frames, by name
+    freedoms: list[DofSummary]  # degrees of freedom
     constraints: list[ConstraintSummary]
-    low: list[float]
+    low: list[float]  # bounding box of all shapes at the default state [m]
     high: list[float]
     extent: list[float]
-    mass: float
-    shapes: int
-    problems: list[str]
-    unplaced: list[str]
-    interlocks: Interlocks
-    touched_as_seen: list[str]
-    contacts: Sequence[DistanceResult] | None
-    sha256: str
+    mass: float  # mass of all bodies [kg]
+    shapes: int  # number of visual shapes
+    problems: list[str]  # frames of shapes that cannot be loaded
+    unplaced: list[str]  # frames whose poses at the default state are not finite; the box leaves them out
+    interlocks: Interlocks  # interlocks between coordinates
+    touched_as_seen: list[str]  # bodies without collision shapes
+    contacts: Sequence[DistanceResult] | None  # pairs that touch at the default state, deepest first
+    sha256: str  # hash of the content if the model is a document, else empty
 
 
 def summarize_model(name: str, model: ModelView) -> ModelSummary:

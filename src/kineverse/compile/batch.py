@@ -43,11 +43,6 @@ def allocate_aligned(size: int) -> Array:
     """Return an uninitialised vector that begins at a cache line.
 
     Its memory is reused only after this vector and all views of it are deleted.
-
-    Parameters
-    ----------
-    size
-        The number of doubles.
     """
     if 8 * size < _SMALLEST_BUFFER:
         return _from_line(np.empty(size + _CACHE_LINE // 8))[:size]
@@ -111,19 +106,6 @@ class Batch:
     The program is compiled for vectors when that pays. A call that would take the interpreter longer than the
     compiler waits for the compiler; smaller calls add up until they start a compilation in the background.
     Programs with other operations stay with CasADi's map over the function of single calls.
-
-    Parameters
-    ----------
-    program
-        The program.
-    signature
-        Its inputs.
-    shapes
-        The shape of each output.
-    single
-        True to return the only array instead of a tuple.
-    tier
-        As for :func:`compile`.
     """
 
     def __init__(
@@ -143,17 +125,7 @@ class Batch:
             )
 
     def __call__(self, x: npt.ArrayLike, out: Any, function: CasadiFunction) -> Any:
-        """Return the outputs at all rows of ``x``, see :meth:`.CompiledFunction.batch`.
-
-        Parameters
-        ----------
-        x
-            The points, shape (N, n).
-        out
-            Arrays for the results, or None.
-        function
-            CasADi's function, for use until the program is compiled.
-        """
+        """Return the outputs at all rows of ``x``, see :meth:`.CompiledFunction.batch`."""
         points = self._points(x)
         rows = len(points)
         if out is None:

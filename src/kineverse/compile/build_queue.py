@@ -86,17 +86,7 @@ def working_seconds() -> float:
 
 
 class BuildJob:
-    """A library to be compiled.
-
-    Attributes
-    ----------
-    path
-        The path of the library when it is compiled.
-    error
-        The reason of a failure.
-    forgotten
-        True if the job was dropped without a failure.
-    """
+    """A library to be compiled."""
 
     def __init__(
         self, key: str, compiler: Toolchain, source: Callable[[], str], flags: Sequence[str]
@@ -120,13 +110,7 @@ class BuildJob:
         return self._done.is_set()
 
     def wait(self, timeout: float | None = None) -> bool:
-        """Wait until the job is done, ahead of jobs that are not urgent, and return True if it is.
-
-        Parameters
-        ----------
-        timeout
-            In seconds; forever if None.
-        """
+        """Wait until the job is done, ahead of jobs that are not urgent, and return True if it is."""
         _worker.prioritise(self)
         begin = time.perf_counter()
         try:
@@ -158,29 +142,7 @@ def request(
     listener: BuildCallback,
     urgent: bool = False,
 ) -> BuildJob | None:
-    """Request the compilation of a library in the background.
-
-    Parameters
-    ----------
-    key
-        The key of the library in the cache.
-    compiler
-        The compiler.
-    source
-        Function that returns the C source; called in another thread.
-    flags
-        Flags of the compiler.
-    listener
-        Method to be called in another thread when the job is done. It is referenced weakly: a job whose
-        listeners are all deleted is dropped.
-    urgent
-        True to compile it before jobs that are not urgent.
-
-    Returns
-    -------
-    BuildJob or None
-        None if too many jobs are waiting.
-    """
+    """Request the compilation of a library in the background."""
     return _worker.request(BuildJob(key, compiler, source, flags), listener, urgent)
 
 

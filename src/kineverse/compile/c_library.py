@@ -46,32 +46,7 @@ def open_library(path: str) -> ctypes.CDLL:
 
 
 class ProgramLibrary(Generic[Code]):
-    """The compiled library of one program, loaded when it is ready.
-
-    Parameters
-    ----------
-    program
-        The program.
-    kind
-        The kind of generated code, with the version of its generator.
-    source
-        Function that generates the C, called in another thread.
-    load
-        Function from the path of a library to its code; raises if that fails.
-    level
-        The optimisation flag; None if the program is too large for a compiler.
-    flags
-        More flags of the compiler, that follow from the kind.
-    ready
-        Method to be called in another thread when the library is compiled. It is referenced weakly.
-
-    Attributes
-    ----------
-    code
-        The loaded code; None until it is ready.
-    error
-        The reason why there will be no code; None while there is none.
-    """
+    """The compiled library of one program, loaded when it is ready."""
 
     def __init__(
         self,
@@ -113,13 +88,7 @@ class ProgramLibrary(Generic[Code]):
             self._build = request(self._key, self._toolchain, self._source, self._flags, self._built, urgent)
 
     def wait(self, timeout: float | None = None) -> bool:
-        """Wait until the library is loaded or has failed, and return True if it is loaded.
-
-        Parameters
-        ----------
-        timeout
-            In seconds; forever if None.
-        """
+        """Wait until the library is loaded or has failed, and return True if it is loaded."""
         end = None if timeout is None else time.monotonic() + timeout
         while self.code is None and self.error is None:
             self.request(urgent=True)
@@ -142,20 +111,6 @@ class SourceLibrary:
     """The compiled functions of a hand-written C source, loaded when they are ready.
 
     Until then, and without a compiler, the callers compute the same in numpy.
-
-    Parameters
-    ----------
-    source
-        The C source.
-    declare
-        Function that sets the argument types of the loaded functions.
-    flags
-        Flags of the compiler.
-
-    Attributes
-    ----------
-    error
-        The reason why there are no compiled functions; None while there is none.
     """
 
     def __init__(

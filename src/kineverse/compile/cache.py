@@ -40,22 +40,7 @@ Code = TypeVar("Code")
 
 
 class LibraryCache:
-    """A folder of compiled libraries.
-
-    Parameters
-    ----------
-    folder
-        A folder that only this user can write to; it is created if it does not exist.
-    made
-        True if this process has just created it.
-
-    Raises
-    ------
-    NotPrivateError
-        If others can write to it.
-    OSError
-        If it cannot be created.
-    """
+    """A folder of compiled libraries."""
 
     def __init__(self, folder: Path, made: bool = False) -> None:
         self.folder = folder
@@ -77,16 +62,7 @@ class LibraryCache:
         return self._files.path(key)
 
     def load(self, key: str, load: Callable[[str], Code]) -> Code | None:
-        """Return the code of a library; None if it does not exist or cannot be used.
-
-        Parameters
-        ----------
-        key
-            The key of the library.
-        load
-            Function from a path to the code. The path is valid only during the call, and unique: the loader
-            would take a library with the path of a loaded one for that one.
-        """
+        """Return the code of a library; None if it does not exist or cannot be used."""
         found = self._files.open(key)
         if found is None:
             return None
@@ -100,15 +76,7 @@ class LibraryCache:
             os.close(found[0])
 
     def store(self, key: str, library: str) -> str:
-        """Move a compiled library into the folder, and return its path.
-
-        Parameters
-        ----------
-        key
-            The key of the library.
-        library
-            A file on the same file system (see :meth:`create_build_folder`).
-        """
+        """Move a compiled library into the folder, and return its path."""
         self._files.adopt(library, key)
         return self._files.path(key)
 
@@ -135,13 +103,7 @@ def library_cache() -> LibraryCache:
 
 
 def avoid_full_cache(cache: LibraryCache, reason: str) -> LibraryCache:
-    """Return a cache in place of one without room, for this process; log the reason, once.
-
-    Raises
-    ------
-    OSError
-        If there is no other one.
-    """
+    """Return a cache in place of one without room, for this process; log the reason, once."""
     if cache.folder not in _without_room:
         if _private_folder.cache_info().currsize and cache.folder == Path(_private_folder().name):
             raise OSError(reason)

@@ -316,13 +316,7 @@ _EXTENSION_NAME = "kineverse_native"
 
 
 class CallExtension:
-    """The extension module, loaded when it is ready.
-
-    Attributes
-    ----------
-    module
-        The extension module; None until it is loaded.
-    """
+    """The extension module, loaded when it is ready."""
 
     def __init__(self) -> None:
         self.module: Any = None
@@ -332,15 +326,7 @@ class CallExtension:
         self._lock = threading.Lock()
 
     def prepare(self, listener: Callable[[], object], urgent: bool = False) -> None:
-        """Load the extension from the cache, or request its compilation in the background, once.
-
-        Parameters
-        ----------
-        listener
-            Method to be called in another thread if the extension is loaded later; referenced weakly.
-        urgent
-            True to compile it before jobs that are not urgent.
-        """
+        """Load the extension from the cache, or request its compilation in the background, once."""
         if self._state == "settled":
             return
         with self._lock:

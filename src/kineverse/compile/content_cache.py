@@ -31,21 +31,7 @@ Content = TypeVar("Content")
 
 
 class ContentCache:
-    """Files by key in a folder that only this user can write to.
-
-    Parameters
-    ----------
-    open_folder
-        Function that returns the folder.
-    ending
-        End of the names of files.
-    most_bytes
-        Largest size of all files [bytes]; beyond it, the least recently used ones are removed.
-    logger, complaint
-        The log, and its message about a file that cannot be used, with places for path and reason.
-    mark
-        Bytes before the digest.
-    """
+    """Files by key in a folder that only this user can write to."""
 
     def __init__(
         self,

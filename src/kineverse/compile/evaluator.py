@@ -26,24 +26,7 @@ VectorCall: TypeAlias = Callable[[Any], Any]
 def bind(
     function: CasadiFunction, vector: Array, outputs: Sequence[Array], check: Check | None
 ) -> tuple[BoundCall, object]:
-    """Bind a function of one vector to arrays.
-
-    Parameters
-    ----------
-    function
-        CasADi's function.
-    vector
-        The array of inputs; contiguous.
-    outputs
-        An array per output; contiguous.
-    check
-        Function of vector and outputs, called after each evaluation; None for none.
-
-    Returns
-    -------
-    tuple
-        The bound call, and an object that has to live as long as it.
-    """
+    """Bind a function of one vector to arrays."""
     buffer, run = function.buffer()
     buffer.set_arg(0, vector.data)
     for i, output in enumerate(outputs):
@@ -66,23 +49,7 @@ def make_pooled_call(
     convert: VectorCall,
     check: Check | None,
 ) -> VectorCall:
-    """Return a call that returns new arrays and can be used by any number of threads.
-
-    Parameters
-    ----------
-    function
-        CasADi's function of one vector.
-    size
-        The length of the vector.
-    shapes
-        The shape of each output.
-    single
-        True to return the only array instead of a tuple.
-    convert
-        Function that converts other values to a vector of doubles, or raises.
-    check
-        As for :func:`bind`.
-    """
+    """Return a call that returns new arrays and can be used by any number of threads."""
     # Appending to and popping from a list are atomic.
     pool: list[tuple[memoryview, BoundCall, Any, object]] = []
     take, give_back = pool.pop, pool.append
@@ -169,15 +136,7 @@ class Evaluator(metaclass=ABCMeta):
         self._run()
 
     def _evaluate_by(self, run: BoundCall, keep: object) -> None:
-        """Replace the function from the next call on, with the same arrays.
-
-        Parameters
-        ----------
-        run
-            A function that reads :attr:`input` and writes :attr:`outputs`.
-        keep
-            An object that has to live as long as ``run``.
-        """
+        """Replace the function from the next call on, with the same arrays."""
         # A call may be running in another thread, so the previous object must stay alive.
         self._references.append(keep)
         object.__setattr__(self, "_run", run)

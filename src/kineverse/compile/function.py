@@ -301,15 +301,7 @@ class CompiledFunction(Generic[Results]):
             self._evaluate_by(self._library.code.function, self._library.code)
 
     def _evaluate_by(self, function: CasadiFunction, code: _Code | None) -> None:
-        """Replace the function from the next call on.
-
-        Parameters
-        ----------
-        function
-            CasADi's function.
-        code
-            Its C, if it is compiled.
-        """
+        """Replace the function from the next call on."""
         shapes, check, convert = self.shapes, self._program.checked, self._signature.vector
         if code is not None and len(shapes) <= MOST_OUTPUTS and call_extension.module is not None:
             native: _Code | None = code
@@ -338,7 +330,6 @@ class CompiledFunction(Generic[Results]):
                 self._evaluators.clear()
 
     def _set_function(self, evaluator: Evaluator) -> None:
-        """Set the present function of an evaluator."""
         if self._native is not None:
             run = self._native_evaluator(self._native, evaluator.input, evaluator.outputs)
             evaluator._evaluate_by(run, None)

@@ -24,17 +24,6 @@ def cores() -> int:
 def parallel_rows(work: Callable[[int, int], object], rows: int, smallest: int, align: int = 8) -> None:
     """Call ``work(first, end)`` for pieces of all rows, in several threads if there are enough rows.
 
-    Parameters
-    ----------
-    work
-        The function; threads only help if it releases the GIL.
-    rows
-        The number of rows.
-    smallest
-        The smallest number of rows that is worth a thread.
-    align
-        Pieces begin at multiples of this.
-
     Notes
     -----
     A signal, such as Ctrl-C, ends the call between two pieces. No thread works on when it has ended, since

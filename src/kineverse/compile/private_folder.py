@@ -34,22 +34,7 @@ class NotPrivateError(Exception):
 
 
 class PrivateFolder:
-    """A folder that only this user can write to.
-
-    Parameters
-    ----------
-    path
-        The path; the folder is created with mode 0700 if it does not exist.
-    made
-        True if this process has just created it, so that it needs no check.
-
-    Raises
-    ------
-    NotPrivateError
-        If others can write to it or replace it.
-    OSError
-        If it cannot be created or opened.
-    """
+    """A folder that only this user can write to."""
 
     def __init__(self, path: Path, made: bool = False) -> None:
         self.path = path
@@ -71,15 +56,7 @@ class PrivateFolder:
         return status.st_nlink > 0 and _refusal(status) is None
 
     def open(self, name: str) -> int:
-        """Return the descriptor of a file in the folder, to be closed by the caller.
-
-        Raises
-        ------
-        NotPrivateError
-            If it is not a plain file of this user alone.
-        OSError
-            If it does not exist.
-        """
+        """Return the descriptor of a file in the folder, to be closed by the caller."""
         try:
             descriptor = os.open(*self._at(name, _FILE), **self._relative())
         except OSError:
@@ -100,17 +77,7 @@ class PrivateFolder:
             return False
 
     def adopt(self, path: str, name: str, end: bytes = b"") -> None:
-        """Move a file into the folder, in place of one of that name, with access for this user only.
-
-        Parameters
-        ----------
-        path
-            A file on the same file system.
-        name
-            Its name in the folder.
-        end
-            Bytes to append to its content.
-        """
+        """Move a file into the folder, in place of one of that name, with access for this user only."""
         with open(os.open(path, os.O_APPEND | os.O_RDWR | _FILE), "ab") as file:
             reason = _file_refusal(os.fstat(file.fileno()), writable=False)
             if reason is not None:

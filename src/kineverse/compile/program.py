@@ -45,15 +45,7 @@ _TABLE = 64
 
 
 class Program:
-    """A function of a vector, with one column of numbers, in C order, per output.
-
-    Parameters
-    ----------
-    outputs
-        The expressions.
-    inputs
-        All symbols of the expressions, and maybe others, in the order of the input vector.
-    """
+    """A function of a vector, with one column of numbers, in C order, per output."""
 
     def __init__(self, outputs: Sequence[Expression], inputs: Sequence[Symbol]) -> None:
         self.size = len(inputs)
@@ -73,32 +65,13 @@ class Program:
         self.digest = hashlib.sha256(text.encode())
 
     def key(self, *details: str) -> str:
-        """Return the digest of this program and of its compilation, the same in every process.
-
-        Parameters
-        ----------
-        details
-            Everything else that the library depends on.
-        """
+        """Return the digest of this program and of its compilation, the same in every process."""
         digest = self.digest.copy()
         digest.update(repr(details).encode())
         return digest.hexdigest()[:40]
 
     def check(self, vector: Array, results: Array | Sequence[Array]) -> None:
-        """Raise an error if results are NaN because an implicit function has no solution.
-
-        Parameters
-        ----------
-        vector
-            The inputs, shape (n,).
-        results
-            The results: arrays of any shape, or a single one.
-
-        Raises
-        ------
-        NoSolutionError
-            With the name of the function, and its inputs.
-        """
+        """Raise an error if results are NaN because an implicit function has no solution."""
         arrays = (results,) if isinstance(results, np.ndarray) else results
         if any(np.isnan(array).any() for array in arrays):
             error = explain_no_solution(self.implicit, self._symbols, vector)
@@ -138,11 +111,6 @@ class Program:
         All inputs and outputs have to be given when it is called: CasADi asks for each number whether it is,
         and hundreds of such branches keep a compiler busy for minutes. Constants of which there are many are
         copied from a table.
-
-        Raises
-        ------
-        CompileError
-            If an operation has no definition in C.
         """
         columns: list[Any] = []
         tables: dict[int, dict[int, float]] = {}

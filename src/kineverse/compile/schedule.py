@@ -36,37 +36,17 @@ class Instruction:
 
 @dataclass(frozen=True, slots=True)
 class StraightLine:
-    """A program without branches and loops.
+    """A program without branches and loops."""
 
-    Attributes
-    ----------
-    steps
-        The instructions of all values, by their numbers. Some may be for no output.
-    outputs
-        Pairs of a place in the outputs and its value.
-    """
-
-    steps: list[Instruction]
-    outputs: list[tuple[int, int]]
+    steps: list[Instruction]  # instructions of all values, by their numbers. Some may be for no output
+    outputs: list[tuple[int, int]]  # pairs of a place in the outputs and its value
 
 
 @dataclass(slots=True)
 class CFunction:
-    """The values, loads and saves of one C function.
+    """The values, loads and saves of one C function."""
 
-    Attributes
-    ----------
-    values
-        The computed values, in order.
-    loads
-        From values of earlier functions to their slots in the store.
-    saves
-        From own values for later functions to their slots in the store.
-    outputs
-        Pairs of a place in the outputs and its value.
-    """
-
-    values: list[int] = field(default_factory=list)
+    values: list[int] = field(default_factory=list)  # computed values, in order
     loads: dict[int, int] = field(default_factory=dict)
     saves: dict[int, int] = field(default_factory=dict)
     outputs: list[tuple[int, int]] = field(default_factory=list)
@@ -74,21 +54,11 @@ class CFunction:
 
 @dataclass(frozen=True, slots=True)
 class Schedule:
-    """The C functions of a program.
+    """The C functions of a program."""
 
-    Attributes
-    ----------
-    steps
-        The instructions of all values, by their numbers.
-    parts
-        The functions, in order.
-    stored
-        The size of the store.
-    """
-
-    steps: list[Instruction]
-    parts: list[CFunction]
-    stored: int
+    steps: list[Instruction]  # instructions of all values, by their numbers
+    parts: list[CFunction]  # functions, in order
+    stored: int  # size of the store
 
 
 def read_instructions(function: CasadiFunction) -> StraightLine:
@@ -120,15 +90,7 @@ def read_instructions(function: CasadiFunction) -> StraightLine:
 
 
 def separate_parameters(program: StraightLine, inputs: int) -> tuple[StraightLine, StraightLine]:
-    """Return a program of the parameters, and one of the inputs and the results of the first.
-
-    Parameters
-    ----------
-    program
-        A program whose input vector is inputs and then parameters.
-    inputs
-        The number of inputs.
-    """
+    """Return a program of the parameters, and one of the inputs and the results of the first."""
     varying: list[bool] = []
     for step in program.steps:
         if step.op == ca.OP_INPUT:
@@ -163,15 +125,7 @@ def relax_residuals(program: StraightLine) -> StraightLine:
 
 
 def schedule(program: StraightLine, length: int) -> Schedule:
-    """Return the schedule of a program.
-
-    Parameters
-    ----------
-    program
-        The program; what is for no output is left out.
-    length
-        The number of operations of one C function.
-    """
+    """Return the schedule of a program."""
     steps = program.steps
     parts = [CFunction()]
     home: dict[int, int] = {}

@@ -26,15 +26,7 @@ _LISTED = 12
 
 
 class Signature:
-    """The inputs of a function.
-
-    Attributes
-    ----------
-    inputs
-        The symbols, in the order of the vector.
-    names
-        Their text names.
-    """
+    """The inputs of a function."""
 
     def __init__(self, inputs: tuple[Symbol, ...]) -> None:
         self.inputs = inputs
@@ -50,22 +42,7 @@ class Signature:
         return self._positions
 
     def vector(self, x: Any) -> Array:
-        """Return the numbers of all inputs as a contiguous vector, shape (n,).
-
-        Parameters
-        ----------
-        x
-            A sequence of n numbers; or a mapping from symbols or names to numbers; or a state.
-
-        Raises
-        ------
-        ShapeError
-            If it is not a vector of n numbers.
-        UnknownNameError
-            If a mapping lacks a symbol without a value of its own, or has one that is not an input.
-        InvalidValueError
-            If a mapping contains NaN or values that are not numbers.
-        """
+        """Return the numbers of all inputs as a contiguous vector, shape (n,)."""
         if isinstance(x, State):  # which may have more symbols
             return x.vector(self.inputs)
         if isinstance(x, Mapping):
@@ -119,24 +96,7 @@ class Signature:
 
 
 def make_signature(outputs: Sequence[Expression], inputs: Iterable[Symbol] | None) -> Signature:
-    """Return the signature of a function of ``outputs``.
-
-    Parameters
-    ----------
-    outputs
-        The expressions of the function.
-    inputs
-        The symbols in the order of the vector; those of the outputs in canonical order if None.
-
-    Raises
-    ------
-    ExpressionError
-        If an input is not a symbol.
-    DuplicateNameError
-        If a symbol occurs twice, or two have the same text name.
-    UnknownNameError
-        If the outputs depend on symbols that are not among the inputs.
-    """
+    """Return the signature of a function of ``outputs``."""
     needed = set().union(*(e.symbols for e in outputs))
     if inputs is None:
         found = Signature(tuple(sorted(needed, key=lambda s: s.sort_key)))
@@ -159,13 +119,7 @@ def make_signature(outputs: Sequence[Expression], inputs: Iterable[Symbol] | Non
 
 
 def as_doubles(x: Any, wanted: str) -> Array:
-    """Return real numbers as an array of doubles, of any shape and strides.
-
-    Raises
-    ------
-    ShapeError
-        For other values; the message says what was ``wanted``.
-    """
+    """Return real numbers as an array of doubles, of any shape and strides."""
     if type(x) is not np.ndarray and isinstance(x, np.ndarray) and isinstance(x, np.ma.MaskedArray):
         raise ShapeError(
             f"Expected {wanted}, not a masked array, some of whose entries have no value. Write "

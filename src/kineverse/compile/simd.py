@@ -188,11 +188,6 @@ def vector_header(scalar: Scalar) -> str:
     Generated functions and other C that is compiled with the flags of the same :class:`.Toolchain` have the
     same vectors, and so may call each other.
 
-    Parameters
-    ----------
-    scalar
-        The type of the numbers, ``Real`` in C.
-
     Notes
     -----
     ``V``, ``I``

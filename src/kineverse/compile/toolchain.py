@@ -42,29 +42,13 @@ _CPU_LINES = (
 
 @dataclass(frozen=True, slots=True)
 class Toolchain:
-    """A C compiler.
+    """A C compiler."""
 
-    Attributes
-    ----------
-    command
-        The absolute path of the compiler, and its constant arguments.
-    identity
-        Digest of compiler, processor and platform; libraries of different identities are not exchanged.
-    """
-
-    command: tuple[str, ...]
-    identity: str
+    command: tuple[str, ...]  # absolute path of the compiler, and its constant arguments
+    identity: str  # digest of compiler, processor and platform
 
     def arguments(self, flags: Sequence[str], output: str) -> list[str]:
-        """Return the command line that compiles C from standard input to a shared library.
-
-        Parameters
-        ----------
-        flags
-            Flags in addition to those for every library.
-        output
-            The path of the library.
-        """
+        """Return the command line that compiles C from standard input to a shared library."""
         always = ("-std=gnu11", "-fPIC", "-shared", "-fvisibility=hidden", "-w")
         return [*self.command, *FLOATING_POINT_FLAGS, *always, *flags, "-x", "c", "-", "-o", output, "-lm"]
 

@@ -21,45 +21,19 @@ PART_LENGTH = 1000
 
 @dataclass(frozen=True, slots=True)
 class Dialect:
-    """C notation of a program's operations.
+    """C notation of a program's operations."""
 
-    Attributes
-    ----------
-    type
-        The type of values.
-    mask
-        The type of truth values.
-    literal
-        A value, from a literal ``{}``.
-    truth
-        A value, from a truth value ``{}``: 1 or 0.
-    plain
-        Operations with the operands ``{a}`` and ``{b}``.
-    conditions
-        Truth values with the operands ``{a}`` and ``{b}``. NaN is true, as in C.
-    negation
-        The opposite of a truth value ``{}``.
-    guarded
-        The value ``{b}``, or 0 where the truth value ``{a}`` is false.
-    is_true
-        The truth value of a value ``{}``.
-    circle
-        Statement for sine ``{s}`` and cosine ``{c}`` of an angle ``{a}``.
-    written
-        The vector of a value ``{}``.
-    """
-
-    type: str
-    mask: str
-    literal: str
-    truth: str
-    plain: Mapping[int, str]
-    conditions: Mapping[int, str]
-    negation: str
-    guarded: str
-    is_true: str
-    circle: str
-    written: str
+    type: str  # type of values
+    mask: str  # type of truth values
+    literal: str  # value, from a literal {}
+    truth: str  # value, from a truth value {}: 1 or 0
+    plain: Mapping[int, str]  # operations with the operands {a} and {b}
+    conditions: Mapping[int, str]  # truth values with the operands {a} and {b}. NaN is true, as in C
+    negation: str  # opposite of a truth value {}
+    guarded: str  # value {b}, or 0 where the truth value {a} is false
+    is_true: str  # truth value of a value {}
+    circle: str  # statement for sine {s} and cosine {c} of an angle {a}
+    written: str  # vector of a value {}
 
 
 _SAME = {
@@ -200,17 +174,6 @@ def generate_parts(plan: Schedule, name: str, dialect: Dialect, scalar: Scalar =
 
     Their arguments are the inputs ``x``, the kept numbers ``kept`` (both of the dialect's type, null if the
     program has none), the store ``store``, and the outputs ``o``, which are vectors.
-
-    Parameters
-    ----------
-    plan
-        The schedule.
-    name
-        The beginning of the names.
-    dialect
-        The notation.
-    scalar
-        The type to which constants are rounded.
     """
     type_ = dialect.type
     arguments = (

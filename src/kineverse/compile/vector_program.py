@@ -82,35 +82,6 @@ class VectorProgram:
     of it. The second computes the outputs of one vector of configurations, ``o``: the elements of each output
     in C order, one output after the other. It needs memory for :attr:`stored` vectors. All memory of vectors
     begins at multiples of 64 bytes. Both may be called by several threads.
-
-    Parameters
-    ----------
-    outputs
-        The expressions.
-    inputs
-        Symbols that have another value in each lane, in the order of ``x``.
-    parameters
-        Symbols that have the same value in all lanes, in the order of ``parameters``.
-    scalar
-        The type of numbers in vectors. In float, products and sums may be rounded together.
-
-    Attributes
-    ----------
-    size
-        The number of inputs.
-    sizes
-        The number of elements of each output.
-    shapes
-        The shape of each output.
-
-    Raises
-    ------
-    CompileError
-        If there is no C compiler, or an operation has no version for vectors.
-    UnknownNameError
-        If the outputs depend on other symbols.
-    DuplicateNameError
-        If a symbol is given twice.
     """
 
     def __init__(
@@ -158,13 +129,7 @@ class VectorProgram:
             self._library.request()
 
     def wait(self) -> None:
-        """Load the library, and compile it before if it is not in the cache.
-
-        Raises
-        ------
-        CompileError
-            If that fails.
-        """
+        """Load the library, and compile it before if it is not in the cache."""
         if not self.find() and not self._library.wait():
             raise self._failed()
 
@@ -203,16 +168,7 @@ class VectorProgram:
     def prepare(
         self, values: npt.ArrayLike | Mapping[Any, float] | State = (), out: npt.NDArray[Any] | None = None
     ) -> npt.NDArray[Any]:
-        """Return what depends on parameters only, shape (kept, lanes).
-
-        Parameters
-        ----------
-        values
-            The values of the parameters, as for a call of a :class:`.CompiledFunction`.
-        out
-            An array that :meth:`allocate` returned for ``kept`` vectors, which is written and returned; a new
-            one if None.
-        """
+        """Return what depends on parameters only, shape (kept, lanes)."""
         vector = self._parameters.vector(values)
         kept = self.allocate(self.kept) if out is None else out
         if (kept.shape, kept.dtype) != ((self.kept, self.lanes), self._dtype) or not kept.flags.c_contiguous:
@@ -225,25 +181,7 @@ class VectorProgram:
     def evaluate(
         self, x: npt.ArrayLike, values: npt.ArrayLike | Mapping[Any, float] | State = ()
     ) -> tuple[npt.NDArray[Any], ...]:
-        """Return the outputs at many configurations, in the program's scalar type.
-
-        Parameters
-        ----------
-        x
-            The values of the inputs, shape (N, n).
-        values
-            The values of the parameters.
-
-        Returns
-        -------
-        tuple
-            An array for each output, shape (N, ...).
-
-        Raises
-        ------
-        ShapeError
-            If ``x`` has another shape.
-        """
+        """Return the outputs at many configurations, in the program's scalar type."""
         wanted = f"an array of shape (N, {self.size}), a configuration per row"
         rows = as_doubles(x, wanted)
         if rows.ndim != 2 or rows.shape[1] != self.size:
@@ -286,13 +224,6 @@ def vector_source(program: VectorProgram, *, name: str) -> str:
 
     It defines the static functions ``<name>_prepare`` and ``<name>_compute``, and the constants
     ``<name>_kept`` and ``<name>_stored``, see :class:`VectorProgram`.
-
-    Parameters
-    ----------
-    program
-        The program.
-    name
-        The beginning of the names.
     """
     whole = read_instructions(program._program.function)
     preparing, computing = separate_parameters(whole, program.size)

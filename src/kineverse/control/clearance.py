@@ -29,25 +29,6 @@ class Clearance:
     """Distances of bodies at the coordinates of a program, and steps that increase them.
 
     Pairs that are nearer than the margin in all of some random states do not count.
-
-    Parameters
-    ----------
-    scene
-        Collision scene of the model.
-    program
-        Program of the tasks, to which rows for near pairs are added.
-    margin
-        Least distance of pairs of bodies [m].
-
-    Attributes
-    ----------
-    inputs
-        Symbols of the values of :meth:`load`.
-
-    Raises
-    ------
-    UnknownNameError
-        For a scene of a model that lacks some of the coordinates.
     """
 
     def __init__(self, scene: Scene, program: PositionProgram, margin: float) -> None:
@@ -108,13 +89,7 @@ class Clearance:
         return tuple(near.values())
 
     def find_step(self, H: Array, f: Array, A: Array, lower: Array, upper: Array) -> Array | None:
-        """Return the step of the coordinates for the last near pairs, None if there is none.
-
-        Parameters
-        ----------
-        H, f, A, lower, upper
-            Quadratic program of the tasks at the same coordinates.
-        """
+        """Return the step of the coordinates for the last near pairs, None if there is none."""
         n, static = self._n, self._static
         self._A[: static - n], self._A[static - n :] = A, 0.0
         self._lower[:static], self._lower[static:] = lower, -np.inf

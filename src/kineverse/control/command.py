@@ -27,23 +27,13 @@ class StepTimes(NamedTuple):
 
 
 class TaskErrors(NamedTuple):
-    """Errors of tasks at a state.
+    """Errors of tasks at a state."""
 
-    Attributes
-    ----------
-    names, values
-        Names (k,) of the tasks, and norms (k,) of their errors at the state.
-    speed_goals, first_rows
-        Places of goals about speeds among these, and of their first rows in ``jacobian``.
-    jacobian, rate
-        Jacobian (m, n) and wanted rates (m,) of all goals about speeds; None without any.
-    """
-
-    names: tuple[str, ...]
+    names: tuple[str, ...]  # names (k,) of the tasks, and norms (k,) of their errors at the state
     values: Array
-    speed_goals: npt.NDArray[np.intp]
-    first_rows: npt.NDArray[np.intp]
-    jacobian: Array | None
+    speed_goals: npt.NDArray[np.intp]  # places of goals about speeds among these
+    first_rows: npt.NDArray[np.intp]  # of their first rows in jacobian
+    jacobian: Array | None  # (m, n), (m,)
     rate: Array | None
 
     def norms(self, speeds: Array) -> dict[str, float]:

@@ -35,32 +35,7 @@ class SearchEnd(NamedTuple):
 
 
 class ConfigurationSearch:
-    """Present coordinates of a program, and ways to change them.
-
-    Parameters
-    ----------
-    program
-        Program of the tasks.
-    clearance
-        Distances of bodies; None to ignore collisions.
-
-    Attributes
-    ----------
-    x
-        (n,) present coordinates; written in place.
-    constants
-        Values of all inputs of the program, the coordinates first; written in place.
-    weights
-        (k,) present row weights; written in place.
-    outputs
-        Results of the last evaluation; see :class:`.PositionProgram`.
-    rows
-        Rows of each task and equality among the errors.
-    exact
-        (k,) flags of the rows of holds, equalities and violations.
-    iterations
-        Number of steps so far.
-    """
+    """Present coordinates of a program, and ways to change them."""
 
     def __init__(self, program: PositionProgram, clearance: Clearance | None) -> None:
         self.program, self.clearance, self.space = program, clearance, program.space

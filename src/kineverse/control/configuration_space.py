@@ -21,26 +21,7 @@ _SAME = 1e-9
 
 
 class ConfigurationSpace:
-    """Ranges of some coordinates of a model.
-
-    Parameters
-    ----------
-    model
-        The model.
-    coordinates
-        The n coordinates.
-    ranges
-        Constraints on positions, those of the model included.
-
-    Attributes
-    ----------
-    lower, upper
-        (n,) limits, ±inf for none, at the default values of parameters.
-    turning
-        (n,) flags of coordinates q for which q + 2π is the same; none until they are set.
-    quaternions
-        Indices of the four coordinates of each quaternion.
-    """
+    """Ranges of some coordinates of a model."""
 
     def __init__(
         self, model: ModelView, coordinates: Sequence[Symbol], ranges: Mapping[str, Constraint]
@@ -117,13 +98,6 @@ def find_coordinates(
 
     A dependent coordinate stands for those that determine it, an articulation for all of its coordinates, and
     a speed for the coordinates that it drives.
-
-    Raises
-    ------
-    UnknownNameError
-        For another name, with similar ones.
-    ExpressionError
-        For what is neither a symbol nor a name.
     """
     found: set[Symbol] = set()
     known = {*model.symbols, *model.rates.dependent, *model.speeds}

@@ -77,19 +77,7 @@ row_library = SourceLibrary(_SOURCE, _declare)
 
 
 class ContactRows:
-    """Writer of the rows of near pairs into the arrays of a quadratic program, which it keeps.
-
-    Parameters
-    ----------
-    group, twists
-        (B,) index of the twist of each body; (G, 6, n) twists over the n speeds, in the world.
-    margins
-        (B, B) distance that each pair of bodies keeps [m].
-    H, f
-        Costs over all variables, the speeds first.
-    A, lower
-        The rows, (count, width), and their lower bounds, (count,).
-    """
+    """Writer of the rows of near pairs into the arrays of a quadratic program, which it keeps."""
 
     def __init__(
         self,
@@ -114,19 +102,7 @@ class ContactRows:
     def write(
         self, found: DistanceResults, used: int, *, gain: float, recovery: float, weight: float
     ) -> None:
-        """Write the rows of the first pairs, and add those within their margins to the costs.
-
-        Parameters
-        ----------
-        found
-            Near pairs.
-        used
-            Number of rows, at most the number of pairs.
-        gain, recovery
-            Rates at which a distance may shrink to the margin, and at which pairs within it separate [1/s].
-        weight
-            Weight of the goals to separate.
-        """
+        """Write the rows of the first pairs, and add those within their margins to the costs."""
         if row_library.code is None:
             self._write_by_numpy(found, used, gain, recovery, weight)
             return

@@ -33,49 +33,9 @@ from .velocity_program import RECOVERY_WEIGHT
 
 
 class ContactSlots:
-    """Rows of the nearest pairs of bodies.
+    """Rows of the nearest pairs of bodies."""
 
-    Parameters
-    ----------
-    scene
-        Collision scene of the controller's model.
-    speeds
-        The columns.
-    count
-        Largest number of rows; further pairs are omitted, the farthest first.
-    margin
-        Distance that is kept [m].
-    radius
-        Distance up to which pairs count [m].
-    gain
-        Rate γ at which a distance may shrink to the margin [1/s].
-    twist
-        Function that returns the twist of a body, (6, n) over the columns; by default the model's Jacobian.
-    rules
-        Further rules on the pairs that count, after those of the scene.
-    tier
-        Kind of evaluation of the twists, see :func:`kineverse.compile`.
-
-    Attributes
-    ----------
-    inputs
-        Symbols of :meth:`update`, in the order of its vector.
-    found
-        Near pairs of the last update, nearest first, all of them. Parallel faces are there with several
-        points, see :class:`.FacingPoints`: a turn away from the one brings the other nearer.
-    function
-        Compiled twists of the groups of bodies.
-    gain, radius
-        The parameters of these names, which can be changed.
-
-    Raises
-    ------
-    InvalidValueError
-        For a scene that is none, a number of slots that is no natural number, a margin that is not finite, or
-        a radius that is not larger.
-    """
-
-    found: DistanceResults
+    found: DistanceResults  # near pairs of the last update, nearest first, all of them
 
     def __init__(
         self,
@@ -127,13 +87,7 @@ class ContactSlots:
         self._twist_values = np.array([place[s] for s in self.function.inputs], dtype=np.intp)
 
     def update(self, values: Array) -> None:
-        """Find the near pairs at the values of :attr:`inputs`.
-
-        Raises
-        ------
-        InvalidValueError
-            For values that are not finite, or after an edit of the scene's model.
-        """
+        """Find the near pairs at the values of :attr:`inputs`."""
         if self.scene.model.version != self._version:
             raise InvalidValueError(
                 "The model of the scene was edited since, so the rows of contacts are not about its bodies. "
@@ -144,22 +98,7 @@ class ContactSlots:
         self._twists()
 
     def set_margin(self, one: str | Iterable[str], other: str | Iterable[str], margin: float) -> None:
-        """Set the distance that some pairs keep [m]; negative for bodies that press on each other.
-
-        Parameters
-        ----------
-        one, other
-            Names of bodies or patterns, or several; a pair has one body of each.
-        margin
-            Distance, smaller than the radius.
-
-        Raises
-        ------
-        UnknownNameError
-            If a name or pattern matches no body.
-        InvalidValueError
-            For a margin that is not smaller than the radius.
-        """
+        """Set the distance that some pairs keep [m]; negative for bodies that press on each other."""
         if not (math.isfinite(margin) and margin < self.radius):
             raise InvalidValueError(f"A margin is smaller than the radius {self.radius!r} m, not {margin!r}.")
         bodies = self.scene.bodies
@@ -174,11 +113,6 @@ class ContactSlots:
         """Return the twist (v, ω) of a body, (6, n) over the columns in the world, at the last update.
 
         The velocities of a point p of the body are ``v + ω × p``.
-
-        Parameters
-        ----------
-        body
-            Index of the body in the scene's ``bodies``.
         """
         return np.asarray(self._twists.outputs[0][self._group[body]])
 
@@ -187,29 +121,13 @@ class ContactSlots:
         return np.asarray(self._twists.outputs[0][self._group[bodies]])
 
     def bind(self, H: Array, f: Array, A: Array, lower: Array) -> None:
-        """Choose the arrays of the program into which :meth:`write` writes.
-
-        Parameters
-        ----------
-        H, f
-            Costs over all variables, the speeds first; soft goals are added to them.
-        A, lower
-            The rows of the slots, (count, n) and (count,), all zero and unbounded before each :meth:`write`.
-        """
+        """Choose the arrays of the program into which :meth:`write` writes."""
         self._rows = ContactRows(
             self._group, self._twists.outputs[0], self._margins, *map(_contiguous, (H, f, A, lower))
         )
 
     def write(self, recovery: float, weight: float = RECOVERY_WEIGHT) -> None:
-        """Write the rows of the nearest pairs into the program, and the soft goals into its costs.
-
-        Parameters
-        ----------
-        recovery
-            Rate at which a pair within the margin separates [1/s].
-        weight
-            Weight of the soft goals.
-        """
+        """Write the rows of the nearest pairs into the program, and the soft goals into its costs."""
         used = min(len(self.found), self.count)
         if used:
             self._rows.write(self.found, used, gain=self.gain, recovery=recovery, weight=weight)

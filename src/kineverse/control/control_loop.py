@@ -57,36 +57,16 @@ class DurationSummary(NamedTuple):
 
 @dataclass(frozen=True, slots=True)
 class LoopReport:
-    """The outcome of a control loop.
+    """The outcome of a control loop."""
 
-    Attributes
-    ----------
-    cycles
-        The number of commands that the sink got.
-    missed_deadlines
-        The number of periods at whose end no command had been given.
-    worst_lateness
-        The longest time from a deadline to the end of its cycle [s]; 0 if none was missed.
-    stale_cycles
-        The number of cycles without a state, or with one that was too old.
-    errors
-        The number of cycles in which the controller raised an error, or had a speed that is not finite.
-    last_error
-        The last of these errors.
-    step_times
-        Durations of the controller's steps [s], by the clock of the loop.
-    interrupted
-        Whether a KeyboardInterrupt ended the loop.
-    """
-
-    cycles: int
-    missed_deadlines: int
-    worst_lateness: float
-    stale_cycles: int
-    errors: int
-    last_error: KineverseError | None
-    step_times: DurationSummary
-    interrupted: bool
+    cycles: int  # number of commands that the sink got
+    missed_deadlines: int  # number of periods at whose end no command had been given
+    worst_lateness: float  # longest time from a deadline to the end of its cycle [s]; 0 if none was missed
+    stale_cycles: int  # number of cycles without a state, or with one that was too old
+    errors: int  # number of cycles in which the controller raised an error, or had a speed that is not finite
+    last_error: KineverseError | None  # last of these errors
+    step_times: DurationSummary  # durations of the controller's steps [s], by the clock of the loop
+    interrupted: bool  # whether a KeyboardInterrupt ended the loop
 
 
 def run_control_loop(
@@ -114,37 +94,6 @@ def run_control_loop(
     An exception of ``source``, ``until`` or ``on_error``, or one of the controller that is none of this
     package, ends the loop: it is raised once the speeds are zero. One of the sink is raised at once, after
     an attempt to command zeros; so is a second KeyboardInterrupt.
-
-    Parameters
-    ----------
-    controller
-        The controller; its time step should be ``1/rate``.
-    rate
-        Cycles per second [Hz].
-    source
-        Returns the latest state, or None if there is no new one. It should not wait. A state counts again in
-        later cycles until it is stale.
-    sink
-        Takes speeds by symbol [m/s], [rad/s], a new dictionary each time.
-    stale
-        Age from which a state is stale [s]: by its stamp, or without one since its arrival. A stamp that is
-        ahead of the clock by more is stale as well, since it is of another clock.
-    acceleration
-        Accelerations of the way to zero [m/s^2], [rad/s^2]: a number, or a mapping by coordinate or speed
-        (symbols or names), the others having :data:`DEFAULT_ACCELERATION`.
-    duration
-        Time after which the speeds go to zero [s]; None for no end.
-    until
-        Tells of a fresh state whether the speeds are to go to zero.
-    on_error
-        Takes each error of the controller.
-    clock, sleep
-        The clock [s] that stamps of states refer to, and the function that waits for a time [s].
-
-    Raises
-    ------
-    InvalidValueError, UnknownNameError
-        For arguments that are not positive, or an acceleration of an unknown speed.
 
     Examples
     --------
@@ -306,7 +255,6 @@ class _Loop:
 def _accelerations(
     speeds: Sequence[Symbol], acceleration: float | Mapping[Symbol | str, float]
 ) -> dict[Symbol, float]:
-    """Return the acceleration of each speed."""
     if not isinstance(acceleration, Mapping):
         acceleration = dict.fromkeys(speeds, acceleration)
     known = {str(name): s for s in speeds for name in (s, s.position)}

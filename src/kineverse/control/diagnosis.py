@@ -19,19 +19,7 @@ from .velocity_program import VelocityProgram
 
 
 class Diagnosis:
-    """Reasons why the last evaluation of a program has no solution.
-
-    Parameters
-    ----------
-    model
-        The model.
-    formulation, program
-        The tasks and rows, and the program made of them.
-    evaluator
-        The program's evaluator, with the values and results of the step.
-    contacts
-        The contact slots; None for none.
-    """
+    """Reasons why the last evaluation of a program has no solution."""
 
     def __init__(
         self,

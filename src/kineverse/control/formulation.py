@@ -32,31 +32,15 @@ _SMALLEST = 1e-300
 
 @dataclass(frozen=True)
 class GoalRows:
-    """Goal as rows ``jacobian @ v ≈ rate``.
-
-    Attributes
-    ----------
-    name
-        Name of the goal.
-    error
-        (k,) expression minus target; of a goal about speeds, minus the target alone.
-    jacobian
-        (k, n) over the columns.
-    correction, rate
-        (k,) wanted rates by the error alone, and with those of the target.
-    weight
-        (k,) weights of the squared differences.
-    about_speeds
-        True for a goal about speeds.
-    """
+    """Goal as rows ``jacobian @ v ≈ rate``."""
 
     name: str
-    error: Expression
-    jacobian: Expression
-    correction: Expression
+    error: Expression  # (k,) expression minus target; of a goal about speeds, minus the target alone
+    jacobian: Expression  # (k, n) over the columns
+    correction: Expression  # (k,) wanted rates by the error alone, and with those of the target
     rate: Expression
-    weight: Expression
-    about_speeds: bool = False
+    weight: Expression  # (k,) weights of the squared differences
+    about_speeds: bool = False  # True for a goal about speeds
 
 
 @dataclass(frozen=True)
@@ -74,39 +58,7 @@ class HoldRows:
 
 
 class Formulation:
-    """Tasks and constraints of a model over its free speeds, for the quadratic programs of controllers.
-
-    Parameters
-    ----------
-    model
-        The model.
-    tasks
-        Goals, holds and keeps.
-    dt
-        Time step [s], a number or a parameter.
-    still
-        Coordinates and speeds that stay still, as symbols or names of coordinates, speeds or articulations.
-    accelerations
-        Limits on the magnitudes of accelerations by speed, beside those of the model; braking respects both.
-
-    Attributes
-    ----------
-    speeds
-        The n columns.
-    goals, holds
-        Rows of the tasks; holds include the equalities of the model.
-    rows
-        Rows of constraints and keeps, without recovery speeds; see :mod:`kineverse.model.velocity_rows`.
-
-    Raises
-    ------
-    UnknownNameError
-        For a task about a symbol that the model does not have, or an unknown name in ``still``.
-    InvalidValueError
-        If there is no task, one that no speed serves, or a keep that cannot be a row.
-    DuplicateNameError
-        For two tasks of one name.
-    """
+    """Tasks and constraints of a model over its free speeds, for the quadratic programs of controllers."""
 
     def __init__(
         self,
@@ -349,15 +301,7 @@ def find_speeds(model: ModelView, names: Iterable[Symbol | str], argument: str) 
 
 
 def find_symbols(model: ModelView, names: Iterable[Symbol | str], argument: str) -> Iterator[Symbol]:
-    """Yield symbols that are given as symbols or names; an articulation stands for its coordinates.
-
-    Raises
-    ------
-    UnknownNameError
-        For another name, with similar ones.
-    ExpressionError
-        For what is neither a symbol nor a name.
-    """
+    """Yield symbols that are given as symbols or names; an articulation stands for its coordinates."""
     coordinates = set(map(str, model.symbols))
     for item in (names,) if isinstance(names, str | Symbol) else names:
         if isinstance(item, str) and item in model.articulations and item not in coordinates:

@@ -17,57 +17,27 @@ from .quadratic_program import make_solver
 
 
 class Conflict(NamedTuple):
-    """One member of a set of contradictory constraints.
+    """One member of a set of contradictory constraints."""
 
-    Attributes
-    ----------
-    name
-        The name of the constraint.
-    operations
-        The operations of the model that wrote it.
-    lower, upper
-        The bounds that take part; infinite where that side does not.
-    """
-
-    name: str
-    operations: tuple[str, ...]
-    lower: float
+    name: str  # name of the constraint
+    operations: tuple[str, ...]  # operations of the model that wrote it
+    lower: float  # bounds that take part; infinite where that side does not
     upper: float
 
 
 class ConflictingBound(NamedTuple):
-    """One bound of a conflict of rows.
+    """One bound of a conflict of rows."""
 
-    Attributes
-    ----------
-    row
-        The index of the row in ``[x; A x]``.
-    side
-        -1 for its lower bound, 1 for its upper one.
-    """
-
-    row: int
-    side: int
+    row: int  # index of the row in [x; A x]
+    side: int  # -1 for its lower bound, 1 for its upper one
 
 
 class LeastViolation(NamedTuple):
-    """The point that violates the soft rows least.
+    """The point that violates the soft rows least."""
 
-    Attributes
-    ----------
-    x
-        The point, of shape (n,).
-    violations
-        The violations of ``[x; A x]``, of shape (n + m,), in the units of the rows: negative below the lower
-        bound, positive above the upper one, else 0. Of a row whose bounds contradict each other, the larger.
-    hard_rows_hold
-        Whether the hard rows are satisfied. If they contradict each other, they are violated little, and the
-        soft ones count for nothing beside them.
-    """
-
-    x: Vector
-    violations: Vector
-    hard_rows_hold: bool
+    x: Vector  # point, of shape (n,)
+    violations: Vector  # violations of [x
+    hard_rows_hold: bool  # whether the hard rows are satisfied
 
 
 def find_irreducible_conflict(
@@ -81,23 +51,6 @@ def find_irreducible_conflict(
     (Gleeson and Ryan 1990, "Identifying minimally infeasible subsystems of inequalities"). Where rounding
     blurs it, one bound after the other is left out instead (Chinneck and Dravnieks 1991, "Locating minimal
     infeasible constraint sets in linear programs"). A row with ``lower > upper`` comes first.
-
-    Parameters
-    ----------
-    A
-        Of shape (m, n).
-    lower, upper
-        Bounds of ``[x; A x]``, of shape (n + m,); may be infinite.
-
-    Returns
-    -------
-    :
-        The bounds by row; empty if the rows do not contradict each other by more than about 1e-9.
-
-    Raises
-    ------
-    ShapeError, InvalidValueError
-        For arrays of other shapes, or with NaN.
     """
     rows, low, high = _stacked(A, lower, upper)
     gap = low - high
@@ -139,25 +92,7 @@ def find_least_violation(
     hard: ArrayLike | None = None,
     near: ArrayLike | None = None,
 ) -> LeastViolation:
-    """Find the point whose violations have the smallest sum of squares, within the hard rows.
-
-    Parameters
-    ----------
-    A
-        Of shape (m, n).
-    lower, upper
-        Bounds of ``[x; A x]``, of shape (n + m,); may be infinite.
-    hard
-        A mask of the rows that must hold, of shape (n + m,), such as speed limits of single joints; none
-        unless given.
-    near
-        The point to be close to among those that violate equally, of shape (n,); zeros unless given.
-
-    Raises
-    ------
-    ShapeError, InvalidValueError
-        For arrays of other shapes, or with NaN.
-    """
+    """Find the point whose violations have the smallest sum of squares, within the hard rows."""
     rows, low, high = _stacked(A, lower, upper)
     n = rows.shape[1]
     held = np.zeros(len(rows), bool) if hard is None else np.asarray(hard, bool)
@@ -216,13 +151,7 @@ def _violations(g: Vector, h: Vector) -> Vector:
 
 
 def _minimal_certificate(g: Vector, h: Vector, y: Vector) -> tuple[NDArray[np.intp], bool]:
-    """Reduce a certificate y > 0 of infeasible ``g x <= h`` to a vertex of ``{y >= 0, g'y = 0, h'y = -1}``.
-
-    Returns
-    -------
-    :
-        The rows that it needs, and whether their number and their signs are clear of rounding.
-    """
+    """Reduce a certificate y > 0 of infeasible ``g x <= h`` to a vertex of ``{y >= 0, g'y = 0, h'y = -1}``."""
     alive = np.arange(len(y))
     if not len(y):
         return alive, False

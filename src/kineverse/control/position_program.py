@@ -52,64 +52,17 @@ _SAME = 1e-9
 
 @dataclass(frozen=True)
 class ErrorRows:
-    """Rows of one task, or of an equality of the model.
+    """Rows of one task, or of an equality of the model."""
 
-    Attributes
-    ----------
-    name
-        Name of the task or constraint.
-    error
-        (k,) errors, in plain independent coordinates.
-    weights
-        (k,) weights of their squares.
-    tolerance
-        Largest entry where the task is done.
-    exact
-        True for holds and equalities, which are kept where goals are out of reach.
-    """
-
-    name: str
-    error: Expression
-    weights: Expression
-    tolerance: float
-    exact: bool
+    name: str  # name of the task or constraint
+    error: Expression  # (k,) errors, in plain independent coordinates
+    weights: Expression  # (k,) weights of their squares
+    tolerance: float  # largest entry where the task is done
+    exact: bool  # True for holds and equalities, which are kept where goals are out of reach
 
 
 class PositionProgram:
-    """Compiled quadratic program of a Gauss-Newton step.
-
-    Parameters
-    ----------
-    model
-        The model.
-    tasks
-        Goals, holds and keeps of positions.
-    still
-        Coordinates that stay still, as symbols or names; see :func:`find_coordinates`.
-    tolerance
-        Largest entry of the errors of a goal that is reached.
-
-    Attributes
-    ----------
-    coordinates
-        The n coordinates that move.
-    inputs
-        The coordinates, then all other symbols; k row weights follow them.
-    parts
-        Rows of tasks and equalities. The errors are those of all parts, then violations of the n bounds, then
-        those of the general rows.
-    weights
-        (k,) default row weights. They make errors comparable: one unit for a usual motion of coordinates.
-    names
-        Names of the constraints of the n bounds and the general rows.
-    keeps
-        Names of the keeps that are ranges.
-    space
-        Limits and periods of the coordinates.
-    function
-        Function with the outputs H, f, A, lower, upper, the k errors and violations, the weighted sum of
-        their squares, and the largest of them as a multiple of its tolerance.
-    """
+    """Compiled quadratic program of a Gauss-Newton step."""
 
     def __init__(
         self, model: ModelView, tasks: Iterable[Task], still: Iterable[Symbol | str], tolerance: float

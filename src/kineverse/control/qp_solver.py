@@ -28,25 +28,11 @@ SOFT_WEIGHT = 1e6
 
 
 class QpSolution(NamedTuple):
-    """The outcome of a quadratic program.
+    """The outcome of a quadratic program."""
 
-    Attributes
-    ----------
-    x
-        The minimiser, of shape (n,); zeros unless solved.
-    multipliers
-        The multipliers of ``[x; A x]``, of shape (n + m,), with ``H x + f + [I; A]' multipliers = 0``:
-        negative at a lower bound, positive at an upper one; zeros unless solved.
-    iterations
-        The number of iterations.
-    status
-        "solved"; "infeasible" (no x satisfies all hard rows, or a lower bound is above its upper one);
-        "failed" (the data are not finite, H is not positive definite, or the solver did not converge).
-    """
-
-    x: Vector
-    multipliers: Vector
-    iterations: int
+    x: Vector  # minimiser, of shape (n,); zeros unless solved
+    multipliers: Vector  # multipliers of [x
+    iterations: int  # number of iterations
     status: Status
 
 
@@ -104,28 +90,7 @@ _library = SourceLibrary(_SOURCE, _declare)
 
 
 class QpSolver(ABC):
-    """A solver of quadratic programs of one size, started from its last solution.
-
-    Parameters
-    ----------
-    n
-        The number of unknowns, at least 1.
-    m
-        The number of rows of A, 0 or more.
-    soft
-        The soft entries of ``[x; A x]``: a mask of shape (n + m,), or None. A violation s of a soft entry
-        costs ``soft_linear s + 1/2 soft_weight s^2``.
-    soft_weight
-        The weight of the squared violation, above 0: a number or one per entry.
-    soft_linear
-        The weight of the violation itself, at least 0: a number or one per entry. Above the multiplier of
-        the row it makes the penalty exact: a row that can be satisfied is.
-
-    Raises
-    ------
-    InvalidValueError, ShapeError
-        For sizes, masks or weights outside of these.
-    """
+    """A solver of quadratic programs of one size, started from its last solution."""
 
     def __init__(
         self,
@@ -173,23 +138,6 @@ class QpSolver(ABC):
 
         The arrays are read in place: rewrite the same ones for each solve, since other ones are checked anew.
         The solution's arrays are its own.
-
-        Parameters
-        ----------
-        H
-            Positive definite and symmetric, of shape (n, n).
-        f
-            Of shape (n,).
-        A
-            Of shape (m, n).
-        lower, upper
-            Of shape (n + m,); infinite where there is no bound, equal for an equality.
-
-        Raises
-        ------
-        ShapeError, InvalidValueError
-            For arrays of another shape, or that are not C-contiguous doubles. Numbers raise nothing, see
-            :class:`QpSolution`.
         """
         h, g, a, low, high = self._bound
         if H is not h or f is not g or A is not a or lower is not low or upper is not high:

@@ -27,23 +27,7 @@ def make_solver(
     soft_weight: ArrayLike = SOFT_WEIGHT,
     soft_linear: ArrayLike = 0.0,
 ) -> QpSolver:
-    """Make a solver of quadratic programs with n unknowns and m rows.
-
-    Parameters
-    ----------
-    name
-        "daqp" (dual active set, for loops), "proxqp" (augmented Lagrangian; or "proxsuite") or "osqp"
-        (operator splitting).
-    n, m, soft, soft_weight, soft_linear
-        See :class:`QpSolver`.
-
-    Raises
-    ------
-    UnknownNameError
-        For another name.
-    MissingDependencyError
-        If the library is not installed.
-    """
+    """Make a solver of quadratic programs with n unknowns and m rows."""
     if name not in SOLVERS:
         raise UnknownNameError(f"There is no QP solver {name!r}. {suggest(name, SOLVERS, 'solver')}")
     return SOLVERS[name](n, m, soft, soft_weight, soft_linear)

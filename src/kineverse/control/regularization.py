@@ -33,48 +33,21 @@ _LEAST_SHARE = 0.01
 
 @dataclass(frozen=True)
 class Costs:
-    """Weights of the terms that no task states.
+    """Weights of the terms that no task states."""
 
-    Attributes
-    ----------
-    damping
-        Weight of squared speeds.
-    smooth, jerk
-        Weights of the first and second differences of commands.
-    progress
-        Weight of the progress of holds, as a multiple of the largest one of goals.
-    recovery
-        Rate at which violations of limits decay [1/s].
-    """
-
-    damping: float = 1e-4
-    smooth: float = 1e-2
-    jerk: float = 0.0
-    progress: float = 10.0
-    recovery: float = 5.0
+    damping: float = 1e-4  # weight of squared speeds
+    smooth: float = 1e-2  # weights of the first
+    jerk: float = 0.0  # second differences of commands
+    progress: float = 10.0  # weight of the progress of holds, as a multiple of the largest one of goals
+    recovery: float = 5.0  # rate at which violations of limits decay [1/s]
 
 
 @dataclass(frozen=True)
 class JointWeights:
-    """Factors of the speeds in the terms that no task states.
+    """Factors of the speeds in the terms that no task states."""
 
-    Attributes
-    ----------
-    shares
-        (n,) factors c_i of damping, smoothness and posture. They are mean squares of the speed's column in
-        the Jacobians of goals and holds over random states, so that units of coordinates do not matter; times
-        the share of bodies that the speed moves, or a given factor.
-    curvatures
-        By the name of a goal about positions (n,) factors κ_i with which ``Σ κ_i v_i²`` bounds the second
-        derivative of its errors, ``Σ_j |∂²e/∂q_i∂q_j| l_i/l_j``, at random states; l is the root mean square
-        of a column of the Jacobian. Times the same shares.
-    immovable
-        Names of equalities of the model whose gradient is nothing but rounding, such as the parts of a
-        planar loop's closure that point out of its plane. A row of them would make others dependent.
-    """
-
-    shares: tuple[Expression, ...]
-    curvatures: Mapping[str, tuple[Expression, ...]]
+    shares: tuple[Expression, ...]  # (n,) factors c_i of damping, smoothness and posture
+    curvatures: Mapping[str, tuple[Expression, ...]]  # (n,)
     immovable: frozenset[str]
 
 

@@ -46,24 +46,12 @@ _SWEEPS = 3
 
 @dataclass(frozen=True)
 class LockSide:
-    """One direction in which a constraint holds a coordinate, and the trend of the condition that frees it.
+    """One direction in which a constraint holds a coordinate, and the trend of the condition that frees it."""
 
-    Attributes
-    ----------
-    name
-        Name of the constraint, with the side.
-    coordinate, way
-        The coordinate, and the direction that is held.
-    room
-        Speed or distance that is left in this direction, positive if the lock is open.
-    trend
-        Gradient of the room with respect to the keys, by coordinate, heuristics included.
-    """
-
-    name: str
+    name: str  # name of the constraint, with the side
     coordinate: Symbol
-    way: Way
-    room: Expression
+    way: Way  # the direction that is held
+    room: Expression  # speed or distance that is left in this direction, positive if the lock is open
     trend: Mapping[Symbol, Expression]
 
     def behind(self, margins: Mapping[Symbol, float]) -> LockSide:

@@ -47,27 +47,7 @@ REACHED = 0.1
 
 
 class VelocityProgram:
-    """Compiled quadratic program of a formulation.
-
-    Attributes
-    ----------
-    inputs
-        Symbols of the state, in the order of the vector; the time step, the last command and, with a weight
-        on jerk, the one before follow them.
-    columns
-        Number of variables: the speeds, and the progress if anything is held.
-    names
-        Names of the constraints of each bound and row, without those of contacts.
-    equalities
-        Names of holds, and of the progress.
-    soft
-        Flags of rows that may be violated: accelerations.
-    speed_goals, speed_rows
-        Places of goals about speeds in the residuals, and of their first rows in the last two outputs of the
-        function, which are Jacobian and wanted rates of all of these, if there are any.
-    contact_rows
-        Slice of the rows of contacts in A, which are zero here.
-    """
+    """Compiled quadratic program of a formulation."""
 
     def __init__(
         self,

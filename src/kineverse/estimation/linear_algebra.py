@@ -27,13 +27,7 @@ def singularity_named() -> Iterator[None]:
 
 
 def invert_matrices(matrices: Array) -> Array:
-    """Invert a stack of positive definite matrices.
-
-    Raises
-    ------
-    InvalidValueError
-        If one is numerically singular.
-    """
+    """Invert a stack of positive definite matrices."""
     size = matrices.shape[-1]
     if size == 1:
         return 1.0 / matrices
@@ -69,13 +63,7 @@ def symmetric(matrix: Array) -> Array:
 
 
 def inverse_spd(matrix: Array) -> Array:
-    """Return the symmetric inverse of a positive definite matrix.
-
-    Raises
-    ------
-    InvalidValueError
-        If it is numerically singular.
-    """
+    """Return the symmetric inverse of a positive definite matrix."""
     if matrix.shape == (1, 1) and 0.0 < matrix[0, 0] < math.inf:
         return 1.0 / matrix
     try:
@@ -86,13 +74,7 @@ def inverse_spd(matrix: Array) -> Array:
 
 
 def squared_errors(errors: Array, covariances: Array) -> Array:
-    """Return the squared Mahalanobis norms eᵀ S⁻¹ e, (N,), of errors (N, m) with covariances S (N, m, m).
-
-    Raises
-    ------
-    InvalidValueError
-        If a covariance is numerically singular.
-    """
+    """Return the squared Mahalanobis norms eᵀ S⁻¹ e, (N,), of errors (N, m) with covariances S (N, m, m)."""
     try:
         weighted = np.linalg.solve(covariances, errors[:, :, None])[:, :, 0]
     except np.linalg.LinAlgError:

@@ -113,20 +113,7 @@ def cauchy_weight(square: float, size: int) -> float:
 
 
 def as_outliers(given: Outliers | bool | None, has_gate: bool = False) -> Outliers | None:
-    """Convert an argument to an outlier model: True stands for the default, False and None for none.
-
-    Parameters
-    ----------
-    given
-        The argument.
-    has_gate
-        True if a gate has a meaning.
-
-    Raises
-    ------
-    InvalidValueError
-        For another argument, and for a gate where it has no meaning.
-    """
+    """Convert an argument to an outlier model: True stands for the default, False and None for none."""
     if isinstance(given, Outliers):
         if given.gate is not None and not has_gate:
             raise InvalidValueError(

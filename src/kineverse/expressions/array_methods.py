@@ -55,13 +55,7 @@ class ArrayMethods:
         return result
 
     def astype(self, dtype: Any) -> Expression:
-        """Return the expression itself: its values are 64-bit floats.
-
-        Raises
-        ------
-        ExpressionError
-            For any other type.
-        """
+        """Return the expression itself: its values are 64-bit floats."""
         if numpy.dtype(dtype) != numpy.float64:
             raise ExpressionError(
                 f"The values of an expression are 64-bit floats, not {numpy.dtype(dtype)}. Call it with "

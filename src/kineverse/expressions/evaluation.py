@@ -56,15 +56,6 @@ def symbol_values(
     A value by name is for the symbol of that name, of any role. Unknown names are an error, unless ``values``
     is a :class:`~kineverse.State`, which may describe more than the symbols. If ``derived``, values may be
     given by other symbols too: a derivative depends on fewer symbols than its function.
-
-    Raises
-    ------
-    UnknownNameError
-        For symbols without a value and values without a symbol.
-    DuplicateNameError
-        If a value is given by a name that several of the symbols have, or a symbol has two values.
-    InvalidValueError
-        For NaN and for values that are not numbers.
     """
     from kineverse.state import State
 

@@ -714,13 +714,7 @@ def binary(op: int, left: ExpressionLike, right: ExpressionLike) -> Expression:
 
 
 def broadcast(*operands: Expression) -> tuple[Expression, ...]:
-    """Bring operands to their common shape.
-
-    Raises
-    ------
-    ShapeError
-        Naming the shapes, if there is none.
-    """
+    """Bring operands to their common shape."""
     try:
         shape = np.broadcast_shapes(*(o.shape for o in operands))
     except ValueError:

@@ -46,41 +46,15 @@ FLOAT_RESIDUAL_TOLERANCE = 1e-4
 
 @dataclass(frozen=True, eq=False)
 class ImplicitFunction:
-    """A definition of unknowns as a function of inputs.
+    """A definition of unknowns as a function of inputs."""
 
-    Attributes
-    ----------
-    name
-        The name in error messages.
-    unknowns, inputs
-        The symbols x, of shape (n,), and u, of shape (k,), of the expressions below. They are the function's
-        own: other expressions take the place of u where it is applied.
-    residual
-        r(x, u), of shape (m,) with m at least n; all of it is zero at a solution.
-    rows
-        The n rows of the residual for Newton's method; a closed loop has more equations than unknowns.
-    seed
-        The first guess of x, of shape (n,), a function of u alone.
-    steps
-        The number of Newton steps.
-    domain
-        Pairs (lower, upper), one for each input, outside of which there is no value; empty if unbounded.
-
-    Raises
-    ------
-    ShapeError
-        If the parts do not fit together.
-    InvalidValueError
-        If residual or seed contain other symbols, steps are negative, or the domain is empty.
-    """
-
-    name: str
-    unknowns: tuple[Symbol, ...]
+    name: str  # name in error messages
+    unknowns: tuple[Symbol, ...]  # (n,), (k,)
     inputs: tuple[Symbol, ...]
-    residual: Expression
-    rows: tuple[int, ...]
-    seed: Expression
-    steps: int
+    residual: Expression  # r(x, u), of shape (m,) with m at least n; all of it is zero at a solution
+    rows: tuple[int, ...]  # n rows of the residual for Newton's method
+    seed: Expression  # first guess of x, of shape (n,), a function of u alone
+    steps: int  # number of Newton steps
     domain: tuple[tuple[float, float], ...] = ()
 
     def __post_init__(self) -> None:
@@ -144,13 +118,7 @@ class ImplicitFunction:
         return self.equations.partial(self.inputs)
 
     def apply(self, arguments: Sequence[Expression]) -> Expression:
-        """Return the unknowns, shape (n,), at other inputs than the function's own.
-
-        Raises
-        ------
-        ShapeError
-            If the arguments are not one scalar for each input.
-        """
+        """Return the unknowns, shape (n,), at other inputs than the function's own."""
         if len(arguments) != len(self.inputs):
             raise ShapeError(
                 f"'{self.name}' is a function of {len(self.inputs)} inputs, not of {len(arguments)}."

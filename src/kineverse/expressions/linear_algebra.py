@@ -26,13 +26,6 @@ def einsum(subscripts: str, *operands: ExpressionLike) -> Expression:
 
     Operands are multiplied from the left to the right. Without an arrow the result has the letters that occur
     once, in alphabetical order.
-
-    Raises
-    ------
-    ExpressionError
-        For subscripts that cannot be parsed.
-    ShapeError
-        For subscripts that do not fit the shapes.
     """
     if not isinstance(subscripts, str):
         raise ExpressionError('np.einsum of expressions takes its subscripts as text: "ij,jk->ik".')

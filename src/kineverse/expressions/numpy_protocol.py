@@ -88,13 +88,7 @@ _AXIS_OF_ITS_OWN = {getattr(np, "vecdot", None)}
 
 
 def apply_ufunc(ufunc: Any, method: str, inputs: tuple[Any, ...], options: Mapping[str, Any]) -> Any:
-    """Carry out a numpy ufunc on expressions.
-
-    Raises
-    ------
-    ExpressionError
-        For ufuncs, methods or options that have no counterpart.
-    """
+    """Carry out a numpy ufunc on expressions."""
     if method == "reduce" and ufunc in _REDUCTIONS and not set(options) - {"axis", "keepdims"}:
         return _REDUCTIONS[ufunc](inputs[0], options.get("axis", 0), keepdims=options.get("keepdims", False))
     if options.get("out") is not None:
@@ -139,13 +133,7 @@ _BEFORE_OUT = {np.take: 3, np.concatenate: 2, np.stack: 2}
 
 
 def apply_function(function: Any, args: Sequence[Any], options: Mapping[str, Any]) -> Any:
-    """Carry out a numpy function on expressions.
-
-    Raises
-    ------
-    ExpressionError
-        If it is not available.
-    """
+    """Carry out a numpy function on expressions."""
     name = f"{getattr(function, '__module__', 'numpy')}.{function.__name__}"
     if function in _AT_LEAST and len(args) != 1:
         return tuple(function(as_expression(a)) for a in args)

@@ -95,26 +95,7 @@ def spline(
 def piecewise(
     x: ExpressionLike, periodic: bool, knots: Sequence[float], pieces: Sequence[Sequence[float]]
 ) -> Expression:
-    """Return a piecewise polynomial of x, elementwise.
-
-    Parameters
-    ----------
-    x
-        The argument.
-    periodic
-        True to repeat with the distance from the first to the last knot as the period.
-    knots
-        At least two increasing numbers. A piece holds from its knot on, up to the next one.
-    pieces
-        The coefficients of each piece, constant first, all equally many: of powers of the distance from the
-        knot before it. Unless it is periodic, there is a piece before the first knot too, about that knot,
-        and one after the last.
-
-    Raises
-    ------
-    InvalidValueError
-        For knots that do not increase, a wrong number of pieces, or numbers that are not finite.
-    """
+    """Return a piecewise polynomial of x, elementwise."""
     operand = as_expression(x)
     return Piecewise.from_arguments((operand,), operand.shape, check_pieces(periodic, knots, pieces))
 

@@ -242,17 +242,7 @@ _LONGEST_CELL = 200
 def html_table(
     caption: str, header: Sequence[str], rows: Sequence[Sequence[str]], total: int | None = None
 ) -> str:
-    """Return an HTML table of texts, which are escaped; long texts and many rows are cut.
-
-    Parameters
-    ----------
-    caption, header
-        The caption, and the title of each column.
-    rows
-        The texts of each row; rows after the first 50 are counted.
-    total
-        The number of all rows, if only the first of them are given.
-    """
+    """Return an HTML table of texts, which are escaped; long texts and many rows are cut."""
     head = "".join(f"<th>{escape(title)}</th>" for title in header)
     body = "".join(
         f"<tr>{''.join(f'<td>{escape(_shorten_cell(cell))}</td>' for cell in row)}</tr>"

@@ -66,13 +66,7 @@ def ptp_axes(a: ExpressionLike, axis: Axis = None, *, keepdims: bool = False) ->
 
 
 def mean_axes(a: ExpressionLike, axis: Axis = None, *, keepdims: bool = False) -> Expression:
-    """Return the mean of all elements, or along one axis or several.
-
-    Raises
-    ------
-    ShapeError
-        For an empty array.
-    """
+    """Return the mean of all elements, or along one axis or several."""
     operand, summed = as_expression(a), sum_axes(a, axis)
     if summed.size and not operand.size:
         raise ShapeError(f"Nothing has no mean (of shape {operand.shape}).")
@@ -199,13 +193,7 @@ def axis_first(x: ExpressionLike, axis: Axis) -> tuple[Expression, tuple[int, ..
 
 
 def move_axis(x: Expression, source: int, destination: int) -> Expression:
-    """Return an array with one of its axes moved to another place.
-
-    Raises
-    ------
-    ShapeError
-        If the array has no such axis.
-    """
+    """Return an array with one of its axes moved to another place."""
     if source == destination:
         return x
     try:

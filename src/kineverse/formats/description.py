@@ -56,31 +56,15 @@ class JointBounds:
 
 @dataclass
 class JointDescription:
-    """Rotation about, or translation along, a line in the frame of its link.
+    """Rotation about, or translation along, a line in the frame of its link."""
 
-    Attributes
-    ----------
-    name
-        Unique name; that of the coordinate if the joint is independent.
-    is_rotation
-        True for a rotation, False for a translation.
-    axis, point
-        Direction of the line, a unit vector, and a point on it [m].
-    symbol, coefficients
-        Coordinate, and the coefficients of the polynomial in it that is the joint's position [rad] or [m].
-    bounds
-        Limits of position and velocity.
-    dynamics
-        Effort, damping, friction and the like, by name.
-    """
-
-    name: str
-    is_rotation: bool
-    axis: Vector3
+    name: str  # unique name; that of the coordinate if the joint is independent
+    is_rotation: bool  # True for a rotation, False for a translation
+    axis: Vector3  # direction of the line, a unit vector, and a point on it [m]
     point: Vector3
-    symbol: Symbol
+    symbol: Symbol  # [rad], [m]
     coefficients: Coefficients = IDENTITY_COEFFICIENTS
-    bounds: JointBounds = field(default_factory=JointBounds)
+    bounds: JointBounds = field(default_factory=JointBounds)  # limits of position and velocity
     dynamics: Mapping[str, Any] = field(default_factory=dict)
 
     @property
@@ -100,33 +84,15 @@ class BallJointDescription:
 
 @dataclass
 class LinkDescription:
-    """Link of a robot description: its pose in its parent, and the joints that move it from there.
+    """Link of a robot description: its pose in its parent, and the joints that move it from there."""
 
-    Attributes
-    ----------
-    name, parent
-        Names of the frame and of its parent.
-    pose
-        parent_T_frame while all of its joints are at 0.
-    joints
-        Joints between parent and link, from the parent outwards.
-    body
-        Inertia, visuals and collision shapes.
-    fixed_joint_name
-        Name of the fixed joint to the parent, if nothing moves.
-    is_articulation
-        True if an articulation of the model has that name.
-    dynamics
-        Dynamics of a planar or floating joint as a whole, by name.
-    """
-
-    name: str
+    name: str  # names of the frame
     parent: str
-    pose: Matrix
+    pose: Matrix  # parent_T_frame while all of its joints are at 0
     joints: list[JointDescription | BallJointDescription] = field(default_factory=list)
-    body: Body = NO_BODY
-    fixed_joint_name: str = ""
-    is_articulation: bool = False
+    body: Body = NO_BODY  # inertia, visuals and collision shapes
+    fixed_joint_name: str = ""  # name of the fixed joint to the parent, if nothing moves
+    is_articulation: bool = False  # True if an articulation of the model has that name
     dynamics: Mapping[str, Any] = field(default_factory=dict)
 
 
@@ -158,28 +124,12 @@ class LoopJoint:
 
 @dataclass
 class RobotDescription:
-    """Robot as a tree of links and joints, with constraints between its coordinates.
+    """Robot as a tree of links and joints, with constraints between its coordinates."""
 
-    Attributes
-    ----------
-    links
-        Links, parents first, without the world.
-    world_body
-        Body of the world frame.
-    sum_limits
-        Constraints on linear combinations of coordinates.
-    loops
-        Joints that close loops.
-    remarks
-        Differences between the model and its description, as sentences.
-    errors
-        Bounds of the pose errors of approximated frames, by frame.
-    """
-
-    links: list[LinkDescription]
-    world_body: Body
+    links: list[LinkDescription]  # links, parents first, without the world
+    world_body: Body  # body of the world frame
     sum_limits: list[SumLimit] = field(default_factory=list)
-    loops: list[LoopJoint] = field(default_factory=list)
+    loops: list[LoopJoint] = field(default_factory=list)  # joints that close loops
     remarks: list[str] = field(default_factory=list)
     errors: dict[str, FrameDeviation] = field(default_factory=dict)
 
@@ -197,22 +147,10 @@ class RobotDescription:
 
 @dataclass(frozen=True)
 class WrittenFile:
-    """Content of a file to be written, and its differences from the model.
+    """Content of a file to be written, and its differences from the model."""
 
-    Attributes
-    ----------
-    content
-        Text of the file.
-    remarks, errors
-        As of :class:`RobotDescription`.
-    left_out
-        Reasons why parts of the model are left out, by name.
-    companion_files
-        Content of further files, such as converted meshes, by path.
-    """
-
-    content: bytes
-    remarks: tuple[str, ...]
+    content: bytes  # text of the file
+    remarks: tuple[str, ...]  # as of RobotDescription
     errors: Mapping[str, FrameDeviation]
     left_out: Mapping[str, str] = field(default_factory=dict)
     companion_files: Mapping[Path, bytes] = field(default_factory=dict)

@@ -15,13 +15,7 @@ MAX_BYTES = 1 << 28
 
 
 def read_file(path: Path) -> bytes:
-    """Return the bytes of a file.
-
-    Raises
-    ------
-    FormatError
-        If there is no such file, it cannot be read, or it is larger than ``MAX_BYTES``.
-    """
+    """Return the bytes of a file."""
     try:
         with path.open("rb") as file:
             data = file.read(MAX_BYTES + 1)
@@ -38,13 +32,7 @@ def read_file(path: Path) -> bytes:
 
 
 def replace_file(path: Path, content: bytes) -> None:
-    """Replace a file atomically: after an error, the old file is unchanged.
-
-    Raises
-    ------
-    FormatError
-        If it cannot be written.
-    """
+    """Replace a file atomically: after an error, the old file is unchanged."""
     try:
         _replace(Path(os.path.realpath(path)), content)
     except (OSError, ValueError) as error:  # a name with a zero byte raises a ValueError

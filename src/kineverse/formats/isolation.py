@@ -39,20 +39,7 @@ class IsolatedCallError(KineverseError):
 
 
 def call_isolated(module: str, function: str, *arguments: Any) -> Any:
-    """Call a function in a process of its own and return its result.
-
-    Parameters
-    ----------
-    module, function
-        Module of the function and its name.
-    arguments
-        Arguments that JSON can represent, as the result.
-
-    Raises
-    ------
-    IsolatedCallError
-        If the process crashes, or takes more than :data:`CPU_SECONDS` or :data:`MEMORY`.
-    """
+    """Call a function in a process of its own and return its result."""
     job = {"path": sys.path, "module": module, "function": function, "arguments": arguments}
     with TemporaryDirectory(prefix="kineverse-") as folder:  # MuJoCo writes a log where it runs
         try:

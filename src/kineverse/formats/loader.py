@@ -190,13 +190,7 @@ def include(
 def _arguments(
     source: str | os.PathLike[str], arguments: Mapping[str, object] | None
 ) -> tuple[str | os.PathLike[str], dict[str, str]]:
-    """Return the path of a template and its arguments, of which some may follow the path.
-
-    Raises
-    ------
-    InvalidValueError
-        If there are arguments for another file.
-    """
+    """Return the path of a template and its arguments, of which some may follow the path."""
     given = {str(name): str(value) for name, value in (arguments or {}).items()}
     if isinstance(source, str) and ":=" in source:
         source, more = split_arguments(source)

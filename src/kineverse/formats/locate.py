@@ -160,13 +160,7 @@ def _is_called(file: str, name: str) -> bool:
 
 
 def _only(found: list[str], name: str, folder: Path) -> str:
-    """Return the file closest to the top.
-
-    Raises
-    ------
-    UnknownNameError
-        If there are several.
-    """
+    """Return the file closest to the top."""
     top = min(f.count("/") for f in found)
     found = sorted(f for f in found if f.count("/") == top)
     if len(found) > 1:

@@ -35,32 +35,14 @@ _SHOWN = 6
 
 @dataclass
 class LoopClosures:
-    """Application of the operations of a description, with the requested treatment of its loops.
-
-    Attributes
-    ----------
-    edit, model
-        The edit, and the model that it edits.
-    source
-        Name of the file, for warnings.
-    element
-        Element that closes a loop in the format: ``joint`` or ``equality``.
-    loops
-        ``"solve"``: dependent coordinates become a function of the free ones; if that fails, the closure is
-        kept as a constraint. ``"constraint"``: all are kept. ``"refuse"``: a loop that cannot be solved is an
-        error.
-    kept
-        Names of the loops that are kept as constraints.
-    homes
-        Articulations with their coordinates at home, as the description gives them.
-    """
+    """Application of the operations of a description, with the requested treatment of its loops."""
 
     edit: Edit
-    model: ModelView
-    source: str
-    element: str
-    loops: LoopTreatment
-    kept: list[str] = field(default_factory=list)
+    model: ModelView  # the model that it edits
+    source: str  # name of the file, for warnings
+    element: str  # element that closes a loop in the format: joint or equality
+    loops: LoopTreatment  # "solve": dependent coordinates become a function of the free ones
+    kept: list[str] = field(default_factory=list)  # names of the loops that are kept as constraints
     homes: list[tuple[str, tuple[float, ...]]] = field(default_factory=list)
 
     def apply(self, tag: str, operation: Operation) -> Iterator[str]:

@@ -31,20 +31,7 @@ def resolve_mimic_chains(
     shown: Callable[[K], str] = str,
     check: Callable[[K, K], bool] | None = None,
 ) -> dict[K, MimicRelation[K]]:
-    """Return the relation of each follower to the independent end of its chain, with composed factors.
-
-    Parameters
-    ----------
-    following
-        Relation of each follower to its leader; all others are independent.
-    refuse
-        Called with a follower that cannot be resolved and the reason. If it does not raise, the follower is
-        independent.
-    shown
-        Returns the name of a follower in that reason.
-    check
-        Called with each follower and its leader; a follower for which it returns False is independent.
-    """
+    """Return the relation of each follower to the independent end of its chain, with composed factors."""
     resolved: dict[K, MimicRelation[K]] = {}
     free: set[K] = set()
     for start in following:

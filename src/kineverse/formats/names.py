@@ -11,13 +11,7 @@ from kineverse.symbols import position
 
 
 def check_prefix(prefix: object) -> None:
-    """Check that a prefix can stand in front of names.
-
-    Raises
-    ------
-    FormatError
-        If it is no text, or has an empty part, a control character or half of a surrogate pair.
-    """
+    """Check that a prefix can stand in front of names."""
     if prefix is None or prefix == "":
         return
     if not isinstance(prefix, str):
@@ -76,15 +70,7 @@ class TakenNames:
 
 
 class UniqueNames:
-    """Names of the elements of a description, each with the element that has it.
-
-    Parameters
-    ----------
-    report
-        Handler of names that are replaced.
-    taken
-        Names that no element may have.
-    """
+    """Names of the elements of a description, each with the element that has it."""
 
     def __init__(self, report: NameFaultHandler, *taken: str) -> None:
         self._owners: dict[str, str] = dict.fromkeys(taken, "the world")
@@ -92,13 +78,7 @@ class UniqueNames:
         self._numbers = NumberedNames()
 
     def take(self, name: str, where: str) -> str:
-        """Take the name of an element and return it, or another one if it is taken or no valid name.
-
-        Raises
-        ------
-        FormatError
-            If it is another one, and the file is read strictly.
-        """
+        """Take the name of an element and return it, or another one if it is taken or no valid name."""
         short, problem = drop_empty_parts(name), ""
         if not short or any(ord(character) < 32 for character in short):
             problem = "the name has nothing but slashes, or a control character. Rename it"

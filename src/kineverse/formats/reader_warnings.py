@@ -23,21 +23,11 @@ class Fault(str):
 
 @dataclass(slots=True)
 class ReaderWarnings:
-    """Warnings about one document; with ``strict``, mistakes raise instead.
+    """Warnings about one document; with ``strict``, mistakes raise instead."""
 
-    Attributes
-    ----------
-    source
-        Name of the document.
-    texts
-        The warnings so far.
-    strict
-        True if mistakes are errors.
-    """
-
-    source: str
-    texts: list[str] = field(default_factory=list)
-    strict: bool = False
+    source: str  # name of the document
+    texts: list[str] = field(default_factory=list)  # warnings so far
+    strict: bool = False  # True if mistakes are errors
 
     def add(self, element: Element, text: str, owner: Element | None = None) -> None:
         """Add a warning about an element, which is part of ``owner``."""
@@ -47,13 +37,7 @@ class ReaderWarnings:
         warn([f"{self.source}, {remark}"])
 
     def mend(self, mistake: ElementError, taken: str, owner: Element | None = None) -> None:
-        """Add a warning about a mistake in a part of ``owner``, with the value used instead.
-
-        Raises
-        ------
-        ElementError
-            The mistake, if the document is read strictly.
-        """
+        """Add a warning about a mistake in a part of ``owner``, with the value used instead."""
         if self.strict:
             raise mistake
         element = mistake.element

@@ -78,24 +78,6 @@ def locate_resource(
     With a root, paths have to lie below it, below ``../meshes`` of ``folder``, below ``search``, or below a
     folder in one of these variables or ``KINEVERSE_ROOT``. Parents of a description's folder that lie outside
     of the root count if they have a manifest, or if they are neither the home folder nor above it.
-
-    Parameters
-    ----------
-    uri
-        URI or path in the description.
-    folder
-        Folder of the description.
-    search
-        Folders to search first.
-    root
-        Folder that the description must not leave, as :func:`.root_folder.find_root` returns it; None for no
-        restriction.
-
-    Raises
-    ------
-    FormatError
-        If there is no such file (the message lists the folders searched and the variable to set), if the path
-        leaves its package or the root, or if the URI is one of a network.
     """
     scheme, colon, rest = uri.partition("://")
     if not colon:
@@ -115,11 +97,6 @@ def find_package(name: str, folder: Folder, root: str, inside: str = "") -> tupl
 
     Without such a package, the nearest folder above ``folder`` that has ``inside`` is the substitute, else
     the parent of ``folder``.
-
-    Raises
-    ------
-    FormatError
-        If there is none, or it may not be opened.
     """
     if not name or name in (".", "..") or "/" in name or "\\" in name:
         raise FormatError(f"{quote(name)} is no name of a package.")
@@ -154,24 +131,12 @@ def model_paths() -> Iterator[tuple[str, Path]]:
 
 @dataclass
 class _SearchLog:
-    """Log of the search for a package, for the error message.
+    """Log of the search for a package, for the error message."""
 
-    Attributes
-    ----------
-    places
-        Folders searched, as text.
-    without_file
-        Folders of the package that lack the file.
-    outside
-        True if a folder of that name may not count as a package, because it lies outside of the root.
-    trusted
-        True while the folders come from the user rather than the description.
-    """
-
-    places: list[str] = field(default_factory=list)
-    without_file: list[Path] = field(default_factory=list)
+    places: list[str] = field(default_factory=list)  # folders searched, as text
+    without_file: list[Path] = field(default_factory=list)  # folders of the package that lack the file
     outside: bool = False
-    trusted: bool = True
+    trusted: bool = True  # True while the folders come from the user rather than the description
 
 
 def _locate_packaged(uri: str, rest: str, folder: Folder, search: Sequence[Folder], root: str | None) -> Path:
@@ -290,13 +255,7 @@ def declared_folders() -> Iterator[str]:
 
 
 def _inside(uri: str, text: str) -> list[str]:
-    """Return the parts of a path in a package.
-
-    Raises
-    ------
-    FormatError
-        If the path leads out of the package.
-    """
+    """Return the parts of a path in a package."""
     parts = [part for part in re.split(r"[/\\]", text) if part not in ("", ".")]
     depth = 0
     for part in parts:
@@ -474,17 +433,7 @@ def _locate_plain(uri: str, text: str, folder: Folder, search: Sequence[Folder],
 
 
 def restrict_meshes(body: Body, root: str, where: str) -> Body:
-    """Return a body whose meshes are restricted to a root; warn about meshes outside of it.
-
-    Parameters
-    ----------
-    body
-        Body as in the document.
-    root
-        Root folder, as :func:`.root_folder.find_root` returns it.
-    where
-        Document and body, for warnings.
-    """
+    """Return a body whose meshes are restricted to a root; warn about meshes outside of it."""
 
     def shape(given: Shape) -> Shape:
         mesh = given.geometry

@@ -31,23 +31,7 @@ _PYTHON = "__init__.py"
 
 
 def find_root(folder: Folder, root: Folder | None = None, models: Folder | None = None) -> str:
-    """Return the real path of the root for a description in a folder.
-
-    Parameters
-    ----------
-    folder
-        Folder of the description.
-    root
-        Requested root. None for the innermost folder of ``KINEVERSE_ROOT`` that contains ``folder``, else the
-        repository or package around it, else ``models``, else ``folder`` itself.
-    models
-        Folder of models in which the description was found by its name.
-
-    Raises
-    ------
-    FormatError
-        If the requested root is no folder.
-    """
+    """Return the real path of the root for a description in a folder."""
     if root is not None:
         try:
             given = os.fsdecode(root)

@@ -32,33 +32,6 @@ def save(
     The file is replaced atomically; after an error, the old file is unchanged. URDF and MJCF are read again
     before that, MJCF by MuJoCo if it is installed. Meshes that MuJoCo cannot read are converted, into a
     folder beside the file.
-
-    Parameters
-    ----------
-    model
-        Model to save.
-    path
-        Path that ends in ``.kv.json`` for a document, which preserves the whole model, ``.kv.msgpack`` for
-        the same in msgpack, ``.urdf`` for URDF, or ``.xml`` or ``.mjcf`` for MJCF.
-    tolerance
-        Largest deviation of any frame in position [m] and in angle [rad] over all values of coordinates
-        within their limits. Motions along curves are approximated then. None for exact motions only.
-    leave_out
-        Names of constraints that may be left out of URDF or MJCF, and of articulations with speeds other than
-        those of their coordinates, whose rates may be left out.
-    strict
-        True to refuse constraints, and ties between speeds, that URDF or MJCF cannot express. Otherwise they
-        are left out, with a remark. Motions that it cannot express are always refused.
-
-    Raises
-    ------
-    FormatError
-        If the name has another ending, the file cannot be written or could not be read again; or with all
-        parts of the model that the format cannot express, and the reasons.
-    UnknownNameError
-        If a name in ``leave_out`` does not exist.
-    InvalidValueError
-        For a tolerance that is no positive number.
     """
     target = _target(path)
     file_format = _check(target)
@@ -100,13 +73,7 @@ def _put(target: Path, written: WrittenFile) -> None:
 
 
 def _check(target: Path) -> FileFormat:
-    """Check the name of a file before the file is made, which may take long; return its format.
-
-    Raises
-    ------
-    FormatError
-        If nothing is written that ends like this, or there is no such folder.
-    """
+    """Check the name of a file before the file is made, which may take long; return its format."""
     file_format = registry.find_writer(target.name)
     endings = registry.writable_suffixes()
     if file_format is None:

@@ -32,33 +32,15 @@ LEAST_INERTIA = 1e-12
 
 @dataclass(frozen=True, slots=True)
 class ModelProblem:
-    """Problem of a model.
+    """Problem of a model."""
 
-    Attributes
-    ----------
-    kind
-        Kind of the part: limit, loop, pose, inertia or mesh.
-    where
-        Name of the part.
-    text
-        Description of the problem.
-    """
-
-    kind: str
-    where: str
-    text: str
+    kind: str  # kind of the part: limit, loop, pose, inertia or mesh
+    where: str  # name of the part
+    text: str  # description of the problem
 
 
 def find_problems(model: ModelView, meshes: bool = True) -> Iterator[ModelProblem]:
-    """Yield the problems of a model.
-
-    Parameters
-    ----------
-    model
-        Model to check.
-    meshes
-        True to check that mesh files exist.
-    """
+    """Yield the problems of a model."""
     yield from _find_limit_problems(model)
     samples = StateSamples(model, count=SAMPLED_STATES)
     allowed = _states_within_limits(model, samples)

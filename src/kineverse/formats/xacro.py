@@ -21,16 +21,7 @@ from .xml_reader import read_root_tag
 
 
 def xacro_file_operations(file: FileContent) -> Iterable[tuple[str, Operation]]:
-    """Return the operations of the description that a template expands to.
-
-    Raises
-    ------
-    MissingDependencyError
-        If xacro is not installed.
-    FormatError
-        If it cannot be expanded, with the place in the template where xacro fails; or as the reader of what
-        it expands to.
-    """
+    """Return the operations of the description that a template expands to."""
     content = expand_xacro(file)
     # Lines in messages are those of the text that it expands to.
     name = f"{file.path.name} (expanded)"
@@ -72,13 +63,7 @@ def split_arguments(source: str) -> tuple[str, dict[str, str]]:
 
 
 def parse_arguments(words: Iterable[str]) -> dict[str, str]:
-    """Return the arguments in words such as ``side:=left``.
-
-    Raises
-    ------
-    InvalidValueError
-        If one is no such word.
-    """
+    """Return the arguments in words such as ``side:=left``."""
     found: dict[str, str] = {}
     for word in words:
         name, sign, value = word.partition(":=")

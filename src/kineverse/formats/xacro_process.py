@@ -67,15 +67,7 @@ def expand(path: str, root: str, arguments: Mapping[str, str]) -> dict[str, Any]
 
 
 def check_expression(text: str, allowed: type[Exception]) -> None:
-    """Check that an expression calls nothing but what xacro gives it.
-
-    Raises
-    ------
-    SyntaxError
-        If it is no expression.
-    allowed
-        If it is not allowed.
-    """
+    """Check that an expression calls nothing but what xacro gives it."""
     for node in ast.walk(ast.parse(text.strip(), mode="eval")):
         name = node.attr if isinstance(node, ast.Attribute) else node.id if isinstance(node, ast.Name) else ""
         is_attribute = isinstance(node, ast.Attribute)

@@ -52,33 +52,7 @@ def parse_xml(
     depth: int = MAX_DEPTH,
     mend: XmlFaultHandler | None = None,
 ) -> Element:
-    """Parse a document and return its root element.
-
-    Parameters
-    ----------
-    data
-        The document. Bytes are decoded by the rules of XML (byte order mark, declaration, else UTF-8).
-    source
-        Name of the document in errors.
-    skipped
-        Tags of children of the root to skip.
-    begin
-        Called with the root when it opens; its result is called with each complete child of the root. The
-        children are not stored then, so memory is bounded by the largest child.
-    texts
-        True to store the text of elements, as their attribute ``TEXT``.
-    depth
-        Deepest nesting of elements.
-    mend
-        Handler of faults that XML forbids and parsers of robots accept: content before the declaration, a
-        misspelt declaration, comments with two hyphens. Without it, these are refused.
-
-    Raises
-    ------
-    FormatError
-        If the text is not well-formed XML, declares a document type or entities, nests deeper than
-        ``depth`` or is larger than ``MAX_BYTES``.
-    """
+    """Parse a document and return its root element."""
     if len(data) > MAX_BYTES:
         raise FormatError(f"{source}: larger than {MAX_BYTES} bytes, the most that is read of one document.")
     encoding = None
@@ -258,13 +232,7 @@ def _commented(data: str | bytes, mend: XmlFaultHandler) -> str | bytes:
 
 
 def read_name(element: Element) -> str:
-    """Return the name of an element.
-
-    Raises
-    ------
-    ElementError
-        If it has none, or an empty one.
-    """
+    """Return the name of an element."""
     name = element[1].get("name")
     if not name:
         raise ElementError(

@@ -35,25 +35,13 @@ _MAX_LENGTH = 1000
 
 @lru_cache(maxsize=8192)
 def parse_number(text: str) -> float:
-    """Parse one finite number.
-
-    Raises
-    ------
-    ValueError
-        With the reason, for any other text.
-    """
+    """Parse one finite number."""
     return _parse_words(text, 1)[0]
 
 
 @lru_cache(maxsize=8192)
 def parse_directions(text: str, count: int) -> tuple[float, ...]:
-    """Parse ``count`` numbers of any magnitude: angles, or the components of an axis or a quaternion.
-
-    Raises
-    ------
-    ValueError
-        With the reason, for any other text.
-    """
+    """Parse ``count`` numbers of any magnitude: angles, or the components of an axis or a quaternion."""
     return _parse_words(text, count)
 
 
@@ -65,13 +53,7 @@ def scale_to_bounds(values: tuple[float, ...]) -> tuple[float, ...]:
 
 @lru_cache(maxsize=8192)
 def parse_numbers(text: str, count: int) -> tuple[float, ...]:
-    """Parse ``count`` coordinates, separated by white space.
-
-    Raises
-    ------
-    ValueError
-        With the reason, for any other text.
-    """
+    """Parse ``count`` coordinates, separated by white space."""
     values = _parse_words(text, count)
     if values and max(map(abs, values)) > LARGEST:
         raise ValueError(f"has a number beyond {LARGEST:g}, where {_expected(count)}")
@@ -150,13 +132,7 @@ def read_attribute_vector(
 def read_or_default(
     read: Callable[[], T], default: T, taken: str, remarks: ReaderWarnings, owner: Element | None = None
 ) -> T:
-    """Read a value that affects no motion; with a mistake, warn and return a default.
-
-    Raises
-    ------
-    ElementError
-        If the document is read strictly.
-    """
+    """Read a value that affects no motion; with a mistake, warn and return a default."""
     try:
         return read()
     except ElementError as mistake:

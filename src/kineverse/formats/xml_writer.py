@@ -45,13 +45,7 @@ class Tag:
 
 
 def format_xml(root: Tag, remarks: Iterable[str] = ()) -> bytes:
-    """Return an element as the text of a document, after remarks as comments.
-
-    Raises
-    ------
-    FormatError
-        For text that XML cannot contain.
-    """
+    """Return an element as the text of a document, after remarks as comments."""
     lines = ['<?xml version="1.0" encoding="utf-8"?>']
     # Two hyphens are forbidden in a comment.
     lines += [f"<!-- {re.sub('-(?=-|$)', '- ', _check_characters(remark))} -->" for remark in remarks]
@@ -74,13 +68,7 @@ def format_xml(root: Tag, remarks: Iterable[str] = ()) -> bytes:
 
 
 def escape_attribute(text: str) -> str:
-    """Return text as the value of an attribute.
-
-    Raises
-    ------
-    FormatError
-        For text that XML cannot contain: control characters and the like.
-    """
+    """Return text as the value of an attribute."""
     return "".join(_ESCAPES.get(c, c) for c in _check_characters(text))
 
 
@@ -92,13 +80,7 @@ def _check_characters(text: str) -> str:
 
 
 def format_numbers(values: float | Iterable[float]) -> str:
-    """Return numbers as text, each in the shortest form that is read back exactly.
-
-    Raises
-    ------
-    FormatError
-        For NaN and infinities, which descriptions cannot contain.
-    """
+    """Return numbers as text, each in the shortest form that is read back exactly."""
     if isinstance(values, (int, float)):
         values = (values,)
     words = []

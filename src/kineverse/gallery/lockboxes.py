@@ -55,23 +55,11 @@ class Condition(NamedTuple):
 
 @dataclass(frozen=True, slots=True)
 class Slider:
-    """Slider of a lockbox, shut at 0, and its lock.
+    """Slider of a lockbox, shut at 0, and its lock."""
 
-    Attributes
-    ----------
-    upper
-        Upper limit [m].
-    groups
-        Conditions of the lock: all groups have to hold, and of each group one condition.
-    speed, back
-        Limits of the speed forward and backward [m/s].
-    blocks
-        ``"forward"`` if the way back is always free, ``"both"`` if the lock holds the part altogether.
-    """
-
-    upper: float = 1.0
-    groups: tuple[tuple[Condition, ...], ...] = ()
-    speed: float = 0.4
+    upper: float = 1.0  # upper limit [m]
+    groups: tuple[tuple[Condition, ...], ...] = ()  # conditions of the lock
+    speed: float = 0.4  # limits of the speed forward and backward [m/s]
     back: float = 0.4
     blocks: Literal["forward", "both"] = "forward"
 
@@ -108,11 +96,6 @@ def make_rings(count: int) -> Lockbox:
     """Return the Chinese rings: a ring moves while the one before it is on, and all before that are off.
 
     All rings are on at the start, at 0, and the goal is to take off all.
-
-    Raises
-    ------
-    InvalidValueError
-        For less than one ring.
     """
     if count < 1:
         raise InvalidValueError(f"There is at least one ring, not {count}.")
@@ -131,22 +114,6 @@ def draw_lockbox(
     The parts of the chain need each other one by one. Apart from that, locks have up to two conditions on
     earlier parts, of which three in ten are alternatives; so a box without negations can be opened. Negated
     conditions are about any part, so a box with them may have no solution.
-
-    Parameters
-    ----------
-    parts
-        Number of parts, at least 3.
-    seed
-        Seed of the random numbers.
-    negated
-        Share of negated conditions among those that make no chain.
-    blocks
-        Directions that the locks block, see :class:`Slider`.
-
-    Raises
-    ------
-    InvalidValueError
-        For less than three parts, or a share that is not within 0 and 1.
     """
     if parts < 3 or not 0 <= negated <= 1:
         raise InvalidValueError(
@@ -184,13 +151,6 @@ def draw_tangled_lockbox(parts: int, seed: int) -> Lockbox:
 
     Locks may depend on each other in circles, and half of them block both directions, so that the box may
     have no solution.
-
-    Parameters
-    ----------
-    parts
-        Number of parts.
-    seed
-        Seed of the random numbers.
     """
     rng = np.random.default_rng(seed)
     names = [f"part_{k}" for k in range(parts)]
@@ -218,17 +178,7 @@ def remove_locks(box: Lockbox) -> Lockbox:
 
 
 def make_lockbox_model(box: Lockbox, prefix: str | None = "lockbox", join: Join = and_) -> Model:
-    """Return the model of a box.
-
-    Parameters
-    ----------
-    box
-        The box.
-    prefix
-        Prefix of the names of frames and coordinates, without the slash; None for none.
-    join
-        Conjunction of the groups of a lock: ``operator.mul`` gives the product rule of trends.
-    """
+    """Return the model of a box."""
     model = Model()
     with model.edit() as edit:
         for operation in make_operations(box, prefix, join):
@@ -293,20 +243,7 @@ def _is_number(text: str) -> bool:
 
 
 def lockbox_operations(name: str, prefix: str | None = None) -> Iterator[Operation]:
-    """Yield the operations of the box with a name.
-
-    Parameters
-    ----------
-    name
-        ``thesis``, ``rings-N``, or a seed.
-    prefix
-        Prefix of the names, without the slash.
-
-    Raises
-    ------
-    UnknownNameError
-        If there is no such box.
-    """
+    """Yield the operations of the box with a name."""
     box = find_lockbox(name)
     if box is None:
         raise UnknownNameError(

@@ -20,13 +20,7 @@ from .shapes import Shapes
 
 
 class SceneBuilder:
-    """Builder of a scene, whose names are below a prefix.
-
-    Attributes
-    ----------
-    operations
-        Operations of the scene, in order.
-    """
+    """Builder of a scene, whose names are below a prefix."""
 
     def __init__(self, prefix: str | None = None) -> None:
         self._prefix = prefix

@@ -89,23 +89,6 @@ class FacingPoints:
     Parallel faces are nearest at every point, and a query finds one of them. Faces that are parallel, up to
     an angle, have up to four further pairs of points, with the distance along the normal of the pair, see
     :mod:`.manifold_c`. Meshes of triangles have none, nor has anything without a C compiler.
-
-    Parameters
-    ----------
-    margins
-        (B, B) distances that pairs of bodies keep [m]; the array is read at each query.
-    usual
-        Margin of the pairs that have facing points; others have none [m].
-    angle
-        Angle up to which faces count as parallel [rad]. A pair is near if a turn by it may close the gap
-        beyond the margin.
-    apart
-        Least distance of two points of a body [m].
-
-    Attributes
-    ----------
-    address
-        Address of the parameters as C reads them.
     """
 
     def __init__(self, margins: Floats, usual: float, angle: float = 0.02, apart: float = 0.1) -> None:
@@ -115,20 +98,7 @@ class FacingPoints:
 
 
 class ObjectPlacement:
-    """Objects of a table at poses of their own, for other compiled code; the solids are shared.
-
-    Attributes
-    ----------
-    poses, positions
-        (M, 3, 4) poses and (M, 3) centres in the world, which their owner writes.
-    address, is_within
-        Addresses of the table as C reads it, and of the function that compares a distance with a limit.
-
-    Raises
-    ------
-    CompileError
-        Without a C compiler.
-    """
+    """Objects of a table at poses of their own, for other compiled code; the solids are shared."""
 
     def __init__(self, table: ObjectTable) -> None:
         if not collision_library.prepare(wait=True):
@@ -183,14 +153,7 @@ class CollisionLibrary(SourceLibrary):
             binding.reserve(2 * found)
 
     def measure(self, table: ObjectTable, pairs: Indices, limit: float) -> tuple[Floats, Floats]:
-        """Measure pairs of objects, (K, 2) with the smaller index first, as far as C can.
-
-        Returns
-        -------
-        distances, witnesses
-            (K,) distances [m], possibly infinite beyond the limit, and NaN for pairs that are left to coal;
-            (K, 9) both nearest points and the normal, where the distance is finite.
-        """
+        """Measure pairs of objects, (K, 2) with the smaller index first, as far as C can."""
         count = len(pairs)
         if self._code is None or not count:
             return np.full(count, np.nan), np.empty((count, 9))
@@ -263,11 +226,6 @@ class CollisionLibrary(SourceLibrary):
 
         The search covers the selected pairs of bodies, or all checked pairs if None. With ``facing``, ranked
         pairs are extended, see :meth:`extend`.
-
-        Returns
-        -------
-        measured, ranked
-            The measured pairs if some are left to coal, else the ranked ones.
         """
         if self._code is None:
             wanted = None if selection is None else selection.bodies

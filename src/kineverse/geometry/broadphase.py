@@ -39,75 +39,34 @@ _INHERITED = (
 
 @dataclass(eq=False)
 class ObjectTable:
-    """Table of M collision objects of B bodies, moving objects first.
+    """Table of M collision objects of B bodies, moving objects first."""
 
-    Attributes
-    ----------
-    moving
-        Number of moving objects; the others are static.
-    body
-        (M,) index of the body of each object.
-    allowed
-        (B, B) 1 for pairs of bodies that are checked, symmetric; 0 on the diagonal.
-    active
-        (M,) 1 for objects that have a solid.
-    centre, half, radius
-        (M, 3), (M, 3), (M,) bounding box and bounding sphere in the frame of the object [m].
-    poses
-        (M, 3, 4) poses in the world.
-    travel
-        (M,) upper bounds of the motion of any point of an object since the last reset [m].
-    position, low, high
-        (M, 3) each: the centre in the world, and the corners of the axis-aligned bounding box [m].
-    corners, corner_count, edges, radii, round, tip
-        Cores of the solids, see :class:`.shapes.Core`, which has to outlive the table: (M,) address and (M,)
-        number of the corners, -1 without a core; (M, 3) half edges of the box, (M, 3) radii of the ellipsoid,
-        (M,) radius of the ball and (M,) tip of the cone [m].
-    memory
-        Last results of C, in slots that later pairs overwrite.
-    order
-        (M,) moving objects as last sorted along ``axis``, then the static ones.
-    sorted_boxes
-        Work space of C: corners of the moving objects' boxes in that order, and a row of gaps.
-    axis
-        Axis of the sweep: 0, 1 or 2.
-    binding
-        The table as C reads it, once it exists.
-    resets
-        Number of resets of travel.
-    static_changed
-        True if a static object was placed since the static tree was built.
-    bounds
-        (M, M) for i < j, the last measured distance plus the travel of both at that time; 0 before. Minus the
-        present travel it is a lower bound of the distance. None for too many objects.
-    """
-
-    moving: int
-    body: Indices
-    allowed: Flags
-    active: Flags = field(init=False)
-    centre: Floats = field(init=False)
+    moving: int  # number of moving objects; the others are static
+    body: Indices  # (M,) index of the body of each object
+    allowed: Flags  # (B, B) 1 for pairs of bodies that are checked, symmetric; 0 on the diagonal
+    active: Flags = field(init=False)  # (M,) 1 for objects that have a solid
+    centre: Floats = field(init=False)  # (M, 3), (M,), [m]
     half: Floats = field(init=False)
     radius: Floats = field(init=False)
-    poses: Floats = field(init=False)
-    travel: Floats = field(init=False)
-    position: Floats = field(init=False)
+    poses: Floats = field(init=False)  # (M, 3, 4) poses in the world
+    travel: Floats = field(init=False)  # (M,), [m]
+    position: Floats = field(init=False)  # (M, 3), [m]
     low: Floats = field(init=False)
     high: Floats = field(init=False)
-    corners: npt.NDArray[np.uintp] = field(init=False)
+    corners: npt.NDArray[np.uintp] = field(init=False)  # (M,), (M, 3), [m]
     corner_count: npt.NDArray[np.int64] = field(init=False)
     edges: Floats = field(init=False)
     radii: Floats = field(init=False)
     round: Floats = field(init=False)
     tip: Floats = field(init=False)
-    memory: npt.NDArray[np.void] = field(init=False)
-    order: Indices = field(init=False)
+    memory: npt.NDArray[np.void] = field(init=False)  # last results of C, in slots that later pairs overwrite
+    order: Indices = field(init=False)  # (M,) moving objects as last sorted along axis, then the static ones
     sorted_boxes: Floats = field(init=False)
-    bounds: Floats | None = field(init=False)
-    axis: int = 0
-    binding: Any = None
-    resets: int = 0
-    static_changed: bool = True
+    bounds: Floats | None = field(init=False)  # (M, M)
+    axis: int = 0  # axis of the sweep: 0, 1 or 2
+    binding: Any = None  # table as C reads it, once it exists
+    resets: int = 0  # number of resets of travel
+    static_changed: bool = True  # True if a static object was placed since the static tree was built
 
     def __post_init__(self) -> None:
         count = len(self.body)
@@ -212,24 +171,9 @@ class ObjectTable:
 
 
 class PairSelection:
-    """Selected pairs of bodies of a table, for a search among these only.
+    """Selected pairs of bodies of a table, for a search among these only."""
 
-    Parameters
-    ----------
-    table
-        The table; the objects of selected bodies have solids.
-    bodies
-        (B, B) 1 for selected pairs, symmetric; 0 on the diagonal.
-
-    Attributes
-    ----------
-    addresses
-        Addresses of the flags of the pairs, and of those of the objects that are in any pair.
-    binding
-        Neighbours as C reads them, once they exist.
-    """
-
-    binding: Any = None
+    binding: Any = None  # neighbours as C reads them, once they exist
 
     def __init__(self, table: ObjectTable, bodies: Flags) -> None:
         self.bodies = np.ascontiguousarray(bodies)
@@ -243,21 +187,7 @@ TREE_WIDTH = 8
 
 
 def build_static_tree(low: Floats, high: Floats, objects: Indices) -> tuple[Floats, Indices]:
-    """Build an AABB tree: a full tree of boxes, split at medians of the longest edge.
-
-    Parameters
-    ----------
-    low, high
-        (M, 3) corners of the boxes of all objects [m].
-    objects
-        (K,) indices of the objects in the tree.
-
-    Returns
-    -------
-    boxes, leaves
-        (N, 6, W) corners of the boxes of the W = :data:`TREE_WIDTH` children of each node; those of node k
-        are W k + 1 to W k + W. (L, W) objects that are the children of the last L nodes; -1 for none.
-    """
+    """Build an AABB tree: a full tree of boxes, split at medians of the longest edge."""
     count = 1
     while TREE_WIDTH * count < len(objects):
         count *= TREE_WIDTH
@@ -293,14 +223,7 @@ PLACED, TRAVEL_EXCEEDED = -1, -2
 
 
 def place_objects(table: ObjectTable, fresh: Floats) -> int:
-    """Move the moving objects to new poses (moving, 3, 4) and add to their travel.
-
-    Returns
-    -------
-    The index of the first object whose pose is not finite or too far away; then nothing has changed.
-    Otherwise :data:`PLACED`, or :data:`TRAVEL_EXCEEDED` if the travel of an object is above
-    :data:`LONGEST_TRAVEL`.
-    """
+    """Move the moving objects to new poses (moving, 3, 4) and add to their travel."""
     bad = ~(np.abs(fresh) <= FURTHEST).all(axis=(1, 2))
     if bad.any():
         return int(np.argmax(bad))
@@ -320,12 +243,6 @@ def find_near_pairs(table: ObjectTable, reach: float, allowed: Flags | None = No
 
     Pairs consist of active objects, at least one of which moves, of checked bodies, or of the bodies flagged
     in ``allowed``, (B, B). No pair whose measured distance is at most ``reach`` is missing.
-
-    Returns
-    -------
-    pairs, lows
-        (K, 2) indices of objects, the smaller one first, in no particular order; (K,) lower bounds of their
-        distances [m].
     """
     low, high = table.low[:, table.axis], table.high[:, table.axis]
     order = np.argsort(low, kind="stable").astype(np.int32)
@@ -354,11 +271,6 @@ def rank_pairs(
 
     If ``per_shape``, all pairs within the radius are returned.
     Ties are broken by the indices of the bodies and then of the objects.
-
-    Parameters
-    ----------
-    pairs, distances
-        (K, 2) objects and (K,) their distances [m].
     """
     owners = table.body[pairs]
     low, high = owners.min(axis=1, initial=len(table.allowed)), owners.max(axis=1, initial=0)

@@ -49,13 +49,7 @@ class Rule(NamedTuple):
 
 
 def parse_rules(entries: Any) -> tuple[Rule, ...]:
-    """Return rules from their data in a model or document.
-
-    Raises
-    ------
-    InvalidValueError
-        If an entry is not ``(a, b, check, why)``.
-    """
+    """Return rules from their data in a model or document."""
     if isinstance(entries, str | Rule) or not isinstance(entries, Iterable):
         raise InvalidValueError(f"Rules are a sequence of kv.geometry.Rule, not {entries!r}.")
     rules = []
@@ -72,26 +66,14 @@ def parse_rules(entries: Any) -> tuple[Rule, ...]:
 
 
 def parse_known_rules(entries: Any, model: ModelView) -> tuple[Rule, ...]:
-    """Return rules from their data as :func:`parse_rules` does, after checking their names.
-
-    Raises
-    ------
-    UnknownNameError
-        If a rule names a frame that does not exist.
-    """
+    """Return rules from their data as :func:`parse_rules` does, after checking their names."""
     rules = parse_rules(entries)
     check_frame_names("A rule is about", (name for rule in rules for name in rule[:2]), model)
     return rules
 
 
 def read_rules(model: ModelView) -> tuple[Rule, ...]:
-    """Return the rules that a model keeps: first those of included models, below their prefix, then its own.
-
-    Raises
-    ------
-    InvalidValueError
-        If an entry is not ``(a, b, check, why)``.
-    """
+    """Return the rules that a model keeps: first those of included models, below their prefix, then its own."""
     found: list[Rule] = []
     for name, entries in model.data.items():
         if name.endswith(f"/{RULES}"):

@@ -46,35 +46,7 @@ _MAX_MEASUREMENTS = 200_000
 
 
 class CollisionWorld:
-    """Collision objects of a model and their poses; for one thread.
-
-    Parameters
-    ----------
-    model
-        The model, whose present version is used.
-    rules
-        Rules of the collision filter, applied after those that the model keeps.
-    triangles, decomposed, leave_out
-        Patterns of bodies whose meshes stay triangles; of bodies whose meshes are replaced by the hulls of
-        their decomposition; and exclusions.
-
-    Attributes
-    ----------
-    inputs
-        Symbols that poses depend on.
-    objects
-        Collision objects in the order of the table: moving ones first, each group in the order of the bodies.
-    bodies
-        Names of the bodies that have objects, in the order of the model.
-    members
-        Indices of the objects of each body, in the order of :attr:`bodies`.
-    shape_numbers
-        (M,) index of the shape of each object among the shapes of its body.
-    table, narrowphase
-        Tables of the broad phase, and the narrow phase by coal.
-    lock
-        Lock of the tables, which one thread uses at a time.
-    """
+    """Collision objects of a model and their poses; for one thread."""
 
     def __init__(
         self,
@@ -302,15 +274,7 @@ class CollisionWorld:
     # -- questions -----------------------------------------------------------------------------------------
 
     def prepare(self, objects: Iterable[int] | None = None) -> None:
-        """Update to the model's version, and make the solids of some objects, or of all.
-
-        Raises
-        ------
-        UnknownNameError
-            If no state determines the poses.
-        KineverseError
-            If a solid cannot be made.
-        """
+        """Update to the model's version, and make the solids of some objects, or of all."""
         self.synchronize()
         if self._missing_state:
             raise UnknownNameError(f"{self._missing_state}: call scene.update(state) first.")
@@ -335,22 +299,7 @@ class CollisionWorld:
         return bool(wanted)
 
     def measure(self, pairs: Indices, lows: Floats, limit: float) -> tuple[Floats, Floats]:
-        """Measure pairs of objects; of each pair of bodies, at least the nearest one.
-
-        Parameters
-        ----------
-        pairs, lows
-            (K, 2) pairs, the smaller index first, and (K,) lower bounds of their distances [m].
-        limit
-            Largest distance of interest [m].
-
-        Returns
-        -------
-        distances, witnesses
-            (K,) distances [m]: above the limit for pairs beyond it, infinite for pairs that are not the
-            nearest of their bodies. (K, 9) both nearest points and the normal, where the distance is within
-            the limit.
-        """
+        """Measure pairs of objects; of each pair of bodies, at least the nearest one."""
         distances, witnesses = collision_library.measure(self.table, pairs, limit)
         if np.isnan(distances).any():
             self.measure_remaining(pairs, lows, limit, distances, witnesses)
@@ -407,13 +356,7 @@ class CollisionWorld:
         return distance, witness
 
     def body_index(self, body: str) -> int:
-        """Return the index of a body.
-
-        Raises
-        ------
-        UnknownNameError
-            If it has no collision objects; the message lists similar names.
-        """
+        """Return the index of a body."""
         self.synchronize()
         try:
             return self._body_numbers[body]

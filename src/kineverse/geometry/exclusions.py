@@ -31,11 +31,6 @@ def find_unusable_shapes(model: ModelView) -> dict[tuple[str, int], str]:
 
     The keys are body and index of the shape. A scene without these shapes answers for all others:
     ``Scene(model, leave_out=find_unusable_shapes(model))``.
-
-    Raises
-    ------
-    MissingDependencyError
-        If coal is not installed.
     """
     known: dict[Geometry, str] = {}
     found: dict[tuple[str, int], str] = {}
@@ -82,15 +77,7 @@ def _find_problem(geometry: Geometry) -> str:
 
 
 class ExcludedPairs:
-    """Pairs of a model's bodies that its collision filter excludes, with the reasons.
-
-    Parameters
-    ----------
-    model
-        The model, in its present version.
-    bodies
-        The bodies of the scene.
-    """
+    """Pairs of a model's bodies that its collision filter excludes, with the reasons."""
 
     def __init__(self, model: ModelView, bodies: Sequence[str]) -> None:
         self._model = model

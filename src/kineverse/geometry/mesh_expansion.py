@@ -34,18 +34,7 @@ class _Part:
 
 
 def expanded_size(path: Path) -> float:
-    """Return by how much a mesh file would be larger with all that it draws written out [bytes].
-
-    Parameters
-    ----------
-    path
-        The file.
-
-    Raises
-    ------
-    ValueError
-        If a part draws itself.
-    """
+    """Return by how much a mesh file would be larger with all that it draws written out [bytes]."""
     kind = path.suffix.lower()
     if kind == ".dae":
         return _collada_size(path.read_bytes())

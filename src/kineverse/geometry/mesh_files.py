@@ -60,15 +60,7 @@ _reading = threading.Lock()
 
 
 def find_mesh_file(mesh: Mesh) -> MeshFile:
-    """Return the file of a mesh.
-
-    Raises
-    ------
-    FormatError
-        If there is no such file, or it lies outside of the root of the description.
-    OSError
-        If it cannot be read, or is larger than :data:`LARGEST_FILE`.
-    """
+    """Return the file of a mesh."""
     path = locate_mesh(mesh)
     size = path.stat().st_size
     if size > LARGEST_FILE:
@@ -84,14 +76,7 @@ def read_mesh(mesh: Mesh) -> Faces:
 
 
 def read_faces(file: MeshFile) -> Faces:
-    """Return all triangles of a file, in its frame [m]; files of equal content are read once.
-
-    Raises
-    ------
-    FormatError
-        If it cannot be read as a mesh of that suffix, holds no triangles, or holds numbers that are not
-        finite.
-    """
+    """Return all triangles of a file, in its frame [m]; files of equal content are read once."""
     key = (file.digest, file.kind)
     with _reading:
         if key not in _by_content:
@@ -122,15 +107,7 @@ def _read_file(file: MeshFile) -> Faces:
 
 
 def load_mesh_parts(file: MeshFile) -> list[Any]:
-    """Return the parts of a file as ``trimesh.Trimesh``, at least one, in the file's own unit of length.
-
-    Raises
-    ------
-    MissingDependencyError
-        If trimesh is not installed.
-    OSError
-        If there are no triangles. Other exceptions of trimesh for unreadable content pass through.
-    """
+    """Return the parts of a file as ``trimesh.Trimesh``, at least one, in the file's own unit of length."""
     try:
         import trimesh
     except ImportError as error:

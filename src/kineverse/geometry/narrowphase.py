@@ -55,21 +55,7 @@ Witness: TypeAlias = tuple[Floats, Floats, Floats]
 
 
 class Narrowphase:
-    """Distance computation between placed solids by coal, for one thread.
-
-    Parameters
-    ----------
-    solids
-        Solid of each object; None for solids that are not made yet.
-    poses
-        (M, 3, 4) poses in the world. The owner of the array rewrites it and then calls
-        :meth:`invalidate_poses`.
-
-    Attributes
-    ----------
-    calls
-        Number of measured distances.
-    """
+    """Distance computation between placed solids by coal, for one thread."""
 
     def __init__(self, solids: Sequence[Solid | None], poses: Floats) -> None:
         self._coal = coal = import_coal()
@@ -331,13 +317,7 @@ class Narrowphase:
 
 
 def distance_to_point(solid: Solid, pose: Floats, point: Floats) -> tuple[float, Floats, Floats]:
-    """Return the signed distance of a point from a placed solid [m], its nearest point, and the normal there.
-
-    Parameters
-    ----------
-    solid, pose, point
-        The solid, its (3, 4) pose and the (3,) point, in the world.
-    """
+    """Return the signed distance of a point from a placed solid [m], its nearest point, and the normal there."""
     ball = solid_from_geometry(Sphere(_POINT_RADIUS))
     # The radius of the solid bounds the translations of _measure_shifted, not that of the ball.
     point_ball = replace(ball, radius=solid.radius)

@@ -27,13 +27,7 @@ Exclusion: TypeAlias = str | tuple[str, int]
 
 
 def parse_exclusions(entries: Any) -> tuple[Exclusion, ...]:
-    """Return the entries of ``leave_out=``: bodies, patterns, and single shapes (body, number).
-
-    Raises
-    ------
-    InvalidValueError
-        For anything else.
-    """
+    """Return the entries of ``leave_out=``: bodies, patterns, and single shapes (body, number)."""
     if isinstance(entries, str):
         return (entries,)
     found = tuple(entries) if isinstance(entries, Iterable) else (entries,)
@@ -48,42 +42,18 @@ def parse_exclusions(entries: Any) -> tuple[Exclusion, ...]:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class CollisionObject:
-    """Shape of a body, or one of the convex hulls that a mesh is decomposed into.
+    """Shape of a body, or one of the convex hulls that a mesh is decomposed into."""
 
-    Attributes
-    ----------
-    body
-        Frame of the body.
-    number
-        Index of the shape among the shapes of the body.
-    shape
-        Geometry and its pose in the frame.
-    triangles
-        True if a mesh stays a triangle mesh rather than its convex hull.
-    body_pose
-        The pose of the body, world_T_body: a (4, 4) expression.
-    moves
-        True if it depends on any symbol.
-    hull
-        Corners of the hull, (n, 3) in the frame of the shape [m]; None for the shape itself.
-    """
-
-    body: str
-    number: int
-    shape: Shape
-    triangles: bool
-    body_pose: Expression
-    moves: bool
-    hull: Floats | None = None
+    body: str  # frame of the body
+    number: int  # index of the shape among the shapes of the body
+    shape: Shape  # geometry and its pose in the frame
+    triangles: bool  # True if a mesh stays a triangle mesh rather than its convex hull
+    body_pose: Expression  # pose of the body, world_T_body: a (4, 4) expression
+    moves: bool  # True if it depends on any symbol
+    hull: Floats | None = None  # (n, 3), [m]
 
     def make_solid(self) -> Solid:
-        """Make the solid of the object, for distance computation.
-
-        Raises
-        ------
-        KineverseError
-            Of the same type as the cause; the message names the body and the file.
-        """
+        """Make the solid of the object, for distance computation."""
         try:
             if self.hull is not None:
                 return solid_from_points(self.hull)
@@ -115,19 +85,7 @@ def matches_pattern(name: str, patterns: Iterable[str]) -> bool:
 
 
 class CollisionObjects:
-    """Collision objects of a model, updated from version to version.
-
-    Parameters
-    ----------
-    triangles, decomposed, leave_out
-        Patterns of bodies whose meshes stay triangles; of bodies whose meshes are replaced by the hulls of
-        their decomposition; and exclusions, see :data:`Exclusion`.
-
-    Attributes
-    ----------
-    by_body
-        The collision objects of each body.
-    """
+    """Collision objects of a model, updated from version to version."""
 
     def __init__(
         self, triangles: tuple[str, ...], decomposed: tuple[str, ...], leave_out: tuple[Exclusion, ...]
@@ -216,13 +174,7 @@ class _UnchangedPoses:
 
 
 def load_solids(objects: Iterable[CollisionObject]) -> list[Solid]:
-    """Make the solids of collision objects.
-
-    Raises
-    ------
-    KineverseError
-        If one cannot be made, its error; if several cannot, one error that lists them.
-    """
+    """Make the solids of collision objects."""
     solids, errors = [], []
     for item in objects:
         try:

@@ -208,15 +208,7 @@ def _as_rows(Q: npt.ArrayLike, columns: int) -> Floats:
 
 
 def flag_pair(world: CollisionWorld, a: str, b: str) -> Flags:
-    """Return (B, B) flags of one pair of bodies.
-
-    Raises
-    ------
-    UnknownNameError
-        If one has no shapes.
-    InvalidValueError
-        If both are the same.
-    """
+    """Return (B, B) flags of one pair of bodies."""
     one, other = world.body_index(a), world.body_index(b)
     if one == other:
         raise InvalidValueError(f"'{a}' is asked for its distance to itself.")
@@ -232,13 +224,7 @@ def flag_between(ones: PairFlags, others: PairFlags) -> npt.NDArray[np.bool_]:
 
 
 def flag_matching(bodies: Sequence[str], patterns: str | Iterable[str]) -> npt.NDArray[np.bool_]:
-    """Return (B,) flags of the bodies that match one of some names or patterns.
-
-    Raises
-    ------
-    UnknownNameError
-        If a name or pattern matches no body.
-    """
+    """Return (B,) flags of the bodies that match one of some names or patterns."""
     found = np.zeros(len(bodies), dtype=bool)
     for pattern in (patterns,) if isinstance(patterns, str) else tuple(patterns):
         matching = np.array([matches_pattern(body, (pattern,)) for body in bodies], dtype=bool)
@@ -251,13 +237,7 @@ def flag_matching(bodies: Sequence[str], patterns: str | Iterable[str]) -> npt.N
 
 
 def flag_subtree(model: ModelView, bodies: Sequence[str], frame: str) -> npt.NDArray[np.bool_]:
-    """Return (B,) flags of the bodies at or below a frame.
-
-    Raises
-    ------
-    UnknownNameError
-        If there is no such frame.
-    """
+    """Return (B,) flags of the bodies at or below a frame."""
     frames = model.frames
     if frame != WORLD and frame not in frames:
         raise UnknownNameError(f"There is no frame '{frame}'. {suggest(frame, frames, 'frame')}")
@@ -270,13 +250,7 @@ def flag_subtree(model: ModelView, bodies: Sequence[str], frame: str) -> npt.NDA
 def flag_relatively_moving(
     model: ModelView, bodies: Sequence[str], symbols: Iterable[Symbol | str]
 ) -> npt.NDArray[np.bool_]:
-    """Return (B, B) flags of the pairs whose relative pose depends on some symbols.
-
-    Raises
-    ------
-    UnknownNameError
-        For a symbol that the model does not know.
-    """
+    """Return (B, B) flags of the pairs whose relative pose depends on some symbols."""
     motion = FrameDependence(model, symbols)
     ancestors_of = [motion.moving_ancestors(body) for body in bodies]
     numbers = {moving: k for k, moving in enumerate(dict.fromkeys(ancestors_of))}

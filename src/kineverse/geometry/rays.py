@@ -29,13 +29,7 @@ _PARALLEL = 1e-14
 
 
 def intersect_ray(solid: Solid, origin: Floats, direction: Floats) -> RayEntry | None:
-    """Return the first point of a ray in a solid: distance [m], 0 from inside, and normal; None if it misses.
-
-    Parameters
-    ----------
-    origin, direction
-        (3,) point [m] and unit vector.
-    """
+    """Return the first point of a ray in a solid: distance [m], 0 from inside, and normal; None if it misses."""
     surface = solid.surface
     if isinstance(surface, Faces):
         return _intersect_triangles(surface, origin, direction)

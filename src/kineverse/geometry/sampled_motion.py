@@ -20,23 +20,7 @@ _ROOM = 64
 
 
 class SampledMotion:
-    """Motion of the objects that some coordinates move, at the present version of a model.
-
-    Parameters
-    ----------
-    world
-        The collision world; the objects of selected pairs have solids.
-    selected
-        (B, B) flags of pairs of bodies.
-    coordinates
-        The n coordinates that move.
-
-    Attributes
-    ----------
-    struct
-        Tables as C reads them; ``limit`` is the largest distance of interest, and ``least`` the least
-        distance so far [m].
-    """
+    """Motion of the objects that some coordinates move, at the present version of a model."""
 
     def __init__(self, world: CollisionWorld, selected: Flags, coordinates: Sequence[Symbol]) -> None:
         self._world, self.coordinates, self.version = world, tuple(coordinates), world.model.version

@@ -46,11 +46,6 @@ def convex_hull(points: Floats) -> Any:
 
     Distance algorithms fail for hulls without volume. A flat hull, such as a pane of glass, is therefore
     thickened to :data:`THICKNESS`, half of it on each side.
-
-    Raises
-    ------
-    InvalidValueError
-        If the points are too close together or too far apart, lie on a line, or are not finite.
     """
     return _find_hull(thicken_flat(points))
 
@@ -118,28 +113,13 @@ class Core:
 
     A core is the hull of corners; or the Minkowski sum of a box, an ellipsoid and a ball about the origin; or
     a cone.
-
-    Attributes
-    ----------
-    half
-        (3,) half edges of the box [m].
-    radius
-        Radius of the ball [m].
-    radii
-        (3,) radii of the ellipsoid, which is a disc if the last one is 0 [m].
-    corners
-        (3, n) corners in the frame of the solid [m]. The first corner is repeated until n is a multiple of 8;
-        n = 0 for a core that is not a hull.
-    tip
-        Half the height of a cone [m], which is the hull of the tip at (0, 0, tip) and the disc at
-        (0, 0, -tip); 0 for all other cores.
     """
 
-    half: Floats
-    radius: float = 0.0
-    radii: Floats = field(default_factory=lambda: np.zeros(3))
-    corners: Floats = field(default_factory=lambda: np.empty((3, 0)))
-    tip: float = 0.0
+    half: Floats  # (3,) half edges of the box [m]
+    radius: float = 0.0  # radius of the ball [m]
+    radii: Floats = field(default_factory=lambda: np.zeros(3))  # (3,), [m]
+    corners: Floats = field(default_factory=lambda: np.empty((3, 0)))  # (3, n), [m]
+    tip: float = 0.0  # [m], (0, 0, tip)
 
     @staticmethod
     def from_corners(points: Floats) -> Core:
@@ -151,31 +131,15 @@ class Core:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Solid:
-    """Immutable shape for distance computation; equal geometries share one solid.
+    """Immutable shape for distance computation; equal geometries share one solid."""
 
-    Attributes
-    ----------
-    engine
-        Geometry of coal. coal keeps pointers only, so the solid must outlive all functors made of it.
-    surface
-        Surface for ray casts: a primitive, a hull, or triangles.
-    centre, half
-        Bounding box in the frame of the solid: (3,) centre and (3,) half edges [m].
-    radius
-        Radius of the bounding sphere about ``centre`` [m].
-    stand_in
-        Geometry of coal for pairs with a cylinder; None if that is ``engine``.
-    core
-        Support description for our own GJK; None for triangles.
-    """
-
-    engine: Any
-    surface: Primitive | Hull | Faces
-    centre: Floats
+    engine: Any  # geometry of coal
+    surface: Primitive | Hull | Faces  # surface for ray casts: a primitive, a hull, or triangles
+    centre: Floats  # bounding box in the frame of the solid: (3,) centre and (3,) half edges [m]
     half: Floats
-    radius: float
-    stand_in: Any = None
-    core: Core | None = None
+    radius: float  # radius of the bounding sphere about centre [m]
+    stand_in: Any = None  # geometry of coal for pairs with a cylinder; None if that is engine
+    core: Core | None = None  # support description for our own GJK; None for triangles
 
     @property
     def is_convex(self) -> bool:
@@ -188,24 +152,7 @@ _making = threading.Lock()
 
 
 def solid_from_geometry(geometry: Geometry, triangles: bool = False) -> Solid:
-    """Return the solid of a geometry.
-
-    Parameters
-    ----------
-    geometry
-        A primitive or a mesh; negative factors of a scale mirror the mesh.
-    triangles
-        Whether a mesh stays a triangle mesh, a surface without an inside, rather than its convex hull.
-
-    Raises
-    ------
-    MissingDependencyError
-        If coal or trimesh is not installed.
-    FormatError, OSError
-        If a mesh cannot be found or read.
-    InvalidValueError
-        If sizes are not positive numbers, or a mesh is degenerate or of an impossible size.
-    """
+    """Return the solid of a geometry."""
     import_coal()
     if not isinstance(geometry, Mesh):
         return _primitive_solid(geometry)
@@ -221,15 +168,7 @@ def solid_from_geometry(geometry: Geometry, triangles: bool = False) -> Solid:
 
 
 def solid_from_points(points: Floats) -> Solid:
-    """Return the solid of the convex hull of (n, 3) points [m].
-
-    Raises
-    ------
-    MissingDependencyError
-        If coal is not installed.
-    InvalidValueError
-        If the points span no volume.
-    """
+    """Return the solid of the convex hull of (n, 3) points [m]."""
     import_coal()
     key = ("hull", points.tobytes())
     with _making:
@@ -265,13 +204,7 @@ def thicken_primitive(solid: Solid, ratio: float) -> tuple[Solid, float]:
 
 
 def import_coal() -> Any:
-    """Import coal and return it.
-
-    Raises
-    ------
-    MissingDependencyError
-        If coal is not installed.
-    """
+    """Import coal and return it."""
     try:
         import coal
     except ImportError as error:

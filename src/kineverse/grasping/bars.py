@@ -35,26 +35,14 @@ _STEPS = 144
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Part:
-    """Convex shape of a placed body.
+    """Convex shape of a placed body."""
 
-    Attributes
-    ----------
-    body, number
-        Frame of the body, and index of the shape.
-    geometry
-        The shape of the model.
-    solid, pose
-        The shape as collision scenes have it, a mesh as its hull, and its pose (4, 4) in the world.
-    axes, size, middle
-        Box around it: axes (3, 3) in columns, the longest edge first, lengths (3,), middle (3,).
-    """
-
-    body: str
-    number: int
-    geometry: Geometry
-    solid: Solid
+    body: str  # frame of the body
+    number: int  # index of the shape
+    geometry: Geometry  # shape of the model
+    solid: Solid  # shape as collision scenes have it, a mesh as its hull, and its pose (4, 4) in the world
     pose: Array
-    axes: Array
+    axes: Array  # box around it: axes (3, 3) in columns, the longest edge first, lengths (3,), middle (3,)
     size: Array
     middle: Array
 
@@ -83,15 +71,7 @@ class Part:
 
 
 def find_parts(scene: Scene, near: Array | None = None, radius: float = math.inf) -> list[Part]:
-    """Return the convex parts of the bodies of a scene, as they are placed.
-
-    Parameters
-    ----------
-    scene
-        The scene.
-    near, radius
-        A point (3,), and the distance [m] beyond which parts are left out.
-    """
+    """Return the convex parts of the bodies of a scene, as they are placed."""
     parts = []
     for item in scene.collision_world.objects:
         solid = item.make_solid()
@@ -132,39 +112,17 @@ def _point() -> Solid:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class ProtrudingBar:
-    """Part that a hand can close around.
-
-    Attributes
-    ----------
-    part
-        The part.
-    cluster
-        It and the slim parts that are fixed to it: mounts, or further pieces of a handle.
-    rotation
-        (3, 3): z along the bar, x away from what the bar is fixed to.
-    stands_out
-        Length by which it stands out along x from what it is fixed to [m].
-    is_knob
-        True if it is short, or stands out along its length.
-    """
+    """Part that a hand can close around."""
 
     part: Part
-    cluster: tuple[Part, ...]
-    rotation: Array
-    stands_out: float
-    is_knob: bool
+    cluster: tuple[Part, ...]  # it and the slim parts that are fixed to it
+    rotation: Array  # (3, 3): z along the bar, x away from what the bar is fixed to
+    stands_out: float  # length by which it stands out along x from what it is fixed to [m]
+    is_knob: bool  # True if it is short, or stands out along its length
 
 
 def find_bars(link: Sequence[Part], around: Sequence[Part]) -> list[ProtrudingBar]:
-    """Return the bars among the parts of a rigid link, one for each cluster of slim parts.
-
-    Parameters
-    ----------
-    link
-        Parts of the link.
-    around
-        Parts of other links, which carry the link.
-    """
+    """Return the bars among the parts of a rigid link, one for each cluster of slim parts."""
     bars = []
     panel = _find_panel(link)
     for cluster in _clusters([part for part in link if part.is_slim and part is not panel]):
@@ -269,19 +227,7 @@ def free_length(
     length: float = math.inf,
     hollow: bool = False,
 ) -> float:
-    """Return the length of a ray to the first of some parts [m]; infinite if none is within a length.
-
-    Parameters
-    ----------
-    origin, direction
-        (3,), the direction of length one.
-    parts, but
-        The parts, and those among them that are not looked at.
-    length
-        Length of the ray [m].
-    hollow
-        True to take meshes as they are, and not as their hulls, which fill cupboards.
-    """
+    """Return the length of a ray to the first of some parts [m]; infinite if none is within a length."""
     nearest, skipped = math.inf, {id(part) for part in but}
     for part in parts:
         radius = float(np.linalg.norm(part.size)) / 2

@@ -19,43 +19,21 @@ MOST_JOINTS = 3
 
 @dataclass(frozen=True, slots=True)
 class Branch:
-    """Part of a kinematic tree that a joint moves on a rigid link.
+    """Part of a kinematic tree that a joint moves on a rigid link."""
 
-    Attributes
-    ----------
-    root
-        The frame that moves in its parent.
-    frames
-        All frames from there on, parents first.
-    joints
-        The free coordinates that move their bodies on the link, sorted.
-    """
-
-    root: str
-    frames: tuple[str, ...]
-    joints: tuple[Symbol, ...]
+    root: str  # frame that moves in its parent
+    frames: tuple[str, ...]  # all frames from there on, parents first
+    joints: tuple[Symbol, ...]  # free coordinates that move their bodies on the link, sorted
 
 
 @dataclass(frozen=True, slots=True)
 class Palm:
-    """Rigid link with branches that may be fingers.
+    """Rigid link with branches that may be fingers."""
 
-    Attributes
-    ----------
-    root
-        The frame of the link that moves in its parent, or stands in the world.
-    frames
-        Its frames, parents first.
-    branches
-        The branches on it with shapes, few joints, and limits, in the order of the model.
-    refused
-        Why each other branch on it is no finger.
-    """
-
-    root: str
-    frames: tuple[str, ...]
+    root: str  # frame of the link that moves in its parent, or stands in the world
+    frames: tuple[str, ...]  # its frames, parents first
     branches: tuple[Branch, ...]
-    refused: tuple[str, ...]
+    refused: tuple[str, ...]  # why each other branch on it is no finger
 
 
 def robot_frames(model: ModelView, robot: str) -> tuple[str, ...]:

@@ -23,30 +23,7 @@ _PLACE = tuple(position(f"free_hand/{name}") for name in ("x", "y", "z", "roll",
 
 
 class HandModel:
-    """Bodies of a hand with their own coordinates, below a frame with six more.
-
-    Parameters
-    ----------
-    model
-        Model of the robot.
-    hand
-        Frame that is placed.
-    bodies
-        Bodies with shapes by their frame, which move with respect to the hand by the joints alone.
-    joints
-        Free coordinates of the fingers; others that move the bodies are held at their default values.
-    obstacles
-        Poses (4, 4) [m] and bodies of what stands still, by name.
-    decomposed
-        Bodies, or patterns, as for :class:`kineverse.geometry.Scene`.
-
-    Attributes
-    ----------
-    scene
-        Collision scene of the bodies and obstacles.
-    bodies
-        The frames of the bodies.
-    """
+    """Bodies of a hand with their own coordinates, below a frame with six more."""
 
     def __init__(
         self,

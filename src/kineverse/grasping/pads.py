@@ -41,34 +41,16 @@ _LEAST_STROKE = 5e-3
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Pads:
-    """Two facing surfaces on fingers, and how they close.
+    """Two facing surfaces on fingers, and how they close."""
 
-    Attributes
-    ----------
-    fingers
-        Frames of both fingers that have shapes.
-    frames
-        The frames that carry the pads.
-    points
-        (2, 3) the middle of each in its own frame.
-    axes
-        (3, 3) rotation hand_R_grasp: x out of the hand, y from the first pad to the second.
-    size
-        Lengths along x and z.
-    opened, closed
-        Values of the joints at both ends of the motion.
-    stroke
-        Rows (n, 5): part of the motion from 0 (open) to 1 (closed), gap along y, and the middle of both pads.
-    """
-
-    fingers: tuple[tuple[str, ...], tuple[str, ...]]
-    frames: tuple[str, str]
-    points: Array
-    axes: Array
-    size: tuple[float, float]
-    opened: Mapping[Symbol, float]
+    fingers: tuple[tuple[str, ...], tuple[str, ...]]  # frames of both fingers that have shapes
+    frames: tuple[str, str]  # frames that carry the pads
+    points: Array  # (2, 3) the middle of each in its own frame
+    axes: Array  # (3, 3) rotation hand_R_grasp: x out of the hand, y from the first pad to the second
+    size: tuple[float, float]  # lengths along x and z
+    opened: Mapping[Symbol, float]  # values of the joints at both ends of the motion
     closed: Mapping[Symbol, float]
-    stroke: Array
+    stroke: Array  # rows (n, 5)
 
     def parts_at(self, gaps: Array) -> Array:
         """Return the parts of the motion at which the pads have gaps (n,) [m], or the nearest ends of it."""
@@ -88,19 +70,7 @@ class Pads:
 def find_pads(
     model: ModelView, alone: HandModel, a: Branch, b: Branch, root: Array
 ) -> tuple[Pads | None, str]:
-    """Return the pads of two branches, or None with the reason why they are no opposed fingers.
-
-    Parameters
-    ----------
-    model
-        Model of the robot, for the limits of the joints.
-    alone
-        The hand with both branches.
-    a, b
-        The branches.
-    root
-        Position (3,) of the joint that moves the hand: the fingers point away from it.
-    """
+    """Return the pads of two branches, or None with the reason why they are no opposed fingers."""
     shared = tuple(s for s in a.joints if s in b.joints)
     if len(a.joints) != len(b.joints):
         return None, f"one has {len(a.joints)} joints and the other {len(b.joints)}"

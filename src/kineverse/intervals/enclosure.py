@@ -52,13 +52,7 @@ _ATTEMPTS = 4
 
 
 class Enclosures:
-    """Evaluation of terms over intervals.
-
-    Parameters
-    ----------
-    terms
-        The graph of the terms.
-    """
+    """Evaluation of terms over intervals."""
 
     def __init__(self, terms: TermGraph) -> None:
         self._terms = terms

@@ -44,33 +44,17 @@ _COMPARISONS = (ca.OP_LT, ca.OP_LE, ca.OP_EQ, ca.OP_NE)
 
 @dataclass(frozen=True, eq=False)
 class Term:
-    """An operation (by CasADi's number, or a name) on other terms.
+    """An operation (by CasADi's number, or a name) on other terms."""
 
-    Attributes
-    ----------
-    index
-        The number of the term; arguments have smaller ones.
-    data
-        The number of a constant, a symbol, a contrast, or a node.
-    deciders
-        Terms whose signs determine the case of this operation.
-    """
-
-    index: int
+    index: int  # number of the term; arguments have smaller ones
     op: int | str
     args: tuple[Term, ...]
-    data: Any = None
+    data: Any = None  # number of a constant, a symbol, a contrast, or a node
     deciders: tuple[Term, ...] = field(default=(), repr=False)
 
 
 class TermGraph:
-    """The terms of one or more expressions.
-
-    Parameters
-    ----------
-    given
-        Values of symbols to be taken as constant.
-    """
+    """The terms of one or more expressions."""
 
     def __init__(self, given: Mapping[Symbol, float]) -> None:
         self._given = given

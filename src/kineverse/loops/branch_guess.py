@@ -34,19 +34,11 @@ Estimates and controllers overstep limits."""
 
 @dataclass(frozen=True)
 class InputDomain:
-    """Domain of one input: limits, or a full revolution.
+    """Domain of one input: limits, or a full revolution."""
 
-    Attributes
-    ----------
-    lower, upper
-        Limits [m] or [rad].
-    whole
-        True for an angle without limits.
-    """
-
-    lower: float
+    lower: float  # limits [m] or [rad]
     upper: float
-    whole: bool = False
+    whole: bool = False  # True for an angle without limits
 
     def widen(self, below: float = 1.0, above: float = 1.0) -> InputDomain:
         """Return the domain widened by fractions of the margin; a full revolution stays."""
@@ -106,24 +98,12 @@ class InputDomain:
 
 @dataclass(frozen=True)
 class BranchGuess:
-    """Fitted guess: Σ coefficient · product of basis functions, plus a linear term in periodic inputs.
+    """Fitted guess: Σ coefficient · product of basis functions, plus a linear term in periodic inputs."""
 
-    Attributes
-    ----------
-    intervals
-        Domain of each input, shape (k,).
-    degree
-        Degree of the basis functions in each input.
-    coefficients
-        One column for each unknown, shape (P, n).
-    winding
-        Slopes of the unknowns over periodic inputs, shape (k, n).
-    """
-
-    intervals: tuple[InputDomain, ...]
-    degree: int
-    coefficients: Array
-    winding: Array
+    intervals: tuple[InputDomain, ...]  # domain of each input, shape (k,)
+    degree: int  # degree of the basis functions in each input
+    coefficients: Array  # one column for each unknown, shape (P, n)
+    winding: Array  # slopes of the unknowns over periodic inputs, shape (k, n)
 
     @staticmethod
     def fit(
@@ -198,19 +178,7 @@ _SHOWN = 6
 
 
 class BranchSamples:
-    """Samples of one solution branch over the domain, which contains the limits.
-
-    Attributes
-    ----------
-    inputs, solutions
-        Samples for the fit, shapes (N, k) and (N, n).
-    tried, wanted
-        Inputs and solutions of the samples for the check.
-    winding
-        Slopes of the unknowns over periodic inputs, shape (k, n).
-    condition, worst
-        Conditioning within the limits, see :class:`.SolvedLoop`.
-    """
+    """Samples of one solution branch over the domain, which contains the limits."""
 
     def __init__(
         self,

@@ -27,23 +27,6 @@ def find_branches(
     """Search solutions from several starts; return them, the nearest first, and the smallest residual.
 
     Of those that are equally near, the one with the largest first unknown that differs comes first.
-
-    Parameters
-    ----------
-    equations
-        Equations of the loop.
-    near
-        First start; solutions are sorted by their distance from it.
-    u
-        Inputs.
-    angles
-        Flags of unknowns that are angles. Solutions that differ by full revolutions count once, the nearest
-        to ``near``.
-    reach
-        Search range around ``near``, for each unknown.
-    upright
-        Functions of unknowns and inputs that are positive in a valid solution; in other solutions, the ends
-        differ by half a revolution.
     """
     # Equal starts in every process, so that branches have equal numbers everywhere.
     generator = np.random.default_rng(0)
@@ -113,18 +96,10 @@ _LITTLE = 0.5
 
 @dataclass(frozen=True)
 class ContinuationResult:
-    """Result of a continuation.
+    """Result of a continuation."""
 
-    Attributes
-    ----------
-    solution
-        Unknowns at the last point.
-    part
-        Completed fraction of the path, 1 for all of it.
-    """
-
-    solution: Array
-    part: float
+    solution: Array  # unknowns at the last point
+    part: float  # completed fraction of the path, 1 for all of it
 
 
 def continue_solution(
@@ -135,17 +110,6 @@ def continue_solution(
     Each step has a predictor along the tangent and a Newton corrector. It is accepted if the correction is
     small relative to the step, so that it stays on the branch. Where two branches come close to each other,
     the other one lies along the tangent, so that a whole line is accepted only if ∂r/∂x changes little.
-
-    Parameters
-    ----------
-    equations
-        Equations of the loop.
-    x
-        Solution at the start.
-    start, end
-        Inputs at both ends of the line.
-    first_step
-        First step, as a fraction of the line.
     """
     direction = end - start
     done, step = 0.0, first_step

@@ -41,15 +41,7 @@ def as_ends(given: Any, name: str) -> tuple[tuple[str, str], ...]:
 
 
 def residual_rows(pose: Expression, mask: Sequence[str]) -> dict[str, Expression]:
-    """Return the rows of the loop-closure residual: elements of p [m] and of ½(R - Rᵀ)^∨ [rad].
-
-    Parameters
-    ----------
-    pose
-        Pose to_T_frame = (R, p), 4×4; the residual of the identity is zero.
-    mask
-        Names of the rows out of :data:`AXES`.
-    """
+    """Return the rows of the loop-closure residual: elements of p [m] and of ½(R - Rᵀ)^∨ [rad]."""
     p, r = pose[:3, 3], pose[:3, :3]
     axis = [(r[2, 1] - r[1, 2]) / 2, (r[0, 2] - r[2, 0]) / 2, (r[1, 0] - r[0, 1]) / 2]
     rows = dict(zip(AXES, [p[0], p[1], p[2], *axis], strict=True))
@@ -88,23 +80,10 @@ MOST_EFFORT = 150_000.0
 
 @dataclass
 class WorkBudget:
-    """Budget of work for the analysis of a loop, independent of machine and process.
+    """Budget of work for the analysis of a loop, independent of machine and process."""
 
-    Attributes
-    ----------
-    name
-        Name of the loop.
-    left
-        Remaining work; an evaluation of a few equations is 1.
-
-    Raises
-    ------
-    NoSolutionError
-        When the budget is spent.
-    """
-
-    name: str
-    left: float = MOST_EFFORT
+    name: str  # name of the loop
+    left: float = MOST_EFFORT  # remaining work; an evaluation of a few equations is 1
 
     def spend(self, amount: float) -> None:
         """Subtract an amount of work."""
@@ -131,17 +110,7 @@ def least_squares(J: Array, r: Array) -> Array:
 
 
 class Equations:
-    """Numeric residual r(x, u) with its derivatives.
-
-    Parameters
-    ----------
-    residual
-        Residual, shape (m,).
-    unknowns, inputs
-        Symbols x, shape (n,), and u, shape (k,).
-    effort
-        Budget for evaluations.
-    """
+    """Numeric residual r(x, u) with its derivatives."""
 
     def __init__(
         self, residual: Expression, unknowns: Sequence[Symbol], inputs: Sequence[Symbol], effort: WorkBudget

@@ -19,27 +19,13 @@ LOOP_KINDS = (SOLVED_LOOP, CONSTRAINED_LOOP)
 
 @dataclass(frozen=True)
 class LoopRecord:
-    """Closed loop of a model.
-
-    Attributes
-    ----------
-    name
-        Name of the loop.
-    ends
-        Pairs of frames (frame, to) that coincide in the axes of the mask.
-    mask
-        Names out of ``x y z rx ry rz``.
-    free, dependent
-        Names of the free and of the dependent coordinates.
-    constraints
-        Names of the equality constraints of a loop without dependent coordinates.
-    """
+    """Closed loop of a model."""
 
     name: str
-    ends: tuple[tuple[str, str], ...]
-    mask: tuple[str, ...]
-    free: tuple[str, ...]
-    dependent: tuple[str, ...]
+    ends: tuple[tuple[str, str], ...]  # pairs of frames (frame, to) that coincide in the axes of the mask
+    mask: tuple[str, ...]  # names out of x y z rx ry rz
+    free: tuple[str, ...]  # names of the free
+    dependent: tuple[str, ...]  # of the dependent coordinates
     constraints: tuple[str, ...] = ()
 
 

@@ -55,26 +55,7 @@ _Key: TypeAlias = tuple[int, int, int]
 
 
 class BaseDrive:
-    """Drives of a base on wheels.
-
-    Parameters
-    ----------
-    model
-        The model.
-    base
-        Coordinates x [m], y [m] and angle [rad] of the base.
-    scene
-        Scene with the rules of the collision filter; it is placed anew.
-    own, others
-        Bodies of the robot, and those of everything else.
-    margin
-        Least distance of the robot from everything else [m].
-
-    Attributes
-    ----------
-    is_possible
-        Whether the base can roll straight on and turn on the spot, as differential drives do.
-    """
+    """Drives of a base on wheels."""
 
     def __init__(
         self,
@@ -134,17 +115,7 @@ class BaseDrive:
         return DriveSearch(start, place, is_free, speed, turn)
 
     def follow(self, session: Session, places: Array, act: Callable[[Speeds], object]) -> None:
-        """Drive along places (K, 3), between which the base either turns or rolls straight on.
-
-        Parameters
-        ----------
-        session
-            Robot in a world.
-        places
-            Places x [m], y [m] and angle [rad] of a :class:`DriveSearch`.
-        act
-            Function that commands speeds for one step, and raises SkillError when the time is up.
-        """
+        """Drive along places (K, 3), between which the base either turns or rolls straight on."""
         for start, end in pairwise(places):
             away = end[:2] - start[:2]
             length = float(np.hypot(*away))
@@ -182,19 +153,7 @@ class BaseDrive:
 
 
 class DriveSearch:
-    """Search of ways from one place to several goals; what was found for one helps the others.
-
-    Parameters
-    ----------
-    start
-        The place.
-    place
-        Function that places the scene, before checks.
-    is_free
-        Function that tells whether the robot touches nothing at places (N, 3).
-    speed, turn
-        Speeds of lines [m/s] and of turns [rad/s].
-    """
+    """Search of ways from one place to several goals; what was found for one helps the others."""
 
     def __init__(
         self,

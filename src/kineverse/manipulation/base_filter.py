@@ -13,20 +13,6 @@ class BaseFilter:
 
     The error is a twist (vx, vy, ω) in the axes of the base: the pose is the estimate times exp(error). A
     motion M turns it to Ad(M⁻¹) error (Solà et al., A micro Lie theory, 2018).
-
-    Parameters
-    ----------
-    odometry, turn
-        Standard deviations of position [m] and heading [rad] after one metre, or one radian, of motion.
-    has_outliers
-        Whether poses that the estimate makes improbable are left out.
-
-    Attributes
-    ----------
-    pose
-        Estimated x, y and heading (3,) [m], [rad].
-    covariance
-        Covariance of the error (3, 3).
     """
 
     def __init__(self, odometry: float, turn: float, has_outliers: bool) -> None:
@@ -62,17 +48,7 @@ class BaseFilter:
         self.covariance = adjoint @ self.covariance @ adjoint.T + way * np.diag(self._variance)
 
     def correct(self, seen: Array, known: Array, deviations: Array) -> None:
-        """Correct the estimate by landmarks.
-
-        Parameters
-        ----------
-        seen
-            Poses base_T_landmark (m, 4, 4) as seen.
-        known
-            Poses plane_T_landmark (m, 4, 4) in the plane in which the base moves.
-        deviations
-            Standard deviations (m, 2) of positions [m] and rotations [rad].
-        """
+        """Correct the estimate by landmarks."""
         expected = inverse(place(self.pose)) @ known
         errors = pose_difference(seen, expected)
         slopes = -motion_of(expected)

@@ -21,19 +21,7 @@ _SIDE, _TURN = math.radians(110.0), math.radians(60.0)
 
 
 class BaseSamples:
-    """Random places of a mobile base at which it touches nothing, as far as there are some.
-
-    Parameters
-    ----------
-    scene
-        Scene with the rules of the collision filter; it is placed anew.
-    base
-        Coordinates x [m], y [m] and angle [rad] of the base.
-    own, others
-        Bodies of the robot, and those of everything else.
-    margin
-        Least distance of the base from everything else [m].
-    """
+    """Random places of a mobile base at which it touches nothing, as far as there are some."""
 
     def __init__(
         self, scene: Scene, base: Sequence[Symbol], own: Sequence[str], others: Sequence[str], margin: float
@@ -51,21 +39,7 @@ class BaseSamples:
         directions: Array,
         tries: int = 5,
     ) -> Array:
-        """Return places (B, 3) of the base: x [m], y [m] and angle [rad].
-
-        Parameters
-        ----------
-        random
-            Random numbers.
-        states
-            States of everything else, in none of which the base should touch anything.
-        points
-            Points (B, 2) that the hand has to reach, from above [m].
-        directions
-            Directions (B, 2) from which it comes; those without a length are from above.
-        tries
-            Largest number of draws for each point. The last one may touch something.
-        """
+        """Return places (B, 3) of the base: x [m], y [m] and angle [rad]."""
         places = self._draw(random, points, directions)
         for _ in range(tries - 1):
             hits = self.find_touching(states, places)

@@ -71,13 +71,7 @@ class TrueBelief:
 
 
 def check_believed(state: Collection[Symbol], coordinate: Symbol) -> None:
-    """Check that the coordinates of a state have one.
-
-    Raises
-    ------
-    UnknownNameError
-        If not, with similar ones.
-    """
+    """Check that the coordinates of a state have one."""
     if coordinate not in state:
         raise UnknownNameError(
             f"The belief says nothing about '{coordinate}'. "
@@ -98,13 +92,7 @@ class BelievedStep(Protocol):
 
 
 class EstimateError:
-    """Error of a believed coordinate over the steps of a session; call it after each of them.
-
-    Parameters
-    ----------
-    coordinate
-        The coordinate.
-    """
+    """Error of a believed coordinate over the steps of a session; call it after each of them."""
 
     def __init__(self, coordinate: Symbol) -> None:
         self._coordinate = coordinate

@@ -11,18 +11,10 @@ from kineverse.lie import Array
 
 @dataclass(slots=True, eq=False)
 class HandReference:
-    """Way of a hand that a controller follows.
+    """Way of a hand that a controller follows."""
 
-    Attributes
-    ----------
-    poses
-        World poses (K, 4, 4) along the way [m].
-    share
-        Share of the way that lies behind, in [0, 1].
-    """
-
-    poses: Array
-    share: float = 0.0
+    poses: Array  # world poses (K, 4, 4) along the way [m]
+    share: float = 0.0  # share of the way that lies behind, in [0, 1]
 
     @property
     def pose(self) -> Array:

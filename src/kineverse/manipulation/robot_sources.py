@@ -22,33 +22,15 @@ WHEEL_RADIUS, TRACK, WHEEL_SPEED = 0.06, 0.3748, 17.4
 
 @dataclass(frozen=True)
 class RobotSource:
-    """Robot with its file, its hand and its start.
+    """Robot with its file, its hand and its start."""
 
-    Attributes
-    ----------
-    name
-        Name in tables.
-    prefix
-        Prefix in models.
-    source
-        Name or path of its file.
-    hand
-        Frame of the hand, without the prefix.
-    push_link
-        Body that pushes, without the prefix.
-    start
-        Positions of joints before a push, without the prefix; others are 0 [m], [rad].
-    omni
-        True for a base that moves in any direction, False for two wheels.
-    """
-
-    name: str
+    name: str  # name in tables
     prefix: str
-    source: str
-    hand: str
-    push_link: str
-    start: Mapping[str, float] = field(default_factory=dict)
-    omni: bool = True
+    source: str  # name or path of its file
+    hand: str  # frame of the hand, without the prefix
+    push_link: str  # body that pushes, without the prefix
+    start: Mapping[str, float] = field(default_factory=dict)  # [m], [rad]
+    omni: bool = True  # True for a base that moves in any direction, False for two wheels
 
     def load(self) -> Model:
         """Return the robot on its mobile base at the origin of the world."""
@@ -133,13 +115,7 @@ SHIPPED: Mapping[str, RobotSource] = MappingProxyType(
 
 
 def find_robot(name: str, robots: Mapping[str, RobotSource] = SHIPPED) -> RobotSource:
-    """Return a robot by name.
-
-    Raises
-    ------
-    UnknownNameError
-        For a name that is none of these, with similar names.
-    """
+    """Return a robot by name."""
     if name not in robots:
         raise UnknownNameError(f"There is no robot {name!r} here. {suggest(name, robots, 'robot')}")
     return robots[name]

@@ -24,15 +24,7 @@ the way."""
 
 
 def find_object_coordinate(world: World, what: Symbol | str) -> Symbol:
-    """Return the coordinate of an object by symbol or name.
-
-    Raises
-    ------
-    UnknownNameError
-        If the model does not have it.
-    InvalidValueError
-        For a coordinate of the robot, and what is neither symbol nor name.
-    """
+    """Return the coordinate of an object by symbol or name."""
     if not isinstance(what, (str, Symbol)):
         raise InvalidValueError(f"what= is the coordinate of an object, by symbol or name, not {what!r:.60}.")
     coordinate = world.model.symbol(str(what))

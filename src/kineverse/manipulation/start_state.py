@@ -13,28 +13,7 @@ from kineverse.state import State
 def find_free_state(
     model: ModelView, robot: str, states: Iterable[State], margin: float = 0.0, rules: Iterable[Rule] = ()
 ) -> tuple[State | None, str]:
-    """Return the first of some states in which a robot touches nothing, and its contact in the first.
-
-    Parameters
-    ----------
-    model
-        Model of the robot and of everything else.
-    robot
-        Prefix of the robot.
-    states
-        The states, the best first.
-    margin
-        Least distance of the robot from everything else [m]; a negative one allows contacts of that depth.
-    rules
-        Rules of pairs that do not count.
-
-    Returns
-    -------
-    state
-        None if there is none.
-    contact
-        The nearest pair of bodies in the first state; empty if that one is free.
-    """
+    """Return the first of some states in which a robot touches nothing, and its contact in the first."""
     scene = Scene(model)
     own = [body for body in scene.bodies if is_of_robot(body, robot)]
     others = [body for body in scene.bodies if not is_of_robot(body, robot)]

@@ -44,38 +44,18 @@ _CLEAR = 3e-3
 
 @dataclass(frozen=True, slots=True)
 class Obstacle:
-    """First thing in the way of an object.
+    """First thing in the way of an object."""
 
-    Attributes
-    ----------
-    coordinate, target
-        Coordinate of the object, and the value that it was to reach [m], [rad].
-    body, other
-        Body of the object, and the one that is in its way.
-    value
-        Value of the coordinate from which on they overlap [m], [rad].
-    depth
-        Largest depth of the two on the way to the target [m].
-    free
-        Value up to which the way is free, a little before the contact [m], [rad].
-    unit
-        ``"rad"`` if the object turns, ``"m"`` if it slides.
-    carrier
-        Coordinate that moves the other body; None if none does.
-    aside
-        Value of the carrier at which the way is free, and to which its own way is [m], [rad]; None without.
-    """
-
-    coordinate: Symbol
+    coordinate: Symbol  # coordinate of the object, and the value that it was to reach [m], [rad]
     target: float
-    body: str
-    other: str
-    value: float
-    depth: float
-    free: float
-    unit: str = ""
-    carrier: Symbol | None = None
-    aside: float | None = None
+    body: str  # body of the object
+    other: str  # the one that is in its way
+    value: float  # value of the coordinate from which on they overlap [m], [rad]
+    depth: float  # largest depth of the two on the way to the target [m]
+    free: float  # value up to which the way is free, a little before the contact [m], [rad]
+    unit: str = ""  # "rad" if the object turns, "m" if it slides
+    carrier: Symbol | None = None  # coordinate that moves the other body; None if none does
+    aside: float | None = None  # [m], [rad]
 
     @property
     def measures(self) -> dict[str, Any]:
@@ -96,13 +76,7 @@ class Obstacle:
 
 
 class BlockedError(SkillError):
-    """End of a skill before something in the way of an object.
-
-    Attributes
-    ----------
-    obstacle
-        What is in the way.
-    """
+    """End of a skill before something in the way of an object."""
 
     def __init__(self, obstacle: Obstacle) -> None:
         super().__init__("collision", str(obstacle))
@@ -125,25 +99,6 @@ def find_obstacle(
 
     What overlaps at the begin counts as far as it gets deeper than :class:`.FurnitureOverlaps` allows. The
     robot counts nowhere: it moves.
-
-    Parameters
-    ----------
-    model
-        Model of the object and of everything around it.
-    coordinate
-        Coordinate of the object.
-    state
-        State of everything at the begin; other coordinates keep their values.
-    target
-        Last value of the coordinate [m], [rad].
-    robot
-        Prefix of the robot; empty for none.
-    rules, leave_out
-        Rules of the collision filter, and excluded bodies, as for :class:`.Scene`.
-    start
-        Earlier state whose overlaps are allowed as well, such as the one before the object was opened.
-    least
-        Depth from which on an overlap counts [m]; a larger one for a joint that is not known exactly.
     """
     own = tuple(rules), tuple(leave_out)
 

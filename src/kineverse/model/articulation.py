@@ -60,13 +60,7 @@ class Articulation:
 
 
 def check_home(name: str, record: Articulation) -> None:
-    """Check the home of an articulation.
-
-    Raises
-    ------
-    InvalidValueError
-        If a value is not finite, or a quaternion has length zero.
-    """
+    """Check the home of an articulation."""
     for symbol, value in zip(record.coordinates, record.home, strict=False):
         if isinstance(value, float | int) and not math.isfinite(value):
             raise InvalidValueError(

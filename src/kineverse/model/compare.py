@@ -27,31 +27,14 @@ from .sampling import StateSamples
 
 @dataclass(frozen=True, slots=True)
 class Delta:
-    """Difference in one part of a value.
+    """Difference in one part of a value."""
 
-    Attributes
-    ----------
-    what
-        Path of the part within the value: ``parent``, ``upper``, ``visuals[0].geometry.size``; empty for the
-        value itself.
-    before, after
-        Old and new content of the part; None if there is none.
-    distance
-        Distance between the two. Numbers: relative to the larger one if it is above one. Transforms: distance
-        of the origins [m]. Expressions: maximum over all sampled states. Infinite if the parts are not
-        numeric, 0 if they are the same in another notation.
-    angle
-        Angle of the rotation from one transform to the other [rad]; 0 for other parts.
-    at_default
-        Distance and angle at the default state.
-    """
-
-    what: str
-    before: Any
-    after: Any
-    distance: float = inf
-    angle: float = 0.0
-    at_default: tuple[float, float] = (inf, 0.0)
+    what: str  # path of the part within the value
+    before: Any  # old
+    after: Any  # new content of the part; None if there is none
+    distance: float = inf  # [m]
+    angle: float = 0.0  # angle of the rotation from one transform to the other [rad]; 0 for other parts
+    at_default: tuple[float, float] = (inf, 0.0)  # distance and angle at the default state
 
     def is_within(self, tolerance: float) -> bool:
         """Return whether distance and angle are within a tolerance; False for a tolerance of 0."""
@@ -318,19 +301,7 @@ class ValueDifference:
 
 
 class ModelComparison:
-    """Differences between two models beyond a tolerance.
-
-    Attributes
-    ----------
-    before, after
-        The models.
-    diff
-        Structural differences.
-    differences
-        Differences between values beyond the tolerance.
-    alike
-        Paths of the other values: equal up to rounding or notation.
-    """
+    """Differences between two models beyond a tolerance."""
 
     def __init__(self, before: Model, after: Model, tolerance: float, operations: str = "auto") -> None:
         self.before, self.after, self.tolerance = before, after, tolerance

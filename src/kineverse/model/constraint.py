@@ -99,11 +99,6 @@ def check_bound(bound: Expression, name: str) -> None:
 
     In the papers, eq. 10 and 11, such a product with a condition means 0 where the condition is false; as a
     product of floating-point numbers it is NaN there.
-
-    Raises
-    ------
-    InvalidValueError
-        If it has one.
     """
     if bound.symbols and has_infinite_product(bound):
         raise InvalidValueError(

@@ -80,15 +80,7 @@ class Diff:
 
 
 def find_moved_tags(before: Sequence[str], after: Sequence[str], among: Container[str]) -> tuple[str, ...]:
-    """Return a smallest set of tags whose removal makes both orders equal, in the new order.
-
-    Parameters
-    ----------
-    before, after
-        Tags in their old and in their new order, without duplicates. Tags in only one of them are ignored.
-    among
-        The tags that may have been moved; all others are known to stand as they did.
-    """
+    """Return a smallest set of tags whose removal makes both orders equal, in the new order."""
     present = set(after)
     place = {tag: i for i, tag in enumerate(tag for tag in before if tag in present)}
     common = [tag for tag in after if tag in place]

@@ -62,18 +62,10 @@ RequestedSpeeds: TypeAlias = tuple[Mapping[Symbol, Expression], Mapping[Symbol, 
 
 @dataclass(frozen=True)
 class RecoveryBound:
-    """Bound of a position constraint as a velocity row ``away·v >= -room``.
+    """Bound of a position constraint as a velocity row ``away·v >= -room``."""
 
-    Attributes
-    ----------
-    away
-        Coefficients of the speeds in the rate of the distance to the bound, positive inwards.
-    room
-        Largest speed towards the bound; negative if the bound is violated.
-    """
-
-    away: Weights
-    room: Expression
+    away: Weights  # coefficients of the speeds in the rate of the distance to the bound, positive inwards
+    room: Expression  # largest speed towards the bound; negative if the bound is violated
 
 
 @dataclass(frozen=True)

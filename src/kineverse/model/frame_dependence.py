@@ -21,18 +21,6 @@ class FrameDependence:
     Symbols are compared as coordinates, whatever their order, as for constraints. A speed moves the frames
     that its position moves, and those of every coordinate whose rate contains the speed. An independent
     coordinate of a closed loop moves the frames of its dependent coordinates.
-
-    Parameters
-    ----------
-    model
-        The model.
-    symbols
-        Symbols or their names.
-
-    Raises
-    ------
-    UnknownNameError
-        For a symbol that the model does not know.
     """
 
     def __init__(self, model: ModelView, symbols: Iterable[Symbol | str]) -> None:

@@ -123,13 +123,7 @@ class History:
         return sorted(set(tags), key=lambda t: self.entries[t].place)
 
     def entry(self, tag: str) -> HistoryEntry:
-        """Return the entry of a tag.
-
-        Raises
-        ------
-        UnknownNameError
-            Listing similar tags.
-        """
+        """Return the entry of a tag."""
         try:
             return self.entries[tag]
         except (KeyError, TypeError):
@@ -138,13 +132,7 @@ class History:
             ) from None
 
     def operation(self, tag: str) -> Operation:
-        """Return the operation of a tag.
-
-        Raises
-        ------
-        UnknownNameError
-            Listing similar tags.
-        """
+        """Return the operation of a tag."""
         return self.entry(tag).operation
 
     # -- changes of the sequence ---------------------------------------------------------------------------
@@ -224,13 +212,7 @@ class History:
     # -- running -------------------------------------------------------------------------------------------
 
     def settle(self) -> None:
-        """Apply all operations again whose reads have changed.
-
-        Raises
-        ------
-        EditError
-            Listing every operation that failed, with the reason.
-        """
+        """Apply all operations again whose reads have changed."""
         failures: dict[str, KineverseError] = {}
         failed: list[tuple[int, str]] = []
         done: set[tuple[int, str]] = set()
@@ -588,13 +570,7 @@ class History:
 
 
 def as_cell(path: str) -> Cell:
-    """Return kind and name of a path such as ``frames/kitchen/door``.
-
-    Raises
-    ------
-    UnknownNameError
-        If the path does not begin with a kind.
-    """
+    """Return kind and name of a path such as ``frames/kitchen/door``."""
     kind, _, name = str(path).partition("/")
     if kind not in KINDS or not name:
         raise unknown_path_error(path)

@@ -32,11 +32,6 @@ class StateIntegrator:
 
     Free coordinates move linearly. The others follow their rows by an :class:`.Integrator` of all that their
     rows contain. It is for one thread.
-
-    Parameters
-    ----------
-    coordinates, rates
-        Coordinates to integrate, and their rate table.
     """
 
     def __init__(self, coordinates: Iterable[Symbol], rates: Rates) -> None:
@@ -52,24 +47,7 @@ class StateIntegrator:
             self._integrator = Integrator(rates, (*_sorted(rates), *_sorted(seen.difference(speeds))), speeds)
 
     def integrate(self, state: State, speeds: StateLike, dt: float) -> State:
-        """Return the state after ``dt`` seconds.
-
-        Parameters
-        ----------
-        state
-            Values of at least all coordinates that move.
-        speeds
-            Values by free speed or its name; the default is 0.
-        dt
-            Duration [s]; may be negative.
-
-        Raises
-        ------
-        UnknownNameError
-            For a speed that moves none of the coordinates.
-        InvalidValueError
-            For NaN or an infinite step, or if coordinates diverge.
-        """
+        """Return the state after ``dt`` seconds."""
         step = finite_number(dt)
         if step is None:
             raise InvalidValueError(f"The time step is a finite number of seconds, not {dt!r}.")

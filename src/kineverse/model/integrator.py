@@ -182,13 +182,7 @@ class Integrator:
         self._dt[0] = step
 
     def _follow(self, dt: float) -> None:
-        """Repeat the last step in parts, controlled by the estimated error.
-
-        Raises
-        ------
-        InvalidValueError
-            For NaN and infinite numbers, or if coordinates diverge.
-        """
+        """Repeat the last step in parts, controlled by the estimated error."""
         step = finite_number(dt)
         if step is None:
             raise InvalidValueError(f"The time step is a finite number of seconds, not {dt!r}.")
@@ -299,11 +293,6 @@ def _rate(
     """Return the rate of a driven coordinate, and the sum of the magnitudes of its terms.
 
     Parameters that are not given have their own values, and free speeds that are not given are zero.
-
-    Raises
-    ------
-    UnknownNameError
-        If another symbol of the row is not given.
     """
     terms = lower([g * v for v, g in row.items()])
     others = [s for s in {s for g in row.values() for s in g.symbols} if s not in given]

@@ -121,13 +121,7 @@ def _sparse(numbers: npt.NDArray[np.float64]) -> SX:
 
 
 def ancestors(name: str, lookup: FrameLookup) -> list[str]:
-    """Return the frame and its ancestors, without the world.
-
-    Raises
-    ------
-    ModelError
-        If the chain is cyclic.
-    """
+    """Return the frame and its ancestors, without the world."""
     chain: list[str] = []
     seen: set[str] = set()
     while name != WORLD:

@@ -42,11 +42,6 @@ def center_of_mass(frame: str, bodies: Mapping[str, Body], lookup: FrameLookup) 
     """Return the centre of mass of the bodies at or below a frame, (3,) [m] in the world.
 
     Coordinates are plain.
-
-    Raises
-    ------
-    ModelError
-        If none of the bodies has a mass.
     """
     chains = find_masses(frame, bodies, lookup)
     if not chains:

@@ -221,13 +221,7 @@ class Keywords(NamedTuple):
 
 
 def check_keywords(made: type, arguments: tuple[Any, ...], given: dict[str, Any]) -> None:
-    """Check the arguments of an operation that takes keywords only.
-
-    Raises
-    ------
-    ExpressionError
-        Listing the keywords, if one is missing or unknown, or a value is positional.
-    """
+    """Check the arguments of an operation that takes keywords only."""
     keywords = find_keywords(made)
     if keywords is None or not (arguments or given):
         return  # pickle passes no arguments; in other cases Python reports the missing ones
@@ -267,18 +261,7 @@ ExpressionMap = Callable[[Expression], Any]
 
 
 def map_expressions(kind: str, value: Any, f: ExpressionMap) -> Any:
-    """Apply a function to each expression of a written value; symbols of records stay.
-
-    Parameters
-    ----------
-    kind
-        Kind of data, one of :data:`kineverse.model.operation.KINDS`.
-    value
-        Value in canonical form, see :meth:`kineverse.model.Writes.writes`.
-    f
-        Function that maps a transform of a frame to a transform, and a scalar of a constraint or rate to a
-        scalar. In data and records it may return numbers.
-    """
+    """Apply a function to each expression of a written value; symbols of records stay."""
     if kind == FRAMES:
         return Frame(value.parent, tuple(f(x) if isinstance(x, Expression) else x for x in value.factors))
     if kind == CONSTRAINTS:

@@ -160,21 +160,11 @@ class Override(Operation, document_kind="Override"):
 
 @dataclass(frozen=True)
 class SoftLimits(Operation, document_kind="SoftLimits"):
-    """Limits of a joint by its safety controller, inside the hard limits.
+    """Limits of a joint by its safety controller, inside the hard limits."""
 
-    Attributes
-    ----------
-    name
-        Name of the articulation; the constraint is called ``name/soft_limits``.
-    q
-        Coordinate, or expression of the joint position [rad] or [m].
-    lower, upper
-        Soft limits [rad] or [m].
-    """
-
-    name: str
-    q: Expression
-    lower: float
+    name: str  # name of the articulation; the constraint is called name/soft_limits
+    q: Expression  # coordinate, or expression of the joint position [rad] or [m]
+    lower: float  # soft limits [rad] or [m]
     upper: float
 
     def apply(self, model: ReadRecorder) -> Writes:

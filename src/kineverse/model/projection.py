@@ -44,29 +44,7 @@ class ResidualRow:
 
 
 class EqualityConstraints:
-    """Equality constraints of a model, and the other constraints on their coordinates, as numeric functions.
-
-    Parameters
-    ----------
-    constraints
-        All constraints of the model, in plain coordinates.
-    rates
-        Rate table of the model.
-    articulations
-        Records of the model, which name the coordinates of quaternions.
-    wanted
-        Names of the equalities to satisfy; None for all.
-
-    Attributes
-    ----------
-    rows
-        Residuals of the equalities, followed by those of other constraints on their coordinates, without
-        limits on single coordinates.
-    count
-        Number of equalities.
-    symbols, coordinates
-        Symbols of the rows, and the coordinates among them that may move.
-    """
+    """Equality constraints of a model, and the other constraints on their coordinates, as numeric functions."""
 
     def __init__(
         self,
@@ -167,7 +145,6 @@ def _line(value: Expression) -> tuple[float, float] | None:
 
 
 def _limits_single(row: ResidualRow) -> bool:
-    """Return whether a row limits a single coordinate."""
     return len(row.value.symbols) == 1 and _line(row.value) is not None
 
 
@@ -286,13 +263,7 @@ class _Search:
         ]
 
     def nearest(self) -> Array:
-        """Return all values at the feasible point nearest to the original state.
-
-        Raises
-        ------
-        NoSolutionError
-            Naming the violated constraints, their residuals, and the attempts.
-        """
+        """Return all values at the feasible point nearest to the original state."""
         start = self._unit(np.clip(self._at[self._places], self._lower, self._upper))
         best, found = start, []
         least = np.inf

@@ -41,15 +41,7 @@ RateEntry: TypeAlias = RateRow | Expression
 
 
 def as_entry(coordinate: Symbol, value: Mapping[Symbol, ExpressionLike] | ExpressionLike) -> RateEntry:
-    """Return the row, or the expression of a dependent coordinate, in plain coordinates.
-
-    Raises
-    ------
-    ModelError
-        If the coordinate is not a position, or a key of the row not a velocity.
-    InvalidValueError
-        If the expression is not scalar, or contains speeds.
-    """
+    """Return the row, or the expression of a dependent coordinate, in plain coordinates."""
     if isinstance(value, Mapping):
         return as_row(coordinate, value)
     _check_coordinate(coordinate)
@@ -68,13 +60,7 @@ def _check_coordinate(coordinate: Symbol) -> None:
 
 
 def as_row(coordinate: Symbol, row: Mapping[Symbol, ExpressionLike]) -> RateRow:
-    """Return a row in canonical order and plain coordinates.
-
-    Raises
-    ------
-    ModelError
-        If the coordinate is not a position, or a key not a velocity.
-    """
+    """Return a row in canonical order and plain coordinates."""
     _check_coordinate(coordinate)
     if not isinstance(row, Mapping):
         raise ModelError(f"The rate of '{coordinate}' is a mapping {{speed: expression}}, not {row!r}.")

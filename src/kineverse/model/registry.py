@@ -42,70 +42,30 @@ def check_loops(loops: object) -> None:
 
 @dataclass(frozen=True, slots=True)
 class FileContent:
-    """Content of a model file and the options of its reader.
-
-    Attributes
-    ----------
-    path
-        Path of the file.
-    content
-        All bytes of the file.
-    prefix
-        Prefix of all names, without the slash; None for none.
-    root
-        Folder below which the reader may open further files.
-    strict
-        True if mistakes that have no effect on motion are errors.
-    shipped
-        Name of the model if it comes with the package.
-    arguments
-        Arguments of a template, by name.
-    """
+    """Content of a model file and the options of its reader."""
 
     path: Path
-    content: bytes
-    prefix: str | None
-    root: str
-    strict: bool
-    shipped: str | None = None
-    arguments: Mapping[str, str] = field(default_factory=dict)
+    content: bytes  # all bytes of the file
+    prefix: str | None  # prefix of all names, without the slash; None for none
+    root: str  # folder below which the reader may open further files
+    strict: bool  # True if mistakes that have no effect on motion are errors
+    shipped: str | None = None  # name of the model if it comes with the package
+    arguments: Mapping[str, str] = field(default_factory=dict)  # arguments of a template, by name
 
 
 @dataclass(frozen=True, slots=True)
 class FileFormat:
-    """File format of models, with its reader and its writer.
-
-    Attributes
-    ----------
-    name
-        Name of the format.
-    suffixes
-        Endings of the file names that it reads.
-    read
-        Function from a :class:`FileContent` to an iterable of ``(tag, operation)``.
-    written
-        Endings of the file names that it writes.
-    write
-        Function that writes a model: ``(model, path, leave_out, tolerance, strict)`` to the content of files.
-    recognize
-        Predicate ``(name, content)`` for endings that several formats share. By default the ending decides.
-    exact
-        True if files hold all of a model exactly. Their writer has no options: ``(model, path)``.
-    loop_element
-        Element of the format that closes a loop; empty if the format has none.
-    reference
-        Text in every file that refers to further files; empty if files never do.
-    """
+    """File format of models, with its reader and its writer."""
 
     name: str
-    suffixes: tuple[str, ...]
-    read: str
-    written: tuple[str, ...] = ()
-    write: str = ""
-    recognize: Callable[[str, bytes], bool] | None = None
-    exact: bool = False
-    loop_element: str = ""
-    reference: bytes = b""
+    suffixes: tuple[str, ...]  # endings of the file names that it reads
+    read: str  # function from a FileContent to an iterable of (tag, operation)
+    written: tuple[str, ...] = ()  # endings of the file names that it writes
+    write: str = ""  # (model, path, leave_out, tolerance, strict)
+    recognize: Callable[[str, bytes], bool] | None = None  # (name, content)
+    exact: bool = False  # (model, path)
+    loop_element: str = ""  # element of the format that closes a loop; empty if the format has none
+    reference: bytes = b""  # text in every file that refers to further files; empty if files never do
 
     def reads(self, name: str, content: bytes) -> bool:
         """Return whether the format reads a file of this name and content."""
@@ -119,27 +79,13 @@ class FileFormat:
 
 @dataclass(frozen=True, slots=True)
 class ModelCollection:
-    """Models that functions build, loaded as ``collection/name``.
+    """Models that functions build, loaded as ``collection/name``."""
 
-    Attributes
-    ----------
-    list_names
-        Function that returns all names.
-    build
-        Function from a name and a prefix to an iterable of operations.
-    summary
-        Number of its models, for errors: "one for each ...".
-    accept
-        Predicate of names, if :attr:`list_names` has examples alone; empty if it has all names.
-    prefix
-        Prefix of a model by default; that of an empty text is the name of the model.
-    """
-
-    list_names: str
-    build: str
-    summary: str
-    accept: str = ""
-    prefix: str = ""
+    list_names: str  # function that returns all names
+    build: str  # function from a name and a prefix to an iterable of operations
+    summary: str  # number of its models, for errors: "one for each ..."
+    accept: str = ""  # predicate of names, if list_names has examples alone; empty if it has all names
+    prefix: str = ""  # prefix of a model by default; that of an empty text is the name of the model
 
     def has(self, name: str) -> bool:
         """Return whether there is a model of this name."""
@@ -171,25 +117,11 @@ class FrameDeviation:
 
 @dataclass(frozen=True, slots=True)
 class SaveResult:
-    """Report on a model that was saved.
+    """Report on a model that was saved."""
 
-    Attributes
-    ----------
-    path
-        Path of the file.
-    remarks
-        Differences between the file and the model that are no errors.
-    left_out
-        Constraints, and articulations whose speeds are tied to those of others, that the format cannot
-        express, each with the reason. No pose of a frame depends on them.
-    errors
-        Bounds on the errors of frames [m], [rad], where a tolerance allows some: valid for all values of
-        coordinates within their limits. Other frames are exact.
-    """
-
-    path: Path
-    remarks: tuple[str, ...] = ()
-    errors: Mapping[str, FrameDeviation] = field(default_factory=dict)
+    path: Path  # path of the file
+    remarks: tuple[str, ...] = ()  # differences between the file and the model that are no errors
+    errors: Mapping[str, FrameDeviation] = field(default_factory=dict)  # [m], [rad]
     left_out: Mapping[str, str] = field(default_factory=dict)
 
     @property

@@ -19,13 +19,7 @@ from .frame import Frame
 
 
 class Relevance:
-    """Index of constraints by the coordinates of their expressions and bounds.
-
-    Parameters
-    ----------
-    dependent
-        Expressions of the dependent coordinates.
-    """
+    """Index of constraints by the coordinates of their expressions and bounds."""
 
     def __init__(self, dependent: Mapping[Symbol, Expression]) -> None:
         # A limit on a dependent coordinate limits the coordinates that determine it.

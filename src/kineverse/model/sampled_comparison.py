@@ -34,23 +34,7 @@ class LimitDifference:
 
 
 class BehaviourComparison:
-    """Differences in poses and limits between two models, beyond a tolerance.
-
-    Attributes
-    ----------
-    frames, freedoms
-        Names of frames and degrees of freedom by ``added``, ``removed`` and ``common``.
-    helpers
-        Frames that a format adds to one of the models; they count as neither added nor removed.
-    apart
-        Common frames with different world poses in a sampled state, the largest difference first.
-    ranges
-        Different limits of common degrees of freedom.
-    largest
-        Largest distance [m] and angle [rad] of any frame, within the tolerance or not.
-    states
-        Number of sampled states.
-    """
+    """Differences in poses and limits between two models, beyond a tolerance."""
 
     def __init__(self, before: ModelView, after: ModelView, tolerance: float) -> None:
         self.tolerance = tolerance

@@ -26,15 +26,6 @@ class StateSamples:
     The values of a symbol are a function of its name alone, so models with the same names get the same
     states. Of several models, the first one with a symbol determines its range. Limits of single symbols
     hold; other constraints may be violated.
-
-    Parameters
-    ----------
-    models
-        Models to sample.
-    count
-        Number of random states.
-    seed
-        Seed of the random states.
     """
 
     def __init__(self, *models: ModelView, count: int = 16, seed: int = 0) -> None:

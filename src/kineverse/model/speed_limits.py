@@ -68,25 +68,13 @@ _ONE = as_expression(1.0)
 
 @dataclass(frozen=True)
 class SpeedRow:
-    """Row ``lower <= Σ weight·speed <= upper`` of a constraint.
+    """Row ``lower <= Σ weight·speed <= upper`` of a constraint."""
 
-    Attributes
-    ----------
-    name
-        Name of the constraint.
-    weights
-        Coefficients by speed.
-    lower, upper
-        Bounds, scalars.
-    violation
-        Signed excess of a position constraint: positive above its upper bound, negative below its lower one.
-    """
-
-    name: str
-    weights: Weights
-    lower: Expression
-    upper: Expression
-    violation: Expression = ZERO
+    name: str  # name of the constraint
+    weights: Weights  # coefficients by speed
+    lower: Expression  # bounds
+    upper: Expression  # scalars
+    violation: Expression = ZERO  # signed excess of a position constraint
 
     @property
     def is_simple(self) -> bool:
@@ -101,26 +89,13 @@ class SpeedBounds:
     The greatest of the lower bounds counts, and the least of the upper bounds. At states where constraints on
     one speed contradict each other, a lower bound is above the upper one: where two speed limits exclude each
     other, or one excludes zero speed and another constraint allows no other.
-
-    Attributes
-    ----------
-    speeds
-        The n speeds.
-    lower, upper
-        Expressions of shape (n,) in units of the speeds; ∓infinity for none.
-    violation
-        Signed excess of the position constraints of each speed, in units of its position, shape (n,):
-        positive if the speed has to be negative to reduce it. Of several on one side the largest counts;
-        violations of both sides are added. A goal of recovery is ``v = -gain * violation``.
-    names
-        Names of the constraints of each speed.
     """
 
-    speeds: tuple[Symbol, ...]
-    lower: Expression
+    speeds: tuple[Symbol, ...]  # n speeds
+    lower: Expression  # expressions of shape (n,) in units of the speeds; ∓infinity for none
     upper: Expression
-    violation: Expression
-    names: tuple[tuple[str, ...], ...]
+    violation: Expression  # (n,)
+    names: tuple[tuple[str, ...], ...]  # names of the constraints of each speed
 
 
 @dataclass(frozen=True)
@@ -133,21 +108,11 @@ class NormBound:
 
 @dataclass(frozen=True)
 class AdmissibleSpeeds:
-    """Set of admissible speeds while all other speeds are zero; zero speed is assumed to be admissible.
+    """Set of admissible speeds while all other speeds are zero; zero speed is assumed to be admissible."""
 
-    Attributes
-    ----------
-    box
-        Lower limits <= 0 and upper limits >= 0 of single speeds.
-    coupled
-        Rows that the box does not imply.
-    balls
-        Norm bounds; rows describe their inscribed polygons.
-    """
-
-    box: SpeedBox
-    coupled: list[SpeedRow]
-    balls: list[NormBound]
+    box: SpeedBox  # lower limits <= 0 and upper limits >= 0 of single speeds
+    coupled: list[SpeedRow]  # rows that the box does not imply
+    balls: list[NormBound]  # norm bounds; rows describe their inscribed polygons
 
 
 class SpeedLimits:

@@ -22,11 +22,6 @@ def compile_columns(
 
     Different symbols may have one name here, as parameters of one path with different values do. The columns
     contain no nodes: where a loop does not close the result is NaN, and no error.
-
-    Raises
-    ------
-    DuplicateNameError
-        If a symbol occurs twice.
     """
     names = Counter(map(str, set(symbols)))
     inputs = [s if names[str(s)] == 1 else Symbol(f"{s.path}/input {i}") for i, s in enumerate(symbols)]

@@ -59,21 +59,11 @@ Recovery: TypeAlias = Literal["required", "allowed"]
 
 @dataclass(frozen=True)
 class VelocityRows:
-    """Linear rows ``lower <= matrix @ v <= upper`` in the speeds v.
+    """Linear rows ``lower <= matrix @ v <= upper`` in the speeds v."""
 
-    Attributes
-    ----------
-    speeds
-        Speeds in the order of the n columns.
-    rows
-        The m rows, with their nonzero coefficients by speed.
-    skipped
-        Constraints that cannot be rows, as pairs (name, reason).
-    """
-
-    speeds: tuple[Symbol, ...]
-    rows: tuple[SpeedRow, ...]
-    skipped: tuple[tuple[str, str], ...]
+    speeds: tuple[Symbol, ...]  # speeds in the order of the n columns
+    rows: tuple[SpeedRow, ...]  # m rows, with their nonzero coefficients by speed
+    skipped: tuple[tuple[str, str], ...]  # constraints that cannot be rows, as pairs (name, reason)
 
     @cached_property
     def names(self) -> tuple[str, ...]:
@@ -135,35 +125,7 @@ def velocity_rows(
     speed_limits: Mapping[str, Constraint] | None = None,
     recovery: Recovery = "required",
 ) -> VelocityRows:
-    """Return the rows that enforce constraints over the next step; see the module for the equations.
-
-    Parameters
-    ----------
-    constraints
-        Constraints by name, from :attr:`.Model.constraints` or :meth:`.Model.constraints_for`.
-    dt
-        Control period Δt [s]: a number, or an expression such as a parameter. Values of an expression have to
-        be positive.
-    rates
-        Rate table of the model, to eliminate the speeds of driven coordinates.
-    speeds
-        Columns; by default the speeds of the constraints, sorted. All other speeds are assumed to be zero.
-    gain
-        Gain γ [1/s], at most 1/Δt, which is the default; a number or an expression. If γ or Δt is an
-        expression, its values have to satisfy 0 < γ <= 1/Δt, or a step may cross a bound.
-    speed_limits
-        Further constraints. Those on speeds and accelerations of columns are enforced as well, and so are
-        those of the columns that they add. Others are ignored.
-    recovery
-        ``"required"``: outside a bound, a row demands a recovery speed. ``"allowed"``: outside a bound, a row
-        demands that the violation does not grow, so ``lower <= 0 <= upper`` for all position constraints.
-
-    Raises
-    ------
-    InvalidValueError
-        For a Δt that is not positive, a gain outside (0, 1/Δt], expressions of them that are not scalar or
-        contain speeds, or another recovery.
-    """
+    """Return the rows that enforce constraints over the next step; see the module for the equations."""
     if recovery not in ("required", "allowed"):
         raise InvalidValueError(f"The recovery is 'required' or 'allowed', not {recovery!r}.")
     dt, gamma = _check_step(dt, gain)

@@ -14,15 +14,6 @@ def cached_for_version(model: SymbolicView, key: Hashable, compute: Callable[[],
     """Return a result about the present version of a model; it is computed for the first call with a key.
 
     The result lives no longer than the model, and may refer to it.
-
-    Parameters
-    ----------
-    model
-        The model.
-    key
-        Name of the computation, and its arguments.
-    compute
-        Function that computes the result. It is called without a lock: two threads may compute the same.
     """
     model._settle()
     kept = model._derived  # an edit replaces it, so that no result of an old version is entered later

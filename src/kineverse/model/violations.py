@@ -214,19 +214,7 @@ def _is_infinite(bound: SX) -> bool:
 def find_violations(
     checker: ConstraintChecker, values: StateLike, known: Iterable[Symbol], tolerance: float
 ) -> Violations:
-    """Return the violations at ``values``, see :meth:`.ModelView.violations`.
-
-    Parameters
-    ----------
-    checker
-        Constraints as a function of all their symbols.
-    values
-        A state, or a mapping from symbols or names to numbers.
-    known
-        Symbols allowed in a mapping, beside those of the constraints.
-    tolerance
-        Largest excess of a satisfied constraint.
-    """
+    """Return the violations at ``values``, see :meth:`.ModelView.violations`."""
     tolerance = as_tolerance(tolerance)
     if not isinstance(values, State):
         known = (*known, *checker.symbols)

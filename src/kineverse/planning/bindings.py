@@ -134,13 +134,7 @@ def request_planner() -> None:
 
 
 def planning_functions() -> Any:
-    """Return the compiled functions of the planner, built first if necessary.
-
-    Raises
-    ------
-    CompileError
-        Without a C compiler.
-    """
+    """Return the compiled functions of the planner, built first if necessary."""
     library = _library()
     if not library.prepare(wait=True):
         raise CompileError(

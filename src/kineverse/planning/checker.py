@@ -55,30 +55,7 @@ class LateCheckError(NoSolutionError):
 
 
 class CollisionChecker:
-    """Collision check of many configurations of some coordinates; everything else stands still.
-
-    Parameters
-    ----------
-    scene
-        Scene of the model, whose rules say which pairs of bodies are checked.
-    coordinates
-        The n coordinates that move.
-    conditions
-        Expressions that are at most 0 where a configuration is allowed.
-    margin
-        Least distance of pairs of bodies [m].
-    protrusion
-        Largest distance of a sphere from the shape that it covers [m]; None for what suits the shape.
-
-    Attributes
-    ----------
-    moving
-        Names of the bodies that move.
-    lower, upper
-        (n,) limits, which are written in place.
-    struct
-        The tables as C reads them.
-    """
+    """Collision check of many configurations of some coordinates; everything else stands still."""
 
     def __init__(
         self,
@@ -328,17 +305,7 @@ class CollisionChecker:
     def edges(
         self, A: Floats32, B: Floats32, resolution: float = RESOLUTION, least: float = 0.0
     ) -> npt.NDArray[np.bool_]:
-        """Return flags (N,) of the straight edges between configurations (N, n) that are free.
-
-        Parameters
-        ----------
-        A, B
-            The ends.
-        resolution
-            Samples for each unit of length [1/rad], [1/m].
-        least
-            0 to check samples only; otherwise what happens between them as well, to this length [m].
-        """
+        """Return flags (N,) of the straight edges between configurations (N, n) that are free."""
         found = np.zeros(len(A), dtype=np.uint8)
         self._code.kineverse_edges(
             self.address, A.ctypes.data, B.ctypes.data, len(A), resolution, least, found.ctypes.data
@@ -346,13 +313,7 @@ class CollisionChecker:
         return found.astype(bool)
 
     def find_collision(self, points: Floats32, seconds: float = math.inf) -> tuple[int, float] | None:
-        """Return the first edge of a polyline (N, n) that is not certainly free, and a fraction of it.
-
-        Raises
-        ------
-        LateCheckError
-            If that takes more than some seconds.
-        """
+        """Return the first edge of a polyline (N, n) that is not certainly free, and a fraction of it."""
         where = ctypes.c_double()
         found = self._code.kineverse_certify(
             self.address,

@@ -35,28 +35,7 @@ CONDITION_TOLERANCE = 1e-5
 
 
 class PlanningSpace:
-    """Coordinates that a planner moves, with the constraints of the model on them.
-
-    Parameters
-    ----------
-    model
-        The model.
-    move
-        Coordinates as symbols, names or patterns; an articulation stands for its coordinates. None for all
-        that may move freely.
-
-    Attributes
-    ----------
-    symbols
-        The n coordinates, in the order in which they are given, patterns in the order of the model.
-    lower, upper
-        (n,) limits at the present place, ±inf for none; those that depend on moving coordinates are
-        conditions.
-    conditions
-        Expressions that are at most 0 where the inequalities of the model hold; limits are not among them.
-    equalities
-        Expressions that are 0 where the equalities of the model hold.
-    """
+    """Coordinates that a planner moves, with the constraints of the model on them."""
 
     def __init__(self, model: ModelView, move: Iterable[Symbol | str] | Symbol | str | None) -> None:
         self.model = model
@@ -196,24 +175,7 @@ def _rolling_coordinates(model: ModelView) -> set[Symbol]:
 
 
 def read_configurations(space: PlanningSpace, placed: State, Q: Any, name: str) -> Array:
-    """Return configurations (N, n) from one or several vectors or states.
-
-    Parameters
-    ----------
-    space
-        The coordinates.
-    placed
-        State whose values those have that a given state does not name.
-    Q
-        What is given.
-    name
-        Its name in messages.
-
-    Raises
-    ------
-    InvalidValueError, ShapeError, UnknownNameError
-        For anything else, and for states in which something stands elsewhere that the planner does not move.
-    """
+    """Return configurations (N, n) from one or several vectors or states."""
     if isinstance(Q, Mapping):
         Q = [Q]
     if isinstance(Q, Sequence) and len(Q) and isinstance(Q[0], Mapping):

@@ -36,21 +36,11 @@ as of a door, may be too narrow for it: after that many edges, or half of the ti
 
 @dataclass(frozen=True, slots=True)
 class Connected:
-    """Outcome of a connection.
+    """Outcome of a connection."""
 
-    Attributes
-    ----------
-    points
-        Configurations (N, n) of the path, or of the best partial one.
-    problem
-        Why it does not lead to a goal; empty if it does.
-    iterations
-        Number of samples.
-    """
-
-    points: Array
-    problem: str
-    iterations: int
+    points: Array  # configurations (N, n) of the path, or of the best partial one
+    problem: str  # why it does not lead to a goal; empty if it does
+    iterations: int  # number of samples
 
 
 def connect(
@@ -67,15 +57,6 @@ def connect(
     """Return a path from one of (S, n) starts to one of (G, n) goals, certified between its samples.
 
     Edges of the search that collide between samples are planned anew, with more samples.
-
-    Parameters
-    ----------
-    roadmap
-        Roadmap that is searched; None for trees (RRT-Connect).
-    patience
-        Number of shortcuts in a row that may bring nothing.
-    asked
-        Time that messages name, of which ``seconds`` are a part [s].
     """
     begin = working_seconds()
     search = RrtConnect(checker)

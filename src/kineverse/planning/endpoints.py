@@ -23,34 +23,14 @@ _NEAR = 0.01
 
 @dataclass(frozen=True, slots=True)
 class Endpoint:
-    """Start or goal of a plan.
+    """Start or goal of a plan."""
 
-    Attributes
-    ----------
-    q
-        The configuration (n,), on the manifold if there is one.
-    reason
-        Why it cannot be used; empty if it can.
-    """
-
-    q: Array
-    reason: str = ""
+    q: Array  # configuration (n,), on the manifold if there is one
+    reason: str = ""  # why it cannot be used; empty if it can
 
 
 class Endpoints:
-    """Checks of starts and goals.
-
-    Parameters
-    ----------
-    space
-        Coordinates and their limits.
-    checker
-        Compiled collision check.
-    judge
-        Collision scene.
-    manifold
-        Manifold that they are on; None for the whole space.
-    """
+    """Checks of starts and goals."""
 
     def __init__(
         self, space: PlanningSpace, checker: CollisionChecker, judge: SceneJudge, manifold: Manifold | None

@@ -22,17 +22,7 @@ _AT_ONCE = 512
 
 
 class SceneJudge:
-    """Contacts of configurations of some coordinates, by the scene.
-
-    Parameters
-    ----------
-    scene
-        The scene; it is left at the last configuration.
-    coordinates
-        The n coordinates that move.
-    rules
-        Rules about pairs that do not count.
-    """
+    """Contacts of configurations of some coordinates, by the scene."""
 
     def __init__(self, scene: Scene, coordinates: Sequence[Symbol], rules: Sequence[Rule]) -> None:
         self._scene, self._coordinates = scene, tuple(coordinates)
@@ -61,13 +51,7 @@ class SceneJudge:
     def first_contact(
         self, points: Array, step: float, until: float = math.inf
     ) -> tuple[Array, DistanceResult] | None:
-        """Return the first sample of a polyline (N, n) with a contact, and the contact.
-
-        Raises
-        ------
-        LateCheckError
-            If that lasts until some time of :func:`.working_seconds`.
-        """
+        """Return the first sample of a polyline (N, n) with a contact, and the contact."""
         if not len(points):
             return None
         samples = sample_path(points, step)

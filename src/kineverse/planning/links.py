@@ -18,24 +18,7 @@ from .spheres.sphere_cache import cover_key, find_or_make_tree
 
 
 class LinkTable:
-    """Spheres of the bodies that move, each in the frame of its pose.
-
-    Parameters
-    ----------
-    members
-        Of each body, its objects with their solids and their poses in the frame, (4, 4).
-    poses
-        Of each body, the number of its pose.
-    protrusion
-        Largest distance of a sphere from the shapes that it covers [m]; None for what suits their size.
-
-    Attributes
-    ----------
-    links, coarse, fine, shapes
-        Tables as C reads them.
-    spheres
-        Of each body, the centres in the frame and radii of its spheres, (N, 4) [m].
-    """
+    """Spheres of the bodies that move, each in the frame of its pose."""
 
     def __init__(
         self,

@@ -57,26 +57,7 @@ class FrameHold(Hold):
 def hold_frames(
     model: ModelView, a: str, b: str, mask: str = "xyz rx ry rz", offset: ExpressionLike | None = None
 ) -> FrameHold:
-    """Return the hold of a frame by another one in some directions.
-
-    Parameters
-    ----------
-    model
-        The model.
-    a, b
-        The frames, such as a hand and a handle.
-    mask
-        Directions that are held, of ``x``, ``y``, ``z`` (positions) and ``rx``, ``ry``, ``rz`` (rotations),
-        in any order and in the axes of the pose that is held: ``"xyz rx ry"`` lets the hand turn about its z
-        axis.
-    offset
-        b_T_a, 4×4, the pose of a in b that is held; None for frames that coincide.
-
-    Raises
-    ------
-    InvalidValueError
-        For another mask.
-    """
+    """Return the hold of a frame by another one in some directions."""
     rows = mask.replace(",", " ").split()
     names = [r for part in rows for r in ([part] if part in _ROWS else part)]
     if not names or len(set(names)) < len(names) or not set(names) <= set(_ROWS):
@@ -99,24 +80,7 @@ def hold_frames(
 
 
 class Manifold:
-    """Configurations at which some expressions are zero.
-
-    Parameters
-    ----------
-    checker
-        Collision checker, which has the coordinates and limits.
-    model
-        The model.
-    holds
-        Holds.
-    equalities
-        Further expressions that are zero.
-
-    Raises
-    ------
-    InvalidValueError
-        If no coordinate changes a hold, or there are more rows than coordinates.
-    """
+    """Configurations at which some expressions are zero."""
 
     def __init__(
         self,
@@ -178,15 +142,7 @@ class Manifold:
         return ctypes.addressof(self.struct)
 
     def place(self, state: State, targets: Array) -> None:
-        """Set the values of everything that the holds depend on beside the coordinates.
-
-        Parameters
-        ----------
-        state
-            The state.
-        targets
-            Numbers that holds have as targets, see :func:`hold_targets`.
-        """
+        """Set the values of everything that the holds depend on beside the coordinates."""
         if state is self._state and np.array_equal(targets, self.targets):
             return
         self._state, self.targets = state, targets

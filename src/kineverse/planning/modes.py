@@ -96,28 +96,7 @@ class _Node:
 
 
 class ModeSearch:
-    """Search of a path through modes: a tree of changes from one mode to another.
-
-    Parameters
-    ----------
-    scene
-        What the segments are planned in.
-    modes
-        The modes; the first that the start meets is where the path begins.
-    tasks, ends
-        What is to be met at the end: holds, or configurations (K, n).
-    seconds
-        Largest time [s].
-    seed
-        Seed.
-
-    Raises
-    ------
-    InvalidValueError
-        Without modes, or for an object that the planner does not move.
-    DuplicateNameError
-        For two modes of one name.
-    """
+    """Search of a path through modes: a tree of changes from one mode to another."""
 
     def __init__(
         self,

@@ -27,33 +27,7 @@ Floats32 = npt.NDArray[np.float32]
 
 
 class ObstacleSet:
-    """Solids in one frame, as C reads them.
-
-    Parameters
-    ----------
-    solids
-        Convex solids.
-    bodies
-        (M,) number of the body of each solid.
-    poses
-        (M, 3, 4) poses of the solids [m]. Those that are near to each other are in one chunk, also when they
-        are placed elsewhere later.
-    planes
-        Table that the planes of hulls are added to; rows of a normal and an offset.
-    lanes
-        Number of obstacles in a chunk.
-    objects
-        (M,) number of the object of each solid in the scene; for the world only.
-    pose, link
-        Numbers of the pose and of the link that carries the set; 0 for the world.
-
-    Attributes
-    ----------
-    struct
-        The set as C reads it.
-    cost
-        Time that a sphere takes against all of them, as a multiple of that against a sphere.
-    """
+    """Solids in one frame, as C reads them."""
 
     def __init__(
         self,
@@ -115,13 +89,7 @@ class ObstacleSet:
             planes.append(rows)
 
     def place(self, poses: Array) -> None:
-        """Place all solids in the frame of the set.
-
-        Parameters
-        ----------
-        poses
-            (M, 3, 4) poses [m].
-        """
+        """Place all solids in the frame of the set."""
         poses = poses[self._order]
         moved = np.flatnonzero((poses != self._poses).any(axis=(1, 2)))
         if not len(moved):

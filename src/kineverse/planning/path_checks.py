@@ -25,27 +25,7 @@ _ROUNDING = 1e-6
 
 
 class PathChecks:
-    """Checks of configurations in the surroundings of a path, wherever the planner has placed things since.
-
-    Parameters
-    ----------
-    model
-        The model, at its present version.
-    state
-        State in which everything stands that the planner does not move.
-    checker
-        Collision checker.
-    judge
-        Collision scene, without the pairs that may touch.
-    manifold
-        Manifold of the path; None for the whole space.
-    touching
-        Pairs of bodies that may touch.
-    restore
-        Function that places the planner where it stands at the time of a check.
-    lock
-        Lock of the planner, which checks at the same time would disturb.
-    """
+    """Checks of configurations in the surroundings of a path, wherever the planner has placed things since."""
 
     def __init__(
         self,
@@ -71,13 +51,7 @@ class PathChecks:
             return self._judge.clearance(points, 1 / RESOLUTION)
 
     def ensure_current(self) -> None:
-        """Ensure that the model is the one for which the path was planned.
-
-        Raises
-        ------
-        InvalidValueError
-            If it has been edited.
-        """
+        """Ensure that the model is the one for which the path was planned."""
         if self.model.version != self._version:
             raise InvalidValueError("The model has been edited since this path was planned. Plan it again.")
 

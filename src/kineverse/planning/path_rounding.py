@@ -30,19 +30,11 @@ _STEP = 0.02
 
 
 class PathSection(NamedTuple):
-    """Part of a path with holds of its own, from one of its points to another; the motion rests at both.
+    """Part of a path with holds of its own, from one of its points to another; the motion rests at both."""
 
-    Attributes
-    ----------
-    first, last
-        Indices of the points.
-    checks
-        Checks of configurations between them.
-    """
-
-    first: int
+    first: int  # indices of the points
     last: int
-    checks: PathChecks
+    checks: PathChecks  # checks of configurations between them
 
 
 class TimedSection(NamedTuple):
@@ -101,17 +93,6 @@ def parameterize_path(
     """Return the rounded path and its fastest motion, which is certainly free wherever the path is.
 
     The motion is checked, and corners are rounded less where it collides, down to a stop.
-
-    Parameters
-    ----------
-    points
-        Path (N, n).
-    symbols, limits
-        The n coordinates, and the limits of their speeds and accelerations.
-    deviation
-        Largest distances from the corners, see :func:`.round_corners`.
-    checks
-        Checks of configurations.
     """
     with checks.placed(points):
         path = _round_valid(*_drop_near(points, deviation), checks)

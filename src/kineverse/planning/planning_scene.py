@@ -52,41 +52,7 @@ _SAME = 1e-5
 
 
 class PlanningScene:
-    """Present version of a model, with everything placed at a state: what searches of paths are about.
-
-    Parameters
-    ----------
-    model
-        The model.
-    move, rules, margin, protrusion
-        As for :class:`.Planner`.
-    options
-        Further arguments of the collision scene.
-    state
-        Where everything stands.
-    separate
-        Pairs of bodies that do not always touch, whatever samples say.
-    lock
-        Lock of the planner, for the checks of its paths.
-
-    Attributes
-    ----------
-    space
-        Coordinates that move, with their limits.
-    scene
-        Collision scene.
-    checker
-        Compiled collision check.
-    excluded
-        Rules for pairs of bodies that always touch, which are not checked.
-    version
-        Version of the model.
-
-    Raises
-    ------
-    InvalidValueError
-        If no body has a shape.
-    """
+    """Present version of a model, with everything placed at a state: what searches of paths are about."""
 
     def __init__(
         self,

@@ -56,23 +56,6 @@ class Roadmap:
     (edges checked in the order of A*). There are as many neighbours for all numbers of nodes, since more
     did not pay here; with 2 e log N of them paths would become the shortest ones (Karaman and Frazzoli
     2011).
-
-    Parameters
-    ----------
-    symbols
-        The n coordinates.
-    turning
-        Flags (n,) of coordinates of which a full turn changes nothing.
-    nodes
-        Largest number of nodes; one takes about 300 bytes. When there is no room, nodes that are blocked or
-        beyond the limits and ends of earlier queries give way; an eighth is kept for ends.
-    degree
-        Number of edges of a new node, at most 64.
-
-    Attributes
-    ----------
-    nodes_checked, edges_checked
-        Numbers of nodes and edges that the last query checked.
     """
 
     def __init__(
@@ -140,17 +123,6 @@ class Roadmap:
         """Search a path from any of (S, n) starts to any of (G, n) goals.
 
         Coordinates that turn fully may end full turns away from a goal.
-
-        Parameters
-        ----------
-        checker
-            Checker of the coordinates of the roadmap.
-        starts, goals
-            Free configurations, contiguous.
-        seconds
-            Largest time [s].
-        seed
-            Seed of the samples that this query adds.
         """
         self._forget(checker)
         s = self._struct

@@ -37,15 +37,7 @@ class SearchResult(NamedTuple):
 
 
 class RrtConnect:
-    """RRT-Connect over a checker, in the whole space or on a manifold.
-
-    Parameters
-    ----------
-    checker
-        Collision checker.
-    manifold
-        The manifold; None for the whole space.
-    """
+    """RRT-Connect over a checker, in the whole space or on a manifold."""
 
     def __init__(self, checker: CollisionChecker, manifold: Manifold | None = None) -> None:
         self._checker, self._manifold, self._code = checker, manifold, planning_functions()
@@ -61,21 +53,7 @@ class RrtConnect:
         resolution: float = RESOLUTION,
         edges: int = MOST_EDGES,
     ) -> SearchResult:
-        """Search a path from any of (S, n) starts to any of (G, n) goals.
-
-        Parameters
-        ----------
-        starts, goals
-            Free configurations, contiguous.
-        seconds
-            Largest time [s].
-        seed
-            Seed of the samples.
-        resolution
-            Samples for each unit of length of an edge.
-        edges
-            Largest number of edges that are tried.
-        """
+        """Search a path from any of (S, n) starts to any of (G, n) goals."""
         s = self._setup(seconds, seed, resolution)
         s.nodes, s.most_edges = _MOST_NODES, edges
         count = self._code.kineverse_rrt_connect(
@@ -86,19 +64,7 @@ class RrtConnect:
         return SearchResult(points, s.status, s.iterations, (s.count_start, s.count_goal), s.gap)
 
     def shorten(self, points: Floats32, seconds: float, seed: int, patience: int) -> Floats32:
-        """Return a shorter path: points on it are joined where the way between them is certainly free.
-
-        Parameters
-        ----------
-        points
-            Points (N, n) of the path.
-        seconds
-            Largest time [s].
-        seed
-            Seed of the choice of points.
-        patience
-            Number of tries in a row that may bring less than a hundredth each.
-        """
+        """Return a shorter path: points on it are joined where the way between them is certainly free."""
         s = self._setup(seconds, seed, RESOLUTION)
         room = len(points) + 64
         work = np.zeros((room, points.shape[1]), dtype=np.float32)

@@ -29,23 +29,7 @@ def find_solutions(
     seed: int,
     batches: int = MOST_BATCHES,
 ) -> Array:
-    """Return different configurations (K, n) on a manifold, free of collisions, at most some number of them.
-
-    Parameters
-    ----------
-    checker, manifold
-        Checker with the limits of the search, and manifold.
-    near
-        A configuration (n,): the nearest solutions come first, and the first batch is drawn around it.
-    count
-        Largest number of solutions.
-    seconds
-        Largest time [s].
-    seed
-        Seed of the random configurations.
-    batches
-        Largest number of batches of them.
-    """
+    """Return different configurations (K, n) on a manifold, free of collisions, at most some number of them."""
     generator = np.random.default_rng(seed)
     begin = working_seconds()
     lower, upper = checker.lower.astype(float), checker.upper.astype(float)

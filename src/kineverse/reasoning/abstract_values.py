@@ -70,24 +70,12 @@ _PRODUCT_AT_MOST = 8
 
 @dataclass(frozen=True, slots=True)
 class AbstractValue:
-    """Abstract value of a term in a case.
+    """Abstract value of a term in a case."""
 
-    Attributes
-    ----------
-    range
-        Interval that contains the value.
-    polynomial
-        The exact value, if it is known to be a polynomial.
-    live
-        Symbols that the value depends on in this case.
-    doubtful, void
-        True if the value may be, or certainly is, not a number.
-    """
-
-    range: RealInterval = REALS
-    polynomial: Polynomial | None = None
-    live: frozenset[Symbol] = NO_SYMBOLS
-    doubtful: bool = False
+    range: RealInterval = REALS  # interval that contains the value
+    polynomial: Polynomial | None = None  # exact value, if it is known to be a polynomial
+    live: frozenset[Symbol] = NO_SYMBOLS  # symbols that the value depends on in this case
+    doubtful: bool = False  # True if the value may be, or certainly is, not a number
     void: bool = False
 
     @property

@@ -28,26 +28,7 @@ _CLOSE_ROOTS = 1e-9
 
 
 class Case:
-    """Case: intervals of coordinates and of sums of coordinates, and signs of terms.
-
-    Parameters
-    ----------
-    roots
-        Terms that are evaluated.
-    domain
-        Domain of configurations.
-    axes, signs
-        Further intervals of linear forms, and known signs of terms by index.
-    order
-        All terms below the roots, arguments first.
-    before, narrowed
-        Values in a larger case, and the symbols whose intervals are smaller in this one.
-
-    Attributes
-    ----------
-    values
-        Abstract values of all terms, by index.
-    """
+    """Case: intervals of coordinates and of sums of coordinates, and signs of terms."""
 
     def __init__(
         self,

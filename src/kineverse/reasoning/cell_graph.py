@@ -33,33 +33,15 @@ class CellStep(NamedTuple):
 
 @dataclass(frozen=True)
 class CellGraph:
-    """Cells of coordinates and the steps between them.
-
-    Attributes
-    ----------
-    coordinates
-        The coordinates.
-    cells
-        Their cells, from the lowest to the highest one.
-    first
-        The bit of the first cell of each coordinate.
-    steps
-        For each coordinate, steps upward from each cell and steps downward from each cell; the last one
-        upward and the first one downward lead nowhere and are None.
-    rests
-        Bits of the cells in which a move may end: all but single thresholds, which count as on both sides,
-        unless they are goals.
-    start, goal
-        State at the start, and the bits that are set at the goal.
-    """
+    """Cells of coordinates and the steps between them."""
 
     coordinates: tuple[Symbol, ...]
-    cells: tuple[tuple[Interval, ...], ...]
-    first: tuple[int, ...]
+    cells: tuple[tuple[Interval, ...], ...]  # their cells, from the lowest to the highest one
+    first: tuple[int, ...]  # bit of the first cell of each coordinate
     steps: tuple[tuple[tuple[CellStep | None, ...], tuple[CellStep | None, ...]], ...]
-    rests: int
-    start: int
-    goal: int
+    rests: int  # bits of the cells in which a move may end
+    start: int  # state at the start
+    goal: int  # the bits that are set at the goal
 
     def bit(self, coordinate: int, cell: int) -> int:
         """Return the bit of a cell."""
@@ -121,19 +103,7 @@ def make_graph(
     goals: Mapping[Symbol, float],
     still: Collection[Symbol] = (),
 ) -> CellGraph:
-    """Return the cells between the thresholds of rules, and the steps that the rules allow.
-
-    Parameters
-    ----------
-    coordinates, rules
-        Coordinates and rules, see :func:`.relevant_rules`.
-    limits
-        Limits of coordinates; start and goals lie within.
-    start, goals
-        Positions of all coordinates at the start, and of some at the goal.
-    still
-        Coordinates that do not move.
-    """
+    """Return the cells between the thresholds of rules, and the steps that the rules allow."""
     cells: list[tuple[Interval, ...]] = []
     first: list[int] = []
     rests = 0

@@ -41,21 +41,7 @@ def find_speed_effect(
     domain: Domain,
     unknown: list[tuple[str, IntervalBox]],
 ) -> SpeedEffect:
-    """Find the effect of a constraint of order 1 or higher, in plain coordinates.
-
-    Parameters
-    ----------
-    constraint
-        The constraint.
-    dependent
-        Expressions that replace dependent and periodic coordinates.
-    given
-        Numbers that replace symbols.
-    domain
-        Domain of configurations.
-    unknown
-        List to which reasons and regions are appended where the effect is unknown.
-    """
+    """Find the effect of a constraint of order 1 or higher, in plain coordinates."""
     terms = TermGraph(given)
     held, weight, offset = _isolate_speed(constraint)
     ends = (constraint.lower, constraint.upper, offset, weight)

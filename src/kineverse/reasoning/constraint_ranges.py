@@ -44,13 +44,7 @@ class _Row:
 
 
 class ConstraintRanges:
-    """Excesses of the constraints of a model over boxes of positions.
-
-    Parameters
-    ----------
-    model
-        The model. Dependent coordinates follow the others, parameters have their values.
-    """
+    """Excesses of the constraints of a model over boxes of positions."""
 
     def __init__(self, model: ModelView) -> None:
         self.rows: dict[str, Constraint] = {}

@@ -25,18 +25,10 @@ EVERYWHERE = Interval()
 
 @dataclass(frozen=True)
 class Domain:
-    """Limits of coordinates, and the coordinates that form unit quaternions.
+    """Limits of coordinates, and the coordinates that form unit quaternions."""
 
-    Attributes
-    ----------
-    limits
-        Constant limits of symbols.
-    spheres
-        Unit quaternions.
-    """
-
-    limits: Mapping[Symbol, Interval]
-    spheres: tuple[UnitSphere, ...] = ()
+    limits: Mapping[Symbol, Interval]  # constant limits of symbols
+    spheres: tuple[UnitSphere, ...] = ()  # unit quaternions
 
     def limits_of(self, symbol: Symbol) -> Interval:
         """Return the interval in which a symbol lies."""

@@ -22,27 +22,12 @@ Box: TypeAlias = Mapping[Symbol, Interval]
 
 @dataclass(frozen=True)
 class MoveRule:
-    """Restriction of moves within a box of positions.
+    """Restriction of moves within a box of positions."""
 
-    Attributes
-    ----------
-    way
-        ``"up"``, ``"down"``: within the box, the coordinate cannot increase, or decrease. ``"enter"``: no
-        coordinate may bring the state into the box, except for the given one.
-    coordinate
-        The restricted coordinate; for ``"enter"`` the one that is exempt, or None.
-    box
-        Intervals of positions.
-    lock
-        The interlock that says so, or the constraint that could not be read.
-    is_exact
-        False if the rule holds more than its lock, because that could not be read completely.
-    """
-
-    way: Way
-    coordinate: Symbol | None
-    box: Box
-    lock: Interlock | Undecided
+    way: Way  # "up", "down": within the box, the coordinate cannot increase, or decrease
+    coordinate: Symbol | None  # restricted coordinate; for "enter" the one that is exempt, or None
+    box: Box  # intervals of positions
+    lock: Interlock | Undecided  # interlock that says so, or the constraint that could not be read
     is_exact: bool = True
 
     @property

@@ -27,47 +27,20 @@ _CLOCK = 64
 
 @dataclass(frozen=True)
 class MoveSearchResult:
-    """Moves to the goal, or the reason why there are none.
+    """Moves to the goal, or the reason why there are none."""
 
-    Attributes
-    ----------
-    verdict
-        ``"found"``, ``"refuted"``, or ``"undecided"`` after the budget.
-    moves
-        Moves to the goal if it was found.
-    shortest
-        True if there are no fewer moves.
-    explored
-        Number of states.
-    reached
-        Bits of all cells that were reached, or for a refutation an upper bound of them.
-    regions
-        For a refutation, sets of states that no move leaves together: the start is in the first one, and the
-        goal in none. Each is the product of the cells whose bits are set.
-    following
-        For each region the numbers of those to which moves lead, as far as these are not regions themselves.
-    """
-
-    verdict: Verdict
-    moves: tuple[Move, ...] = ()
-    shortest: bool = False
-    explored: int = 0
-    reached: int = 0
-    regions: tuple[int, ...] = ()
+    verdict: Verdict  # "found", "refuted", or "undecided" after the budget
+    moves: tuple[Move, ...] = ()  # moves to the goal if it was found
+    shortest: bool = False  # True if there are no fewer moves
+    explored: int = 0  # number of states
+    reached: int = 0  # bits of all cells that were reached, or for a refutation an upper bound of them
+    regions: tuple[int, ...] = ()  # for a refutation, sets of states that no move leaves together
     following: tuple[tuple[int, ...], ...] = ()
 
 
 @dataclass(frozen=True)
 class MoveSearch:
-    """Search on a graph of cells.
-
-    Parameters
-    ----------
-    graph
-        The graph.
-    is_late
-        Function that returns True when the budget is spent.
-    """
+    """Search on a graph of cells."""
 
     graph: CellGraph
     is_late: Callable[[], bool] = field(default=lambda: False)
@@ -339,15 +312,7 @@ class MoveSearch:
 
 
 def find_circle(graph: CellGraph, reached: int) -> tuple[tuple[MoveRule, ...], bool]:
-    """Return rules that keep a goal out of reach, each because of the next, and whether they are a circle.
-
-    Parameters
-    ----------
-    graph
-        The graph.
-    reached
-        Bits of all cells that can be reached.
-    """
+    """Return rules that keep a goal out of reach, each because of the next, and whether they are a circle."""
     wanted = next(_bits(graph.goal & ~reached), 0)
     chain: list[MoveRule] = []
     seen: dict[int, int] = {}

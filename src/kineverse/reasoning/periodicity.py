@@ -26,18 +26,7 @@ _SAME = 1e-12
 
 
 class PeriodicCoordinates:
-    """Replacement of periodic coordinates by angles within one turn.
-
-    Parameters
-    ----------
-    coordinates
-        The periodic coordinates.
-
-    Attributes
-    ----------
-    wrapped
-        Angle within one turn for each coordinate.
-    """
+    """Replacement of periodic coordinates by angles within one turn."""
 
     def __init__(self, coordinates: Iterable[Symbol]) -> None:
         self.wrapped = {s: position(f"{s.path} mod 2π") for s in coordinates}

@@ -37,13 +37,7 @@ def default_point(model: ModelView) -> dict[Symbol, float]:
 
 
 def start_point(model: ModelView, state: StateLike | None) -> dict[Symbol, float]:
-    """Return the positions at a start: those of a state, and the default ones of what it lacks.
-
-    Raises
-    ------
-    InvalidValueError
-        For a parameter with another value than its own, since locks are read with that.
-    """
+    """Return the positions at a start: those of a state, and the default ones of what it lacks."""
     point = dict(model.default_state())
     if state is None:
         return point

@@ -343,7 +343,6 @@ def _inside(side: Interval, way: int) -> float:
 
 
 def _check_goal(symbol: Symbol, value: object, limit: Interval) -> float:
-    """Return a goal as a float."""
     number = finite_number(value)
     if number is None:
         raise InvalidValueError(f"The goal of '{symbol}' is a finite number, not {value!r}.")

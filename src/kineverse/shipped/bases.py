@@ -7,15 +7,7 @@ from kineverse.model.frame import WORLD
 
 
 def mobile_base(model: str, prefix: str | None) -> Joint | None:
-    """Return the mobile base of a shipped robot, None for a model without one.
-
-    Parameters
-    ----------
-    model
-        Name of the shipped model.
-    prefix
-        Prefix of the model.
-    """
+    """Return the mobile base of a shipped robot, None for a model without one."""
 
     def named(name: str) -> str:
         return f"{prefix}/{name}" if prefix else name

@@ -18,15 +18,7 @@ _STIFFNESS = {
 
 
 def joint_spring(model: str, joint: str) -> tuple[tuple[str, float], ...]:
-    """Return the spring of a joint as dynamics, (name, value) pairs; empty for a joint without one.
-
-    Parameters
-    ----------
-    model
-        Name of the shipped model.
-    joint
-        Name of the joint, without prefix.
-    """
+    """Return the spring of a joint as dynamics, (name, value) pairs; empty for a joint without one."""
     stiffness = _STIFFNESS.get(model, {}).get(joint)
     if stiffness is None:
         return ()

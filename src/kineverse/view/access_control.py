@@ -30,18 +30,10 @@ _POLICY = (
 
 @dataclass(frozen=True, slots=True)
 class AccessControl:
-    """Rule by which requests are answered or refused.
+    """Rule by which requests are answered or refused."""
 
-    Attributes
-    ----------
-    host
-        The address that the server is bound to.
-    token
-        The first part of every path; empty for a page of this computer alone.
-    """
-
-    host: str
-    token: str = field(repr=False)
+    host: str  # address that the server is bound to
+    token: str = field(repr=False)  # first part of every path; empty for a page of this computer alone
 
     @staticmethod
     def from_host(host: str) -> AccessControl:
@@ -68,19 +60,7 @@ class AccessControl:
     def refusal(
         self, path: str, hosts: Iterable[str], origins: Iterable[str], port: int, websocket: bool
     ) -> str:
-        """Return the reason to refuse a request, empty if it is accepted.
-
-        Parameters
-        ----------
-        path
-            Path and query, as sent.
-        hosts, origins
-            All headers Host and Origin.
-        port
-            The port that the request came to.
-        websocket
-            True if it asks for a WebSocket.
-        """
+        """Return the reason to refuse a request, empty if it is accepted."""
         host = _authority(hosts)
         if host is None or host[1] != port or not self._is_own(host[0]):
             return "the host is not that of the page"

@@ -16,22 +16,7 @@ FADE_IN = 1.5
 
 
 class RangeAnimation:
-    """Oscillation of all degrees of freedom between their limits, each a little behind the one before.
-
-    Parameters
-    ----------
-    start
-        Values at the beginning, by name [m], [rad].
-    limits
-        Lower and upper limit of each degree of freedom to move, finite.
-    now
-        The time of the beginning [s].
-
-    Attributes
-    ----------
-    finished
-        False: it goes on until it is stopped.
-    """
+    """Oscillation of all degrees of freedom between their limits, each a little behind the one before."""
 
     finished = False
 
@@ -66,17 +51,6 @@ def select_animated(
 
     Coordinates without limits have no range, and a robot would drive off the page. They are animated only if
     nothing else can move.
-
-    Parameters
-    ----------
-    model
-        The model.
-    limits
-        Limits of its degrees of freedom, by name, possibly infinite [m], [rad].
-    angles
-        The names of the angles of its quaternions.
-    values, units
-        Values and units of the degrees of freedom, by name.
     """
     found = {name: (low, high) for name, (low, high) in limits.items() if high - low < 1e6}
     if found:

@@ -43,21 +43,7 @@ def choose_camera(
     aspect: float,
     field_of_view: float = 0.6,
 ) -> Camera:
-    """Return the camera that shows most of a scene.
-
-    Parameters
-    ----------
-    scene
-        The triangles.
-    weights
-        The weight of each of its parts.
-    poses
-        The poses of the frames, framed instead if there are no triangles.
-    aspect
-        Width of the picture divided by its height.
-    field_of_view
-        Vertical, full angle [rad].
-    """
+    """Return the camera that shows most of a scene."""
     if not len(scene.corners):
         origins = np.array([pose[:3, 3] for pose in poses.values()])
         return fit_camera(np.concatenate([origins, origins + 0.2]), FRONT, ELEVATION, aspect, field_of_view)
@@ -102,17 +88,7 @@ CAMERA_TOLERANCE = 1e-3
 
 
 class ClientCameras:
-    """Cameras of all browsers that show a page, each fitted to the shape of its window.
-
-    Parameters
-    ----------
-    server
-        A viser server.
-    first
-        The camera of new browsers on the server.
-    framing
-        Returns the camera for an aspect, the width of a picture divided by its height.
-    """
+    """Cameras of all browsers that show a page, each fitted to the shape of its window."""
 
     def __init__(self, server: Any, first: Camera, framing: Callable[[float], Camera]) -> None:
         self._lock = threading.Lock()

@@ -34,15 +34,9 @@ PAGE_BACKGROUND = ((240, 243, 246), (196, 207, 219))
 
 @dataclass(frozen=True, slots=True)
 class DirectionalLight:
-    """Infinitely distant lamp with a shadow map: a depth picture from the direction of the lamp.
+    """Infinitely distant lamp with a shadow map: a depth picture from the direction of the lamp."""
 
-    Attributes
-    ----------
-    toward
-        (3,) unit vector to the lamp, in the world.
-    """
-
-    toward: Floats
+    toward: Floats  # (3,) unit vector to the lamp, in the world
     projection: Projection
     depth: npt.NDArray[np.float32]
     bias: float
@@ -100,17 +94,6 @@ def _shadow_samples() -> list[tuple[Singles, Singles]]:
 def shade(colors: Singles, normals: Singles, lamp: DirectionalLight, lit: Singles) -> Singles:
     """Return the light (N, 3) reflected by matt surfaces, linear.
 
-    Parameters
-    ----------
-    colors
-        (N, 3) reflectance, linear.
-    normals
-        (N, 3) unit normals toward the camera.
-    lamp
-        The lamp.
-    lit
-        (N,) fraction of the lamp that reaches the surface.
-
     Notes
     -----
     Lambert's law for the lamp; between sky and ground by the height of the normal (a hemisphere light).
@@ -152,21 +135,7 @@ DEPTH_STEP = 0.02
 def compute_outlines(
     group: Integers, normals: Singles, near: Singles, covered: Integers, projection: Projection
 ) -> Singles:
-    """Return (N,) factors that darken the outlines of parts and their sharp edges.
-
-    Parameters
-    ----------
-    group
-        (N,) the group visible at each covered pixel: shapes of one frame and colour are one thing.
-    normals
-        (N, 3) the normals there.
-    near
-        (height·width,) the nearness of all pixels.
-    covered
-        (N,) the pixels, as y·width + x.
-    projection
-        The grid of pixels.
-    """
+    """Return (N,) factors that darken the outlines of parts and their sharp edges."""
     size = projection.width * projection.height
     part = np.full(size, -1, dtype=np.int32)
     part[covered] = group
@@ -197,19 +166,7 @@ def draw_background(projection: Projection) -> Singles:
 def draw_ground(
     image: Singles, empty: Integers, corners: Floats, projection: Projection, lamp: DirectionalLight
 ) -> None:
-    """Draw the floor under a scene: its shadow, and a grid that fades into the background.
-
-    Parameters
-    ----------
-    image
-        (height·width, 3) display values, changed in place.
-    empty
-        The pixels in which nothing of the scene is visible.
-    corners
-        (T, 3, 3) triangles of the scene [m]; the floor lies under the lowest of them.
-    projection, lamp
-        Camera and light. The lines of the grid are 1 m apart, 0.1 m under things smaller than that.
-    """
+    """Draw the floor under a scene: its shadow, and a grid that fades into the background."""
     low, high = corners.reshape(-1, 3).min(axis=0), corners.reshape(-1, 3).max(axis=0)
     drop = np.float32(low[2] - projection.origin[2])
     rays = projection.pixel_rays(empty)

@@ -67,19 +67,6 @@ def fit_camera(
 ) -> Camera:
     """Return the nearest camera of a given direction that has all points in view.
 
-    Parameters
-    ----------
-    points
-        (N, 3) points [m].
-    azimuth, elevation
-        The direction from the points to the camera: from x around z, and above the horizon [rad].
-    aspect
-        Width of the picture divided by its height.
-    field_of_view
-        Vertical, full angle [rad].
-    margin
-        The part of the picture left free at each side.
-
     Notes
     -----
     In camera axes a point p is inside if |p_x - c_x| <= t (p_z - c_z), t the tangent of half the angle. Each

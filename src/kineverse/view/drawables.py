@@ -85,46 +85,18 @@ UNPAINTED: tuple[Rgba, ...] = (
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Drawable:
-    """Shape of a body, with its frame and colour.
+    """Shape of a body, with its frame and colour."""
 
-    Attributes
-    ----------
-    frame
-        The frame it moves with.
-    surface
-        Its triangles in that frame [m].
-    color
-        Red, green, blue, alpha in [0, 1]; colours of the surface take precedence, as in RViz.
-    kind
-        ``"visual"`` or ``"collision"``.
-    problem
-        The mesh that could not be loaded, and the reason; empty if there is none.
-    placeholder
-        True if the surface only marks the place of a mesh that could not be loaded.
-    """
-
-    frame: str
-    surface: TriangleMesh
-    color: Rgba
-    kind: Kind
-    problem: str = ""
-    placeholder: bool = False
+    frame: str  # frame it moves with
+    surface: TriangleMesh  # its triangles in that frame [m]
+    color: Rgba  # red, green, blue, alpha in [0, 1]; colours of the surface take precedence, as in RViz
+    kind: Kind  # "visual" or "collision"
+    problem: str = ""  # mesh that could not be loaded, and the reason; empty if there is none
+    placeholder: bool = False  # True if the surface only marks the place of a mesh that could not be loaded
 
 
 def collect_drawables(model: ModelView, kind: Kind = "visual", decomposed: bool = False) -> list[Drawable]:
-    """Return all shapes of a model, in the order of its bodies.
-
-    Parameters
-    ----------
-    model
-        The model.
-    kind
-        ``"visual"``: the visual shapes; of a model without any, the collision shapes.
-        ``"collision"``: the collision shapes, or of a body without any, the visual ones; meshes as the
-        hulls that distances are computed to.
-    decomposed
-        True to show collision meshes as the hulls of their decomposition, as far as there is one.
-    """
+    """Return all shapes of a model, in the order of its bodies."""
     found: list[Drawable] = []
     bare = kind == "visual" and not any(body.visuals for body in model.bodies.values())
     for number, (frame, body) in enumerate(model.bodies.items()):

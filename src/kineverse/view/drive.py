@@ -17,20 +17,7 @@ LONGEST_STEP = 0.2
 
 
 class VelocityDrive:
-    """Speeds of coordinates with rates: wheels, drives, angular velocities.
-
-    Parameters
-    ----------
-    model
-        The model.
-
-    Attributes
-    ----------
-    speeds
-        The present speeds, by name [m/s], [rad/s].
-    limits
-        The limits of the speeds, by name, finite.
-    """
+    """Speeds of coordinates with rates: wheels, drives, angular velocities."""
 
     def __init__(self, model: ModelView) -> None:
         self._model = model

@@ -17,19 +17,7 @@ class Html(str):
 
 
 def element(tag: str, *content: str, style: str = "", **attributes: object) -> Html:
-    """Return an HTML element; its content is escaped, unless it is :class:`Html`.
-
-    Parameters
-    ----------
-    tag
-        Its name, such as ``div``.
-    content
-        Its content, in this order.
-    style
-        Its CSS.
-    attributes
-        Others, an underscore at the end of a name dropped (``class_``), those inside hyphens.
-    """
+    """Return an HTML element; its content is escaped, unless it is :class:`Html`."""
     named = {name.rstrip("_").replace("_", "-"): value for name, value in attributes.items()}
     shown = {**({"style": style} if style else {}), **named}
     opened = "".join(f' {name}="{html.escape(str(value))}"' for name, value in shown.items())
@@ -43,15 +31,7 @@ def join_html(*content: str) -> Html:
 
 
 class HtmlBox:
-    """Exchangeable HTML on a page.
-
-    Parameters
-    ----------
-    gui
-        The gui of a viser server.
-    content
-        The initial content.
-    """
+    """Exchangeable HTML on a page."""
 
     def __init__(self, gui: Any, content: Html) -> None:
         self._handle = gui.add_html(str(content))

@@ -24,20 +24,6 @@ class LiveRun:
     It draws at most thirty times a second, and waits for the clock so that a world that is faster than real
     time can be watched. If the steps have a ``reference`` and a ``command``, as those of a
     :class:`kineverse.manipulation.session.Session`, the way of the hand and the active constraints are shown.
-
-    Parameters
-    ----------
-    page
-        Page of the world's model.
-    speed
-        Time of the world per time of the clock, at most; 0 not to wait.
-    hand
-        Frame of the hand, whose commanded velocity is drawn as an arrow; None for no arrow.
-
-    Attributes
-    ----------
-    captions
-        Lines of text above the others.
     """
 
     def __init__(self, page: Viewer, speed: float = 1.0, hand: str | None = None) -> None:

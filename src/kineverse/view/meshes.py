@@ -42,11 +42,6 @@ def load_mesh(mesh: Mesh) -> LoadedMesh:
 
     Files of equal content are parsed once, under any name. A mesh that cannot be loaded becomes a
     placeholder; the reason is logged once a file and kept in ``problem``.
-
-    Parameters
-    ----------
-    mesh
-        The reference: uri, scale along x, y, z, and the folder from which a relative uri is resolved.
     """
     key = mesh, mesh.root
     if key not in _by_reference:

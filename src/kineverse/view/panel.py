@@ -37,35 +37,7 @@ STYLE = """
 
 
 class Panel:
-    """Controls of one model.
-
-    Parameters
-    ----------
-    gui
-        The gui of a viser server.
-    scene
-        The scene that is switched on and off.
-    proximity
-        The proximity panel, which adds a folder of its own.
-    ranges
-        The limits of the degrees of freedom.
-    quaternions
-        The quaternions among them, which have sliders for three angles instead.
-    drive
-        The speeds that have sliders.
-    units
-        Their units, by name.
-    values
-        Their initial values, by name.
-    on_move
-        Called with the name and value of a slider that a user moved.
-    on_drive
-        Called with the name and value of a speed that a user set.
-    on_reset, on_play
-        Called when a user asks for the initial state, or starts (True) and stops (False) the animation.
-    degrees
-        True to show angles in degrees at first; users can switch that.
-    """
+    """Controls of one model."""
 
     def __init__(
         self,
@@ -120,15 +92,7 @@ class Panel:
         self._status.show(status)
 
     def update(self, values: Mapping[str, float], set_by_program: Iterable[str] = ()) -> None:
-        """Set the ranges of all sliders for a state, and the values of some of them.
-
-        Parameters
-        ----------
-        values
-            The values of all symbols, by name [m], [rad].
-        set_by_program
-            The names of the values that were set by a program, not by their slider.
-        """
+        """Set the ranges of all sliders for a state, and the values of some of them."""
         with self._changing:
             self._update({**values, **self._quaternions.angles}, values, set_by_program)
 

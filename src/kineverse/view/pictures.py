@@ -36,30 +36,13 @@ from kineverse.view.triangle_mesh import Floats, Integers, Singles, dot_rows
 
 
 def write_png(path: str | Path, pixels: npt.NDArray[np.uint8]) -> None:
-    """Write an image of (height, width, 3) or (height, width, 4) bytes to a PNG file.
-
-    Raises
-    ------
-    ShapeError
-        If the array is not an image of 8 bits a channel.
-    FormatError
-        If the name has the suffix of another format, see :func:`check_png_name`; if the file cannot be
-        written, which leaves an old one as it is.
-    """
+    """Write an image of (height, width, 3) or (height, width, 4) bytes to a PNG file."""
     check_png_name(path)
     replace_file(Path(path), encode_png(pixels))
 
 
 def check_png_name(path: str | Path) -> None:
-    """Check that the name of a file ends in .png, or has no suffix, and that its folder exists.
-
-    Raises
-    ------
-    FormatError
-        If it has another suffix.
-    FileNotFoundError
-        If there is no such folder.
-    """
+    """Check that the name of a file ends in .png, or has no suffix, and that its folder exists."""
     suffix = Path(path).suffix
     if suffix.lower() not in ("", ".png"):
         raise FormatError(f"Pictures are written as .png, not {suffix}: '{Path(path).with_suffix('.png')}'.")
@@ -174,21 +157,7 @@ def draw_picture(
     camera: Camera,
     over: Sequence[Drawable] = (),
 ) -> npt.NDArray[np.uint8]:
-    """Return a picture of any parts as (height, width, 3) bytes.
-
-    Parameters
-    ----------
-    items
-        The parts, on a floor.
-    poses
-        The poses of the frames of all parts, 4×4.
-    size
-        Width and height in pixels.
-    camera
-        The camera.
-    over
-        Parts that are drawn over the others, even if they are behind them.
-    """
+    """Return a picture of any parts as (height, width, 3) bytes."""
     scene, overlay = (TriangleSoup.from_drawables(parts, poses) for parts in (items, over))
     return _draw(scene, overlay, size, camera)
 
@@ -203,13 +172,7 @@ def _draw(
 
 
 def join_pictures(rows: Sequence[Sequence[npt.NDArray[np.uint8]]], gap: int = 4) -> npt.NDArray[np.uint8]:
-    """Return rows of pictures of one size as one, with white gaps [pixels] between them.
-
-    Raises
-    ------
-    ShapeError
-        If the pictures are not of one size, or there is none.
-    """
+    """Return rows of pictures of one size as one, with white gaps [pixels] between them."""
     shapes = {image.shape for row in rows for image in row}
     if len(shapes) != 1:
         raise ShapeError(f"pictures of one size can be joined, not of {sorted(shapes)}")

@@ -30,30 +30,7 @@ class PlaybackLayer(Protocol):
 
 
 class TrajectoryPlayback:
-    """Trajectory that is played, and its controls on the page.
-
-    Parameters
-    ----------
-    gui
-        The gui of a viser server.
-    trajectory
-        The trajectory.
-    speed
-        Time of the trajectory per time of the clock, positive.
-    loop
-        True to begin again at the end.
-    on_seek
-        Called with a time of the trajectory [s] that a user chose.
-    on_run
-        Called with True or False when a user starts or stops the playback.
-    layer
-        Further things to show with the trajectory, see :meth:`draw`.
-
-    Raises
-    ------
-    InvalidValueError
-        For a speed that is not positive, or a loop that is no truth value.
-    """
+    """Trajectory that is played, and its controls on the page."""
 
     def __init__(
         self,

@@ -40,29 +40,13 @@ SIGMAS = 2.0
 
 @dataclass(frozen=True)
 class Figure:
-    """Picture that is drawn on demand.
+    """Picture that is drawn on demand."""
 
-    Attributes
-    ----------
-    draw
-        Function that draws on an empty matplotlib figure.
-    size
-        Width and height [inch].
-    """
-
-    draw: Callable[[Canvas], None]
-    size: tuple[float, float]
+    draw: Callable[[Canvas], None]  # function that draws on an empty matplotlib figure
+    size: tuple[float, float]  # width and height [inch]
 
     def save(self, path: str | Path) -> None:
-        """Write the picture to a file, in the format of its suffix.
-
-        Raises
-        ------
-        MissingDependencyError
-            If matplotlib is not installed.
-        FormatError
-            If the file cannot be written, or its suffix is unknown.
-        """
+        """Write the picture to a file, in the format of its suffix."""
         # Not with pyplot, which would search for a display and keep a reference to the figure.
         try:
             figure = importlib.import_module("matplotlib.figure")
@@ -80,22 +64,12 @@ class Figure:
 
 @dataclass(frozen=True, eq=False)
 class FitProjection:
-    """Fit in the axes of a picture: u to the right, v upwards, w towards the viewer; w is the joint's axis.
-
-    Attributes
-    ----------
-    fit
-        The fit.
-    origin, axes
-        The origin in the parent, (3,), and u, v, w as columns, (3, 3).
-    observed, fitted, path
-        Positions of the child in these axes: observed and fitted (N, 3), and evenly along the joint (M, 3).
-    """
+    """Fit in the axes of a picture: u to the right, v upwards, w towards the viewer; w is the joint's axis."""
 
     fit: Fit
-    origin: Array
+    origin: Array  # origin in the parent, (3,), and u, v, w as columns, (3, 3)
     axes: Array
-    observed: Array
+    observed: Array  # (N, 3), (M, 3)
     fitted: Array
     path: Array
 
@@ -143,19 +117,7 @@ def axis_covariances(fit: Fit, heights: Array) -> Array:
 
 
 def draw_fit(canvas: Canvas, fit: Fit, relative: Array, title: str) -> None:
-    """Draw observations and a fit: along the axis, from its side, and over the observations.
-
-    Parameters
-    ----------
-    canvas
-        An empty figure.
-    fit
-        A fit of :func:`kineverse.estimation.identify`.
-    relative
-        Its observations: poses (N, 4, 4) or positions (N, 3) of the child in the parent [m].
-    title
-        The title of the picture. Outliers are ringed.
-    """
+    """Draw observations and a fit: along the axis, from its side, and over the observations."""
     projection = FitProjection.from_fit(fit, relative)
     parts = canvas.subplot_mosaic(
         [["along", "side", "values"], ["along", "side", "left"]], width_ratios=[3, 3, 2]

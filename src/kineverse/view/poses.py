@@ -35,24 +35,7 @@ def roll_pitch_yaw(matrix: npt.ArrayLike) -> Floats:
 
 
 class FramePoses:
-    """Poses of frames in the world, as a compiled function of the values of symbols.
-
-    Parameters
-    ----------
-    model
-        The model.
-    names
-        The frames, in this order; all of the model, the world first, if None.
-
-    Attributes
-    ----------
-    names
-        The frames, in the order of the results of :meth:`evaluate`.
-    moving
-        The compiled frames, in the order of the results of :meth:`batch`: all but the world.
-    inputs
-        The names of the symbols that the poses depend on.
-    """
+    """Poses of frames in the world, as a compiled function of the values of symbols."""
 
     def __init__(self, model: ModelView, names: Iterable[str] | None = None) -> None:
         everything = (WORLD, *(name for name in model.frames if name != WORLD))
@@ -88,21 +71,7 @@ class FramePoses:
 
 
 def complete(model: ModelView, state: StateLike | None = None) -> dict[str, float]:
-    """Return values of all symbols by name: the given ones, and the default state for the others.
-
-    Parameters
-    ----------
-    model
-        The model.
-    state
-        Values by symbol or name; a :class:`kineverse.State` may have more symbols than the model, a mapping
-        of names may not.
-
-    Raises
-    ------
-    UnknownNameError
-        For a name that the model does not have.
-    """
+    """Return values of all symbols by name: the given ones, and the default state for the others."""
     values = {str(symbol): float(value) for symbol, value in model.default_state().items()}
     known = values.keys() | {str(symbol) for symbol in model.symbols}
     given = set[str]()

@@ -32,52 +32,19 @@ MOST_PAIRS = 40
 
 @dataclass(frozen=True, slots=True)
 class ProximityResult:
-    """Nearest pairs of bodies at a state.
+    """Nearest pairs of bodies at a state."""
 
-    Attributes
-    ----------
-    radius
-        The distance within which pairs were searched [m].
-    pairs
-        The nearest pairs, nearest first, at most :data:`MOST_PAIRS` of them.
-    found, touching
-        The number of pairs within the radius, and of those that touch or penetrate.
-    ignored
-        Pairs within the radius that are excluded from checking although they can move with respect to each
-        other, with the reason, nearest first; at most :data:`MOST_PAIRS`.
-    checked_pairs, unchecked_pairs
-        The numbers of pairs of bodies that are checked, and that are excluded.
-    """
-
-    radius: float
-    pairs: Sequence[DistanceResult] = ()
-    found: int = 0
-    touching: int = 0
+    radius: float  # distance within which pairs were searched [m]
+    pairs: Sequence[DistanceResult] = ()  # nearest pairs, nearest first, at most MOST_PAIRS of them
+    found: int = 0  # number of pairs within the radius
+    touching: int = 0  # of those that touch or penetrate
     ignored: Sequence[tuple[DistanceResult, str]] = field(default=())
-    checked_pairs: int = 0
-    unchecked_pairs: int = 0
+    checked_pairs: int = 0  # numbers of pairs of bodies that are checked
+    unchecked_pairs: int = 0  # that are excluded
 
 
 class ProximityQuery:
-    """Distance queries in a model, for one thread; unusable shapes are excluded.
-
-    Parameters
-    ----------
-    model
-        The model; after an edit :meth:`refresh` has to be called.
-    decomposed
-        True to take meshes as the hulls of their decomposition, as far as there is one.
-
-    Attributes
-    ----------
-    problems
-        The reasons for which bodies, or shapes of bodies, are excluded, by their label.
-
-    Raises
-    ------
-    MissingDependencyError
-        If the extra ``geometry`` is not installed.
-    """
+    """Distance queries in a model, for one thread; unusable shapes are excluded."""
 
     def __init__(self, model: ModelView, decomposed: bool = False) -> None:
         self._model = model
@@ -110,24 +77,7 @@ class ProximityQuery:
         containing: str = "",
         ignored: bool = False,
     ) -> ProximityResult:
-        """Return the nearest pairs at values of all symbols, by name.
-
-        Parameters
-        ----------
-        values
-            [m], [rad].
-        radius
-            The distance within which to search [m].
-        containing
-            Only pairs of which a name contains this, in any case.
-        ignored
-            True to search among excluded pairs as well.
-
-        Raises
-        ------
-        KineverseError
-            If there are no distances at these values, as where a pose is not finite.
-        """
+        """Return the nearest pairs at values of all symbols, by name."""
         # A state, because the values may include symbols that the scene does not have.
         self._scene.update(State(values))
         found = _filter_by_name(self._scene.pairs_within(radius), containing)
@@ -170,24 +120,12 @@ BALL, LINE, SHAFT, HEAD, TIP = 0.1, 0.05, 0.05, 0.12, 0.35
 
 @dataclass(frozen=True, slots=True, eq=False)
 class ProximityMarkers:
-    """Lines and arrows at nearest points.
+    """Lines and arrows at nearest points."""
 
-    Attributes
-    ----------
-    lines
-        (N, 2, 3) from a to b, of all pairs [m]; between separate bodies along the normal.
-    colors
-        (N, 3) red, green, blue in [0, 1].
-    arrows
-        (M, 2, 3) along the normal, from the point of a that is deepest in b, of the pairs that touch [m].
-    depths
-        M texts: the penetration depths of these.
-    """
-
-    lines: Floats
-    colors: Floats
-    arrows: Floats
-    depths: tuple[str, ...]
+    lines: Floats  # (N, 2, 3) from a to b, of all pairs [m]; between separate bodies along the normal
+    colors: Floats  # (N, 3) red, green, blue in [0, 1]
+    arrows: Floats  # (M, 2, 3), [m]
+    depths: tuple[str, ...]  # M texts: the penetration depths of these
 
     @staticmethod
     def from_result(found: ProximityResult, length: float) -> ProximityMarkers:
@@ -295,17 +233,7 @@ class ProximityStatus:
 
 
 class ProximityWorker:
-    """Background thread that evaluates proximity queries at the newest values.
-
-    Parameters
-    ----------
-    model
-        The model.
-    values
-        The initial values of all symbols, by name [m], [rad].
-    show
-        Called by the thread with each status; with an empty one while requests are disabled.
-    """
+    """Background thread that evaluates proximity queries at the newest values."""
 
     def __init__(
         self, model: ModelView, values: Mapping[str, float], show: Callable[[ProximityStatus], None]

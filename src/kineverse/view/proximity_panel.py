@@ -123,17 +123,7 @@ WAITING = wrap_report(element("b", "Reading shapes …"))
 
 
 class ProximityPanel:
-    """Contacts and nearest pairs of bodies on the page, with their controls.
-
-    Parameters
-    ----------
-    server
-        A viser server.
-    scene
-        The scene in which the markers are drawn.
-    model, values
-        The model, and the initial values of all symbols, by name [m], [rad].
-    """
+    """Contacts and nearest pairs of bodies on the page, with their controls."""
 
     def __init__(
         self, server: Any, scene: ViewerScene, model: ModelView, values: Mapping[str, float]
@@ -163,24 +153,7 @@ class ProximityPanel:
     def show_near(
         self, radius: float | None = RADIUS, *, containing: str = "", ignored: bool = False
     ) -> None:
-        """Show nearest pairs of bodies, as the controls do.
-
-        Parameters
-        ----------
-        radius
-            The distance within which pairs are shown [m]; None to show nothing.
-        containing
-            Only pairs of which a name contains this.
-        ignored
-            Also pairs that are joined by an articulation, or excluded by rules.
-
-        Raises
-        ------
-        InvalidValueError
-            If the radius is negative or NaN.
-        MissingDependencyError
-            If the extra ``geometry`` is not installed.
-        """
+        """Show nearest pairs of bodies, as the controls do."""
         if radius is None:
             self._apply(replace(self.worker.request, enabled=False))
             return
@@ -201,11 +174,6 @@ class ProximityPanel:
         """Take meshes as the hulls of ``kineverse decompose``, for shapes and distances.
 
         Meshes that were not decomposed stay one hull; the log names them.
-
-        Raises
-        ------
-        MissingDependencyError
-            If the extra ``geometry`` is not installed.
         """
         import_coal()
         self._apply(replace(self.worker.request, decomposed=shown))

@@ -79,25 +79,7 @@ def rasterize(
     opacity: Floats | None = None,
     near: float = 0.01,
 ) -> tuple[Integers, npt.NDArray[np.float32]]:
-    """Return the visible triangle of each pixel and its nearness.
-
-    Parameters
-    ----------
-    projection
-        From the world to pixels.
-    corners
-        (T, 3, 3) corners of the triangles in the world [m], in single or double precision.
-    one_sided
-        (T,) True for triangles that are visible only if their corners run counter-clockwise.
-    opacity
-        (T,) in [0, 1]: a triangle covers this part of its pixels, in a fine regular pattern.
-    near
-        Distance of the near plane, in front of which all is cut away [m].
-
-    Returns
-    -------
-    (height·width,) index of the triangle or -1, and (height·width,) nearness, -inf where there is none.
-    """
+    """Return the visible triangle of each pixel and its nearness."""
     local, owner = projection.to_camera(corners), np.arange(len(corners))
     if not projection.parallel:
         local, owner = _clip(local, owner, near)

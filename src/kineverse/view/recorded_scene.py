@@ -12,22 +12,7 @@ from kineverse.worlds import RunRecording
 
 
 class RecordedScene:
-    """Contents of a recorded run at a time.
-
-    Parameters
-    ----------
-    recording
-        The run.
-
-    Attributes
-    ----------
-    recording
-        The run.
-    trajectory
-        Its true states as a trajectory with the same times; None without any.
-    drawing
-        Drawing of its model.
-    """
+    """Contents of a recorded run at a time."""
 
     def __init__(self, recording: RunRecording) -> None:
         self.recording = recording

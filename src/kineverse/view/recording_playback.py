@@ -19,26 +19,7 @@ def play_recording(
     speed: float = 1.0,
     loop: bool = False,
 ) -> None:
-    """Play a recorded run on a page of its model, with a slider for the time.
-
-    Parameters
-    ----------
-    page
-        Page of ``recording.model``.
-    recording
-        The run.
-    time
-        Time to show, without playing [s]; None to play from the beginning.
-    speed
-        Time of the recording per time of the clock.
-    loop
-        True to play it again and again.
-
-    Raises
-    ------
-    InvalidValueError
-        If no state was recorded.
-    """
+    """Play a recorded run on a page of its model, with a slider for the time."""
     scene = RecordedScene(recording)
     if scene.trajectory is None:
         raise InvalidValueError(f"There is no state in {recording.path.name} to be played.")
@@ -46,15 +27,7 @@ def play_recording(
 
 
 class RecordingLayer:
-    """Layer of a recorded run, by time.
-
-    Parameters
-    ----------
-    server
-        A viser server.
-    scene
-        Contents of the run.
-    """
+    """Layer of a recorded run, by time."""
 
     def __init__(self, server: Any, scene: RecordedScene) -> None:
         self._scene, self._layer = scene, RunLayer(server, scene.drawing, "recording")

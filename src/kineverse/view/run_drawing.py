@@ -50,42 +50,17 @@ Vectors = Mapping[str, tuple[npt.ArrayLike, npt.ArrayLike]]
 
 @dataclass(frozen=True, slots=True, eq=False)
 class RunMoment:
-    """Things to draw of a run at one time.
+    """Things to draw of a run at one time."""
 
-    Attributes
-    ----------
-    ghosts
-        Believed world poses (4, 4) of those bodies that are elsewhere in truth, by frame.
-    arrows
-        Ends (2, 3) of arrows in the world [m], by name.
-    lines
-        Lines of text.
-    way
-        Points (k, 3) of the way ahead of the hand [m]; None without a way.
-    wanted
-        Pose (4, 4) at which the hand is wanted now [m].
-    """
-
-    ghosts: Mapping[str, Floats]
-    arrows: Mapping[str, Floats]
-    lines: Sequence[str] = ()
-    way: Floats | None = None
-    wanted: Floats | None = None
+    ghosts: Mapping[str, Floats]  # (4, 4)
+    arrows: Mapping[str, Floats]  # ends (2, 3) of arrows in the world [m], by name
+    lines: Sequence[str] = ()  # lines of text
+    way: Floats | None = None  # points (k, 3) of the way ahead of the hand [m]; None without a way
+    wanted: Floats | None = None  # pose (4, 4) at which the hand is wanted now [m]
 
 
 class RunDrawing:
-    """Drawing of runs of a model.
-
-    Parameters
-    ----------
-    model
-        Model of the world.
-
-    Attributes
-    ----------
-    parts
-        Visual shapes of the bodies that move.
-    """
+    """Drawing of runs of a model."""
 
     def __init__(self, model: ModelView) -> None:
         self._model = model
@@ -101,15 +76,7 @@ class RunDrawing:
     def find_ghosts(
         self, truth: StateLike, belief: StateLike, poses: Mapping[str, Floats] | None = None
     ) -> dict[str, Floats]:
-        """Return the believed world poses (4, 4) of those bodies that are elsewhere in truth, by frame.
-
-        Parameters
-        ----------
-        truth, belief
-            True and believed state.
-        poses
-            Believed world poses of frames that the believed values do not give.
-        """
+        """Return the believed world poses (4, 4) of those bodies that are elsewhere in truth, by frame."""
         values = self.values(truth)
         named = {str(symbol): float(value) for symbol, value in belief.items()}
         true_poses = self._kinematics.evaluate(values)

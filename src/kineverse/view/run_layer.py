@@ -19,17 +19,7 @@ _CELL = "text-align:left;padding:1px 9px 1px 0;vertical-align:top;white-space:no
 
 
 class RunLayer:
-    """Ghost, arrows, way, text and table of a run on the page.
-
-    Parameters
-    ----------
-    server
-        A viser server.
-    drawing
-        Drawing of the model of the page.
-    title
-        Title of the folder with the text.
-    """
+    """Ghost, arrows, way, text and table of a run on the page."""
 
     def __init__(self, server: Any, drawing: RunDrawing, title: str) -> None:
         self._server, self._drawing = server, drawing

@@ -32,30 +32,7 @@ FADED_OPACITY = 0.45
 
 
 class ViewerScene:
-    """Scene of a model on the page; an update sends only poses that changed.
-
-    Parameters
-    ----------
-    server
-        A viser server.
-    model
-        The model to show.
-    values
-        The initial values of all symbols, by name [m], [rad].
-    camera
-        The initial camera; None for one that shows as much as possible of the moving parts.
-
-    Attributes
-    ----------
-    poses
-        (N, 4, 4): the poses of the frames :attr:`names` that were drawn last.
-    problems
-        The meshes that could not be loaded, one line each.
-    length
-        A length for the size of the scene, for axes and arrows [m].
-    unplaced
-        The frames whose pose is not finite at the present values; the bodies attached to them are hidden.
-    """
+    """Scene of a model on the page; an update sends only poses that changed."""
 
     def __init__(
         self, server: Any, model: ModelView, values: Mapping[str, float], camera: Camera | None = None

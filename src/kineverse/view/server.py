@@ -30,31 +30,7 @@ _TITLE = b"<title>Viser</title>"
 
 
 def start(port: int | None = None, label: str = "", host: str = HOST) -> Any:
-    """Start a viser server that answers requests of its own page only.
-
-    Parameters
-    ----------
-    port
-        The port, 0 for any free one; None for 8080, or any free one if that is taken.
-    label
-        The title of the page.
-    host
-        The address to listen on. Unless it is this computer's own (127.0.0.1, localhost, ::1), the address of
-        the page includes a random token, and requests without it are refused.
-
-    Returns
-    -------
-    A :class:`viser.ViserServer`, whose attribute ``address`` is the address of the page.
-
-    Raises
-    ------
-    MissingDependencyError
-        If viser is not installed.
-    InvalidValueError
-        If the given port is taken or not a port, or if the host is not one of this computer.
-    KineverseError
-        If requests to this version of viser cannot be checked.
-    """
+    """Start a viser server that answers requests of its own page only."""
     try:
         import viser
         from viser import infra

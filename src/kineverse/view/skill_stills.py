@@ -42,13 +42,6 @@ class SkillStills:
     """Stills of a robot that opens and closes objects.
 
     A thread draws them while the robot goes on with the next object; its errors are raised by :meth:`draw`.
-
-    Parameters
-    ----------
-    model
-        Model of the world.
-    robot
-        Prefix of the robot.
     """
 
     def __init__(self, model: ModelView, robot: str) -> None:

@@ -33,11 +33,6 @@ class Ranges:
 
     Numeric limits are evaluated once. Limits that are expressions (a drawer that opens only as far as the
     door beside it) are evaluated at each state.
-
-    Attributes
-    ----------
-    names
-        The degrees of freedom, in the order of the model.
     """
 
     def __init__(self, model: ModelView) -> None:
@@ -93,19 +88,7 @@ class Ranges:
 def choose_slider_range(
     limits: tuple[float, float], value: float, unit: str, beyond: float = 0.0
 ) -> tuple[float, float]:
-    """Return the range of a slider.
-
-    Parameters
-    ----------
-    limits
-        Lower and upper limit, possibly infinite.
-    value
-        The current value, which is always inside of the range.
-    unit
-        ``"rad"``, ``"m"`` or ``""``, which decides the range where there is no limit.
-    beyond
-        The fraction of the range by which it is widened at either end.
-    """
+    """Return the range of a slider."""
     reach = UNLIMITED_RANGE.get(unit, 2.0)
     lower, upper = limits
     if not np.isfinite(lower):
@@ -140,17 +123,7 @@ PROBE_DISTANCES = (0.0, 1.0, -1.0, 0.1, -0.1)
 
 
 def infer_units(model: ModelView, values: Mapping[str, float], names: Iterable[str]) -> dict[str, str]:
-    """Return ``"rad"``, ``"m"`` or ``""`` for each of the named symbols.
-
-    Parameters
-    ----------
-    model
-        The model, whose transforms from parent to child are probed.
-    values
-        Values of all symbols near which to probe, by name [rad], [m].
-    names
-        The symbols.
-    """
+    """Return ``"rad"``, ``"m"`` or ``""`` for each of the named symbols."""
     wanted = list(names)
     # In terms of free coordinates: the angles of a closed loop follow its crank.
     moving = [t for frame in model.frames.values() if (t := model.rates.carry(frame.transform)).symbols]
@@ -217,19 +190,6 @@ class QuaternionAngles:
 
     A quaternion is four coordinates ``name/qx`` to ``name/qw`` that are moved by the same three speeds. Its
     angles are ``name/roll``, ``name/pitch`` and ``name/yaw`` [rad].
-
-    Parameters
-    ----------
-    model
-        The model.
-    values
-        The values of its symbols, by name.
-
-    Attributes
-    ----------
-    angles
-        The present angles, by name [rad]. At a singularity, where two of them rotate about the same axis,
-        they may differ from those of the quaternion: a slider keeps its value.
     """
 
     def __init__(self, model: ModelView, values: Mapping[str, float]) -> None:

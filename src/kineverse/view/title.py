@@ -41,13 +41,7 @@ def choose_title(model: ModelView) -> str:
 
 
 def read_title(source: str) -> str:
-    """Return the name of a model that its file declares, or the name of the file.
-
-    Parameters
-    ----------
-    source
-        The path of a file, or the name of a shipped model, as :func:`kineverse.load` takes it.
-    """
+    """Return the name of a model that its file declares, or the name of the file."""
     plain = os.path.basename(source.rstrip("/"))
     try:
         found = locate_model(source)

@@ -23,26 +23,13 @@ class TriangleMesh:
 
     A vertex is repeated where the surface has a crease, so that ``normals`` are smooth inside a patch and
     sharp at its border.
-
-    Attributes
-    ----------
-    vertices
-        (V, 3) positions in the frame of the surface [m].
-    faces
-        (F, 3) indices into the vertices.
-    normals
-        (V, 3) unit normals.
-    colors
-        (F, 4) red, green, blue, alpha in [0, 1] if the surface has its own colours, else None.
-    closed
-        True if the inside is never visible, so that back faces need not be drawn.
     """
 
-    vertices: Floats
-    faces: Integers
-    normals: Floats
-    colors: Floats | None = None
-    closed: bool = False
+    vertices: Floats  # (V, 3) positions in the frame of the surface [m]
+    faces: Integers  # (F, 3) indices into the vertices
+    normals: Floats  # (V, 3) unit normals
+    colors: Floats | None = None  # (F, 4)
+    closed: bool = False  # True if the inside is never visible, so that back faces need not be drawn
 
     @property
     def bounds(self) -> Floats:
@@ -112,19 +99,6 @@ def build_creased_mesh(
     vertices: npt.ArrayLike, faces: npt.ArrayLike, angle: float = 0.6
 ) -> tuple[TriangleMesh, Integers]:
     """Return a surface whose vertices are split along the sharp edges between faces.
-
-    Parameters
-    ----------
-    vertices
-        (V, 3) positions; equal ones are taken as the same corner.
-    faces
-        (F, 3) indices; faces without area are dropped.
-    angle
-        Faces that meet at a larger angle than this keep normals of their own [rad].
-
-    Returns
-    -------
-    The surface, and the indices of its faces among the given ones.
 
     Notes
     -----

@@ -46,38 +46,6 @@ class Viewer:
     """Web page that shows a model, with sliders.
 
     The page is up when the constructor returns. Use it as a context, or call :meth:`stop`.
-
-    Parameters
-    ----------
-    model
-        The model to show.
-    state
-        Values by symbol or name [m], [rad]; the default state for the others.
-    port
-        The port, 0 for any free one; None for 8080 or any free one.
-    label
-        The title of the page; None for the names in front of all frames.
-    camera
-        The initial camera; None for one that shows all of the model.
-    host
-        The address to listen on. Unless it is this computer's own, :attr:`address` includes a token, and
-        requests without it are refused.
-    degrees
-        True to show angles in degrees at first.
-
-    Attributes
-    ----------
-    collisions
-        Contacts and nearest pairs of bodies.
-
-    Raises
-    ------
-    MissingDependencyError
-        If viser is not installed.
-    UnknownNameError
-        If the state has a name that the model does not have.
-    InvalidValueError
-        If the model is none, the port is taken or no port, or the host is not one of this computer.
     """
 
     def __init__(
@@ -160,13 +128,7 @@ class Viewer:
         self._scene.show_overlay(items)
 
     def move(self, values: StateLike) -> None:
-        """Set the values of some symbols, by symbol or name, as their sliders do.
-
-        Raises
-        ------
-        UnknownNameError
-            If the model has no such symbol; nothing has moved then.
-        """
+        """Set the values of some symbols, by symbol or name, as their sliders do."""
         # The model may have been edited since. The lock is not held meanwhile, because the thread that edits
         # may wait for it.
         model = _freeze(self.model)
@@ -182,11 +144,6 @@ class Viewer:
         """Move the model at speeds, by symbol or name, until they are 0 or violate a constraint.
 
         These are the speeds of coordinates with rates, such as wheel speeds.
-
-        Raises
-        ------
-        UnknownNameError
-            For other speeds; nothing has changed then.
         """
         with self._change:
             for name in map(str, speeds):
@@ -216,29 +173,7 @@ class Viewer:
         layer: PlaybackLayer | None = None,
         at: float | None = None,
     ) -> None:
-        """Start or stop an animation.
-
-        Parameters
-        ----------
-        motion
-            A trajectory, which gets a slider for its time on the page; True for all degrees of freedom
-            through their ranges, False to stop.
-        speed
-            Time of the trajectory per time of the clock.
-        loop
-            True to play the trajectory again and again; else it stops at its end.
-        layer
-            Further things to show with a trajectory.
-        at
-            Time of the trajectory to show, without playing [s]; None to play from the beginning.
-
-        Raises
-        ------
-        UnknownNameError
-            If the model does not have a coordinate of the trajectory; nothing has changed then.
-        InvalidValueError
-            For a speed that is not positive.
-        """
+        """Start or stop an animation."""
         if isinstance(motion, Trajectory):
             complete(_freeze(self.model), dict(motion.at(0.0)))  # raises for unknown names
             playback = TrajectoryPlayback(
@@ -303,13 +238,7 @@ class Viewer:
         return drawn and self.collisions.worker.wait_until_idle(timeout - (time.monotonic() - begin))
 
     def wait(self) -> None:
-        """Keep the page up until :meth:`stop` or Ctrl-C; closing it in the browser changes nothing.
-
-        Raises
-        ------
-        KineverseError
-            If the page has been taken down.
-        """
+        """Keep the page up until :meth:`stop` or Ctrl-C; closing it in the browser changes nothing."""
         if self._stopping:
             raise KineverseError(web.TAKEN_DOWN)
         # After an interrupted join the thread counts as finished (Python 3.11), and a wait without a limit

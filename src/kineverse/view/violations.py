@@ -14,15 +14,7 @@ _RED, _LIGHT_RED = "#c92a2a", "#fff5f5"
 
 
 def format_violations(violations: Iterable[Any], unchecked: Iterable[Any] = ()) -> Html:
-    """Return HTML: each violated constraint with its value, bounds and excess, or that there is none.
-
-    Parameters
-    ----------
-    violations
-        Result of :meth:`kineverse.Model.violations`: name, value, lower, upper, excess.
-    unchecked
-        Names of constraints on speeds, which a posture does not determine.
-    """
+    """Return HTML: each violated constraint with its value, bounds and excess, or that there is none."""
     found = sorted(violations, key=lambda v: -abs(v.excess))
     rest = len(list(unchecked))
     aside = [element("span", f" · {rest} on speeds not checked", style="color:#868e96")] if rest else []

@@ -30,42 +30,16 @@ Flags = npt.NDArray[np.bool_]
 
 
 class FurnitureGaps(NamedTuple):
-    """Gaps of pairs of shapes of furniture that meet.
+    """Gaps of pairs of shapes of furniture that meet."""
 
-    Attributes
-    ----------
-    distances
-        (K,) ways to where the shapes stop [m].
-    rows
-        (K, n) derivatives by the displacement of objects.
-    jammed
-        (K,) flags of contacts that move nothing.
-    moved
-        (n,) flags of coordinates that move, those that are pushed along included.
-    """
-
-    distances: Array
-    rows: Array
-    jammed: Flags
-    moved: Flags
+    distances: Array  # (K,) ways to where the shapes stop [m]
+    rows: Array  # (K, n) derivatives by the displacement of objects
+    jammed: Flags  # (K,) flags of contacts that move nothing
+    moved: Flags  # (n,) flags of coordinates that move, those that are pushed along included
 
 
 class FurnitureContacts:
-    """Search of the gaps of furniture that moves.
-
-    Parameters
-    ----------
-    overlaps
-        Overlaps that are allowed.
-    speeds
-        Speeds of the objects (n,).
-    group
-        (B,) indices of twists by body.
-    twists
-        Function that returns the spatial twists of groups of bodies (G, 6, n or more) at the present place.
-    link
-        Function that adds the coordinates that limits connect to flagged ones.
-    """
+    """Search of the gaps of furniture that moves."""
 
     def __init__(
         self,
@@ -85,15 +59,7 @@ class FurnitureContacts:
         self._met.clear()
 
     def measure(self, driven: Flags, moved: Flags) -> FurnitureGaps:
-        """Return the gaps of what moves, and of what it pushes, to all that it has met in this motion.
-
-        Parameters
-        ----------
-        driven
-            (n,) flags of coordinates that the robot moves.
-        moved
-            (n,) flags of these, and of all others that move.
-        """
+        """Return the gaps of what moves, and of what it pushes, to all that it has met in this motion."""
         n, moved = len(self._speeds), self._link(moved)
         while True:
             pairs = self._query(moved)(_REACH)

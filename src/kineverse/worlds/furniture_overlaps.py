@@ -69,18 +69,6 @@ class FurnitureOverlaps:
     """Overlaps of furniture in a scene, beside those that were there at the start.
 
     The start is the default state until :meth:`begin` is called.
-
-    Parameters
-    ----------
-    scene
-        Collision scene of the model. The constructor leaves it at the default state.
-    robot
-        Prefix of the robot, which is no furniture; none if empty.
-
-    Attributes
-    ----------
-    counting
-        (B, B) flags of pairs of bodies of which some depth counts: the others overlap as they like.
     """
 
     def __init__(self, scene: Scene, robot: str) -> None:

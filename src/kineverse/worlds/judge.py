@@ -51,25 +51,13 @@ _TOUCHING = 1e-6
 
 
 class JudgedOverlap(NamedTuple):
-    """Overlap that came in a run.
+    """Overlap that came in a run."""
 
-    Attributes
-    ----------
-    a, b
-        The bodies.
-    depth
-        Largest depth [m].
-    value
-        Value of the judged coordinate at which it came [m], [rad]; NaN without a coordinate.
-    time
-        Stamp of the state in which it came [s].
-    """
-
-    a: str
+    a: str  # bodies
     b: str
-    depth: float
-    value: float
-    time: float
+    depth: float  # largest depth [m]
+    value: float  # value of the judged coordinate at which it came [m], [rad]; NaN without a coordinate
+    time: float  # stamp of the state in which it came [s]
 
     def __str__(self) -> str:
         where = "" if math.isnan(self.value) else f", from {self.value:.3f} on"

@@ -54,17 +54,7 @@ class _Hold:
 
 
 class _HoldError:
-    """Error of the hold of a body, compiled as a function of its place in the hand.
-
-    Parameters
-    ----------
-    model
-        The model.
-    hand, body
-        Frames of the hand and of the body.
-    speeds
-        Speeds of objects.
-    """
+    """Error of the hold of a body, compiled as a function of its place in the hand."""
 
     def __init__(self, model: ModelView, hand: str, body: str, speeds: Sequence[Symbol]) -> None:
         places = [Symbol(f"world/hold/pose/{k}", 0, "parameter", 0.0) for k in range(12)]
@@ -85,15 +75,7 @@ class _HoldError:
         self._count = len(model.symbols)
 
     def bind(self, hand_T_body: Array, middle: Array) -> Callable[[Array], tuple[Array, Array]]:
-        """Return the error (6,) and its derivatives (6, n) as a function of the model's symbols.
-
-        Parameters
-        ----------
-        hand_T_body
-            Wanted pose of the body in the hand (4, 4).
-        middle
-            Middle between the fingers in the body (3,) [m].
-        """
+        """Return the error (6,) and its derivatives (6, n) as a function of the model's symbols."""
         evaluator, count = self._function.bind(), self._count
         evaluator.input[count:] = [*hand_T_body[:3].ravel(), *middle]
 
@@ -107,26 +89,7 @@ class _HoldError:
 
 
 class KinematicGrip:
-    """Fingers that close, hold and open.
-
-    Parameters
-    ----------
-    motion
-        Bodies at the present configuration.
-    gripper
-        The gripper, whose joints are the last columns of the motion.
-    near
-        Largest gap of the second finger when a hold begins [m].
-    slip
-        Largest distance [m] and angle [rad] of a held body from where it was in the hand.
-    report
-        Function that receives what happens.
-
-    Raises
-    ------
-    InvalidValueError
-        For joints that move by other speeds than their own.
-    """
+    """Fingers that close, hold and open."""
 
     def __init__(
         self,
@@ -195,15 +158,7 @@ class KinematicGrip:
         return np.clip(q + h * self.speeds, low, high) - q
 
     def move(self, h: float, moved: float) -> None:
-        """Move fingers and objects in a time h [s], after the rest of the robot has moved.
-
-        Parameters
-        ----------
-        h
-            Time of the motion [s].
-        moved
-            Largest way of a shape of the robot without the fingers' own motion [m].
-        """
+        """Move fingers and objects in a time h [s], after the rest of the robot has moved."""
         motion = self._motion
         if self._hold is not None:
             motion.resolve(h, moved, self._error)

@@ -18,22 +18,10 @@ class LimitJudge:
     Positions are those of the states, speeds are differences of successive states by time; commanded speeds
     stand in where no coordinate is the integral of a speed. A limit of a speed that depends on the state,
     such as a lock, is violated if it was at the begin and at the end of a step.
-
-    Parameters
-    ----------
-    model
-        The model.
-    commanded
-        Speeds that may be commanded.
-
-    Attributes
-    ----------
-    violation, limit
-        Largest excess since the last reset, in the unit of its constraint, and the constraint's name.
     """
 
-    violation: float
-    limit: str
+    violation: float  # largest excess since the last reset, in the unit of its constraint
+    limit: str  # the constraint's name
 
     def __init__(self, model: ModelView, commanded: Sequence[Symbol] = ()) -> None:
         self.symbols, columns = model.symbols, model.speeds
@@ -58,17 +46,7 @@ class LimitJudge:
         self._values: Array = np.zeros(len(self.symbols))
 
     def update(self, values: Array, stamp: float, commanded: Array | None = None) -> None:
-        """Measure a state.
-
-        Parameters
-        ----------
-        values
-            Values of the model's symbols, (n,).
-        stamp
-            Time of the state [s], after that of the last one.
-        commanded
-            Commanded speeds since the last state, those that were named at first.
-        """
+        """Measure a state."""
         vector, count = self._vector, len(self.symbols)
         rates = vector[count:]
         rates[:] = 0.0

@@ -29,22 +29,6 @@ class LineOfSight:
     points are the middle and eight inner corners of each of its shapes. Bodies that never move relative to
     the camera hide nothing, nor do those of the robot that contain the camera at the default state: it is
     built into them. A camera inside of anything else sees nothing.
-
-    Parameters
-    ----------
-    model
-        The model.
-    camera
-        Frame of the camera.
-    own
-        Frames of the robot.
-    bodies
-        Frames to look for; those without shapes are seen wherever they are.
-
-    Raises
-    ------
-    MissingDependencyError
-        If the extra ``geometry`` is not installed.
     """
 
     def __init__(self, model: ModelView, camera: str, own: Collection[str], bodies: Iterable[str]) -> None:

@@ -35,29 +35,7 @@ class McapMessage(NamedTuple):
 
 
 class McapFile:
-    """Content of an MCAP file.
-
-    Parameters
-    ----------
-    path
-        Path of the file.
-
-    Attributes
-    ----------
-    messages
-        All messages, in the order of the file.
-    metadata
-        Metadata records by name.
-    complete
-        False if the file was cut, as after the process that wrote it was killed.
-
-    Raises
-    ------
-    FormatError
-        For a file that cannot be read, is no MCAP file, or is damaged.
-    MissingDependencyError
-        If the extra ``recording`` is not installed.
-    """
+    """Content of an MCAP file."""
 
     def __init__(self, path: Path) -> None:
         self._name, self._records = path.name, import_mcap("mcap.records")

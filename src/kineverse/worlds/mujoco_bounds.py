@@ -31,28 +31,7 @@ _UNSTATED = 1.0
 
 
 class SimulationBounds:
-    """Largest credible speeds and force of one ``MjModel``.
-
-    Parameters
-    ----------
-    compiled
-        The ``MjModel``.
-    coordinates
-        Positions and velocities of the model in it.
-    model
-        The model, which states the limits of speeds.
-    efforts
-        Largest force of each servo by coordinate [N], [N m].
-    is_robot
-        Function that tells bodies of the robot.
-
-    Attributes
-    ----------
-    speeds
-        Largest speed of each velocity (nv,) [m/s], [rad/s].
-    force
-        Largest force [N].
-    """
+    """Largest credible speeds and force of one ``MjModel``."""
 
     def __init__(
         self,
@@ -94,15 +73,7 @@ class SimulationBounds:
         self.force = mass * max(float(base.max(initial=0.0)), _UNSTATED) / step + _MARGIN * pressed
 
     def find_problem(self, data: Any, force: float) -> str:
-        """Return what is beyond reason after a time step, or an empty text.
-
-        Parameters
-        ----------
-        data
-            The ``MjData``.
-        force
-            Largest force between the robot and another body [N].
-        """
+        """Return what is beyond reason after a time step, or an empty text."""
         speeds = data.qvel
         if not (np.abs(speeds) <= self.speeds).all():
             k = int(np.argmax(np.abs(speeds) / self.speeds))

@@ -14,17 +14,7 @@ from .world import Contact
 
 
 class MujocoContacts:
-    """Contacts of one ``MjModel``.
-
-    Parameters
-    ----------
-    compiled
-        The ``MjModel``.
-    robot
-        Whether a body is the robot's.
-    fingers
-        Frames of the one finger, and of the other; empty without a gripper.
-    """
+    """Contacts of one ``MjModel``."""
 
     def __init__(
         self, compiled: Any, robot: Callable[[str], bool], fingers: Sequence[Sequence[str]] = ()

@@ -25,24 +25,6 @@ class MujocoCoordinates:
 
     A joint that follows another has the value of its polynomial. A coordinate that depends on others by a
     loop has the value of its expression.
-
-    Parameters
-    ----------
-    model
-        The model.
-    compiled
-        Its ``MjModel``, whose joints have the names of the coordinates.
-
-    Attributes
-    ----------
-    default
-        Default state of the model.
-    address
-        Index in ``qpos`` by coordinate: hinges and slides alone.
-    dof
-        Index in ``qvel`` by coordinate: the same.
-    followers
-        Derivative of all velocities by those of the independent joints (nv, nv), where followers are at 0.
     """
 
     def __init__(self, model: ModelView, compiled: Any) -> None:
@@ -90,13 +72,7 @@ class MujocoCoordinates:
         self._loops = compile(values, self._symbols) if values else None
 
     def positions(self, state: StateLike) -> Array:
-        """Return the positions ``qpos`` of a state; coordinates without a value have their default.
-
-        Raises
-        ------
-        InvalidValueError
-            If a loop cannot be closed.
-        """
+        """Return the positions ``qpos`` of a state; coordinates without a value have their default."""
         given = as_state(state, self._symbols)
         values = self.default | State({s: v for s in self._symbols if (v := given.given(s)) is not None})
         qpos: Array = np.array(self._compiled.qpos0, dtype=float)

@@ -30,23 +30,6 @@ def add_floor(
     Bodies that stand on it at the default state, such as wheels, have no contact with it, unless they are
     loose and would fall. There is no floor if another body is below it then, or if furniture is in any
     sampled state: then z = 0 is no floor.
-
-    Parameters
-    ----------
-    spec
-        The specification.
-    coordinates
-        Positions of the model in it.
-    is_robot
-        Function that tells bodies of the robot.
-    names
-        Names that the floor may not have.
-    samples
-        Number of sampled states.
-    seed
-        Their seed.
-    remark
-        Receives what was decided.
     """
     engine, name = mujoco(), "floor"
     while name in names:

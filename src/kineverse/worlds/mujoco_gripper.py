@@ -37,30 +37,6 @@ class GripperDrive:
         τ = F (|∂y_1/∂q| + |∂y_2/∂q|),
 
     where y_k is the position of a finger at the place of the grasp, along the closing motion.
-
-    Parameters
-    ----------
-    spec
-        Specification to which drives and armature are added.
-    compiled
-        Its ``MjModel`` without drives.
-    coordinates
-        Positions and velocities of the model in ``compiled``.
-    gripper
-        The gripper.
-    force
-        F [N].
-    step
-        Time step of the simulation [s].
-    tie
-        True to tie a body to the hand while it is held.
-    remark
-        Receives the assumptions.
-
-    Attributes
-    ----------
-    coordinates
-        Coordinates of the fingers.
     """
 
     def __init__(

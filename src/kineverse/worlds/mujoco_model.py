@@ -43,11 +43,6 @@ def export_spec(model: ModelView, leave_out: Iterable[str], remark: Callable[[st
     """Return a model as an ``MjSpec``, without its visual shapes.
 
     A motion along a curve is approximated within :data:`CURVE_TOLERANCE`.
-
-    Raises
-    ------
-    FormatError
-        Naming all that MuJoCo cannot move.
     """
     engine, path, names = mujoco(), _FOLDER / "world.xml", tuple(leave_out)
     try:
@@ -71,13 +66,7 @@ def export_spec(model: ModelView, leave_out: Iterable[str], remark: Callable[[st
 
 
 def compile_world(spec: Any) -> Any:
-    """Return the ``MjModel`` of a specification.
-
-    Raises
-    ------
-    FormatError
-        With the reason that MuJoCo gives.
-    """
+    """Return the ``MjModel`` of a specification."""
     engine = mujoco()
     with capture_mujoco_warnings():
         try:
@@ -133,19 +122,7 @@ def add_joint_friction(
     friction: Mapping[str, float],
     remark: Callable[[str], None],
 ) -> None:
-    """Give friction and damping to the joints of furniture.
-
-    Parameters
-    ----------
-    spec, compiled
-        The specification, and its ``MjModel`` without friction.
-    coordinates
-        Names of the coordinates of furniture.
-    friction
-        Friction by coordinate [N], [N m], in place of that of the model.
-    remark
-        Receives the assumptions.
-    """
+    """Give friction and damping to the joints of furniture."""
     engine = mujoco()
     assumed: dict[str, list[str]] = {}
     for name in coordinates:
@@ -202,21 +179,6 @@ def add_contact_rules(
 
     Those of furniture that moves relatively collide, also a door and its frame, unless a rule excepts them;
     others, if a scene checks them.
-
-    Parameters
-    ----------
-    spec
-        The specification.
-    model
-        The model.
-    fingers
-        Frames of each finger, whose contacts have six dimensions: they resist turning, too.
-    friction
-        Coefficient of sliding friction.
-    is_robot
-        Function that tells bodies and coordinates of the robot.
-    remark
-        Receives the assumptions.
     """
     engine, held = mujoco(), {name for finger in fingers for name in finger}
     for body in spec.bodies:
@@ -281,21 +243,6 @@ def exclude_overlaps(
     These are pairs of bodies of the robot that overlap at the default state or in all sampled ones, and pairs
     of shapes of furniture that overlap at the default state. Of two bodies of furniture, some of whose shapes
     overlap, the others collide. Excluded are also bodies that one joint keeps apart between its limits.
-
-    Parameters
-    ----------
-    spec, compiled
-        The specification, whose shapes have names, and its ``MjModel``.
-    model
-        The model.
-    coordinates
-        Positions of the model in ``compiled``.
-    is_robot
-        Function that tells bodies of the robot.
-    samples
-        Number of sampled states.
-    seed
-        Their seed.
     """
     engine, data, random = mujoco(), mujoco().MjData(compiled), np.random.default_rng(seed)
     own = np.array([is_robot(compiled.body(k).name) for k in range(compiled.nbody)])

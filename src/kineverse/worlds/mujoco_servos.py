@@ -53,22 +53,7 @@ _PLANAR = 3
 
 
 class SpeedMap:
-    """Map from speeds of a robot to those of its coordinates, by the rates of the model.
-
-    Parameters
-    ----------
-    model
-        The model.
-    coordinates
-        Coordinates of the robot, in the order of the results.
-    address
-        Index in ``qpos`` of coordinates on which the map depends.
-
-    Attributes
-    ----------
-    speeds
-        Speeds of the robot, in the order of the columns.
-    """
+    """Map from speeds of a robot to those of its coordinates, by the rates of the model."""
 
     def __init__(
         self, model: ModelView, coordinates: Sequence[Symbol], address: Mapping[Symbol, int]
@@ -98,15 +83,7 @@ class SpeedMap:
         self._at = np.array([address[s] for s in inputs], dtype=int)
 
     def vector(self, speeds: StateLike) -> tuple[Array, npt.NDArray[np.bool_]]:
-        """Return the speeds of the robot in a mapping, (n,), and flags of the given ones, (n,).
-
-        Raises
-        ------
-        InvalidValueError
-            For a speed that is not finite.
-        UnknownNameError
-            For a speed that the model does not have.
-        """
+        """Return the speeds of the robot in a mapping, (n,), and flags of the given ones, (n,)."""
         if not isinstance(speeds, Mapping):
             raise ExpressionError(f"Speeds are given as a mapping {{name: number}}, not as {speeds!r}.")
         vector, given = np.zeros(len(self.speeds)), np.zeros(len(self.speeds), dtype=bool)
@@ -140,38 +117,7 @@ class SpeedMap:
 
 
 class JointServos:
-    """Servos of all coordinates of a robot but those of its gripper.
-
-    Parameters
-    ----------
-    spec
-        Specification to which servos and armature are added.
-    compiled
-        Its ``MjModel`` without servos.
-    coordinates
-        Positions and velocities of the model in ``compiled``.
-    driven
-        Coordinates with a servo.
-    model
-        The model, which states the effort of its joints.
-    step
-        Time step of the simulation [s].
-    bandwidth
-        w [1/s].
-    press
-        Largest force of spring and damper at the farthest point that a joint moves [N].
-    seed
-        Seed of the sampled configurations.
-    remark
-        Receives the assumptions.
-
-    Attributes
-    ----------
-    coordinates
-        Coordinates with a servo.
-    efforts
-        Largest force of each servo by coordinate [N], [N m].
-    """
+    """Servos of all coordinates of a robot but those of its gripper."""
 
     def __init__(
         self,

@@ -19,27 +19,13 @@ _PARALLEL = 1e-3
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Gaps:
-    """Gaps of near pairs of shapes and their derivatives.
+    """Gaps of near pairs of shapes and their derivatives."""
 
-    Attributes
-    ----------
-    pairs
-        The pairs as the scene found them, nearest first.
-    index
-        (K,) indices of the gaps among these pairs.
-    distances
-        (K,) gaps [m].
-    rows
-        (K, n) derivatives by the displacement of all columns.
-    jammed
-        (K,) flags of contacts that move no object.
-    """
-
-    pairs: DistanceResults
-    index: npt.NDArray[np.intp]
-    distances: Array
-    rows: Array
-    jammed: npt.NDArray[np.bool_]
+    pairs: DistanceResults  # pairs as the scene found them, nearest first
+    index: npt.NDArray[np.intp]  # (K,) indices of the gaps among these pairs
+    distances: Array  # (K,) gaps [m]
+    rows: Array  # (K, n) derivatives by the displacement of all columns
+    jammed: npt.NDArray[np.bool_]  # (K,) flags of contacts that move no object
 
 
 def align_motion(normal: Array, point: Array, twists: Array) -> float:

@@ -33,22 +33,6 @@ class ObjectLimits:
     A limit of a position that is exceeded at first moves nothing by itself. What a motion exceeds it by is
     taken back by the next one: :meth:`begin`, then :meth:`position_rows` where the motion leads, then
     :meth:`finish`. Limits of accelerations are no rows.
-
-    Parameters
-    ----------
-    model
-        The model.
-    speeds
-        Speeds of the objects.
-    is_robot
-        Function that tells frames and coordinates of the robot.
-    leave_out
-        Names of constraints that are no rows.
-
-    Attributes
-    ----------
-    skipped
-        Constraints that are no rows, as pairs (name, reason).
     """
 
     def __init__(
@@ -84,18 +68,7 @@ class ObjectLimits:
         self.reset()
 
     def find_linked(self, moved: npt.NDArray[np.bool_]) -> tuple[npt.NDArray[np.intp], ...]:
-        """Return the indices of speeds that share rows with some, directly or by others, and of these rows.
-
-        Parameters
-        ----------
-        moved
-            (n,) flags of speeds.
-
-        Returns
-        -------
-        tuple of numpy.ndarray
-            Indices of speeds, of rows of positions, and of rows of rates.
-        """
+        """Return the indices of speeds that share rows with some, directly or by others, and of these rows."""
         key = moved.tobytes()
         if key not in self._found:
             linked = moved | self._linked[moved].any(axis=0)

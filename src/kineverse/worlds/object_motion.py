@@ -71,33 +71,7 @@ Residual: TypeAlias = Callable[[], tuple[Array, Array]]
 
 
 class ObjectMotion:
-    """Bodies of a robot and of objects at a configuration, and the motion of the objects.
-
-    Parameters
-    ----------
-    overlaps
-        Overlaps of furniture in the collision scene of the model, whose poses are those of the last
-        configuration.
-    speeds
-        Speeds of objects.
-    fingers
-        Speeds of the robot's fingers, columns after those of the objects.
-    is_robot
-        Function that tells frames of the robot.
-    leave_out
-        Names of constraints that do not hold here.
-
-    Attributes
-    ----------
-    q
-        Values of the model's symbols, in their order; changed in place.
-    columns
-        Speeds of objects, then those of fingers.
-    robot_bodies, object_bodies
-        Bodies with shapes: those of the robot, and those that objects move.
-    skipped
-        Constraints of objects that cannot be enforced, as pairs (name, reason).
-    """
+    """Bodies of a robot and of objects at a configuration, and the motion of the objects."""
 
     def __init__(
         self,
@@ -188,15 +162,7 @@ class ObjectMotion:
         return travel
 
     def longest_way(self, moved: Array, radius: float) -> float | None:
-        """Return the longest way of a body in a pair within a radius [m]; None without such a pair.
-
-        Parameters
-        ----------
-        moved
-            Ways of the shapes of the robot (K,) [m].
-        radius
-            Largest distance of pairs that are not ignored [m].
-        """
+        """Return the longest way of a body in a pair within a radius [m]; None without such a pair."""
         pairs, index = self.find_near(radius)
         if not len(index):
             return None
@@ -304,17 +270,7 @@ class ObjectMotion:
         return self._furniture.measure(driven, moved) if moved.any() else None
 
     def resolve(self, h: float, moved: float, residual: Residual | None = None) -> Array:
-        """Move the objects after the robot has moved, and return their speeds (n,).
-
-        Parameters
-        ----------
-        h
-            Time of the motion [s].
-        moved
-            Largest way of a shape of the robot [m].
-        residual
-            Error of a hold, which the objects that reduce it follow.
-        """
+        """Move the objects after the robot has moved, and return their speeds (n,)."""
         v = best = np.zeros(self.count)
         start, radius, least = self.q.copy(), moved + _REACH, math.inf
         if residual is None and not len(self.find_near(0.0)[1]):

@@ -293,25 +293,13 @@ class Recorder:
 
 
 def check_recording_name(path: str | os.PathLike[str]) -> None:
-    """Check that the name of a file ends in .mcap.
-
-    Raises
-    ------
-    FormatError
-        If it does not.
-    """
+    """Check that the name of a file ends in .mcap."""
     if Path(path).suffix.lower() != ".mcap":
         raise FormatError(f"Recordings are written as .mcap: '{Path(path).with_suffix('.mcap')}'.")
 
 
 def import_mcap(module: str) -> Any:
-    """Return a module of the package mcap.
-
-    Raises
-    ------
-    MissingDependencyError
-        If the extra ``recording`` is not installed.
-    """
+    """Return a module of the package mcap."""
     import importlib
 
     try:

@@ -33,33 +33,17 @@ Entry = TypeVar("Entry")
 
 @dataclass(frozen=True, slots=True, eq=False)
 class ValuesOverTime:
-    """Values of symbols over time.
+    """Values of symbols over time."""
 
-    Attributes
-    ----------
-    times
-        (T,) increasing [s].
-    symbols
-        The n symbols, the columns.
-    values
-        (T, n) [m], [rad] and per second; NaN where a symbol had no value.
-    """
-
-    times: Array
-    symbols: tuple[Symbol, ...]
-    values: Array
+    times: Array  # (T,) increasing [s]
+    symbols: tuple[Symbol, ...]  # n symbols, the columns
+    values: Array  # (T, n) [m], [rad] and per second; NaN where a symbol had no value
 
     def __len__(self) -> int:
         return len(self.times)
 
     def __getitem__(self, symbol: Symbol | str) -> Array:
-        """Return the values (T,) of a symbol, given itself or by name.
-
-        Raises
-        ------
-        UnknownNameError
-            If it has none, with similar names.
-        """
+        """Return the values (T,) of a symbol, given itself or by name."""
         names = list(map(str, self.symbols))
         if str(symbol) not in names:
             raise UnknownNameError(
@@ -84,18 +68,10 @@ class ValuesOverTime:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Recorded:
-    """Things that were recorded at some times.
+    """Things that were recorded at some times."""
 
-    Attributes
-    ----------
-    times
-        (T,) not decreasing [s].
-    entries
-        The T things.
-    """
-
-    times: Array
-    entries: tuple[Any, ...]
+    times: Array  # (T,) not decreasing [s]
+    entries: tuple[Any, ...]  # T things
 
     def __len__(self) -> int:
         return len(self.entries)

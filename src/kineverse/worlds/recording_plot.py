@@ -29,13 +29,6 @@ def plot_recording(recording: RunRecording | str | os.PathLike[str], figure: Can
     The plots are: coordinates of the objects in truth, and dashed as they are believed; commanded speeds;
     contacts between bodies. Bands are the phases. Without a robot's name in ``about``, a coordinate counts as
     the robot's if a speed was commanded below the same prefix.
-
-    Parameters
-    ----------
-    recording
-        The run, or the path of its file.
-    figure
-        An empty matplotlib figure.
     """
     if not isinstance(recording, RunRecording):
         recording = read_run_recording(recording)

@@ -255,21 +255,11 @@ def find_camera(frames: Sequence[str]) -> str | None:
 
 
 class RobotBase(NamedTuple):
-    """Joint that places a robot in the world.
+    """Joint that places a robot in the world."""
 
-    Attributes
-    ----------
-    coordinates
-        Its coordinates; none if the robot stands still.
-    is_planar
-        Whether they are x, y and a heading.
-    parent, child
-        Its frames; empty if the robot stands still.
-    """
-
-    coordinates: tuple[Symbol, ...] = ()
-    is_planar: bool = False
-    parent: str = ""
+    coordinates: tuple[Symbol, ...] = ()  # its coordinates; none if the robot stands still
+    is_planar: bool = False  # whether they are x, y and a heading
+    parent: str = ""  # its frames; empty if the robot stands still
     child: str = ""
 
 

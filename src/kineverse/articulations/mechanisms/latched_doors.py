@@ -21,21 +21,14 @@ class HingedDoor(Mechanism):
     """Base of doors about a vertical hinge at the base: base_T_door = rotation_z(q), q in [rad].
 
     The shut door, q = 0, lies in the (y, z) plane from the hinge to y = width, and opens towards -x.
-
-    Attributes
-    ----------
-    width, height, thickness
-        Dimensions of the door [m].
-    door
-        Limits of q.
     """
 
     main: ClassVar[str] = "door"
 
-    width: float = 0.8
+    width: float = 0.8  # dimensions of the door [m]
     height: float = 2.0
     thickness: float = 0.04
-    door: Limits = Limits(0.0, 1.9, 1.5)
+    door: Limits = Limits(0.0, 1.9, 1.5)  # limits of q
 
     def __post_init__(self) -> None:
         self.check_lengths("width", "height", "thickness")
@@ -144,30 +137,14 @@ class SprungDoor(HingedDoor):
 
     The lock is one of the position (:func:`kineverse.articulations.position_lock`): an open door is free, and
     can be shut, because the bolt gives way.
-
-    Attributes
-    ----------
-    catch
-        Displacement of the bolt or the button that opens the lock [m].
-    play
-        Largest angle at which the door counts as shut [rad].
-    stiffness, rest
-        Stiffness of the spring [N/m] and its rest position [m]: the force on a coordinate b is
-        stiffness·(rest - b).
-
-    Raises
-    ------
-    InvalidValueError
-        For lengths that are not positive, a door that is not shut at 0, a catch beyond the limits of the
-        spring-loaded part, or a spring that does not push it back to 0.
     """
 
     sprung: ClassVar[str]
     """Name of the spring-loaded part."""
 
-    catch: float
-    play: float = 0.003
-    stiffness: float = 300.0
+    catch: float  # displacement of the bolt or the button that opens the lock [m]
+    play: float = 0.003  # largest angle at which the door counts as shut [rad]
+    stiffness: float = 300.0  # [N/m], [m]
     rest: float = -0.01
 
     def __post_init__(self) -> None:

@@ -76,21 +76,11 @@ def sliding_point_twists(motion: FamilyMember, values: Array) -> Array:
 
 
 class ChildOriginMotion(NamedTuple):
-    """Motion in terms of the translation of the child's own origin, for display.
+    """Motion in terms of the translation of the child's own origin, for display."""
 
-    Attributes
-    ----------
-    motion
-        Motion with the sliding point at the origin of the child.
-    covariance
-        Covariance of its parameters.
-    values, covariances
-        Joint values and their covariances, (N, k) and (N, k, k).
-    """
-
-    motion: FamilyMember
-    covariance: Array
-    values: Array
+    motion: FamilyMember  # motion with the sliding point at the origin of the child
+    covariance: Array  # covariance of its parameters
+    values: Array  # joint values and their covariances, (N, k) and (N, k, k)
     covariances: Array
 
 
@@ -154,21 +144,11 @@ BETTER = 1e-3
 
 
 class SingleObservation(NamedTuple):
-    """Joint value and parent orientation of each observation by itself, for a fixed motion.
+    """Joint value and parent orientation of each observation by itself, for a fixed motion."""
 
-    Attributes
-    ----------
-    values
-        Most probable joint values, (N, 1).
-    orientation
-        Most probable orientations of the parent, (N, 3, 3).
-    log_density
-        Log density of each observation with both integrated out, up to a constant, (N,).
-    """
-
-    values: Array
-    orientation: Array
-    log_density: Array
+    values: Array  # most probable joint values, (N, 1)
+    orientation: Array  # most probable orientations of the parent, (N, 3, 3)
+    log_density: Array  # log density of each observation with both integrated out, up to a constant, (N,)
 
 
 def choose_mirrored_values(

@@ -147,11 +147,6 @@ def evaluate_poses(motion: GroupMotion, values: Array) -> LinearisedPoses:
     """Return the poses at joint values (N, k) and their derivatives, in C.
 
     It is the kernel of :meth:`.families.GroupMotion.linearise`.
-
-    Raises
-    ------
-    ShapeError
-        For values of another shape.
     """
     values = np.ascontiguousarray(values, dtype=np.float64)
     if values.ndim != 2 or values.shape[1] != motion.joints:

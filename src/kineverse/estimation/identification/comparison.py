@@ -46,58 +46,25 @@ SAME_RATIO = 2.0
 
 @dataclass(frozen=True)
 class IdentificationData:
-    """Observations and the assumptions under which families are compared.
+    """Observations and the assumptions under which families are compared."""
 
-    Attributes
-    ----------
-    observations
-        The observations, with lengths in the unit.
-    unit
-        The length scale [m], see :mod:`.scale`.
-    stated
-        True if the noise is known. Else the observations have the medians of :mod:`.unknown_noise`.
-    outliers
-        Outlier model, with lengths in the unit; None if all observations are inliers.
-    sequential
-        True if the observations are in temporal order.
-    noise_factor
-        Factor by which standard deviations are larger than those that were stated and refuted.
-    observation_weight
-        Factor on the log likelihood of each observation, below 1 for correlated errors.
-    """
-
-    observations: Observations
-    unit: float
-    stated: bool
-    outliers: Outliers | None
-    sequential: bool
+    observations: Observations  # observations, with lengths in the unit
+    unit: float  # length scale [m], see scale
+    stated: bool  # True if the noise is known. Else the observations have the medians of unknown_noise
+    outliers: Outliers | None  # outlier model, with lengths in the unit; None if all observations are inliers
+    sequential: bool  # True if the observations are in temporal order
     noise_factor: float = 1.0
     observation_weight: float = 1.0
 
 
 @dataclass(frozen=True)
 class FamilySolution:
-    """Solution of a family by its inliers.
+    """Solution of a family by its inliers."""
 
-    Attributes
-    ----------
-    scored
-        The solution and the logarithm of its evidence.
-    noise
-        Posterior of the noise; :data:`.STATED_NOISE` if it is stated.
-    inliers
-        Indices of the inliers.
-    count
-        Number of all observations.
-    log_prior
-        Sum of the log probability of these inliers, the log density of the outliers, and the gain by counted
-        revolutions. It is added to the log evidence.
-    """
-
-    scored: Scored
-    noise: NoisePosterior
-    inliers: RowIndices
-    count: int
+    scored: Scored  # solution and the logarithm of its evidence
+    noise: NoisePosterior  # posterior of the noise; STATED_NOISE if it is stated
+    inliers: RowIndices  # indices of the inliers
+    count: int  # number of all observations
     log_prior: float
 
     @property

@@ -72,19 +72,11 @@ class SplineWeights(NamedTuple):
 
 @dataclass(frozen=True)
 class NaturalSpline:
-    """Natural cubic spline through equidistant knots.
+    """Natural cubic spline through equidistant knots."""
 
-    Attributes
-    ----------
-    first, step
-        First knot, and distance between two of them.
-    count
-        Number of knots.
-    """
-
-    first: float
-    step: float
-    count: int
+    first: float  # first knot
+    step: float  # distance between two of them
+    count: int  # number of knots
 
     @property
     def knots(self) -> Array:
@@ -125,18 +117,10 @@ class NaturalSpline:
 
 @dataclass(frozen=True, eq=False)
 class PathWidths:
-    """Widths of poses along the principal directions of their positions and of their rotations.
+    """Widths of poses along the principal directions of their positions and of their rotations."""
 
-    Attributes
-    ----------
-    directions
-        Principal directions of positions, and of rotations, as columns, (3, 3) each.
-    widths
-        Twice the standard deviations along them, (3,) each, [m] and [rad].
-    """
-
-    directions: tuple[Array, ...]
-    widths: tuple[Array, ...]
+    directions: tuple[Array, ...]  # (3, 3)
+    widths: tuple[Array, ...]  # twice the standard deviations along them, (3,) each, [m] and [rad]
 
     @staticmethod
     def of_poses(poses: Array, rows: int) -> PathWidths:
@@ -176,32 +160,15 @@ class PathWidths:
 
 @dataclass(frozen=True, eq=False)
 class CurveMotion:
-    """Curve through poses at equidistant knots. Lengths are in a unit, see :mod:`.scale`.
+    """Curve through poses at equidistant knots. Lengths are in a unit, see :mod:`.scale`."""
 
-    Attributes
-    ----------
-    rows
-        6 for poses, 3 for positions.
-    spline
-        The knots.
-    positions, quaternions
-        Positions (K, 3) and unit quaternions (K, 4) at the knots. Successive quaternions are on one half of
-        the sphere.
-    across
-        Twists by which the parameters move each knot, (K, m, m - 1).
-    widths
-        Widths of the prior.
-    lever
-        Length ℓ of a rotation by one radian.
-    """
-
-    rows: int
-    spline: NaturalSpline
-    positions: Array
+    rows: int  # 6 for poses, 3 for positions
+    spline: NaturalSpline  # knots
+    positions: Array  # (K, 3), (K, 4)
     quaternions: Array
-    across: Array
-    widths: PathWidths
-    lever: float = LEVER
+    across: Array  # twists by which the parameters move each knot, (K, m, m - 1)
+    widths: PathWidths  # widths of the prior
+    lever: float = LEVER  # length ℓ of a rotation by one radian
 
     name = CURVE
     joints = 1

@@ -54,22 +54,7 @@ def fit_curve(
     log_evidence: Callable[[Solution[FamilyMember]], float] | None = None,
     competitor: float = -math.inf,
 ) -> Scored | None:
-    """Return the most probable curve through observations; None if they are too few for one, or equal.
-
-    Parameters
-    ----------
-    observations
-        The N observations.
-    covariance
-        Covariances of the relative poses in the parent's axes, (N, m, m).
-    orders
-        Candidate positions along the path, (N,) each, besides those of the module.
-    log_evidence
-        Function that returns the log evidence by which numbers of knots are compared; by default that of the
-        stated noise.
-    competitor
-        Log evidence of the best other family. Far below it no further numbers of knots are tried.
-    """
+    """Return the most probable curve through observations; None if they are too few for one, or equal."""
     if not may_be_curve(observations):
         return None
     if len(observations) > _MOST_FITTED:

@@ -30,21 +30,11 @@ from .range_prior import JointRanges, PerObservation, fit_joint_ranges, solve_pe
 
 @dataclass(frozen=True)
 class Evidence:
-    """Evidence of a family and the posterior of its unknowns.
-
-    Attributes
-    ----------
-    log_evidence
-        Natural logarithm of the density of the observed relative poses, in a unit common to all families.
-    covariance
-        Posterior covariance of the parameters, (n, n).
-    joint_values, joint_covariances
-        Posterior joint values and their covariances, (N, k) and (N, k, k).
-    """
+    """Evidence of a family and the posterior of its unknowns."""
 
     log_evidence: float
-    covariance: Array
-    joint_values: Array
+    covariance: Array  # posterior covariance of the parameters, (n, n)
+    joint_values: Array  # posterior joint values and their covariances, (N, k) and (N, k, k)
     joint_covariances: Array
 
     @staticmethod

@@ -28,50 +28,22 @@ VX, VY, VZ, WX, WY, WZ = range(6)
 
 @dataclass(frozen=True, slots=True)
 class Parametrisation:
-    """Components of the joint values and of the parameters.
+    """Components of the joint values and of the parameters."""
 
-    Attributes
-    ----------
-    joints
-        Components of (v, ω) that are joint values.
-    left
-        Components of the twist that moves L, in the axes of L.
-    right
-        Components of the twist that moves R, applied on its left.
-    """
-
-    joints: tuple[int, ...]
-    left: tuple[int, ...]
-    right: tuple[int, ...]
+    joints: tuple[int, ...]  # components of (v, ω) that are joint values
+    left: tuple[int, ...]  # components of the twist that moves L, in the axes of L
+    right: tuple[int, ...]  # components of the twist that moves R, applied on its left
 
 
 @dataclass(frozen=True, slots=True)
 class JointFamily:
-    """Joint family.
+    """Joint family."""
 
-    Attributes
-    ----------
-    name
-        Name of the family, as in ``result["revolute"]``.
-    poses
-        Parametrisation for observed poses of the child.
-    positions
-        Parametrisation for observed positions only. The orientation of the child is no parameter then.
-    pitch
-        True if the joint translates along z by a pitch [m/rad] as it rotates.
-    reach
-        Number of components of the child's position in the joint's frame that are a lever. They have a
-        Gaussian prior of width :data:`REACH`.
-    slides
-        Number of translations of a joint that also rotates, so that the translated point matters, see
-        :mod:`.ambiguities`.
-    """
-
-    name: str
-    poses: Parametrisation
-    positions: Parametrisation
-    pitch: bool = False
-    reach: int = 0
+    name: str  # name of the family, as in result["revolute"]
+    poses: Parametrisation  # parametrisation for observed poses of the child
+    positions: Parametrisation  # parametrisation for observed positions only
+    pitch: bool = False  # True if the joint translates along z by a pitch [m/rad] as it rotates
+    reach: int = 0  # number of components of the child's position in the joint's frame that are a lever
     slides: int = 0
 
     def parametrisation(self, rows: int) -> Parametrisation:
@@ -145,25 +117,13 @@ REACH = 1.0
 
 @dataclass(frozen=True, slots=True)
 class GroupMotion:
-    """Member of a joint family, parent_T_child = L · g(a) · R.
+    """Member of a joint family, parent_T_child = L · g(a) · R."""
 
-    Attributes
-    ----------
-    group
-        The family.
-    rows
-        6, or 3 for positions only.
-    left, right
-        L and R, (4, 4).
-    pitch
-        Pitch [m/rad]; 0 for families without one.
-    """
-
-    group: JointFamily
-    rows: int
-    left: Array
+    group: JointFamily  # family
+    rows: int  # 6, or 3 for positions only
+    left: Array  # L and R, (4, 4)
     right: Array
-    pitch: float = 0.0
+    pitch: float = 0.0  # pitch [m/rad]; 0 for families without one
 
     @property
     def parametrisation(self) -> Parametrisation:

@@ -44,15 +44,9 @@ _Z = (0.0, 0.0, 1.0)
 
 @dataclass(frozen=True, kw_only=True)
 class Mounted(Joint):
-    """Base class of joints with a child frame off the axis.
+    """Base class of joints with a child frame off the axis."""
 
-    Attributes
-    ----------
-    mount
-        joint_T_child at joint value 0.
-    """
-
-    mount: Pose = Pose()
+    mount: Pose = Pose()  # joint_T_child at joint value 0
 
     @property
     def kind(self) -> str:
@@ -92,17 +86,10 @@ class SlidingPoint(Joint, document_kind="SlidingPoint"):
     """Translation of a point in a plane or in space: parent_T_child = origin · translation(x, y, z).
 
     Coordinates are ``name/x``, ``name/y`` and, in space, ``name/z`` [m].
-
-    Attributes
-    ----------
-    ranges
-        Range seen of each coordinate [m]; home is in the middle.
-    limited
-        True if the coordinates are limited to the range.
     """
 
-    ranges: tuple[tuple[float, float], ...]
-    limited: bool = True
+    ranges: tuple[tuple[float, float], ...]  # range seen of each coordinate [m]; home is in the middle
+    limited: bool = True  # True if the coordinates are limited to the range
 
     def apply(self, model: ReadRecorder) -> Writes:
         """Write the child frame, the coordinates and their limits."""
@@ -127,20 +114,11 @@ class FamilyJoint(Joint, document_kind="FamilyJoint"):
     """Joint of a custom family: parent_T_child = origin · transform.
 
     A single coordinate is ``name``. Several are named like the joints of the family, below ``name``.
-
-    Attributes
-    ----------
-    motion
-        Member of the family.
-    ranges
-        Range seen of its joint values; home is in the middle.
-    limited
-        True if the joint values are limited to the range.
     """
 
-    motion: FamilyMotion
-    ranges: tuple[tuple[float, float], ...]
-    limited: bool = True
+    motion: FamilyMotion  # member of the family
+    ranges: tuple[tuple[float, float], ...]  # range seen of its joint values; home is in the middle
+    limited: bool = True  # True if the joint values are limited to the range
 
     def apply(self, model: ReadRecorder) -> Writes:
         """Write the child frame, the coordinates and their limits."""
@@ -173,19 +151,7 @@ def joint_operation(
     child: str,
     limited: bool = True,
 ) -> Operation:
-    """Return the operation that writes a member of a family.
-
-    Parameters
-    ----------
-    motion
-        The member.
-    ranges
-        Range of each joint value.
-    name, parent, child
-        Names of the articulation and its frames.
-    limited
-        True if these ranges are its limits.
-    """
+    """Return the operation that writes a member of a family."""
     names: dict[str, Any] = {"name": name, "parent": parent, "child": child}
     if isinstance(motion, CurveMotion):
         motion = _as_family_motion(motion, ranges[0])

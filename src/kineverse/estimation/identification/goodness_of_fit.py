@@ -30,42 +30,18 @@ _EXACT = 0.1
 
 @dataclass(frozen=True)
 class GoodnessOfFit:
-    """Residuals of a family against the noise.
+    """Residuals of a family against the noise."""
 
-    Attributes
-    ----------
-    factor
-        Size of the residuals relative to the noise; NaN if the family leaves none.
-    p_value
-        Probability of a χ² at least as large if family and noise are right; 1 if there are no residuals.
-    slow_p_value
-        Probability of residuals that vary as slowly along the joint value if they are white; 1 unless there
-        is one joint value.
-    slow_share
-        Share of these slow residuals in χ².
-    """
-
-    factor: float
-    p_value: float
+    factor: float  # size of the residuals relative to the noise; NaN if the family leaves none
+    p_value: float  # probability of a χ² at least as large if family and noise are right
     slow_p_value: float = 1.0
-    slow_share: float = 0.0
+    slow_share: float = 0.0  # share of these slow residuals in χ²
 
 
 def measure_fit(
     solution: Solution[FamilyMember], covariance: Array | None = None, observation_weight: float = 1.0
 ) -> GoodnessOfFit:
-    """Return the goodness of fit of a solution.
-
-    Parameters
-    ----------
-    solution
-        The solution. Its observations are the inliers.
-    covariance
-        Covariances of the residuals, (N, m, m) or (m, m), instead of those of the solution.
-    observation_weight
-        Share of an observation in an independent one, below 1 for correlated errors. These vary slowly along
-        the joint value for any joint.
-    """
+    """Return the goodness of fit of a solution."""
     motion, by_joints = solution.motion, solution.linear.by_joints
     weights = invert_matrices(solution.covariance if covariance is None else covariance)
     weights = np.broadcast_to(weights, solution.covariance.shape)

@@ -116,13 +116,7 @@ def resolve_noise(
     child_covariance: npt.ArrayLike | None,
     noise: npt.ArrayLike | None,
 ) -> tuple[npt.ArrayLike, npt.ArrayLike, bool]:
-    """Return the covariances of parent and child, and True if they were stated.
-
-    Raises
-    ------
-    InvalidValueError
-        If only one of the two is stated.
-    """
+    """Return the covariances of parent and child, and True if they were stated."""
     if noise is not None or (
         child_covariance is not None and (parent_covariance is not None or not has_parent)
     ):
@@ -138,15 +132,7 @@ def resolve_noise(
 
 
 def family_weights(families: Families) -> dict[str | Family, float]:
-    """Return the families to compare and their prior weights.
-
-    Raises
-    ------
-    UnknownNameError
-        For an unknown family.
-    InvalidValueError
-        For a weight that is not positive, or if there is no family.
-    """
+    """Return the families to compare and their prior weights."""
     if families is None:
         families = WEIGHTS
     elif isinstance(families, (str, Family)):

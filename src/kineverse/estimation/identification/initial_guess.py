@@ -96,23 +96,13 @@ def initial_guesses(name: str, statistics: MotionStatistics) -> Iterator[Initial
 
 
 class _AxisRotation(NamedTuple):
-    """Rotation about a fixed axis, the common part of revolute, screw and cylindrical joints.
+    """Rotation about a fixed axis, the common part of revolute, screw and cylindrical joints."""
 
-    Attributes
-    ----------
-    left, right
-        Frames on both sides of the joint, (4, 4). The axis is the z axis of ``left``.
-    angles, along
-        Angle and displacement along the axis of each observation, (N,).
-    slope
-        Slope of the displacement over the angle.
-    """
-
-    left: Array
+    left: Array  # frames on both sides of the joint, (4, 4). The axis is the z axis of left
     right: Array
-    angles: Array
+    angles: Array  # angle and displacement along the axis of each observation, (N,)
     along: Array
-    slope: float
+    slope: float  # slope of the displacement over the angle
 
 
 def _find_rotations(statistics: MotionStatistics, frame: Array, places: Array) -> Iterator[_AxisRotation]:

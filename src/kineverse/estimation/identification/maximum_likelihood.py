@@ -70,16 +70,6 @@ def continue_from(
     """Return the solution of more observations, starting from an earlier solution.
 
     The joint values are integrated out if they were in the earlier solution.
-
-    Parameters
-    ----------
-    observations
-        All observations, the earlier ones first.
-    start, parent, joint_prior
-        Motion and joint values, true poses of the parent, and prior of the joint values.
-    known
-        Number of the earlier observations. The joint values of the others are first optimised with the motion
-        fixed, because their starts are rough.
     """
     motion, values, parent = start.motion, start.values.copy(), parent.copy()
     new = slice(known, len(observations))

@@ -98,24 +98,7 @@ def weigh_and_check(
     weights: Mapping[str | Family, float],
     before: FamilySolution | None = None,
 ) -> CheckedComparison:
-    """Return the fits of all families with their probabilities, and the reason if the best is not sure.
-
-    Parameters
-    ----------
-    data
-        The observations and assumptions.
-    solutions
-        Solutions of all families but the curve.
-    weights
-        Prior weights of all families.
-    before
-        Solution of the curve for fewer observations.
-
-    Raises
-    ------
-    InvalidValueError
-        If the curve is the only family, and the observations are too few for one.
-    """
+    """Return the fits of all families with their probabilities, and the reason if the best is not sure."""
     found = weigh_families(data, solutions, weights) if solutions else None
     curve, is_online = None, before is not None
     is_sure = found is not None and not is_doubtful(data, found, solutions)
@@ -269,19 +252,7 @@ def _compare_refuted(
     otherwise: str,
     is_online: bool,
 ) -> IdentificationResult:
-    """Return the comparison at a larger size of the noise than was stated.
-
-    Parameters
-    ----------
-    data, solutions, weights
-        As for :func:`weigh_and_check`.
-    factor
-        The size relative to the stated one.
-    otherwise
-        The best family for the stated noise; empty if its residuals refute that noise.
-    is_online
-        True if the curve keeps its number of knots, to save time.
-    """
+    """Return the comparison at a larger size of the noise than was stated."""
     larger = replace(
         data, observations=scale_noise(data.observations, np.full(2, factor)), noise_factor=factor
     )

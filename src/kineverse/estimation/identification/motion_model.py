@@ -11,22 +11,11 @@ from kineverse.lie import Array
 
 
 class LinearisedPoses(NamedTuple):
-    """Relative poses and their derivatives.
+    """Relative poses and their derivatives."""
 
-    Attributes
-    ----------
-    pose
-        parent_T_child, (N, 4, 4).
-    by_parameters
-        Twists of the child in the parent's axes, about the child's origin, per unit of each parameter: (N, 6,
-        n), linear rows first.
-    by_joints
-        The same per unit of each joint value, (N, 6, k).
-    """
-
-    pose: Array
-    by_parameters: Array
-    by_joints: Array
+    pose: Array  # parent_T_child, (N, 4, 4)
+    by_parameters: Array  # (N, 6, n)
+    by_joints: Array  # same per unit of each joint value, (N, 6, k)
 
 
 class ParameterPrior(NamedTuple):

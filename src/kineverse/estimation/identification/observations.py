@@ -24,24 +24,12 @@ _THIN = 4.0
 
 @dataclass(frozen=True, eq=False)
 class Observations:
-    """Poses of a parent and a child in one frame, with the covariances of their errors.
+    """Poses of a parent and a child in one frame, with the covariances of their errors."""
 
-    Attributes
-    ----------
-    parent
-        world_T_parent, (N, 4, 4); identities if the parent is the world.
-    child
-        world_T_child, (N, 4, 4). If only positions were observed, the rotations are arbitrary.
-    parent_covariance
-        (N, 6, 6), see :mod:`kineverse.estimation.noise`; None if the parent's pose is exact.
-    child_covariance
-        (N, m, m) with m = 6, or m = 3 if only positions were observed.
-    """
-
-    parent: Array
-    child: Array
-    parent_covariance: Array | None
-    child_covariance: Array
+    parent: Array  # world_T_parent, (N, 4, 4); identities if the parent is the world
+    child: Array  # world_T_child, (N, 4, 4). If only positions were observed, the rotations are arbitrary
+    parent_covariance: Array | None  # (N, 6, 6), see kineverse.estimation.noise
+    child_covariance: Array  # (N, m, m) with m = 6, or m = 3 if only positions were observed
 
     def __len__(self) -> int:
         return len(self.child)
@@ -108,17 +96,7 @@ def check_observations(
     child_covariance: npt.ArrayLike,
     fewest: int = 2,
 ) -> Observations:
-    """Check poses and covariances and return them as observations.
-
-    Raises
-    ------
-    ShapeError
-        For arrays of other shapes than (N, 4, 4), or (N, 3) for positions of the child, and for different
-        numbers of poses.
-    InvalidValueError
-        For fewer than ``fewest`` poses, NaN, matrices that are not rigid, and covariances that are not
-        positive definite.
-    """
+    """Check poses and covariances and return them as observations."""
     b = _numbers(child, "The poses of the child")
     positions = b.ndim == 2 and b.shape[1:] == (3,)
     if not positions and b.shape[1:] != (4, 4):
@@ -162,13 +140,7 @@ def check_observations(
 
 
 def check_rigid(poses: Array, part: str) -> None:
-    """Check that matrices (N, 4, 4) are rigid transforms.
-
-    Raises
-    ------
-    InvalidValueError
-        With the first that is not, and its error.
-    """
+    """Check that matrices (N, 4, 4) are rigid transforms."""
     _check_finite(poses.reshape(len(poses), -1), part)
     rotations = poses[:, :3, :3]
     off = np.abs(np.swapaxes(rotations, 1, 2) @ rotations - np.eye(3)).max(axis=(1, 2))
@@ -185,13 +157,7 @@ def check_rigid(poses: Array, part: str) -> None:
 
 
 def covariances(given: npt.ArrayLike, count: int, rows: int, part: str) -> Array:
-    """Return covariances (N, m, m) from a common one (m, m) or from one for each pose.
-
-    Raises
-    ------
-    ShapeError, InvalidValueError
-        For other shapes, and for matrices that are not symmetric and positive definite.
-    """
+    """Return covariances (N, m, m) from a common one (m, m) or from one for each pose."""
     matrices = _numbers(given, f"The covariance of the {part}")
     if matrices.shape not in ((rows, rows), (count, rows, rows)):
         raise ShapeError(
@@ -265,21 +231,11 @@ points are accepted, positions (N, 3) with (3, 3) or (N, 3, 3)."""
 
 @dataclass(frozen=True)
 class PoseTrack:
-    """Poses of one frame over time.
+    """Poses of one frame over time."""
 
-    Attributes
-    ----------
-    poses
-        (N, 4, 4). The rotations of a point are arbitrary.
-    covariances
-        (N, 6, 6), or (N, 3, 3) of a point; None for exact poses.
-    seen
-        Mask of the times with an observation, (N,).
-    """
-
-    poses: Array
-    covariances: Array | None
-    seen: npt.NDArray[np.bool_]
+    poses: Array  # (N, 4, 4). The rotations of a point are arbitrary
+    covariances: Array | None  # (N, 6, 6), or (N, 3, 3) of a point; None for exact poses
+    seen: npt.NDArray[np.bool_]  # mask of the times with an observation, (N,)
 
     @property
     def is_point(self) -> bool:
@@ -290,22 +246,7 @@ class PoseTrack:
 def check_tracks(
     observations: Mapping[str, PosesLike], noise: npt.ArrayLike | None, points: bool = False
 ) -> dict[str, PoseTrack]:
-    """Check the observations of frames over time and return them as tracks.
-
-    Parameters
-    ----------
-    observations
-        Poses, or pairs of poses and covariance, by name of the frame. A pose of NaN only is a gap.
-    noise
-        Covariance of frames that have none of their own.
-    points
-        True if positions, (N, 3), are accepted.
-
-    Raises
-    ------
-    ShapeError, InvalidValueError
-        For invalid poses or covariances, different numbers of poses, and a frame without covariance.
-    """
+    """Check the observations of frames over time and return them as tracks."""
     if not isinstance(observations, Mapping):
         raise ShapeError("Observations are a mapping from names of frames to poses of shape (N, 4, 4).")
     found = {name: _track(name, given, noise, points) for name, given in observations.items()}

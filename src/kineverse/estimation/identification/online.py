@@ -52,13 +52,7 @@ class ObservationBuffer:
         return self._count
 
     def add(self, one: Observations) -> None:
-        """Append an observation.
-
-        Raises
-        ------
-        ShapeError
-            If it has other shapes than the observations before.
-        """
+        """Append an observation."""
         new = [one.parent, one.child, one.parent_covariance, one.child_covariance]
         if not self._arrays:
             self._arrays = [None if array is None else np.empty_like(array) for array in new]
@@ -95,19 +89,7 @@ def warm_start(
     weights: Mapping[str | Family, float],
     renew: bool = False,
 ) -> dict[str | Family, FamilySolution]:
-    """Return the solutions of families for all observations, starting from earlier solutions.
-
-    Parameters
-    ----------
-    data
-        All observations, the earlier ones first.
-    known
-        Solutions of the earlier observations.
-    weights
-        Prior weights of the families.
-    renew
-        True to estimate an unknown noise again. Else each family keeps its own.
-    """
+    """Return the solutions of families for all observations, starting from earlier solutions."""
     inliers = {name: _predict_inliers(data, one) for name, one in known.items()}
     nearest_of = functools.cache(_nearest_observations)  # most families have the same inliers
     found = {}
@@ -389,27 +371,13 @@ class Identifier:
 
 @dataclass(frozen=True)
 class _Check:
-    """Check of the most probable family.
+    """Check of the most probable family."""
 
-    Attributes
-    ----------
-    family
-        The most probable family but the curve.
-    count
-        Number of observations.
-    is_doubted
-        True if there was a reason why the best family was not sure.
-    curve
-        Solution of the curve; None if none was fitted.
-    odds
-        Odds of the curve against that family.
-    """
-
-    family: str
-    count: int
-    is_doubted: bool = False
-    curve: FamilySolution | None = None
-    odds: float = 0.0
+    family: str  # most probable family but the curve
+    count: int  # number of observations
+    is_doubted: bool = False  # True if there was a reason why the best family was not sure
+    curve: FamilySolution | None = None  # solution of the curve; None if none was fitted
+    odds: float = 0.0  # odds of the curve against that family
 
 
 def _with_curve(

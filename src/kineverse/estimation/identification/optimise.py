@@ -43,21 +43,11 @@ _DIFFERENCE = 1e-5
 
 @dataclass(frozen=True)
 class JointValuePrior:
-    """Prior of the joint values: independent Gaussians.
+    """Prior of the joint values: independent Gaussians."""
 
-    Attributes
-    ----------
-    mean, precision
-        Mean and precision of each joint value, (k,).
-    marginal
-        True if the joint values are integrated out. The cost then includes log |S + J_a P⁻¹ J_aᵀ| of each
-        observation. Without that term, the estimate is biased towards directions with little observed
-        motion, as soon as the noise is as large as the motion.
-    """
-
-    mean: Array
+    mean: Array  # mean and precision of each joint value, (k,)
     precision: Array
-    marginal: bool = False
+    marginal: bool = False  # True if the joint values are integrated out
 
     @staticmethod
     def vague(joints: int) -> JointValuePrior:
@@ -74,39 +64,17 @@ class InitialGuess(NamedTuple):
 
 @dataclass(frozen=True)
 class Solution(Generic[M_co]):
-    """Maximum of the likelihood and the quadratic approximation around it.
+    """Maximum of the likelihood and the quadratic approximation around it."""
 
-    Attributes
-    ----------
-    motion
-        The motion with its parameters.
-    values
-        Joint values, (N, k).
-    cost
-        Twice the negative logarithm of likelihood and prior, without constants.
-    residuals
-        Residuals e_B - M e_A of the child's pose in the parent, in the parent's axes, (N, m).
-    covariance
-        Their covariance S, (N, m, m).
-    linear
-        Derivatives at the solution.
-    parent
-        Most likely true poses of the parent, (N, 4, 4).
-    joint_prior
-        Prior of the joint values.
-    converged
-        True if the steps became small. Else the solution is the best one so far.
-    """
-
-    motion: M_co
-    values: Array
-    cost: float
-    residuals: Array
-    covariance: Array
-    linear: LinearisedPoses
-    parent: Array
-    joint_prior: JointValuePrior
-    converged: bool
+    motion: M_co  # motion with its parameters
+    values: Array  # joint values, (N, k)
+    cost: float  # twice the negative logarithm of likelihood and prior, without constants
+    residuals: Array  # residuals e_B - M e_A of the child's pose in the parent, in the parent's axes, (N, m)
+    covariance: Array  # their covariance S, (N, m, m)
+    linear: LinearisedPoses  # derivatives at the solution
+    parent: Array  # most likely true poses of the parent, (N, 4, 4)
+    joint_prior: JointValuePrior  # prior of the joint values
+    converged: bool  # True if the steps became small. Else the solution is the best one so far
 
 
 @dataclass(frozen=True)
@@ -135,21 +103,7 @@ def levenberg_marquardt(
     joint_prior: JointValuePrior | None = None,
     steps: int = STEPS,
 ) -> Solution[M]:
-    """Return the maximum of the likelihood, from a start.
-
-    Parameters
-    ----------
-    observations
-        The N observations.
-    motion, values
-        Initial motion and joint values (N, k).
-    parent
-        Initial true poses of the parent, (N, 4, 4); None for the observed poses.
-    joint_prior
-        Prior of the joint values; None for a vague one.
-    steps
-        Largest number of steps.
-    """
+    """Return the maximum of the likelihood, from a start."""
     joint_prior = joint_prior or JointValuePrior.vague(motion.joints)
     point = _linearise(
         observations, motion, values, observations.parent if parent is None else parent, joint_prior
@@ -318,7 +272,6 @@ def _log_determinant_gradient(point: _Point[M], gains: Array, joint_prior: Joint
 
 
 def _lever_covariance(lever: Array, covariance: Array | None) -> Array | float:
-    """Return M Σ_A Mᵀ."""
     return 0.0 if covariance is None else lever @ covariance @ np.swapaxes(lever, 1, 2)
 
 
@@ -331,7 +284,6 @@ def _lever(offset: Array, rows: int) -> Array:
 
 
 def _rotate_covariances(covariance: Array, rotation: Array) -> Array:
-    """Return covariances in rotated axes."""
     turned = np.empty_like(covariance) if covariance.flags.writeable else np.empty(covariance.shape)
     back = np.swapaxes(rotation, 1, 2)
     for i in range(0, covariance.shape[1], 3):

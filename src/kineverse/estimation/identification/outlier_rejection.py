@@ -57,25 +57,12 @@ _FEWEST, _SHARE = 5, 0.5
 
 @dataclass(frozen=True)
 class _InlierHypothesis:
-    """Hypothesis on the inliers among the observations.
+    """Hypothesis on the inliers among the observations."""
 
-    Attributes
-    ----------
-    inliers
-        Mask of the inliers, (N,).
-    solution
-        Solution of the family for all observations, with covariances divided by the weights.
-    log_density
-        Log density of all observations at the most likely joint values.
-    weights
-        Weights for the next round, (N,). The weight of an outlier decreases with its error, so that it only
-        determines its own joint value.
-    """
-
-    inliers: npt.NDArray[np.bool_]
+    inliers: npt.NDArray[np.bool_]  # mask of the inliers, (N,)
     solution: Solution[FamilyMember]
-    log_density: float
-    weights: Array
+    log_density: float  # log density of all observations at the most likely joint values
+    weights: Array  # weights for the next round, (N,)
 
     @property
     def has_enough_inliers(self) -> bool:
@@ -90,21 +77,7 @@ def find_inliers(
     stated: bool,
     find: Callable[[Observations, Name], Scored],
 ) -> dict[Name, RowIndices]:
-    """Return the indices of the inliers under each family.
-
-    Parameters
-    ----------
-    observations
-        All observations.
-    found
-        Most likely member of each family by all observations.
-    outliers
-        Outlier model.
-    stated
-        True if the size of the noise is known; else it is estimated for each family.
-    find
-        Function that returns the most likely member of a family by some observations.
-    """
+    """Return the indices of the inliers under each family."""
     everything = np.arange(len(observations))
     if len(observations) < _FEWEST:
         return dict.fromkeys(found, everything)
@@ -163,17 +136,7 @@ def log_inlier_prior(outliers: Outliers, count: int, inliers: int, rows: int) ->
 
 
 def is_inlier(squares: Array, log_scale: Array, outliers: Outliers, rows: int = 6) -> npt.NDArray[np.bool_]:
-    """Return the mask of observations that are more probable as inliers than as outliers.
-
-    Parameters
-    ----------
-    squares, log_scale
-        Squared norms of the whitened errors, and ½ log |2πS| of their covariances, (N,).
-    outliers
-        Outlier model.
-    rows
-        6 for poses, 3 for positions.
-    """
+    """Return the mask of observations that are more probable as inliers than as outliers."""
     inliers: npt.NDArray[np.bool_] = math.log(
         1.0 - outliers.fraction
     ) - 0.5 * squares - log_scale > _log_outlier_density(outliers, rows)

@@ -23,20 +23,7 @@ from .unwrapping import find_revolving_joint
 def project_observations(
     motion: MotionModel, values: Array, observations: Observations, expected: Array | None = None
 ) -> Solution[FixedMotion]:
-    """Return the most likely joint values of a fixed motion at observations.
-
-    Parameters
-    ----------
-    motion
-        The motion. It may have been fitted to other observations.
-    values
-        Candidate joint values, (M, k). Each observation starts from the one whose pose is nearest.
-    observations
-        The N observations.
-    expected
-        Expected angles of the revolving joint, (N,) [rad]. Each start is shifted by whole revolutions to the
-        nearest of them. None leaves the starts as they are.
-    """
+    """Return the most likely joint values of a fixed motion at observations."""
     poses = motion.linearise(values).pose
     distances = np.sum((observations.relative[:, None] - poses[None])[:, :, :3] ** 2, axis=(2, 3))
     starts = values[np.argmin(distances, axis=1)]
@@ -58,21 +45,6 @@ def complete_fit(
 
     The motion stays as it is. The other observations get joint values, deviations and residuals, and are
     classified as inliers or outliers.
-
-    Parameters
-    ----------
-    fit
-        The fit of the observations ``used``.
-    observations
-        All observations.
-    used
-        Indices of the observations of the fit.
-    outliers
-        Outlier model of the other observations. If None, all of them are outliers.
-    stated
-        True if the size of the noise is known.
-    sequential
-        True if revolutions are counted.
     """
     others: npt.NDArray[np.int_] = np.setdiff1d(np.arange(len(observations)), used)
     if not len(others):

@@ -26,17 +26,9 @@ _STEP = math.log(float(GRID[1] / GRID[0]))
 
 @dataclass(frozen=True)
 class PerObservation:
-    """Joint values of each observation by itself, without their prior.
+    """Joint values of each observation by itself, without their prior."""
 
-    Attributes
-    ----------
-    values, covariances
-        Joint values and their covariances, (N, k) and (N, k, k).
-    log_likelihood
-        Log likelihood of all observations, with the joint values integrated out under a uniform prior.
-    """
-
-    values: Array
+    values: Array  # joint values and their covariances, (N, k) and (N, k, k)
     covariances: Array
     log_likelihood: float
 
@@ -62,20 +54,11 @@ def solve_per_observation(solution: Solution[FamilyMember]) -> PerObservation:
 
 @dataclass(frozen=True)
 class JointRanges:
-    """Width and mean of the range of joint values.
+    """Width and mean of the range of joint values."""
 
-    Attributes
-    ----------
-    deviations, mean
-        s and μ of each joint value, (k,).
-    log_density
-        log ∫ Π N(â_k; μ, s² + C_k) p(s) ds at this μ. The prior p(s) is uniform in log s between 10⁻⁵ and 10
-        [m], [rad].
-    """
-
-    deviations: Array
+    deviations: Array  # s and μ of each joint value, (k,)
     mean: Array
-    log_density: float
+    log_density: float  # [m], [rad]
 
 
 def fit_joint_ranges(

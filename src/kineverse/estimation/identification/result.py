@@ -29,19 +29,10 @@ SURE = 0.95
 
 
 class NoiseDeviations(NamedTuple):
-    """Standard deviations of the noise.
+    """Standard deviations of the noise."""
 
-    Attributes
-    ----------
-    position
-        Standard deviation of each coordinate of a position [m].
-    orientation
-        Standard deviation of each component of the rotation vector of an orientation [rad]; NaN if no
-        orientation was observed.
-    """
-
-    position: float
-    orientation: float
+    position: float  # standard deviation of each coordinate of a position [m]
+    orientation: float  # standard deviation of each component of the rotation vector of an orientation [rad]
 
 
 @dataclass(frozen=True)

@@ -31,17 +31,7 @@ _MEAN, _PRECISION, _HEAD = MOTION_SIZE + 4, MOTION_SIZE + 10, MOTION_SIZE + 16
 
 
 class SolutionBuffer:
-    """Contiguous memory of a solution, shared with C, and views of it as arrays.
-
-    Parameters
-    ----------
-    motion
-        Initial member of the family.
-    joint_prior
-        Prior of the joint values.
-    values, parents
-        Initial joint values (N, k) and true poses of the parent (N, 4, 4).
-    """
+    """Contiguous memory of a solution, shared with C, and views of it as arrays."""
 
     __slots__ = ("_covariances", "_linear", "_motion", "_parents", "_residuals", "_values", "numbers")
 
@@ -221,20 +211,7 @@ class IdentificationSolver:
     def log_evidences(
         self, solution: Solution[FamilyMember], factors: Array, parts: Array, weight: float = 1.0
     ) -> Array:
-        """Return the log evidence for each of several sizes of the noise.
-
-        Parameters
-        ----------
-        solution
-            The solution. Its motion is kept.
-        factors
-            Factors on the standard deviations of positions and orientations, (M, 2).
-        parts
-            Covariances of the residuals by errors of positions, and by those of orientations,
-            (2, N, m, m).
-        weight
-            Weight of the log likelihood of each observation.
-        """
+        """Return the log evidence for each of several sizes of the noise."""
         if not _is_kernel_solution(solution):
             return np.array(
                 [

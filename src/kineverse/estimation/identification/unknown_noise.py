@@ -61,21 +61,10 @@ def median_factor(unit: float) -> float:
 
 
 class NoisePosterior(NamedTuple):
-    """Posterior of the sizes of the noise under one family.
+    """Posterior of the sizes of the noise under one family."""
 
-    Attributes
-    ----------
-    logs
-        Logarithms of the most probable factors on the medians, (d,): of positions and orientations, or of
-        positions alone. Empty if the noise is stated.
-    root
-        Square root R of their covariance R Rᵀ, (d, d).
-    log_weight
-        Logarithm of the evidence with both integrated out, relative to that at the most probable factors.
-    """
-
-    logs: Array
-    root: Array
+    logs: Array  # logarithms of the most probable factors on the medians, (d,)
+    root: Array  # square root R of their covariance R Rᵀ, (d, d)
     log_weight: float
 
     @property
@@ -85,13 +74,7 @@ class NoisePosterior(NamedTuple):
         return factors
 
     def deviations(self, unit: float) -> NoiseDeviations | None:
-        """Return the most probable standard deviations [m], [rad]; None if the noise is stated.
-
-        Parameters
-        ----------
-        unit
-            Length scale of the data [m].
-        """
+        """Return the most probable standard deviations [m], [rad]; None if the noise is stated."""
         if not len(self.logs):
             return None
         medians = np.array([UNKNOWN_NOISE[0] * median_factor(unit), UNKNOWN_NOISE[1]])
@@ -104,18 +87,10 @@ STATED_NOISE = NoisePosterior(np.zeros(0), np.zeros((0, 0)), 0.0)
 
 
 class NoiseSolution(NamedTuple):
-    """Solution of a family at the noise that suits it best.
+    """Solution of a family at the noise that suits it best."""
 
-    Attributes
-    ----------
-    scored
-        The solution and its evidence at this noise.
-    noise
-        Posterior of the noise.
-    """
-
-    scored: Scored
-    noise: NoisePosterior
+    scored: Scored  # solution and its evidence at this noise
+    noise: NoisePosterior  # posterior of the noise
 
     @property
     def log_evidence(self) -> float:
@@ -147,17 +122,7 @@ class _NoiseMode(NamedTuple):
 
 
 class _NoiseSearch:
-    """Posterior density of the sizes of the noise, for a motion that is kept.
-
-    Parameters
-    ----------
-    observations
-        The observations, with the medians of the noise.
-    solution
-        Solution of a family at any size of the noise.
-    weight
-        Weight of the log likelihood of each observation.
-    """
+    """Posterior density of the sizes of the noise, for a motion that is kept."""
 
     def __init__(
         self, observations: Observations, solution: Solution[FamilyMember], weight: float = 1.0
@@ -220,17 +185,7 @@ class _NoiseSearch:
 def estimate_noise(
     observations: Observations, solution: Solution[FamilyMember], near: NoisePosterior | None = None
 ) -> NoiseSolution:
-    """Return a solution whose motion is kept at the most probable noise.
-
-    Parameters
-    ----------
-    observations
-        The observations, with the medians of the noise.
-    solution
-        Solution at any noise.
-    near
-        Posterior of a similar noise, to save time.
-    """
+    """Return a solution whose motion is kept at the most probable noise."""
     search = _NoiseSearch(observations, solution)
     return _at_mode(
         search, search.maximise_anywhere() if near is None else search.maximise(near.logs, near.root)
@@ -238,15 +193,7 @@ def estimate_noise(
 
 
 def solve_unknown_noise(observations: Observations, solve: Callable[[Observations], Scored]) -> NoiseSolution:
-    """Return the most likely member of a family, at the noise that suits it best.
-
-    Parameters
-    ----------
-    observations
-        The observations, with the medians of the noise.
-    solve
-        Function that returns the most likely member at some noise.
-    """
+    """Return the most likely member of a family, at the noise that suits it best."""
     search, mode = None, None
     for factors in _STARTS:
         solution = solve(scale_noise(observations, np.array(factors))).solution
@@ -276,17 +223,7 @@ def adapt_noise(
     near: NoiseSolution,
     proceed: Callable[[Observations, Solution[FamilyMember]], Scored] | None = None,
 ) -> NoiseSolution:
-    """Return the solution at the noise that suits it best, with the joint values integrated out.
-
-    Parameters
-    ----------
-    observations
-        The observations, with the medians of the noise. They may be more than those of ``near``.
-    near
-        Solution of the same observations at a similar noise.
-    proceed
-        Function that continues a solution at some noise; None for that of a joint.
-    """
+    """Return the solution at the noise that suits it best, with the joint values integrated out."""
     (solution, _), noise = near
     logs, root, motion = noise.logs, noise.root, solution.motion
     rough = bool(motion.joints and motion.size) and not solution.joint_prior.marginal
@@ -312,17 +249,7 @@ def adapt_noise(
 
 
 def weigh_observations(observations: Observations, one: NoiseSolution, weight: float) -> NoiseSolution:
-    """Return a solution with the evidence and the noise for a weight of each observation's log likelihood.
-
-    Parameters
-    ----------
-    observations
-        The observations, with the medians of the noise if it is unknown.
-    one
-        Their solution. Its motion is kept.
-    weight
-        The weight, below 1 if errors are correlated.
-    """
+    """Return a solution with the evidence and the noise for a weight of each observation's log likelihood."""
     (solution, reached), noise = one
     if not len(noise.logs):
         predicted, weighted = (solver.evidence(solution, w).log_evidence for w in (1.0, weight))

@@ -72,13 +72,6 @@ def log_evidence(served: KnownJoint, residuals: KnownResiduals, is_static: bool 
 
     Limits truncate the prior only for a single joint value. For several joint values, and for limits on
     several coordinates, violations reduce the density by their distance.
-
-    Parameters
-    ----------
-    served, residuals
-        The served joint and its residuals.
-    is_static
-        True to assume one constant joint value within the limits.
     """
     log = -float(np.sum(0.5 * np.sum(residuals.orthogonal**2, axis=1) + residuals.log_scale))
     log -= 0.5 * float(np.nansum(np.maximum(residuals.limit_excess, 0.0) ** 2))
@@ -193,28 +186,14 @@ _ALMOST_ONE = 1.1
 
 @dataclass(frozen=True)
 class JointObservations:
-    """Observations of a tested joint.
+    """Observations of a tested joint."""
 
-    Attributes
-    ----------
-    joint, served
-        The tested joint, and its motion in the served model.
-    observations
-        Observations of both frames.
-    residuals
-        Residuals under the served joint.
-    times
-        Numbers of the observations, (N,).
-    stamps
-        Their times [s], (N,).
-    """
-
-    joint: TestableJoint
-    served: KnownJoint
-    observations: Observations
-    residuals: KnownResiduals
-    times: npt.NDArray[np.int_]
-    stamps: Array
+    joint: TestableJoint  # tested joint
+    served: KnownJoint  # its motion in the served model
+    observations: Observations  # observations of both frames
+    residuals: KnownResiduals  # residuals under the served joint
+    times: npt.NDArray[np.int_]  # numbers of the observations, (N,)
+    stamps: Array  # their times [s], (N,)
 
     def select(self, rows: slice | npt.NDArray[np.int_]) -> JointObservations:
         """Return some of the observations."""

@@ -36,32 +36,14 @@ _RANGE, _NONLINEAR = 2.0, 0.5
 
 @dataclass(frozen=True)
 class TimedResiduals:
-    """Residuals of one joint, with the numbers of their observations.
+    """Residuals of one joint, with the numbers of their observations."""
 
-    Attributes
-    ----------
-    times
-        Numbers of the observations, (N,).
-    residuals
-        Residuals under the served joint.
-    """
-
-    times: npt.NDArray[np.int_]
-    residuals: KnownResiduals
+    times: npt.NDArray[np.int_]  # numbers of the observations, (N,)
+    residuals: KnownResiduals  # residuals under the served joint
 
 
 class ConsistencyTests:
-    """Consistency tests of all tested joints.
-
-    Parameters
-    ----------
-    model
-        The served model.
-    served_joints
-        Served joints by tested joint.
-    exact
-        Frame whose pose is exactly known, if any.
-    """
+    """Consistency tests of all tested joints."""
 
     def __init__(
         self, model: Model, served_joints: Mapping[TestableJoint, KnownJoint], exact: str | None
@@ -177,15 +159,7 @@ class _Limits:
         covariances: Array,
         shared: npt.NDArray[np.bool_],
     ) -> Array:
-        """Return the violation of each limit in standard deviations, (N, c).
-
-        Parameters
-        ----------
-        served, residuals
-            The served joint and its residuals.
-        values, covariances, shared
-            Other coordinates, those of the limits first.
-        """
+        """Return the violation of each limit in standard deviations, (N, c)."""
         count, m = len(own_residuals), len(self.others)
         if not self.slacks:
             return np.zeros((count, 0))

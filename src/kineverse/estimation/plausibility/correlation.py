@@ -36,18 +36,10 @@ _JUMP = 5
 
 @dataclass(frozen=True)
 class CorrelationSettings:
-    """Stated or unknown correlation of errors in time.
+    """Stated or unknown correlation of errors in time."""
 
-    Attributes
-    ----------
-    time
-        Correlation time of the errors [s], or in looks if there are no time stamps; None to measure it.
-    stamped
-        True if the looks have time stamps.
-    """
-
-    time: float | None
-    stamped: bool
+    time: float | None  # correlation time of the errors [s], or in looks if there are no time stamps
+    stamped: bool  # True if the looks have time stamps
 
     def measure(self, residuals: Array, size: int, stamps: Array) -> float:
         """Return the number of looks that tell as much as one, from residuals (N, 6) at times (N,)."""
@@ -58,18 +50,7 @@ class CorrelationSettings:
 
 
 class ErrorCorrelation:
-    """Number of looks that tell as much as one look with independent errors.
-
-    Parameters
-    ----------
-    settings
-        The stated correlation, if any.
-
-    Attributes
-    ----------
-    looks
-        m, at least 1.
-    """
+    """Number of looks that tell as much as one look with independent errors."""
 
     def __init__(self, settings: CorrelationSettings) -> None:
         self._stated = settings.time

@@ -29,21 +29,7 @@ def find_exchanged_frames(
     exact: str | None,
     first: int = 0,
 ) -> dict[TestableJoint, str]:
-    """Return the joints that fit after two frames are exchanged, with that as the reason.
-
-    Parameters
-    ----------
-    implausible_since
-        First observation that each rejected joint does not explain.
-    served_joints
-        Served joints by tested joint.
-    tracks
-        Poses by name of the frame.
-    exact
-        Frame whose pose is exactly known, if any.
-    first
-        Number of the first observation of the tracks.
-    """
+    """Return the joints that fit after two frames are exchanged, with that as the reason."""
     known = [joint for joint in served_joints if {joint.parent, joint.child} <= tracks.keys()]
     frames = dict.fromkeys(
         f for joint in known if joint in implausible_since for f in (joint.parent, joint.child) if f != exact

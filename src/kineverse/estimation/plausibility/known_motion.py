@@ -35,19 +35,6 @@ class KnownJoint:
 
     Joint values are the coordinates between both. With a quaternion among them, they are displacements from a
     reference instead. With ``open_loops``, coordinates determined by loops count as free.
-
-    Attributes
-    ----------
-    coordinates
-        The n coordinates.
-    joints
-        Number of joint values, k.
-    lower, upper
-        Limits of the joint values, (k,); ±inf where there are none.
-    is_angle
-        True for joint values that rotate the child, (k,).
-    home, middle
-        Coordinates in the model's default state, (n,), and the child's position there, (3,).
     """
 
     def __init__(self, model: Model, child: str, parent: str, open_loops: bool = False) -> None:

@@ -33,53 +33,20 @@ _PRECISION = 1e-4
 
 @dataclass(frozen=True)
 class KnownResiduals:
-    """Residuals of N observations under a served joint.
+    """Residuals of N observations under a served joint."""
 
-    Attributes
-    ----------
-    coordinates
-        Most likely coordinates inside the limits, (N, n).
-    values
-        Most likely joint values without limits, by linearisation, (N, k). Where they are not the coordinates,
-        they are displacements from the first observation.
-    covariances
-        Covariances of ``values``, (N, k, k).
-    orthogonal
-        ρ, the whitened residual orthogonal to the joint directions, (N, 6 - k).
-    whitened
-        The same residual in the axes of the whitened pose, (N, 6). They do not turn with the basis of ρ.
-    displacement_jacobian
-        Derivative of ρ by a displacement of the joint in the parent and of the child on the joint: per unit
-        of a twist of either, in their axes and about the child in the default state, (N, 6 - k, 12).
-    bound_excess
-        Distance of values below the lower and above the upper limits, in standard deviations; -∞ without
-        limits, (N, 2 k).
-    pose_residuals
-        Residual of the relative pose in the parent's axes, with the best joint values inside the limits, (N,
-        6).
-    log_scale
-        ½ log |2πS| of each observation minus ½ log |2πC| of its joint values. Together with ½ |ρ|² it is the
-        negative log density with joint values integrated out, (N,).
-    limit_excess
-        Violation of limits on several coordinates, in standard deviations; NaN where unknown, (N, c).
-    disagreement
-        Difference from the estimates of the same coordinates by others, likewise, (N, e).
-    other_values
-        These estimates, (N, e). :mod:`.consistency` sets the last three.
-    """
-
-    coordinates: Array
-    values: Array
-    covariances: Array
-    orthogonal: Array
-    whitened: Array
+    coordinates: Array  # most likely coordinates inside the limits, (N, n)
+    values: Array  # most likely joint values without limits, by linearisation, (N, k)
+    covariances: Array  # covariances of values, (N, k, k)
+    orthogonal: Array  # ρ, the whitened residual orthogonal to the joint directions, (N, 6 - k)
+    whitened: Array  # same residual in the axes of the whitened pose, (N, 6)
     displacement_jacobian: Array
     bound_excess: Array
-    pose_residuals: Array
-    log_scale: Array
-    limit_excess: Array
-    disagreement: Array
-    other_values: Array
+    pose_residuals: Array  # (N, 6)
+    log_scale: Array  # (N,)
+    limit_excess: Array  # (N, c)
+    disagreement: Array  # difference from the estimates of the same coordinates by others, likewise, (N, e)
+    other_values: Array  # these estimates, (N, e). consistency sets the last three
 
     def __len__(self) -> int:
         return len(self.orthogonal)

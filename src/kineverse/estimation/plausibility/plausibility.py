@@ -158,13 +158,7 @@ def check_plausibility(
 
 
 def check_false_alarms(probability: float) -> None:
-    """Check a probability of false alarms.
-
-    Raises
-    ------
-    InvalidValueError
-        If it is not between 0 and 1.
-    """
+    """Check a probability of false alarms."""
     if not 0.0 < probability < 1.0:
         raise InvalidValueError(
             f"The probability of a false alarm is between 0 and 1, and not {probability}."
@@ -200,13 +194,7 @@ def pair_outliers(
 
 
 def check_decorrelation_time(time: float | None) -> None:
-    """Check a correlation time.
-
-    Raises
-    ------
-    InvalidValueError
-        If it is negative or not finite.
-    """
+    """Check a correlation time."""
     if time is not None and not (math.isfinite(time) and time >= 0.0):
         raise InvalidValueError(
             "The decorrelation time is a number of seconds, 0 for independent errors, or None to measure it, "
@@ -215,13 +203,7 @@ def check_decorrelation_time(time: float | None) -> None:
 
 
 def check_time(at: object, last: float) -> float:
-    """Return a time stamp as a number.
-
-    Raises
-    ------
-    InvalidValueError
-        If it is no finite number, or not later than the last one.
-    """
+    """Return a time stamp as a number."""
     try:
         time = float(at)  # type: ignore[arg-type]
     except (TypeError, ValueError):
@@ -237,13 +219,7 @@ def check_time(at: object, last: float) -> float:
 
 
 def _checked_model(given: Model | Snapshot | Tracker) -> Model:
-    """Return the model to check.
-
-    Raises
-    ------
-    InvalidValueError
-        For anything else.
-    """
+    """Return the model to check."""
     model = given.model if isinstance(given, Tracker) else given
     if isinstance(model, Snapshot):
         model = model.model()

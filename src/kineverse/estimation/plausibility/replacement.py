@@ -43,27 +43,13 @@ from .testability import TestableJoint
 
 @dataclass(frozen=True)
 class JointValue:
-    """Value of a joint as an expression of its coordinate.
+    """Value of a joint as an expression of its coordinate."""
 
-    Attributes
-    ----------
-    coordinate
-        Coordinate of the served joint.
-    value
-        Joint value, as an expression of the coordinate.
-    follows
-        Expression that the joint follows, if it has no coordinate of its own.
-    is_derived
-        True if the value is not the coordinate itself.
-    lower, upper
-        Limits of the value.
-    """
-
-    coordinate: Symbol
-    value: Expression
-    follows: Expression | None
-    is_derived: bool
-    lower: float
+    coordinate: Symbol  # coordinate of the served joint
+    value: Expression  # joint value, as an expression of the coordinate
+    follows: Expression | None  # expression that the joint follows, if it has no coordinate of its own
+    is_derived: bool  # True if the value is not the coordinate itself
+    lower: float  # limits of the value
     upper: float
 
     def evaluate(self, coordinates: Array) -> Array:
@@ -104,23 +90,7 @@ def follows_another(model: Model, joint: TestableJoint) -> bool:
 
 
 def extend_fit(fit: Fit, observations: Observations, used: RowIndices) -> tuple[RowIndices, Fit]:
-    """Extend a fit of some observations to all observations that it explains.
-
-    Parameters
-    ----------
-    fit
-        Fit of the observations ``used``.
-    observations
-        All observations.
-    used
-        Numbers of the fitted observations.
-
-    Returns
-    -------
-    rows, fit
-        Numbers of further explained observations followed by the fitted ones, and the fit with all joint
-        values.
-    """
+    """Extend a fit of some observations to all observations that it explains."""
     others = np.setdiff1d(np.arange(len(observations)), used)
     if not len(others) or not fit.motion.joints:
         return used, fit
@@ -138,28 +108,14 @@ _FOLLOWS, _GEARED = 3.0, 4.0
 
 @dataclass(frozen=True)
 class ReplacedJoint(Operation, document_kind="Relearned"):
-    """Identified joint, with the other writes of the operation that it replaces.
+    """Identified joint, with the other writes of the operation that it replaces."""
 
-    Attributes
-    ----------
-    joint
-        Operation of the joint.
-    record
-        Name of the articulation's record; that of the joint if None.
-    kept
-        Other writes, as pairs of a cell (kind, name) and a value.
-    frame
-        Frame that the joint places.
-    before, after
-        Pose of the joint in its parent, and of the frame in the joint's child.
-    """
-
-    joint: Operation
-    record: str | None = None
+    joint: Operation  # operation of the joint
+    record: str | None = None  # name of the articulation's record; that of the joint if None
     kept: tuple[tuple[tuple[str, str], Any], ...] = ()
-    frame: str = ""
-    before: Pose = Pose()
-    after: Pose = Pose()
+    frame: str = ""  # frame that the joint places
+    before: Pose = Pose()  # pose of the joint in its parent
+    after: Pose = Pose()  # of the frame in the joint's child
 
     def apply(self, model: ReadRecorder) -> Writes:
         """Write the joint and the other cells."""
@@ -183,19 +139,7 @@ class ReplacedJoint(Operation, document_kind="Relearned"):
 def build_replacement(
     model: Model, joint: TestableJoint, served: KnownJoint, coordinates: Array, others: Array, fit: Fit
 ) -> Operation:
-    """Build the operation that replaces a joint.
-
-    Parameters
-    ----------
-    model, joint, served
-        The served model, the tested joint, and its motion.
-    coordinates
-        Coordinates of the served joint at the fit's observations, (N, n).
-    others
-        Values of shared coordinates from other joints, (N, e); NaN where unknown.
-    fit
-        Identified joint between the observed frames.
-    """
+    """Build the operation that replaces a joint."""
     base_T_parent = _constant(model, joint.parent, joint.base)
     frame_T_child = _constant(model, joint.child, joint.frame)
     writes = model.history.entry(joint.tag).writes
@@ -247,7 +191,6 @@ def build_replacement(
 
 
 def _records(writes: WrittenValues, joint: TestableJoint) -> dict[str, Articulation]:
-    """Return the articulation records of the joint."""
     return {
         name: value
         for (kind, name), value in writes.items()

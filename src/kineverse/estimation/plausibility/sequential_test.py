@@ -56,25 +56,7 @@ _LEAST_WEIGHT = 0.1
 
 
 class SequentialTest:
-    """Sequential test of one joint.
-
-    Parameters
-    ----------
-    false_alarms
-        Probability α of ever rejecting a joint that is as served.
-    outlier_fraction
-        Probability ε of an outlier.
-
-    Attributes
-    ----------
-    count
-        Number of observations so far.
-    implausible_since
-        Most likely change point: the first observation, from 0, that the joint does not explain; None before
-        rejection. A rejection is final.
-    detected_at
-        Observation at which the joint was rejected.
-    """
+    """Sequential test of one joint."""
 
     def __init__(self, false_alarms: float, outlier_fraction: float = 0.0) -> None:
         self._threshold = -math.log(false_alarms)
@@ -91,15 +73,7 @@ class SequentialTest:
     def add(
         self, orthogonal: Array, displacement_jacobian: Array, one_sided: Array, looks: float = 1.0
     ) -> float:
-        """Add one observation; return log M.
-
-        Parameters
-        ----------
-        orthogonal, displacement_jacobian, one_sided
-            Row of a :class:`.known_residuals.KnownResiduals`; NaN is ignored.
-        looks
-            Number m of observations that tell as much as one with independent errors.
-        """
+        """Add one observation; return log M."""
         time = self._time + 1.0 / looks if self.count else 1.0
         weight = math.log((time - self._time) / ((1.0 + self._time) * (1.0 + time)))
         self._time = time
@@ -138,13 +112,6 @@ class CorrelatedTest:
     """Sequential test of one joint with errors that are correlated in time.
 
     Where many observations tell as much as one, only some of them are tested, with the weight of all.
-
-    Parameters
-    ----------
-    false_alarms, outlier_fraction
-        As in :class:`SequentialTest`.
-    correlation
-        The stated correlation of the errors, if any.
     """
 
     def __init__(

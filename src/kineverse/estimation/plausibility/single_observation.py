@@ -29,41 +29,19 @@ _EYE_3, _EYE_6 = np.eye(3), np.eye(6)
 
 
 class PoseSolution(NamedTuple):
-    """Most likely joint values of one observation inside the limits.
+    """Most likely joint values of one observation inside the limits."""
 
-    Attributes
-    ----------
-    values
-        Joint values, (k,).
-    pose, by_joints
-        Pose of the joint there, (4, 4), and twists per unit of each joint value, (6, k).
-    residual, covariance
-        Residual of the relative pose in the parent's axes, (6,), and its covariance, (6, 6).
-    """
-
-    values: Array
-    pose: Array
+    values: Array  # joint values, (k,)
+    pose: Array  # pose of the joint there, (4, 4), and twists per unit of each joint value, (6, k)
     by_joints: Array
-    residual: Array
+    residual: Array  # residual of the relative pose in the parent's axes, (6,), and its covariance, (6, 6)
     covariance: Array
 
 
 def solve_observation(
     served: KnownJoint, observations: Observations, start: Array, precision: float
 ) -> PoseSolution | None:
-    """Return the solution for one observation of a joint; None if the steps do not converge.
-
-    Parameters
-    ----------
-    served
-        Joint whose joint values are its coordinates.
-    observations
-        The observation of both poses, (1, ...).
-    start
-        Initial joint values, (k,).
-    precision
-        Prior information of the joint values, which only keeps unobservable ones finite.
-    """
+    """Return the solution for one observation of a joint; None if the steps do not converge."""
     parent, child = observations.parent[0], observations.child[0]
     of_parent = None if observations.parent_covariance is None else observations.parent_covariance[0]
     of_child = observations.child_covariance[0]

@@ -19,63 +19,26 @@ from kineverse.model.model import Model
 
 @dataclass(frozen=True)
 class TestableJoint:
-    """Pair of observed frames with one operation between them.
+    """Pair of observed frames with one operation between them."""
 
-    Attributes
-    ----------
-    tag
-        Tag of the tested operation.
-    parent, child
-        The observed frames.
-    base, frame
-        Frame to which the operation attaches, and the frame that it places there. Between them are only
-        frames of the same operation.
-    moves
-        True if the child moves relative to the parent.
-    """
-
-    tag: str
-    parent: str
+    tag: str  # tag of the tested operation
+    parent: str  # observed frames
     child: str
-    base: str
-    frame: str
-    moves: bool
+    base: str  # frame to which the operation attaches
+    frame: str  # the frame that it places there. Between them are only frames of the same operation
+    moves: bool  # True if the child moves relative to the parent
 
 
 @dataclass(frozen=True)
 class TestableJoints:
-    """Testable joints of a model, with the reasons for other frames.
+    """Testable joints of a model, with the reasons for other frames."""
 
-    Attributes
-    ----------
-    joints
-        Parents first.
-    untested
-        Observed frames that test no single operation, with the reason in words.
-    """
-
-    joints: tuple[TestableJoint, ...]
-    untested: Mapping[str, str]
+    joints: tuple[TestableJoint, ...]  # parents first
+    untested: Mapping[str, str]  # observed frames that test no single operation, with the reason in words
 
 
 def find_testable_joints(model: Model, observed: Iterable[str], relative_to: str | None) -> TestableJoints:
-    """Find the joints that observed frames can test.
-
-    Parameters
-    ----------
-    model
-        The served model.
-    observed
-        Names of the observed frames.
-    relative_to
-        Frame in which they are observed, with exactly known pose; None for an observer that is no part of the
-        model.
-
-    Raises
-    ------
-    UnknownNameError
-        For a frame that does not exist.
-    """
+    """Find the joints that observed frames can test."""
     frames = list(dict.fromkeys(observed))
     for name in frames if relative_to is None else [*frames, relative_to]:
         if name != WORLD and name not in model.frames:

@@ -50,65 +50,27 @@ _WITH_UNIT = re.compile(r"(?P<name>.*?)\s*(?:[\[(]\s*(?P<unit>[^\[\]()]*?)\s*[\]
 
 @dataclass(frozen=True)
 class PartColumns:
-    """Columns of one part.
+    """Columns of one part."""
 
-    Attributes
-    ----------
-    position
-        Columns of x, y and z.
-    orientation
-        Columns of the orientation; empty if there is none.
-    form
-        One of :data:`ORIENTATIONS`, or "".
-    """
-
-    position: tuple[int, ...]
-    orientation: tuple[int, ...] = ()
-    form: str = ""
+    position: tuple[int, ...]  # columns of x, y and z
+    orientation: tuple[int, ...] = ()  # columns of the orientation; empty if there is none
+    form: str = ""  # one of ORIENTATIONS, or ""
 
 
 @dataclass(frozen=True)
 class Columns:
-    """Columns of a table by meaning.
+    """Columns of a table by meaning."""
 
-    Attributes
-    ----------
-    names
-        Names as given.
-    parts
-        Columns of each part by name; the name is "" if columns name no part.
-    time, part
-        Columns of the time and of the part's name; None if there are none.
-    factors
-        Factors that convert columns to metres, radians and seconds.
-    ignored
-        Names without meaning.
-    """
-
-    names: tuple[str, ...]
-    parts: Mapping[str, PartColumns]
+    names: tuple[str, ...]  # names as given
+    parts: Mapping[str, PartColumns]  # columns of each part by name; the name is "" if columns name no part
     time: int | None = None
-    part: int | None = None
+    part: int | None = None  # of the part's name; None if there are none
     factors: Mapping[int, float] = field(default_factory=dict)
-    ignored: tuple[str, ...] = ()
+    ignored: tuple[str, ...] = ()  # names without meaning
 
 
 def parse_columns(names: Sequence[str], where: str) -> Columns:
-    """Parse column names.
-
-    Parameters
-    ----------
-    names
-        Quantities, optionally followed by a unit in brackets, and preceded by a part and ``.``, ``/`` or
-        ``:``.
-    where
-        File and line, at the beginning of messages.
-
-    Raises
-    ------
-    FormatError
-        If a quantity occurs twice, a position or an orientation lacks a column, or there is no position.
-    """
+    """Parse column names."""
     places: dict[tuple[str, str], int] = {}
     factors: dict[int, float] = {}
     ignored: list[str] = []

@@ -28,24 +28,12 @@ COMMENT = "#"
 
 @dataclass(frozen=True)
 class TextTable:
-    """Text cells of a table file.
+    """Text cells of a table file."""
 
-    Attributes
-    ----------
-    source
-        Name of the file in messages.
-    head
-        Column names; None if the file begins with numbers.
-    lines
-        Line number of each row, counted from 1.
-    cells
-        Texts of each row, equally many in each.
-    """
-
-    source: str
-    head: tuple[str, ...] | None
-    lines: tuple[int, ...]
-    cells: tuple[tuple[str, ...], ...]
+    source: str  # name of the file in messages
+    head: tuple[str, ...] | None  # column names; None if the file begins with numbers
+    lines: tuple[int, ...]  # line number of each row, counted from 1
+    cells: tuple[tuple[str, ...], ...]  # texts of each row, equally many in each
 
 
 def read_table(path: Path) -> TextTable:
@@ -54,11 +42,6 @@ def read_table(path: Path) -> TextTable:
     Empty lines and lines that begin with ``#`` are skipped. The first other line is the head if one of its
     cells is not a number. It also determines the separator: a semicolon if it has one, else a comma, else a
     tab in a head, else spaces.
-
-    Raises
-    ------
-    FormatError
-        If there is no such file, it is not text, it is empty, or rows differ in length.
     """
     source = str(path)
     found = [
@@ -253,7 +236,6 @@ def _rotations(table: TextTable, columns: Columns, where: PartColumns, rows: Ind
 
 
 def _check_order(table: TextTable, times: Array, lines: Indices) -> None:
-    """Check that times increase."""
     wrong = np.flatnonzero(np.diff(times) <= 0.0)
     if not wrong.size:
         return

@@ -72,11 +72,6 @@ class NativeMapSolver:
     """Compiled counterpart of :class:`.map_update.MapSolver` for one tracker.
 
     It owns its memory; a lock serialises threads.
-
-    Parameters
-    ----------
-    layout, limits, function, process_model
-        Components of the tracker.
     """
 
     def __init__(
@@ -248,13 +243,7 @@ _MOST_TRIMMED = 4
 
 
 class NativeInlierSolver:
-    """Compiled update of groups whose measurements are unambiguous inliers or outliers.
-
-    Parameters
-    ----------
-    layout, native, outliers
-        Components of the tracker.
-    """
+    """Compiled update of groups whose measurements are unambiguous inliers or outliers."""
 
     def __init__(self, layout: Layout, native: NativeMapSolver, outliers: Outliers) -> None:
         self._layout, self._native, self._outliers = layout, native, outliers

@@ -27,22 +27,12 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True, eq=False)
 class StateBounds:
-    """Constraints on the estimated coordinates.
+    """Constraints on the estimated coordinates."""
 
-    Attributes
-    ----------
-    names
-        Names of all constraints in use.
-    lower, upper
-        Bounds of single free coordinates, in the order of the coordinates; ±inf where there are none.
-    curved
-        All other constraints, resolved: of several coordinates, nonlinear, or with moving bounds.
-    """
-
-    names: tuple[str, ...]
-    lower: Array
-    upper: Array
-    curved: tuple[Constraint, ...]
+    names: tuple[str, ...]  # names of all constraints in use
+    lower: Array  # bounds of single free coordinates
+    upper: Array  # in the order of the coordinates; ±inf where there are none
+    curved: tuple[Constraint, ...]  # all other constraints, resolved
 
     def by_symbol(self, tangent_space: TangentSpace) -> dict[Symbol, tuple[float, float]]:
         """Return the bounds of single coordinates by symbol."""
@@ -98,20 +88,7 @@ def _is_coordinate_bound(constraint: Constraint, tangent_space: TangentSpace) ->
 def arrange_state(
     model: ModelView, observations: tuple[MeasurementModel, ...], given: frozenset[Symbol]
 ) -> tuple[Layout, StateBounds]:
-    """Choose the estimated coordinates, and collect their limits.
-
-    Parameters
-    ----------
-    model, observations
-        The model, and its measurement models.
-    given
-        Coordinates that are measured elsewhere.
-
-    Raises
-    ------
-    InvalidValueError
-        If an observation depends on no estimated coordinate.
-    """
+    """Choose the estimated coordinates, and collect their limits."""
     rates = model.rates
     values = [rates.resolve(to_plain(one.value)) for one in observations]
     tangent_space = build_tangent_space(rates, values, given, model.default_state())
@@ -182,15 +159,7 @@ class BoundRows(NamedTuple):
 
 
 class GroupBounds:
-    """Limits of one group.
-
-    Parameters
-    ----------
-    number
-        Number of the group.
-    layout, limits
-        Components of the tracker.
-    """
+    """Limits of one group."""
 
     def __init__(self, number: int, layout: Layout, limits: StateBounds) -> None:
         group = layout.groups[number]
@@ -234,13 +203,7 @@ _STILL = 1e-6
 
 
 class SpeedLocks:
-    """Constraints that bound single speeds by expressions of estimated coordinates and inputs.
-
-    Parameters
-    ----------
-    model, layout, process_model
-        Components of the tracker.
-    """
+    """Constraints that bound single speeds by expressions of estimated coordinates and inputs."""
 
     def __init__(self, model: ModelView, layout: Layout, process_model: ProcessModel) -> None:
         tangent_space = layout.tangent_space

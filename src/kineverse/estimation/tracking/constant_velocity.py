@@ -40,35 +40,16 @@ _MOST_STEPS = 10
 
 @dataclass(frozen=True, eq=False)
 class ConditionalSpeeds:
-    """Gaussian of the speeds of a group given its state: u | ξ ~ N(m + K ξ, C).
+    """Gaussian of the speeds of a group given its state: u | ξ ~ N(m + K ξ, C)."""
 
-    Attributes
-    ----------
-    anchor
-        Coordinates (n,) in whose tangent space ξ is.
-    mean, gain, covariance
-        m (k,), K (k, t) and C (k, k).
-    """
-
-    anchor: Array
-    mean: Array
+    anchor: Array  # coordinates (n,) in whose tangent space ξ is
+    mean: Array  # m (k,), K (k, t) and C (k, k)
     gain: Array
     covariance: Array
 
 
 class ConstantVelocity:
-    """Prediction of states and speeds.
-
-    Parameters
-    ----------
-    layout, process_model
-        Components of the tracker.
-
-    Attributes
-    ----------
-    periods
-        Periods of coordinates, whose changes are wrapped [rad].
-    """
+    """Prediction of states and speeds."""
 
     def __init__(self, layout: Layout, process_model: ProcessModel) -> None:
         self._layout, self._process_model = layout, process_model
@@ -116,21 +97,7 @@ class ConstantVelocity:
         commands: Mapping[Symbol, float],
         noise: Mapping[Symbol, float],
     ) -> None:
-        """Predict states and speeds by ``dt`` seconds; in place.
-
-        Parameters
-        ----------
-        belief
-            The belief.
-        inputs
-            Values of the inputs.
-        dt
-            Time step [s].
-        commands
-            Speeds that are known during the step.
-        noise
-            Spectral density q of the acceleration of each other speed [m²/s³], [rad²/s³].
-        """
+        """Predict states and speeds by ``dt`` seconds; in place."""
         # Too long a step leads to numbers that are not finite, which the caller refuses.
         with np.errstate(over="ignore", invalid="ignore"):
             for numbers in self._batches:

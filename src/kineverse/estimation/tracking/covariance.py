@@ -67,13 +67,7 @@ class RidgeCovariance(_CovarianceComputation):
     """Posterior covariance of groups with unobservable directions."""
 
     def compute(self, number: int, belief: InformationState) -> Array:
-        """Return the second moment of the posterior of a group about its estimate (t, t).
-
-        Raises
-        ------
-        InvalidValueError
-            If the information is numerically singular.
-        """
+        """Return the second moment of the posterior of a group about its estimate (t, t)."""
         t = self._layout.groups[number].t
         information = belief.information[np.ix_(t, t)]
         gaussian = inverse_spd(information)

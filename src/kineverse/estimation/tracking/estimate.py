@@ -22,30 +22,14 @@ from .track_loss import TrackLoss
 
 @dataclass(frozen=True, eq=False)
 class TrackerState:
-    """State of a tracker between two steps.
+    """State of a tracker between two steps."""
 
-    Attributes
-    ----------
-    mixture
-        Belief.
-    result
-        Result of the last update.
-    loss
-        Groups that are lost.
-    inputs
-        Values of the inputs.
-    stamp
-        Time [s]; None if the tracker was given none.
-    reading
-        Latest measurements of this time, of each observation; None if there are none.
-    """
-
-    mixture: GaussianSum
-    result: StepResult
-    loss: TrackLoss
-    inputs: Array
-    stamp: float | None = None
-    reading: Measurements | None = None
+    mixture: GaussianSum  # belief
+    result: StepResult  # result of the last update
+    loss: TrackLoss  # groups that are lost
+    inputs: Array  # values of the inputs
+    stamp: float | None = None  # time [s]; None if the tracker was given none
+    reading: Measurements | None = None  # latest measurements of this time, of each observation
 
 
 class Estimate:

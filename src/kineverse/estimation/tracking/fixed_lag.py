@@ -24,34 +24,16 @@ State = TypeVar("State", bound=Stamped)
 
 @dataclass(frozen=True, eq=False)
 class Step(Generic[State]):
-    """Step of a filter.
+    """Step of a filter."""
 
-    Attributes
-    ----------
-    stamp
-        Time at its end [s].
-    before
-        State before it.
-    apply
-        Function of the state before it that returns the state at its end.
-    predict
-        Function of the state before it and a time within it that returns the predicted state then.
-    """
-
-    stamp: float
-    before: State
-    apply: Callable[[State], State]
+    stamp: float  # time at its end [s]
+    before: State  # state before it
+    apply: Callable[[State], State]  # function of the state before it that returns the state at its end
     predict: Callable[[State, float], State]
 
 
 class FixedLag(Generic[State]):
-    """Steps of the last seconds, which are repeated after a late measurement.
-
-    Parameters
-    ----------
-    lag
-        Duration [s].
-    """
+    """Steps of the last seconds, which are repeated after a late measurement."""
 
     def __init__(self, lag: float) -> None:
         self.lag = lag
@@ -73,13 +55,7 @@ class FixedLag(Generic[State]):
         self._steps = (*(one for one in self._steps if one.stamp >= oldest), step)
 
     def insert(self, stamp: float, apply: Callable[[State], State]) -> State:
-        """Apply a late measurement at its time, repeat all later steps, and return the state at their end.
-
-        Raises
-        ------
-        InvalidValueError
-            If it comes later than the lag, or is from before the start or a reset.
-        """
+        """Apply a late measurement at its time, repeat all later steps, and return the state at their end."""
         later = [one for one in self._steps if one.stamp > stamp]
         if later and later[-1].stamp - stamp > self.lag:
             raise InvalidValueError(

@@ -22,21 +22,11 @@ TangentIndices = npt.NDArray[np.int64]
 
 @dataclass(frozen=True, eq=False)
 class QuadraticCost:
-    """Quadratic cost ``cost - vectorᵀ ξ + ½ ξᵀ matrix ξ`` of steps ξ in a tangent space.
+    """Quadratic cost ``cost - vectorᵀ ξ + ½ ξᵀ matrix ξ`` of steps ξ in a tangent space."""
 
-    Attributes
-    ----------
-    matrix
-        Λ, positive definite (t, t).
-    vector
-        η (t,).
-    cost
-        Value at ξ = 0.
-    """
-
-    matrix: Array
-    vector: Array
-    cost: float
+    matrix: Array  # Λ, positive definite (t, t)
+    vector: Array  # η (t,)
+    cost: float  # value at ξ = 0
 
     @staticmethod
     def from_density(matrix: Array, vector: Array) -> QuadraticCost:
@@ -78,30 +68,6 @@ class InformationState:
 
     With ξ in the tangent space at ``x``, the density is exp(-½ξᵀΛξ + ηᵀξ) up to a factor. The estimate stays
     inside the limits and the Gaussian does not, so its mean Λ⁻¹η need not be 0.
-
-    Parameters
-    ----------
-    sizes
-        Numbers of coordinates, tangent directions and groups.
-    numbers
-        All numbers in one array; zeros if None.
-    records
-        Static record of each group; None for all if not given.
-    speeds
-        Speeds of each group given its state; None for all if not given.
-
-    Attributes
-    ----------
-    x
-        Coordinates (n,).
-    vector, information
-        η (t,), and Λ (t, t), block diagonal by group.
-    evidence
-        Log density of all measurements of each group.
-    records
-        Measurements of each group since it last moved, where they are stored, see :mod:`.static_batch`.
-    speeds
-        Speeds of each group given its state, if they are estimated, see :mod:`.constant_velocity`.
     """
 
     __slots__ = ("evidence", "information", "numbers", "records", "sizes", "speeds", "vector", "x")

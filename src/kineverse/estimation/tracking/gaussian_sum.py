@@ -35,50 +35,19 @@ PRUNING_LOG_RATIO = 15.0
 
 @dataclass(slots=True, eq=False)
 class Candidate:
-    """Candidate component for some groups.
+    """Candidate component for some groups."""
 
-    Attributes
-    ----------
-    belief
-        Belief after the update.
-    predicted
-        Predicted measurements there.
-    weights
-        Inlier weight of each observation; None if all are 1.
-    nis, dof
-        Normalised innovation squared of each group, and its degrees of freedom.
-    groups
-        Numbers of the groups.
-    covariances
-        Ridge covariances of groups, computed on demand.
-    """
-
-    belief: InformationState
-    predicted: Array
-    weights: Array | None
-    nis: Array
-    dof: Array
-    groups: Sequence[int]
+    belief: InformationState  # belief after the update
+    predicted: Array  # predicted measurements there
+    weights: Array | None  # inlier weight of each observation; None if all are 1
+    nis: Array  # normalised innovation squared of each group
+    dof: Array  # its degrees of freedom
+    groups: Sequence[int]  # numbers of the groups
     covariances: dict[int, Array] = field(default_factory=dict)
 
 
 class GaussianSum:
-    """Gaussian sum with independent components for each group, the best first.
-
-    Parameters
-    ----------
-    layout
-        Layout of the groups.
-    beliefs
-        Components.
-    alive
-        True where a group has a component (components, groups); all have the first.
-
-    Attributes
-    ----------
-    beliefs, alive
-        As given.
-    """
+    """Gaussian sum with independent components for each group, the best first."""
 
     def __init__(
         self,
@@ -125,13 +94,6 @@ class GaussianSum:
         """Prune and merge candidates to new components; also return the best candidate of each group.
 
         Groups without candidates keep their components.
-
-        Parameters
-        ----------
-        candidates
-            All candidates after an update.
-        should_merge
-            Predicate for two candidates that are the same component of a group.
         """
         kept: list[list[tuple[InformationState, Candidate | None]]] = []
         for number, group in enumerate(self._layout.groups):
@@ -190,13 +152,7 @@ _SAME_PREDICTION, _NEAR = 0.3, 3.0
 
 
 class MergeCriterion:
-    """Criterion for two candidates that are one component.
-
-    Parameters
-    ----------
-    layout, residuals, reader, process_model, ridge_covariance
-        Components of the tracker.
-    """
+    """Criterion for two candidates that are one component."""
 
     def __init__(
         self,
@@ -217,19 +173,7 @@ class MergeCriterion:
         one: Candidate,
         other: Candidate,
     ) -> bool:
-        """Return True if two candidates predict the same measurements of a group from nearby states.
-
-        Parameters
-        ----------
-        inputs
-            Values of the inputs.
-        periods
-            Periods of coordinates [rad].
-        group
-            The group.
-        one, other
-            The candidates.
-        """
+        """Return True if two candidates predict the same measurements of a group from nearby states."""
         values = self._reader.as_values(other.predicted)
         nothing = self._reader.empty()
         as_seen = nothing._replace(values=values, mask=~nothing.mask)

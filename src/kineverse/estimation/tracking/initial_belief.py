@@ -31,20 +31,10 @@ _BEYOND = 1e-3
 
 @dataclass(frozen=True, eq=False)
 class InitialBelief:
-    """Initial state and its standard deviations.
+    """Initial state and its standard deviations."""
 
-    Attributes
-    ----------
-    x
-        Coordinates (n,).
-    deviations
-        Standard deviation of each tangent direction (t,).
-    speeds, speed_variances
-        Mean and variance of each speed, if speeds are estimated.
-    """
-
-    x: Array
-    deviations: Array
+    x: Array  # coordinates (n,)
+    deviations: Array  # standard deviation of each tangent direction (t,)
     speeds: Mapping[Symbol, float] = field(default_factory=dict)
     speed_variances: Mapping[Symbol, float] = field(default_factory=dict)
 
@@ -77,44 +67,16 @@ class InitialBelief:
 
 @dataclass(frozen=True, eq=False)
 class GivenValues:
-    """Checked initial values and standard deviations.
+    """Checked initial values and standard deviations."""
 
-    Attributes
-    ----------
-    coordinates, speeds
-        Values by symbol.
-    deviations
-        Standard deviations by number of the tangent direction.
-    speed_deviations
-        Standard deviations of speeds.
-    """
-
-    coordinates: Mapping[Symbol, float]
+    coordinates: Mapping[Symbol, float]  # values by symbol
     speeds: Mapping[Symbol, float]
-    deviations: Mapping[int, float]
-    speed_deviations: Mapping[Symbol, float]
+    deviations: Mapping[int, float]  # standard deviations by number of the tangent direction
+    speed_deviations: Mapping[Symbol, float]  # standard deviations of speeds
 
     @staticmethod
     def read(update_step: UpdateStep, start: StateLike, uncertainty: StateLike) -> GivenValues:
-        """Check initial values and standard deviations.
-
-        Parameters
-        ----------
-        update_step
-            Components of the tracker.
-        start
-            Values of coordinates, and of speeds if these are estimated; other values of a state are ignored.
-        uncertainty
-            Standard deviations of coordinates, of tangent directions that are no coordinate's, by speed, and
-            of speeds if these are estimated.
-
-        Raises
-        ------
-        UnknownNameError
-            For a name that is not estimated.
-        InvalidValueError
-            For a value that is not finite, or a deviation that is not positive.
-        """
+        """Check initial values and standard deviations."""
         tangent_space = update_step.layout.tangent_space
         speeds = () if update_step.velocity is None else tuple(update_step.process_model.speeds.values())
         state = start if isinstance(start, State) else State(start)
@@ -148,13 +110,7 @@ class GivenValues:
 
 
 def _check_limits(update_step: UpdateStep, symbol: Symbol, value: float) -> None:
-    """Check that a given value is within the limits of its coordinate.
-
-    Raises
-    ------
-    InvalidValueError
-        Otherwise.
-    """
+    """Check that a given value is within the limits of its coordinate."""
     k = update_step.layout.tangent_space.coordinates.index(symbol)
     low, high = float(update_step.limits.lower[k]), float(update_step.limits.upper[k])
     if not low - _BEYOND <= value <= high + _BEYOND:
@@ -171,19 +127,7 @@ def _unknown_name(key: object, names: Iterable[object]) -> UnknownNameError:
 def make_initial_belief(
     model: ModelView, update_step: UpdateStep, values: GivenValues, inputs: Array
 ) -> InitialBelief:
-    """Return the initial belief, and set the periodic coordinates and initial deviations of a tracker.
-
-    Parameters
-    ----------
-    model
-        The model, with default values of coordinates.
-    update_step
-        Components of the tracker.
-    values
-        Given values and standard deviations.
-    inputs
-        Values of the inputs.
-    """
+    """Return the initial belief, and set the periodic coordinates and initial deviations of a tracker."""
     tangent_space, limits = update_step.layout.tangent_space, update_step.limits
     x = initial_point(model, tangent_space, limits, values.coordinates)
     update_step.periods, update_step.counted = find_turning_coordinates(update_step, x, inputs)

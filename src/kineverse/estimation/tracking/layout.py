@@ -23,28 +23,14 @@ from .tangent import TangentSpace, connected_components
 
 @dataclass(frozen=True, eq=False)
 class CoordinateGroup:
-    """Coordinates that share observations or limits; groups are independent of each other.
+    """Coordinates that share observations or limits; groups are independent of each other."""
 
-    Attributes
-    ----------
-    coordinates, tangent
-        Symbols of the group.
-    x, t
-        Indices into all coordinates and into the whole tangent space.
-    observation_indices
-        Numbers of its observations.
-    limits
-        Numbers of its curved limits.
-    rate_directions
-        Indices in its tangent of speeds that are no coordinate's derivative, such as angular velocities.
-    """
-
-    coordinates: tuple[Symbol, ...]
+    coordinates: tuple[Symbol, ...]  # symbols of the group
     tangent: tuple[Symbol, ...]
-    x: TangentIndices
-    t: TangentIndices
-    observation_indices: tuple[int, ...]
-    limits: tuple[int, ...]
+    x: TangentIndices  # indices into all coordinates
+    t: TangentIndices  # into the whole tangent space
+    observation_indices: tuple[int, ...]  # numbers of its observations
+    limits: tuple[int, ...]  # numbers of its curved limits
     rate_directions: TangentIndices
 
     @property
@@ -72,27 +58,13 @@ class CoordinateGroup:
 
 @dataclass(frozen=True, eq=False)
 class Layout:
-    """Arrangement of state, observations and inputs in vectors.
+    """Arrangement of state, observations and inputs in vectors."""
 
-    Attributes
-    ----------
-    tangent_space
-        Coordinates and tangent directions.
-    observations
-        Measurement models.
-    limits
-        Curved limits: all but bounds on a single free coordinate.
-    inputs
-        Symbols with given values: coordinates that are measured elsewhere, and parameters.
-    groups
-        Independent groups, in the order of their first observation.
-    """
-
-    tangent_space: TangentSpace
-    observations: tuple[MeasurementModel, ...]
-    limits: tuple[Constraint, ...]
-    inputs: tuple[Symbol, ...]
-    groups: tuple[CoordinateGroup, ...]
+    tangent_space: TangentSpace  # coordinates and tangent directions
+    observations: tuple[MeasurementModel, ...]  # measurement models
+    limits: tuple[Constraint, ...]  # curved limits: all but bounds on a single free coordinate
+    inputs: tuple[Symbol, ...]  # symbols with given values
+    groups: tuple[CoordinateGroup, ...]  # independent groups, in the order of their first observation
 
     @cached_property
     def group_of(self) -> tuple[int, ...]:
@@ -217,13 +189,7 @@ def build_layout(
     limits: tuple[Constraint, ...],
     inputs: Sequence[Symbol],
 ) -> Layout:
-    """Arrange observations and limits in independent groups.
-
-    Raises
-    ------
-    InvalidValueError
-        If an observation depends on no estimated coordinate.
-    """
+    """Arrange observations and limits in independent groups."""
     speeds = {x: frozenset(tangent_space.rate_row(x)) for x in tangent_space.coordinates}
     observed: list[frozenset[Symbol]] = []
     for one in observations:

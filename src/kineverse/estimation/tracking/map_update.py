@@ -38,77 +38,36 @@ Loss: TypeAlias = Outliers | Literal["gaussian", "cauchy"]
 
 @dataclass(slots=True, eq=False)
 class MapResult:
-    """Result of a MAP update.
+    """Result of a MAP update."""
 
-    Attributes
-    ----------
-    belief
-        Belief after the update.
-    nis, dof
-        Normalised innovation squared of each group, and its degrees of freedom.
-    rounds
-        Number of model evaluations.
-    weights
-        Weight of each observation; None if all are 1.
-    squares
-        Squared norms of the whitened residuals; None if not stored.
-    priors
-        Prior of each group in the tangent space at the estimate; None if not stored.
-    """
-
-    belief: InformationState
-    nis: Array
-    dof: Array
-    rounds: int
-    weights: Array | None = None
-    squares: Array | None = None
+    belief: InformationState  # belief after the update
+    nis: Array  # normalised innovation squared of each group
+    dof: Array  # its degrees of freedom
+    rounds: int  # number of model evaluations
+    weights: Array | None = None  # weight of each observation; None if all are 1
+    squares: Array | None = None  # squared norms of the whitened residuals; None if not stored
     priors: Mapping[int, QuadraticCost] | None = None
 
 
 @dataclass(slots=True, eq=False)
 class _GroupIterate:
-    """State of the iteration of one group.
+    """State of the iteration of one group."""
 
-    Attributes
-    ----------
-    x, prior, posterior, cost
-        Best iterate so far: coordinates, quadratic costs without and with measurements, and the cost.
-    excess
-        Cost beyond that of the posterior, whose squares are weighted.
-    trial, trial_prior
-        Next iterate to evaluate.
-    rows
-        Bounds on steps at the best iterate; None before the first.
-    constrained_minimum
-        Least cost of the prior inside the limits.
-    """
-
-    x: Array
-    prior: QuadraticCost
-    posterior: QuadraticCost
-    trial: Array
+    x: Array  # best iterate so far: coordinates
+    prior: QuadraticCost  # quadratic costs without
+    posterior: QuadraticCost  # with measurements
+    trial: Array  # next iterate to evaluate
     trial_prior: QuadraticCost
-    constrained_minimum: float = 0.0
+    constrained_minimum: float = 0.0  # least cost of the prior inside the limits
     cost: float = np.inf
-    excess: float = 0.0
-    rows: BoundRows | None = None
+    excess: float = 0.0  # cost beyond that of the posterior, whose squares are weighted
+    rows: BoundRows | None = None  # bounds on steps at the best iterate; None before the first
     damping: float = 0.0
     settled: QuadraticCost | None = None
 
 
 class MapSolver:
-    """MAP solver of one tracker.
-
-    Parameters
-    ----------
-    layout, residuals, process_model, limits
-        Components of the tracker.
-
-    Attributes
-    ----------
-    group_bounds
-        Limits of each group.
-    """
+    """MAP solver of one tracker."""
 
     def __init__(
         self, layout: Layout, residuals: Residuals, process_model: ProcessModel, limits: StateBounds
@@ -124,28 +83,7 @@ class MapSolver:
         groups: Sequence[int],
         loss: Loss = "gaussian",
     ) -> MapResult:
-        """Return the posterior after a reading; arguments are not changed.
-
-        Parameters
-        ----------
-        belief
-            Prior belief.
-        reading
-            The measurements.
-        inputs
-            Values of the inputs.
-        groups
-            Numbers of the groups to update.
-        loss
-            Loss of the residuals.
-
-        Raises
-        ------
-        InvalidValueError
-            If the model is not finite where it is evaluated.
-        ModelError
-            If the limits contradict each other.
-        """
+        """Return the posterior after a reading; arguments are not changed."""
         iterates, weights, rounds = self._run(belief, reading, inputs, groups, loss)
         return self._build_result(belief, iterates, reading, rounds, loss, weights)
 

@@ -99,38 +99,17 @@ ObservedLike: TypeAlias = str | ObservedPose | ObservedPosition | ObservedExpres
 
 @dataclass(frozen=True, eq=False)
 class MeasurementModel:
-    """Checked measurement model of one observation.
+    """Checked measurement model of one observation."""
 
-    Attributes
-    ----------
-    name
-        Key of its measurements.
-    label
-        Name in error messages.
-    is_pose
-        True if the value is on SE(3); otherwise it is a vector.
-    value
-        Predicted measurement, 4×4 or (d,).
-    covariance
-        Default covariance of one measurement.
-    period
-        Period of the values; inf if they are not periodic.
-    frame, relative_to
-        Observed and observing frame of a pose or a position, whose first three residuals are lengths [m];
-        empty for an expression.
-    is_stated
-        False if the covariance is a default.
-    """
-
-    name: str
-    label: str
-    is_pose: bool
-    value: Expression
-    covariance: Array
-    period: float = math.inf
-    frame: str = ""
+    name: str  # key of its measurements
+    label: str  # name in error messages
+    is_pose: bool  # True if the value is on SE(3); otherwise it is a vector
+    value: Expression  # predicted measurement, 4×4 or (d,)
+    covariance: Array  # default covariance of one measurement
+    period: float = math.inf  # period of the values; inf if they are not periodic
+    frame: str = ""  # [m]
     relative_to: str = ""
-    is_stated: bool = True
+    is_stated: bool = True  # False if the covariance is a default
 
     @property
     def size(self) -> int:
@@ -148,17 +127,7 @@ def list_observed(observed: Iterable[ObservedLike] | ObservedLike) -> list[Obser
 def build_measurement_models(
     model: ModelView, observed: Iterable[ObservedLike]
 ) -> tuple[MeasurementModel, ...]:
-    """Check observations and build their measurement models.
-
-    Raises
-    ------
-    UnknownNameError
-        For frames that do not exist.
-    DuplicateNameError
-        If two have one name.
-    InvalidValueError
-        If there is none, one is of another type, or a covariance is not positive.
-    """
+    """Check observations and build their measurement models."""
     result: dict[str, MeasurementModel] = {}
     for item in observed:
         one = _observation(model, item)
@@ -226,13 +195,7 @@ def _vector(item: ObservedExpression) -> Expression:
 
 
 def require_covariance(given: npt.ArrayLike, size: int, label: str) -> Array:
-    """Check a covariance, size × size.
-
-    Raises
-    ------
-    ShapeError, InvalidValueError
-        If it has another shape, is not finite, not symmetric or not positive.
-    """
+    """Check a covariance, size × size."""
     try:
         matrix = np.array(given, dtype=np.float64)
     except (TypeError, ValueError):
@@ -257,13 +220,7 @@ def require_covariance(given: npt.ArrayLike, size: int, label: str) -> Array:
 
 
 def require_number(given: Any, what: str) -> float:
-    """Convert to float.
-
-    Raises
-    ------
-    InvalidValueError
-        If that fails; ``what`` names the value.
-    """
+    """Convert to float."""
     try:
         return float(given)
     except (TypeError, ValueError):
@@ -271,26 +228,14 @@ def require_number(given: Any, what: str) -> float:
 
 
 def require_mapping(given: Any, what: str) -> Mapping[Any, Any]:
-    """Check values by name.
-
-    Raises
-    ------
-    InvalidValueError
-        If it is no mapping; ``what`` names the argument.
-    """
+    """Check values by name."""
     if not isinstance(given, Mapping):
         raise InvalidValueError(f"{what} is a mapping {{name: number}}, not {given!r:.80}.")
     return given
 
 
 def require_positive(key: object, given: Any) -> float:
-    """Check the standard deviation or variance of ``key``.
-
-    Raises
-    ------
-    InvalidValueError
-        If it is not positive and finite.
-    """
+    """Check the standard deviation or variance of ``key``."""
     number = require_number(given, f"The uncertainty of '{key}'")
     if not (math.isfinite(number) and number > 0):
         raise InvalidValueError(f"The uncertainty of '{key}' is positive and finite, not {given!r}.")

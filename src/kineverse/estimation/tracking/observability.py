@@ -28,18 +28,7 @@ _LEAST = 1e-4
 
 
 class UnobservableDirections:
-    """Classification of tangent directions by their information.
-
-    Parameters
-    ----------
-    layout
-        Layout of the state.
-
-    Attributes
-    ----------
-    deviations
-        Initial standard deviation of each tangent direction (t,).
-    """
+    """Classification of tangent directions by their information."""
 
     def __init__(self, layout: Layout) -> None:
         self._groups = layout.groups
@@ -93,13 +82,7 @@ def move_origin(
 
 
 class StationaryPoints:
-    """Detection of states where the measurement Jacobian vanishes, and restarts beside them.
-
-    Parameters
-    ----------
-    layout, process_model, unobservable, group_bounds
-        Components of the tracker.
-    """
+    """Detection of states where the measurement Jacobian vanishes, and restarts beside them."""
 
     def __init__(
         self,
@@ -131,17 +114,7 @@ class StationaryPoints:
     def restart_states(
         self, before: InformationState, after: InformationState, groups: Sequence[int], inputs: Array
     ) -> list[InformationState]:
-        """Return the prior belief about points on both sides of the estimate, along unobservable directions.
-
-        Parameters
-        ----------
-        before, after
-            Beliefs before and after the update.
-        groups
-            Numbers of the groups to move; all at once, each in its next direction.
-        inputs
-            Values of the inputs.
-        """
+        """Return the prior belief about points on both sides of the estimate, along unobservable directions."""
         beliefs: list[InformationState] = []
         for number in groups:
             group, x = self._layout.groups[number], before.x[self._layout.groups[number].x]

@@ -24,24 +24,7 @@ _MOST_STEPS = 100_000
 
 
 class RateFlow:
-    """Flow of coordinates at constant speeds, with its partial derivatives.
-
-    Parameters
-    ----------
-    coordinates
-        Moving coordinates; all other symbols in the rows are inputs and stay constant.
-    rows
-        Rate of each coordinate by each speed: the rows of R(q).
-    speeds
-        Order of the speeds.
-    inputs
-        Symbols with given values.
-
-    Attributes
-    ----------
-    is_varying
-        True where the rate of a coordinate by a speed depends on symbols (n, m).
-    """
+    """Flow of coordinates at constant speeds, with its partial derivatives."""
 
     def __init__(
         self,
@@ -89,11 +72,6 @@ class RateFlow:
         """Return q after one unit of time, and its derivatives by the initial q (n, n) and the speeds (n, m).
 
         Classical Runge-Kutta steps of fourth order.
-
-        Raises
-        ------
-        InvalidValueError
-            If the displacement is too large to integrate.
         """
         largest = float((self.is_varying * np.abs(self.rates(q, inputs))).sum(axis=0) @ np.abs(speeds))
         if not math.isfinite(largest) or largest > _MOST_STEPS * _LONGEST:
@@ -111,18 +89,7 @@ class RateFlow:
 
 
 class ProcessModel:
-    """Process model of a layout: retraction and prediction.
-
-    Parameters
-    ----------
-    layout
-        Layout of the state.
-
-    Attributes
-    ----------
-    speeds
-        All speeds by name.
-    """
+    """Process model of a layout: retraction and prediction."""
 
     def __init__(self, layout: Layout) -> None:
         self._layout = layout
@@ -144,13 +111,7 @@ class ProcessModel:
         self.speeds: Mapping[str, Symbol] = by_name
 
     def speed(self, key: Symbol | str) -> Symbol:
-        """Return the speed of a name, or that of the coordinate of this name.
-
-        Raises
-        ------
-        UnknownNameError
-            If no estimated coordinate moves with it.
-        """
+        """Return the speed of a name, or that of the coordinate of this name."""
         result = self.speeds.get(str(key))
         if result is None:
             result = self.speeds.get(f"{key}:velocity")

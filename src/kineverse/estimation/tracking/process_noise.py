@@ -37,26 +37,14 @@ _LEAST = 1e-6
 
 
 def check_process(process: str) -> None:
-    """Check the name of a process model.
-
-    Raises
-    ------
-    InvalidValueError
-        If there is none of this name.
-    """
+    """Check the name of a process model."""
     known = (*PROCESSES, "static")
     if process not in known:
         raise InvalidValueError(f"There is no process {process!r}. {suggest(str(process), known, 'process')}")
 
 
 def require_noise(key: object, given: Any) -> float:
-    """Check the process noise of ``key``.
-
-    Raises
-    ------
-    InvalidValueError
-        If it is negative or not finite.
-    """
+    """Check the process noise of ``key``."""
     number = require_number(given, f"The process noise of '{key}'")
     if not (math.isfinite(number) and number >= 0):
         raise InvalidValueError(
@@ -69,17 +57,7 @@ def require_noise(key: object, given: Any) -> float:
 def default_process_noise(
     update_step: UpdateStep, process: Process, start: Array, inputs: Array
 ) -> dict[Symbol, float]:
-    """Return the process noise of each speed: variances per second, or spectral densities of accelerations.
-
-    Parameters
-    ----------
-    update_step
-        Components of the tracker.
-    process
-        Name of the process model; nothing moves by itself if it is static.
-    start, inputs
-        Initial state, and values of the inputs.
-    """
+    """Return the process noise of each speed: variances per second, or spectral densities of accelerations."""
     if process == "static":
         return {}
     linear, angular = PROCESSES[process]

@@ -16,17 +16,7 @@ _LEAST = 1e-12
 def solve_bounded_qp(
     inverse: Array, gradient: Array, rows: Array, lower: Array, upper: Array
 ) -> Array | None:
-    """Minimise ½xᵀAx + gᵀx subject to lower <= rows x <= upper; return None if it is infeasible.
-
-    Parameters
-    ----------
-    inverse
-        A⁻¹, positive definite, (n, n).
-    gradient
-        g, (n,).
-    rows, lower, upper
-        (m, n) and (m,); bounds may be infinite.
-    """
+    """Minimise ½xᵀAx + gᵀx subject to lower <= rows x <= upper; return None if it is infeasible."""
     x = -inverse @ gradient
     normals = np.concatenate([rows, -rows])
     bounds = np.concatenate([lower, -upper])

@@ -18,41 +18,18 @@ from .residuals import Measurements
 
 @dataclass(frozen=True, eq=False)
 class RecentPoses:
-    """Poses of frames that one observer measured.
+    """Poses of frames that one observer measured."""
 
-    Attributes
-    ----------
-    relative_to
-        Name of the observing frame; the world if that frame moves with inputs only, and so is known.
-    poses
-        Poses by name of the frame (N, 4, 4), in order; NaN where missing.
-    covariances
-        Mean covariance of the errors of each frame (6, 6), or (N, 6, 6) if the observing frame moved. Frames
-        whose covariance was never stated are absent.
-    times
-        (N,) [s]; None if they have none.
-    """
-
-    relative_to: str
-    poses: Mapping[str, Array]
-    covariances: Mapping[str, Array]
-    times: Array | None
+    relative_to: str  # name of the observing frame
+    poses: Mapping[str, Array]  # poses by name of the frame (N, 4, 4), in order; NaN where missing
+    covariances: Mapping[str, Array]  # (6, 6), (N, 6, 6)
+    times: Array | None  # (N,) [s]; None if they have none
 
 
 def collect_recent_poses(
     model: ModelView, layout: Layout, readings: Sequence[tuple[float | None, Measurements, Array]]
 ) -> RecentPoses:
-    """Return the poses of readings with their times, of the first observer among the observations.
-
-    Parameters
-    ----------
-    model
-        Model with the frames.
-    layout
-        Layout of the readings.
-    readings
-        Times [s], measurements and values of the inputs.
-    """
+    """Return the poses of readings with their times, of the first observer among the observations."""
     poses = {i: one for i, one in enumerate(layout.observations) if one.is_pose}
     observer = next((one.relative_to for one in poses.values()), "")
     has_times = all(stamp is not None for stamp, _, _ in readings)

@@ -28,30 +28,14 @@ NO_NOISE: Mapping[Symbol, float] = MappingProxyType({})
 
 @dataclass(frozen=True, eq=False)
 class Recursion:
-    """Prediction and update of states, which it never changes in place.
+    """Prediction and update of states, which it never changes in place."""
 
-    Attributes
-    ----------
-    update_step
-        Prediction and update of beliefs.
-    first
-        Initial belief.
-    noise
-        Process noise by speed.
-    locks
-        Locks that hold speeds; None if they are ignored.
-    lost_after
-        Number of refuted updates in a row after which a group is lost.
-    restarts
-        True if lost groups start anew.
-    """
-
-    update_step: UpdateStep
-    first: InitialBelief
-    noise: Mapping[Symbol, float]
-    locks: SpeedLocks | None
-    lost_after: int
-    restarts: bool
+    update_step: UpdateStep  # prediction and update of beliefs
+    first: InitialBelief  # initial belief
+    noise: Mapping[Symbol, float]  # process noise by speed
+    locks: SpeedLocks | None  # locks that hold speeds; None if they are ignored
+    lost_after: int  # number of refuted updates in a row after which a group is lost
+    restarts: bool  # True if lost groups start anew
 
     def start(self, inputs: Array, stamp: float | None) -> TrackerState:
         """Return the initial state."""
@@ -116,23 +100,7 @@ class Recursion:
         inputs: StateLike | None,
         noise_now: Mapping[Symbol, float] = NO_NOISE,
     ) -> TrackerState:
-        """Return the state after a reading at a time, or at the present one.
-
-        Parameters
-        ----------
-        state
-            State before.
-        reading
-            The measurements.
-        stamp
-            Their time [s]; None for the present one.
-        speeds
-            Commanded speeds until then.
-        inputs
-            Values of the inputs.
-        noise_now
-            Process noise until then by speed; others have the usual one.
-        """
+        """Return the state after a reading at a time, or at the present one."""
         values = self.read_inputs(state.inputs, inputs)
         # The prediction uses the previous values of the inputs, if there are any.
         if not np.isfinite(state.inputs).all():
@@ -163,13 +131,7 @@ class Recursion:
         return TrackerState(mixture, result, loss, values, state.stamp, seen or state.reading)
 
     def read_inputs(self, last: Array, given: StateLike | None) -> Array:
-        """Return the values of the inputs, those not given as they were last.
-
-        Raises
-        ------
-        UnknownNameError, InvalidValueError
-            For a name that is no input, and for an input without a finite value.
-        """
+        """Return the values of the inputs, those not given as they were last."""
         symbols = self.update_step.layout.inputs
         values = last.copy()
         if given is not None:

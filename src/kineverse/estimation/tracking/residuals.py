@@ -21,34 +21,16 @@ RIGID = 1e-4
 
 
 class Measurements(NamedTuple):
-    """One reading of all observations, as arrays laid out by :class:`.layout.Layout`.
+    """One reading of all observations, as arrays laid out by :class:`.layout.Layout`."""
 
-    Attributes
-    ----------
-    values
-        Poses 4×4 row by row, and vectors; arbitrary where missing.
-    mask
-        True for each observation that was measured (m,).
-    whitening
-        Lower triangular W of each observation with Wᵀ W = R⁻¹, row by row.
-    log_scale
-        ½ log |2πR| of each observation.
-    """
-
-    values: Array
-    mask: npt.NDArray[np.bool_]
-    whitening: Array
-    log_scale: Array
+    values: Array  # poses 4×4 row by row, and vectors; arbitrary where missing
+    mask: npt.NDArray[np.bool_]  # True for each observation that was measured (m,)
+    whitening: Array  # lower triangular W of each observation with Wᵀ W = R⁻¹, row by row
+    log_scale: Array  # ½ log |2πR| of each observation
 
 
 class MeasurementReader:
-    """Checked conversion of user input into :class:`Measurements`.
-
-    Parameters
-    ----------
-    layout
-        Layout of the observations.
-    """
+    """Checked conversion of user input into :class:`Measurements`."""
 
     def __init__(self, layout: Layout) -> None:
         self._layout = layout
@@ -78,12 +60,6 @@ class MeasurementReader:
         """Convert a mapping from names to measurements; absent names are missing.
 
         Rigidity of poses is checked separately, see :meth:`check_poses`.
-
-        Raises
-        ------
-        UnknownNameError, ShapeError, InvalidValueError
-            For unknown names, wrong shapes, vectors that are not finite and covariances that are not
-            positive.
         """
         if not isinstance(given, Mapping):
             raise InvalidValueError(f"What was seen is a mapping {{frame: pose}}, not {given!r:.80}.")
@@ -116,11 +92,6 @@ class MeasurementReader:
         """Convert an array of poses in the order of the observations, and their covariances (m, 6, 6).
 
         Rigidity is checked separately, see :meth:`check_poses`.
-
-        Raises
-        ------
-        ShapeError, InvalidValueError
-            For wrong shapes, if some observations are not poses, and for covariances that are not positive.
         """
         if self._vectors:
             raise InvalidValueError(
@@ -159,13 +130,7 @@ class MeasurementReader:
         return np.tril(np.linalg.inv(roots)).reshape(-1), scales
 
     def combine(self, before: Measurements, reading: Measurements, stamp: float) -> Measurements:
-        """Return two readings of one time as one, with the latest of each observation.
-
-        Raises
-        ------
-        InvalidValueError
-            Naming a measurement that is given twice.
-        """
+        """Return two readings of one time as one, with the latest of each observation."""
         values = reading.values.copy()
         for i in np.flatnonzero(before.mask & reading.mask).tolist():
             where = self._layout.measurement_slices[i]
@@ -181,26 +146,14 @@ class MeasurementReader:
         return reading._replace(values=values, mask=before.mask | reading.mask)
 
     def check_poses(self, reading: Measurements) -> None:
-        """Check that all measured poses are rigid.
-
-        Raises
-        ------
-        InvalidValueError
-            Naming the first pose that is not rigid.
-        """
+        """Check that all measured poses are rigid."""
         for i, one in enumerate(self._layout.observations):
             if one.is_pose and reading.mask[i]:
                 check_pose(reading.values[self._layout.measurement_slices[i]].reshape(4, 4), one.label)
 
 
 def check_pose(pose: Array, label: str) -> None:
-    """Check that a 4×4 matrix is a rigid transform.
-
-    Raises
-    ------
-    InvalidValueError
-        Otherwise, with the deviation.
-    """
+    """Check that a 4×4 matrix is a rigid transform."""
     if not np.isfinite(pose).all():
         raise InvalidValueError(f"The pose of '{label}' is not finite.")
     rotation = pose[:3, :3]
@@ -272,13 +225,7 @@ def _numbers(given: npt.ArrayLike, what: str) -> Array:
 
 
 class Residuals:
-    """Whitened residuals; for a pose (p_measured - p, log(R_measured Rᵀ)) in the axes of the observer.
-
-    Parameters
-    ----------
-    layout, function
-        Layout of the numbers, and the compiled function that computes them.
-    """
+    """Whitened residuals; for a pose (p_measured - p, log(R_measured Rᵀ)) in the axes of the observer."""
 
     def __init__(self, layout: Layout, function: CompiledFunction) -> None:
         self._layout = layout
@@ -293,17 +240,7 @@ class Residuals:
     def errors(
         self, out: Array, reading: Measurements, indices: Sequence[int]
     ) -> dict[int, tuple[Array, Array]]:
-        """Return whitened residuals (d,) and Jacobians of the prediction (d, t), by observation.
-
-        Parameters
-        ----------
-        out
-            Output of :meth:`evaluate`.
-        reading
-            The measurements.
-        indices
-            Numbers of the requested observations.
-        """
+        """Return whitened residuals (d,) and Jacobians of the prediction (d, t), by observation."""
         layout = self._layout
         measured = [i for i in indices if reading.mask[i]]
         values = {i: reading.values[layout.measurement_slices[i]] for i in measured}
@@ -337,13 +274,7 @@ class Residuals:
         return pairs
 
     def check(self, out: Array, indices: Sequence[int]) -> None:
-        """Check that values and Jacobians of observations are finite.
-
-        Raises
-        ------
-        InvalidValueError
-            Naming the observation.
-        """
+        """Check that values and Jacobians of observations are finite."""
         for i in indices:
             one = self._layout.observations[i]
             for where in (self._layout.value_slices[i], self._layout.jacobian_slices[i]):

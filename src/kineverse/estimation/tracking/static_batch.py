@@ -33,21 +33,11 @@ _LEAST_WEIGHT = 1e-3
 
 @dataclass(frozen=True, eq=False)
 class MeanMeasurement:
-    """Information-weighted mean of measurements of one observation.
+    """Information-weighted mean of measurements of one observation."""
 
-    Attributes
-    ----------
-    value
-        Pose 4×4 row by row, or vector.
-    information
-        Inverse covariance of the mean (d, d), in the axes of the observing frame.
-    peak
-        Log density of all averaged measurements at their mean.
-    """
-
-    value: Array
-    information: Array
-    peak: float
+    value: Array  # pose 4×4 row by row, or vector
+    information: Array  # inverse covariance of the mean (d, d), in the axes of the observing frame
+    peak: float  # log density of all averaged measurements at their mean
 
     def combine(self, other: MeanMeasurement, one: MeasurementModel) -> MeanMeasurement:
         """Return the mean of both, weighted by information."""
@@ -69,30 +59,14 @@ class MeanMeasurement:
 
 @dataclass(frozen=True, eq=False)
 class StaticRecord:
-    """Prior and averaged measurements of a group since it last moved.
+    """Prior and averaged measurements of a group since it last moved."""
 
-    Attributes
-    ----------
-    prior
-        Prior before the measurements, in the tangent space at the present estimate.
-    means
-        Averaged measurements, by number of the observation.
-    inputs
-        Values of the inputs during these measurements.
-    evidence
-        Log evidence of the group before these measurements.
-    count
-        Number of updates.
-    branch
-        Identity of the first update; records that descend from it share this object.
-    """
-
-    prior: QuadraticCost
-    means: Mapping[int, MeanMeasurement]
-    inputs: Array
-    evidence: float
-    count: int = 0
-    branch: object = field(default_factory=object)
+    prior: QuadraticCost  # prior before the measurements, in the tangent space at the present estimate
+    means: Mapping[int, MeanMeasurement]  # averaged measurements, by number of the observation
+    inputs: Array  # values of the inputs during these measurements
+    evidence: float  # log evidence of the group before these measurements
+    count: int = 0  # number of updates
+    branch: object = field(default_factory=object)  # identity of the first update
 
     def with_measurements(
         self, new: Mapping[int, MeanMeasurement], observations: Sequence[MeasurementModel]
@@ -115,15 +89,7 @@ class StaticRecord:
 
 
 class StaticBatch:
-    """Batch relinearisation for the groups of a tracker.
-
-    Parameters
-    ----------
-    layout, residuals, reader, solver, unobservable
-        Components of the tracker.
-    update
-        MAP update that runs compiled code where it can.
-    """
+    """Batch relinearisation for the groups of a tracker."""
 
     def __init__(
         self,
@@ -147,21 +113,7 @@ class StaticBatch:
         inputs: Array,
         groups: Sequence[int] | None = None,
     ) -> None:
-        """Recompute an update from all stored measurements where a group has unobservable directions.
-
-        Parameters
-        ----------
-        before
-            Belief before the reading.
-        result
-            Result of the update; its belief is changed in place.
-        reading
-            The measurements.
-        inputs
-            Values of the inputs.
-        groups
-            Numbers of the groups to recompute; all if None.
-        """
+        """Recompute an update from all stored measurements where a group has unobservable directions."""
         after, weights = result.belief, result.weights
         for number in self._groups if groups is None else self._groups.intersection(groups):
             group, old = self._layout.groups[number], before.records[number]
@@ -193,17 +145,7 @@ class StaticBatch:
     def add_noise(
         self, number: int, before: InformationState, after: InformationState, added_variance: Array
     ) -> None:
-        """Add process noise to the record of a group that moves by noise alone.
-
-        Parameters
-        ----------
-        number
-            Number of the group.
-        before, after
-            Beliefs before and after the prediction; ``after`` is changed in place.
-        added_variance
-            Variances added to its tangent directions (t,).
-        """
+        """Add process noise to the record of a group that moves by noise alone."""
         record, group = before.records[number], self._layout.groups[number]
         assert record is not None
         out = self._residuals.evaluate(after.x, record.inputs)

@@ -31,26 +31,13 @@ from .static_batch import StaticBatch
 
 @dataclass(slots=True, eq=False)
 class StepResult:
-    """Result of an update of all components.
+    """Result of an update of all components."""
 
-    Attributes
-    ----------
-    mixture
-        Gaussian sum after the update.
-    nis, dof
-        Normalised innovation squared of each group, and its degrees of freedom. Rejected measurements count
-        with their residuals.
-    outliers
-        Numbers of the observations with an inlier probability below one half.
-    rounds
-        Number of model evaluations, the largest of all candidates.
-    """
-
-    mixture: GaussianSum
-    nis: Array
-    dof: Array
-    outliers: tuple[int, ...]
-    rounds: int
+    mixture: GaussianSum  # gaussian sum after the update
+    nis: Array  # normalised innovation squared of each group
+    dof: Array  # its degrees of freedom. Rejected measurements count with their residuals
+    outliers: tuple[int, ...]  # numbers of the observations with an inlier probability below one half
+    rounds: int  # number of model evaluations, the largest of all candidates
 
 
 _OUTSIDE = 1e-9
@@ -59,27 +46,7 @@ _SETTLED = 1e-5
 
 
 class UpdateStep:
-    """Prediction and update of all components of a tracker.
-
-    Parameters
-    ----------
-    layout, limits
-        Layout of the state, and its limits.
-    outliers
-        Outlier model; None without outliers.
-    has_speeds
-        True if speeds are estimated.
-
-    Attributes
-    ----------
-    periods
-        Angles of coordinates after which all observations are the same [rad]: none tells the turn, so that it
-        is the one nearest to the prediction.
-    counted
-        Coordinates whose turn is observed by some observations and not by others.
-    velocity
-        Prediction of states and speeds; None if no speeds are estimated.
-    """
+    """Prediction and update of all components of a tracker."""
 
     def __init__(
         self, layout: Layout, limits: StateBounds, outliers: Outliers | None, has_speeds: bool = False
@@ -286,20 +253,7 @@ class UpdateStep:
         speeds: Mapping[Symbol, float],
         noise: Mapping[Symbol, float],
     ) -> InformationState:
-        """Predict a belief by ``dt`` seconds; it stays about the most probable point inside the limits.
-
-        Parameters
-        ----------
-        belief
-            Belief before; not changed.
-        inputs
-            Values of the inputs.
-        dt
-            Time step [s].
-        speeds, noise
-            Commanded speeds, and process noise by speed: the variance per second, or the spectral density of
-            the acceleration if speeds are estimated.
-        """
+        """Predict a belief by ``dt`` seconds; it stays about the most probable point inside the limits."""
         if self.velocity is not None:
             result = self._inflated(belief, range(len(self.layout.groups))).copy()
             self.velocity.periods = self.periods
@@ -432,19 +386,7 @@ class UpdateStep:
         reading: Measurements,
         inputs: Array,
     ) -> StepResult:
-        """Return the result of a reading of some groups that start anew; they keep their evidence.
-
-        Parameters
-        ----------
-        before, initial
-            Beliefs before the reading, and those of the start.
-        groups
-            Numbers of the groups.
-        reading
-            The measurements.
-        inputs
-            Values of the inputs.
-        """
+        """Return the result of a reading of some groups that start anew; they keep their evidence."""
         mask = reading.mask & np.isin(self.layout.group_of, groups)
         evidence = {n: float(np.logaddexp.reduce(before.evidence(n))) for n in groups}
 

@@ -24,24 +24,12 @@ SpeedRow = Mapping[Symbol, Expression]
 
 @dataclass(frozen=True)
 class TangentSpace:
-    """Estimated coordinates and their tangent directions.
+    """Estimated coordinates and their tangent directions."""
 
-    Attributes
-    ----------
-    coordinates
-        Estimated coordinates, sorted.
-    tangent
-        Tangent directions, as speeds, sorted.
-    rates
-        Rate table of the model.
-    by_speeds
-        Coordinates whose tangent directions are speeds other than their own.
-    """
-
-    coordinates: tuple[Symbol, ...]
-    tangent: tuple[Symbol, ...]
-    rates: Rates
-    by_speeds: frozenset[Symbol]
+    coordinates: tuple[Symbol, ...]  # estimated coordinates, sorted
+    tangent: tuple[Symbol, ...]  # tangent directions, as speeds, sorted
+    rates: Rates  # rate table of the model
+    by_speeds: frozenset[Symbol]  # coordinates whose tangent directions are speeds other than their own
 
     def resolve(self, expression: Expression) -> Expression:
         """Substitute dependent coordinates and rate nodes of an expression."""
@@ -68,19 +56,7 @@ class TangentSpace:
 def build_tangent_space(
     rates: Rates, values: Sequence[Expression], inputs: Iterable[Symbol], default: Mapping[Symbol, float]
 ) -> TangentSpace:
-    """Collect the coordinates that values and their rates depend on, with their tangent directions.
-
-    Parameters
-    ----------
-    rates
-        Rate table of the model.
-    values
-        Predicted measurements, resolved.
-    inputs
-        Symbols with given values.
-    default
-        State at which the values are defined.
-    """
+    """Collect the coordinates that values and their rates depend on, with their tangent directions."""
     inputs = set(inputs)
     wanted = [s for value in values for s in value.symbols if _is_coordinate(s, inputs)]
     result: set[Symbol] = set()

@@ -22,18 +22,10 @@ _QUANTILE = 4.753
 
 @dataclass(frozen=True, eq=False)
 class TrackLoss:
-    """Refuted updates of each group.
+    """Refuted updates of each group."""
 
-    Attributes
-    ----------
-    refuted
-        Number of updates in a row that refute the estimate (groups,).
-    is_lost
-        True for each lost group (groups,).
-    """
-
-    refuted: npt.NDArray[np.int64]
-    is_lost: Groups
+    refuted: npt.NDArray[np.int64]  # number of updates in a row that refute the estimate (groups,)
+    is_lost: Groups  # True for each lost group (groups,)
 
     @staticmethod
     def none(count: int) -> TrackLoss:

@@ -101,13 +101,7 @@ def encode_numbers(values: Any) -> list[float | str]:
 
 
 def encode_number(value: Any) -> float | str:
-    """Encode a number as a JSON value; infinities are texts.
-
-    Raises
-    ------
-    FormatError
-        For NaN, and for a value that is no number.
-    """
+    """Encode a number as a JSON value; infinities are texts."""
     if isinstance(value, np.generic):
         value = value.item()
     if type(value) not in (float, int):
@@ -122,13 +116,7 @@ def encode_number(value: Any) -> float | str:
 
 
 def encode_text(value: Any) -> str:
-    """Return a text after checking that it is one.
-
-    Raises
-    ------
-    FormatError
-        For any other type.
-    """
+    """Return a text after checking that it is one."""
     if type(value) is not str:
         raise FormatError(f"a text is wanted, not {value!r}")
     return value
@@ -138,13 +126,7 @@ def encode_text(value: Any) -> str:
 
 
 def decode_body(value: Any) -> Body:
-    """Decode a body from its JSON value.
-
-    Raises
-    ------
-    InvalidDocumentError
-        If the value is no valid body.
-    """
+    """Decode a body from its JSON value."""
     given = check_keys(value, ("visuals", "collisions"), ("inertia",))
     return Body(
         tuple(map(_decode_shape, check_list(given["visuals"], "visuals"))),
@@ -198,13 +180,7 @@ def _decode_vector(value: Any) -> tuple[float, float, float]:
 
 
 def decode_pose(value: Any) -> Pose:
-    """Decode a pose from its 12 numbers.
-
-    Raises
-    ------
-    InvalidDocumentError
-        If the value is no rigid pose.
-    """
+    """Decode a pose from its 12 numbers."""
     rows = check_numbers(value, POSE_NUMBERS)
     try:
         return _pose(_POSE.pack(*rows))

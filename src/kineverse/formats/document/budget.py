@@ -64,13 +64,7 @@ class Budget:
         self._left = MAX_WORK
 
     def spend(self, steps: int) -> None:
-        """Spend steps on work before it is done.
-
-        Raises
-        ------
-        InvalidDocumentError
-            If fewer remain.
-        """
+        """Spend steps on work before it is done."""
         self._left -= steps
         if self._left < 0:
             raise InvalidDocumentError(
@@ -79,13 +73,7 @@ class Budget:
 
 
 def check_counts(content: bytes) -> None:
-    """Check the number of parts of a JSON text before it is parsed.
-
-    Raises
-    ------
-    InvalidDocumentError
-        If there are too many.
-    """
+    """Check the number of parts of a JSON text before it is parsed."""
     lists = content.count(b"[") + content.count(b"{")
     if lists > MAX_LISTS:
         raise InvalidDocumentError(
@@ -96,25 +84,13 @@ def check_counts(content: bytes) -> None:
 
 
 def check_depth(depth: int) -> None:
-    """Check the nesting depth of data.
-
-    Raises
-    ------
-    InvalidDocumentError
-        If it exceeds ``MAX_DEPTH``.
-    """
+    """Check the nesting depth of data."""
     if depth > MAX_DEPTH:
         raise InvalidDocumentError(f"data are nested too deeply, in more than {MAX_DEPTH} others")
 
 
 def spend_rate_coupling(rates: Iterable[tuple[Symbol, Any]], budget: Budget) -> None:
-    """Spend the cost of carrying every coordinate, each with all rates that its own depends on.
-
-    Raises
-    ------
-    InvalidDocumentError
-        If it exceeds the budget.
-    """
+    """Spend the cost of carrying every coordinate, each with all rates that its own depends on."""
     given = dict(rates)
     leads = {
         coordinate: _symbols_of_rate(entry).intersection(given.keys()) for coordinate, entry in given.items()

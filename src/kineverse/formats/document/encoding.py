@@ -51,22 +51,7 @@ def read_hash(text: str) -> str:
 
 
 def check_hash(claim: Any, content: bytes, given: dict[str, Any]) -> None:
-    """Check the hash of a document.
-
-    Parameters
-    ----------
-    claim
-        Hash in the document.
-    content
-        Text of the document; empty for a packed one.
-    given
-        Parsed document.
-
-    Raises
-    ------
-    InvalidDocumentError
-        If the hash is not that of the content.
-    """
+    """Check the hash of a document."""
     if type(claim) is not str or len(claim) != _DIGITS or set(claim) - set("0123456789abcdef"):
         raise InvalidDocumentError(f"{HASH!r} is {_DIGITS} digits from 0 to f")
     end = f"{_LEAD}{claim}{_TAIL}".encode()
@@ -119,27 +104,13 @@ _LISTS = bytes((*range(0x80, 0xA0), 0xDC, 0xDD, 0xDE, 0xDF))
 
 
 def pack_document(text: str) -> bytes:
-    """Return the text of a document as msgpack.
-
-    Raises
-    ------
-    MissingDependencyError
-        If the package for it is not installed.
-    """
+    """Return the text of a document as msgpack."""
     data: bytes = _msgpack().encode(json.loads(text))
     return data
 
 
 def unpack_document(data: bytes) -> Any:
-    """Return the JSON value of a packed document.
-
-    Raises
-    ------
-    InvalidDocumentError
-        If it is no msgpack, has too many parts, or is not packed in the shortest form.
-    MissingDependencyError
-        If the package for it is not installed.
-    """
+    """Return the JSON value of a packed document."""
     msgpack = _msgpack()
     if len(data) - len(data.translate(None, _LISTS)) > MAX_LISTS:
         raise InvalidDocumentError(

@@ -29,24 +29,7 @@ from .schema import InvalidDocumentError, check_integer, check_length, check_lis
 
 
 class NodeGraph:
-    """Expressions of a document, by their place in its node table.
-
-    Parameters
-    ----------
-    prefix
-        Prefix of the paths of all symbols, without the slash.
-
-    Attributes
-    ----------
-    sx, shapes, depths
-        CasADi graph and shape of every node, and the nesting depth of nodes with a gradient of their own.
-    has_read_nodes
-        True if there are ``read`` nodes, which belong into traces.
-    budget
-        Budget for the work of reading.
-    work
-        Cost of implicit functions with their Newton steps written out, by key.
-    """
+    """Expressions of a document, by their place in its node table."""
 
     def __init__(self, prefix: str | None) -> None:
         self.before = f"{prefix}/" if prefix else ""
@@ -174,19 +157,7 @@ class NodeGraph:
         self.keep(made, depth, 1 + self._count(below), compositions)
 
     def keep(self, expression: Expression, depth: int, below: int = 1, compositions: int = 0) -> None:
-        """Add the expression of a node with a gradient of its own.
-
-        Parameters
-        ----------
-        expression
-            The expression, of one node.
-        depth
-            Nesting depth of nodes with a gradient of their own.
-        below
-            Number of such nodes in it, itself included.
-        compositions
-            Nesting depth of compositions.
-        """
+        """Add the expression of a node with a gradient of its own."""
         (node,) = expression.nodes
         self._owners.update(dict.fromkeys(node.elements, node))
         self._below[node] = below

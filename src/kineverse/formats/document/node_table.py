@@ -68,11 +68,6 @@ class NodeTable:
     """Topologically sorted table of the nodes of expressions; :meth:`ref` returns the place of one.
 
     Equal parts are one node, in the order in which the expressions need them: equal models have equal texts.
-
-    Raises
-    ------
-    FormatError
-        For NaN, and for nodes and functions that documents do not have.
     """
 
     def __init__(self, expressions: Iterable[Expression]) -> None:
@@ -232,15 +227,7 @@ class NodeTable:
 
 
 class _Program:
-    """CasADi's program for all elements of expressions, with every common subexpression once.
-
-    Attributes
-    ----------
-    steps
-        Steps of the program: a number, a leaf (symbol or node, element), or (function, earlier steps ...).
-    elements
-        By ``id`` of an expression: the places of its stored elements in C order, and their steps.
-    """
+    """CasADi's program for all elements of expressions, with every common subexpression once."""
 
     def __init__(self, expressions: list[Expression]) -> None:
         self._keep = expressions
@@ -297,13 +284,7 @@ def _encode_floats(values: Sequence[float]) -> str:
 
 
 def encode_float(value: float) -> str:
-    """Encode a number as JSON text that is read back as the same bits.
-
-    Raises
-    ------
-    FormatError
-        For NaN.
-    """
+    """Encode a number as JSON text that is read back as the same bits."""
     if value != value:
         raise FormatError("NaN has no place in a document.")
     if value in (math.inf, -math.inf):

@@ -161,13 +161,7 @@ def _arguments_of(node: Node) -> tuple[Expression, ...]:
 
 
 def read_node(graph: NodeGraph, node: Any) -> None:
-    """Add the next node of a table to the graph.
-
-    Raises
-    ------
-    InvalidDocumentError
-        If the node is invalid.
-    """
+    """Add the next node of a table to the graph."""
     if type(node) is not list or not node or type(node[0]) is not str:
         raise InvalidDocumentError("a node is a list that begins with its type")
     reader = NODE_TYPES.get(node[0])

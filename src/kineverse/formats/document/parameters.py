@@ -129,19 +129,7 @@ def expressions_in_parameter(parameter: Any, writes: Mapping[Cell, Any]) -> list
 
 
 def encode_parameter(value: Any, writes: Mapping[Cell, Any], ref: Ref, depth: int = 0) -> Any:
-    """Encode a parameter as a JSON value.
-
-    Parameters
-    ----------
-    value
-        Constructor argument of an operation, or a part of one.
-    writes
-        Writes of the operation.
-    ref
-        Returns the place of an expression in the node table.
-    depth
-        Nesting depth of the value.
-    """
+    """Encode a parameter as a JSON value."""
 
     def inner(item: Any) -> Any:
         return encode_parameter(item, writes, ref, depth + 1)
@@ -177,15 +165,7 @@ def encode_parameter(value: Any, writes: Mapping[Cell, Any], ref: Ref, depth: in
 
 
 def rebuild_parameter(value: Any, writes: Mapping[str, Any]) -> Any:
-    """Rebuild a constructor argument from a decoded parameter.
-
-    Parameters
-    ----------
-    value
-        Result of :func:`decode_parameter`.
-    writes
-        Writes of the operation, by ``kind/name``.
-    """
+    """Rebuild a constructor argument from a decoded parameter."""
     if isinstance(value, tuple):
         return tuple(rebuild_parameter(item, writes) for item in value)
     if isinstance(value, dict):
@@ -212,28 +192,7 @@ def decode_parameter(
     written: Collection[str],
     depth: int = 0,
 ) -> Any:
-    """Decode a parameter from its JSON value.
-
-    Parameters
-    ----------
-    value
-        JSON value.
-    graph
-        Expressions of the document.
-    rename
-        Prepends the document's prefix to a name.
-    path
-        Prepends it to the name of a cell, ``kind/name``.
-    written
-        Cells that the operation writes, as ``kind/name``.
-    depth
-        Nesting depth of the value.
-
-    Raises
-    ------
-    InvalidDocumentError
-        For an invalid value, or a reference to a write that does not exist.
-    """
+    """Decode a parameter from its JSON value."""
 
     def inner(item: Any) -> Any:
         return decode_parameter(item, graph, rename, path, written, depth + 1)

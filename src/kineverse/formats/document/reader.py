@@ -278,7 +278,6 @@ def _check_size(content: str | bytes, source: str) -> None:
 
 
 def _parse_json(content: bytes) -> Any:
-    """Parse a JSON text."""
     check_counts(content)
     text = content.decode()
     try:

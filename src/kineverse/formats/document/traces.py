@@ -54,22 +54,7 @@ def encode_queries(trace: Trace, ref: Ref) -> list[list[Any]]:
 
 
 def decode_queries(value: Any, graph: NodeGraph, cell: Callable[[str, Any], Cell]) -> tuple[TraceStep, ...]:
-    """Decode the queries of a trace from their JSON value.
-
-    Parameters
-    ----------
-    value
-        JSON value.
-    graph
-        Expressions of the document.
-    cell
-        Returns the cell of a kind and a name in the document.
-
-    Raises
-    ------
-    InvalidDocumentError
-        For an invalid query.
-    """
+    """Decode the queries of a trace from their JSON value."""
     steps = []
     if len(check_list(value, "questions")) > MAX_QUESTIONS:
         raise InvalidDocumentError(f"{len(value)} questions, more than {MAX_QUESTIONS}")
@@ -93,13 +78,7 @@ def decode_queries(value: Any, graph: NodeGraph, cell: Callable[[str, Any], Cell
 
 
 def check_read_nodes(expression: Expression, questions: int) -> None:
-    """Check that the read nodes of an expression refer to earlier queries.
-
-    Raises
-    ------
-    InvalidDocumentError
-        If one refers to a query that comes later, or never.
-    """
+    """Check that the read nodes of an expression refer to earlier queries."""
     for answer in find_read_nodes(expression):
         if answer.query >= questions:
             raise InvalidDocumentError(
@@ -110,7 +89,6 @@ def check_read_nodes(expression: Expression, questions: int) -> None:
 def _decode_arguments(
     kind: str, given: list[Any], graph: NodeGraph, cell: Callable[[str, Any], Cell]
 ) -> tuple[Any, ...]:
-    """Decode the arguments of a query."""
     if kind == "exists":
         return cell(given[0], given[1])
     if kind == "names":
@@ -132,15 +110,6 @@ class TraceConsistency:
     Reads are derived from the queries of a trace: an operation with too few reads on record would not be run
     again when one changes. The writes of the trace are compared with those on record. Comparing costs work;
     beyond a budget far above that of all known documents, a million nodes and more, it is skipped.
-
-    Parameters
-    ----------
-    graph
-        Expressions of the document.
-    cells
-        Writes of the operations before the present one; the reader adds to it.
-    names
-        Names of these cells, by kind.
     """
 
     def __init__(self, graph: NodeGraph, cells: Mapping[Cell, Any], names: Mapping[str, set[str]]) -> None:
@@ -148,20 +117,7 @@ class TraceConsistency:
         self._left = MAX_WORK
 
     def reads_of(self, trace: Trace, writes: tuple[tuple[Cell, Any], ...]) -> Reads:
-        """Return the reads of the queries of a trace.
-
-        Parameters
-        ----------
-        trace
-            Trace of the next operation.
-        writes
-            Writes of that operation on record.
-
-        Raises
-        ------
-        InvalidDocumentError
-            If the trace leads to other writes, or fails.
-        """
+        """Return the reads of the queries of a trace."""
         if [cell for cell, _ in trace.writes] != [cell for cell, _ in writes]:
             raise InvalidDocumentError("it writes other things than the operation, and one of them is wrong")
         reads = Reads()

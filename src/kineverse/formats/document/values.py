@@ -60,13 +60,7 @@ _INTEGER = re.compile("-?[0-9]{1,3011}")
 
 
 def encode_value(kind: str, value: Any, ref: Ref) -> Any:
-    """Encode a write of one kind as a JSON value.
-
-    Raises
-    ------
-    FormatError
-        For a value that a document cannot carry.
-    """
+    """Encode a write of one kind as a JSON value."""
     if kind == FRAMES:
         factors = [encode_pose(f) if isinstance(f, Pose) else ref(f) for f in value.factors]
         return {"parent": value.parent, "factors": factors}
@@ -94,13 +88,7 @@ def encode_value(kind: str, value: Any, ref: Ref) -> Any:
 
 
 def encode_datum(value: Any, ref: Ref, depth: int = 0) -> Any:
-    """Encode a datum, nested in ``depth`` tuples, as a JSON value.
-
-    Raises
-    ------
-    FormatError
-        For a value that is no datum.
-    """
+    """Encode a datum, nested in ``depth`` tuples, as a JSON value."""
     if type(value) is int and value.bit_length() > MAX_BITS:
         raise FormatError(f"an integer of {value.bit_length()} bits is too long, of more than {MAX_BITS}")
     if type(value) is int and value.bit_length() > PLAIN_BITS:
@@ -126,13 +114,7 @@ def encode_datum(value: Any, ref: Ref, depth: int = 0) -> Any:
 
 
 def decode_value(kind: str, value: Any, graph: NodeGraph, rename: Rename) -> Any:
-    """Decode a write of one kind from its JSON value.
-
-    Raises
-    ------
-    InvalidDocumentError
-        If the value is invalid.
-    """
+    """Decode a write of one kind from its JSON value."""
     return _DECODERS[kind](value, graph, rename)
 
 

@@ -136,13 +136,7 @@ def _with_cells_before(entries: Sequence[HistoryEntry]) -> Iterator[tuple[Histor
 
 
 class _Parts:
-    """Content of a document for one operation.
-
-    Attributes
-    ----------
-    kind, parameters, trace, frozen
-        As in :class:`.opaque_operation.OpaqueOperation`.
-    """
+    """Content of a document for one operation."""
 
     trace: Trace | None = None
     frozen = ""

@@ -28,19 +28,7 @@ _UP = 1 + 1e-12
 
 
 class CurveApproximation:
-    """Polynomial approximation of motions by curves over one coordinate.
-
-    Parameters
-    ----------
-    terms
-        Graph of the terms in the motions.
-    limits
-        Ranges of coordinates and speeds; those that are missing are unlimited.
-    degree
-        Degree of the polynomials.
-    tolerance
-        Largest error of a motion [m], [rad].
-    """
+    """Polynomial approximation of motions by curves over one coordinate."""
 
     def __init__(
         self, terms: TermGraph, limits: Mapping[Symbol, RealInterval], degree: int, tolerance: float

@@ -9,27 +9,13 @@ from kineverse.errors import FormatError
 
 @dataclass(frozen=True)
 class FormatCapabilities:
-    """Features that a file format can represent.
-
-    Attributes
-    ----------
-    name
-        Name of the format.
-    sum_limits
-        True if the format limits linear combinations of coordinates.
-    one_way_speeds
-        True if the velocity limits of the two directions may differ.
-    loop_joints
-        True if the format closes loops by itself, so that dependent coordinates need no expression.
-    polynomial_degree
-        Highest degree of the polynomials by which a joint may follow another.
-    """
+    """Features that a file format can represent."""
 
     name: str
-    sum_limits: bool = False
-    one_way_speeds: bool = False
+    sum_limits: bool = False  # True if the format limits linear combinations of coordinates
+    one_way_speeds: bool = False  # True if the velocity limits of the two directions may differ
     loop_joints: bool = False
-    polynomial_degree: int = 1
+    polynomial_degree: int = 1  # highest degree of the polynomials by which a joint may follow another
 
 
 _SHOWN = 6
@@ -37,20 +23,7 @@ _SHOWN = 6
 
 
 class UnsupportedError(FormatError):
-    """Features of a model that a file format cannot represent, with remedies.
-
-    Parameters
-    ----------
-    problem
-        Description of the features.
-    curved
-        True if an approximation of curves removes some of them.
-    strict
-        True if constraints are among them, which can be left out.
-    options
-        Options of the caller's interface that approximate curves, leave out one constraint, and leave out all
-        constraints.
-    """
+    """Features of a model that a file format cannot represent, with remedies."""
 
     def __init__(
         self,
@@ -77,23 +50,11 @@ class UnsupportedError(FormatError):
 
 @dataclass
 class UnsupportedFeatures:
-    """Features of a model that a format does not support, collected during the conversion.
+    """Features of a model that a format does not support, collected during the conversion."""
 
-    Attributes
-    ----------
-    target
-        Name of the format.
-    strict
-        True if constraints that the format cannot represent are errors. Otherwise they are left out.
-    curved
-        True if an approximation of curves removes some of the errors.
-    left_out
-        Reasons why constraints, and speeds of articulations, are left out, by name.
-    """
-
-    target: str
-    strict: bool = False
-    curved: bool = False
+    target: str  # name of the format
+    strict: bool = False  # True if constraints that the format cannot represent are errors
+    curved: bool = False  # True if an approximation of curves removes some of the errors
     left_out: dict[str, str] = field(default_factory=dict)
     _reasons: dict[str, list[str]] = field(default_factory=dict)
     _speeds: set[str] = field(default_factory=set)
@@ -132,13 +93,7 @@ class UnsupportedFeatures:
         ]
 
     def check(self, file: str) -> None:
-        """Raise an error if a feature is not supported.
-
-        Raises
-        ------
-        UnsupportedError
-            Naming the first features, each with its reasons, and the number of further ones.
-        """
+        """Raise an error if a feature is not supported."""
         if not self._reasons:
             return
         count = len(self._reasons)

@@ -29,29 +29,13 @@ ZERO_VECTOR: Vector3 = (0.0, 0.0, 0.0)
 
 @dataclass(frozen=True)
 class JointMotion:
-    """Rotation about a line or translation along one, by a polynomial of a variable [rad] or [m].
+    """Rotation about a line or translation along one, by a polynomial of a variable [rad] or [m]."""
 
-    Attributes
-    ----------
-    is_rotation
-        True for a rotation, False for a translation.
-    axis
-        Direction of the line, a unit vector.
-    point
-        Point on the line of a rotation [m].
-    variable
-        Variable of the polynomial: a coordinate, or a curve over coordinates.
-    coefficients
-        Coefficients of the polynomial, constant first.
-    curve
-        The variable as an expression, if it is a curve that was given as an expression.
-    """
-
-    is_rotation: bool
-    axis: Vector3
-    point: Vector3
-    variable: Term
-    coefficients: Coefficients
+    is_rotation: bool  # True for a rotation, False for a translation
+    axis: Vector3  # direction of the line, a unit vector
+    point: Vector3  # point on the line of a rotation [m]
+    variable: Term  # variable of the polynomial: a coordinate, or a curve over coordinates
+    coefficients: Coefficients  # coefficients of the polynomial, constant first
     curve: Expression | None = None
 
     @property
@@ -120,24 +104,7 @@ def decompose_transform(
     *,
     offsets: bool = False,
 ) -> MotionChain:
-    """Decompose a product of transforms into a constant pose and motions.
-
-    Parameters
-    ----------
-    factors
-        The transforms, as expressions of independent coordinates.
-    terms
-        Term graph of the expressions.
-    quaternions
-        All rotations by quaternions in the model; a factor is such a rotation if it equals one of them.
-    offsets
-        If True, the constant part of a motion's position stays in its polynomial rather than in the pose.
-
-    Raises
-    ------
-    UnrecognisedMotionError
-        If a factor is no product of motions about fixed lines.
-    """
+    """Decompose a product of transforms into a constant pose and motions."""
     parts: list[Matrix | AnyJointMotion] = []
     for factor in factors:
         if isinstance(factor, Pose):

@@ -52,17 +52,7 @@ def classify_constraints(
     resolve: Callable[[Expression], Expression],
     unsupported: UnsupportedFeatures,
 ) -> Iterator[CoordinateLimit | SumLimit | NonlinearLimit]:
-    """Yield constraints as limits of one symbol, of a linear combination of positions, or of a curve.
-
-    Parameters
-    ----------
-    constraints
-        Constraints by name.
-    resolve
-        Function that returns an expression in terms of independent symbols.
-    unsupported
-        Receives all other constraints, with the reason.
-    """
+    """Yield constraints as limits of one symbol, of a linear combination of positions, or of a curve."""
     for name, given in constraints.items():
         middle, bounds = resolve(given.expression), [resolve(b) for b in (given.lower, given.upper)]
         about = [s for b in bounds for s in b.symbols]
@@ -119,19 +109,7 @@ def assign_limits(
     target: FormatCapabilities,
     unsupported: UnsupportedFeatures,
 ) -> None:
-    """Assign limits to joints: to the joint that a limit is named for, else to the joint of its coordinate.
-
-    Parameters
-    ----------
-    description
-        Robot description whose joints receive the limits.
-    found
-        Limits of symbols and of sums.
-    target
-        Capabilities of the format.
-    unsupported
-        Receives the limits that the format cannot represent.
-    """
+    """Assign limits to joints: to the joint that a limit is named for, else to the joint of its coordinate."""
     joints = {joint.name: joint for joint in description.joints}
     independent = {joint.symbol: joint for joint in description.joints if joint.is_independent}
     for item in found:

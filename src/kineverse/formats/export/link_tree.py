@@ -71,13 +71,7 @@ def sort_parents_first(model: ModelView) -> list[str]:
 
 
 def check_left_out_names(leave_out: Iterable[str], model: ModelView) -> frozenset[str]:
-    """Check that constraints or articulations of the given names exist, and return the names.
-
-    Raises
-    ------
-    UnknownNameError
-        If a name is neither a constraint nor an articulation.
-    """
+    """Check that constraints or articulations of the given names exist, and return the names."""
     names = [leave_out] if isinstance(leave_out, str) else list(leave_out)
     known = {*model.constraints, *model.articulations, *map(str, model.rates)}
     for name in names:
@@ -151,28 +145,7 @@ _UNIT_COEFFICIENTS = (IDENTITY_COEFFICIENTS, (0.0, -1.0))
 
 
 class LinkTreeBuilder:
-    """Builder of the robot description of one model.
-
-    Parameters
-    ----------
-    model
-        The model.
-    target
-        Capabilities of the format.
-    leave_out
-        Names of constraints to leave out, and of articulations whose relations between speeds to leave out.
-    tolerance
-        Largest pose error of a frame [m], [rad]; None for exact poses.
-    strict
-        If True, constraints that the format cannot represent are refused rather than left out.
-
-    Attributes
-    ----------
-    unsupported
-        Features of the model that the format cannot represent.
-    remarks
-        Differences between the model and its description, as sentences.
-    """
+    """Builder of the robot description of one model."""
 
     def __init__(
         self,
@@ -410,17 +383,7 @@ class LinkTreeBuilder:
     def _dynamics_of(
         self, joint: JointDescription | BallJointDescription, record: Articulation | None, count: int
     ) -> dict[str, object]:
-        """Return the dynamics of a joint: those of its articulation, or those under the joint's last name.
-
-        Parameters
-        ----------
-        joint
-            The joint.
-        record
-            Articulation of the link; a mechanism may also move other links.
-        count
-            Number of joints of the link.
-        """
+        """Return the dynamics of a joint: those of its articulation, or those under the joint's last name."""
         if isinstance(joint, BallJointDescription):
             is_only = count == 1
         elif joint.is_independent:

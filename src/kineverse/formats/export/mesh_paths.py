@@ -21,15 +21,6 @@ def mesh_reference(mesh: Mesh, folder: Path, remark: RemarkCallback) -> str:
 
     Addresses such as ``package://`` stay if they lead to the same file from there. A mesh that is not found
     keeps its reference.
-
-    Parameters
-    ----------
-    mesh
-        The mesh.
-    folder
-        Folder of the description file.
-    remark
-        Called with a remark where an address is replaced by a path.
     """
     if not mesh.folder or Path(mesh.folder) == folder or os.path.isabs(mesh.uri):
         return mesh.uri

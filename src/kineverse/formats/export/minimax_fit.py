@@ -63,21 +63,7 @@ def chebyshev_points(lower: float, upper: float) -> Matrix:
 def fit_polynomial(
     curve: SeriesCurve, values: Matrix, lower: float, upper: float, degree: int, tolerance: float
 ) -> MinimaxFit:
-    """Return the minimax polynomial of a curve.
-
-    Parameters
-    ----------
-    curve
-        Taylor series of the curve over intervals.
-    values
-        Values of the curve at :func:`chebyshev_points`.
-    lower, upper
-        The interval.
-    degree
-        Degree of the polynomial.
-    tolerance
-        Largest acceptable error. If a sample exceeds it, the error is not bounded and returned as infinite.
-    """
+    """Return the minimax polynomial of a curve."""
     x = chebyshev_points(lower, upper)
     polynomial = _remez(x, values, lower, upper, degree)
     found = np.polynomial.polynomial.polyval(x, polynomial)

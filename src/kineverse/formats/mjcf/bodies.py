@@ -32,15 +32,7 @@ FREE_JOINT = "free"
 
 
 class MjcfBodies:
-    """Bodies, joints and sites of a compiled model, with unique names.
-
-    Attributes
-    ----------
-    links, sites
-        Links and sites of the description.
-    body_names, joint_names, site_names
-        Names by number in the ``MjModel``.
-    """
+    """Bodies, joints and sites of a compiled model, with unique names."""
 
     def __init__(
         self,
@@ -155,7 +147,6 @@ class MjcfBodies:
         return names
 
     def _link(self, number: int, joints: tuple[MjcfJoint, ...]) -> MjcfLink:
-        """Return the link of a body."""
         m, name = self._model, self.body_names[number]
         body = self._shapes.body(number)
         if name in self._custom.massless and m.body_mass[number] <= self._bound:
@@ -170,7 +161,6 @@ class MjcfBodies:
         )
 
     def _site(self, number: int) -> MjcfSite:
-        """Return the site of a number."""
         m = self._model
         return MjcfSite(
             self.site_names[number],

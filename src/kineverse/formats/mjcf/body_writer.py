@@ -37,22 +37,7 @@ MAX_STL_FACES = 200_000
 
 
 class MeshFiles:
-    """Mesh files of one description; meshes that MuJoCo cannot read are converted.
-
-    Parameters
-    ----------
-    path
-        Path of the description. Converted meshes are in the folder ``NAME_meshes`` next to it.
-    remark
-        Called with remarks on meshes that are left out or converted.
-    excluded_files
-        References to files that are left out because MuJoCo refuses them.
-
-    Attributes
-    ----------
-    converted
-        Content of the converted meshes, by path.
-    """
+    """Mesh files of one description; meshes that MuJoCo cannot read are converted."""
 
     def __init__(self, path: Path, remark: RemarkCallback, excluded_files: Collection[str] = ()) -> None:
         self._folder = path.absolute().parent
@@ -70,13 +55,7 @@ class MeshFiles:
         return None if reference in self._excluded_files else reference
 
     def texture_reference(self, texture: Mesh) -> str | None:
-        """Return the reference to the file of a texture; None, with a remark, if it is left out.
-
-        Parameters
-        ----------
-        texture
-            Address, folder and root of the texture, as those of a mesh.
-        """
+        """Return the reference to the file of a texture; None, with a remark, if it is left out."""
         uri = texture.uri
         if not texture.folder and "://" not in uri and not os.path.isabs(uri):
             self._remark(f"the texture {uri} is left out: it is relative to a folder that is not known")
@@ -160,24 +139,7 @@ _ROUNDING = 1e-12
 
 
 class MjcfBodyWriter:
-    """Writer of the bodies of one file.
-
-    Parameters
-    ----------
-    path
-        Path of the file.
-    remarks
-        Receives remarks on parts that are left out or changed.
-    excluded_files
-        References to mesh files that are left out.
-
-    Attributes
-    ----------
-    assets
-        Element with all meshes, textures and materials.
-    files
-        Mesh files, with those that are converted.
-    """
+    """Writer of the bodies of one file."""
 
     def __init__(self, path: Path, remarks: list[str], excluded_files: Collection[str] = ()) -> None:
         self.assets = Tag("asset")

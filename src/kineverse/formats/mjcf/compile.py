@@ -37,34 +37,16 @@ _CHECKED_ARRAYS = (
 
 @dataclass(frozen=True, slots=True)
 class CompiledMjcf:
-    """Document compiled by MuJoCo.
+    """Document compiled by MuJoCo."""
 
-    Attributes
-    ----------
-    spec, model
-        ``MjSpec`` and ``MjModel`` of the document; elements have the same numbers in both.
-    prepared
-        Preprocessed document.
-    assets
-        Meshes of files, by name.
-    left_out
-        Reasons why geoms are left out, by the number of the geom.
-    unknown_inertia
-        Numbers of the bodies whose inertia depends on missing files.
-    efforts
-        Largest force [N] or torque [N m] of joints, by name.
-    home
-        Positions of all joints in the key ``home``; None without that key.
-    """
-
-    spec: Any
-    model: Any
-    prepared: PreprocessedMjcf
-    assets: dict[str, MeshAsset]
-    left_out: dict[int, str]
-    unknown_inertia: frozenset[int]
-    efforts: dict[str, float]
-    home: npt.NDArray[np.float64] | None
+    spec: Any  # MjSpec
+    model: Any  # MjModel of the document; elements have the same numbers in both
+    prepared: PreprocessedMjcf  # preprocessed document
+    assets: dict[str, MeshAsset]  # meshes of files, by name
+    left_out: dict[int, str]  # reasons why geoms are left out, by the number of the geom
+    unknown_inertia: frozenset[int]  # numbers of the bodies whose inertia depends on missing files
+    efforts: dict[str, float]  # largest force [N] or torque [N m] of joints, by name
+    home: npt.NDArray[np.float64] | None  # positions of all joints in the key home; None without that key
 
     def nodes(self, parts: Any) -> dict[int, MjcfElement | None]:
         """Return the elements of parts of the specification, such as its joints, by number."""
@@ -78,26 +60,7 @@ class _MeshError(FormatError):
 def compile_document(
     prepared: PreprocessedMjcf, source: str, folder: str, root: str, remark: ElementRemark
 ) -> CompiledMjcf:
-    """Parse and compile a document with MuJoCo.
-
-    Parameters
-    ----------
-    prepared
-        Preprocessed document.
-    source
-        Name of the document in messages.
-    folder
-        Folder relative to which mesh files are found.
-    root
-        Folder that contains all mesh files.
-    remark
-        Called with remarks on parts that are left out.
-
-    Raises
-    ------
-    FormatError
-        With the message of MuJoCo and the element it is about; for numbers that are not finite or too large.
-    """
+    """Parse and compile a document with MuJoCo."""
     with mujoco_api.capture_mujoco_warnings() as captured:
         try:
             compiled = _try_compile(prepared, source, folder, root, remark)

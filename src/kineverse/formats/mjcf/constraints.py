@@ -28,17 +28,7 @@ _IDENTITY_WXYZ = (1.0, 0.0, 0.0, 0.0)
 
 
 class MjcfConstraints:
-    """Constraints of a compiled model: couplings, loop closures and tendons.
-
-    Attributes
-    ----------
-    couplings, tendon_couplings
-        Equalities between joints and between tendons.
-    closures
-        Equalities that close loops.
-    tendons
-        Tendons with fixed and spatial lengths.
-    """
+    """Constraints of a compiled model: couplings, loop closures and tendons."""
 
     def __init__(
         self, compiled: CompiledMjcf, bodies: MjcfBodies, remark: ElementRemark, mend: NameFaultHandler
@@ -100,7 +90,6 @@ class MjcfConstraints:
         return "" if node is None else node.where
 
     def _joint_coupling(self, number: int) -> MjcfCoupling:
-        """Return a joint equality."""
         m = self._model
         return self._coupling(number, self._bodies.joint_names, m.qpos0[m.jnt_qposadr])
 

@@ -58,15 +58,7 @@ class CustomElements:
 
 
 def read_custom_elements(root: MjcfElement, remark: ElementRemark) -> CustomElements:
-    """Read the custom elements of a document that Kineverse has written; others are ignored.
-
-    Parameters
-    ----------
-    root
-        Root element of the document.
-    remark
-        Called with remarks on malformed elements.
-    """
+    """Read the custom elements of a document that Kineverse has written; others are ignored."""
     speeds: dict[str, tuple[float, float]] = {}
     loops: dict[str, CustomLoop] = {}
     named: dict[str, set[str]] = {MASSLESS: set(), ENDS: set()}

@@ -44,13 +44,7 @@ class MjcfElement:
         return f"{self.source}, {self.place}"
 
     def refuse(self, reason: str) -> NoReturn:
-        """Raise an error about the element.
-
-        Raises
-        ------
-        FormatError
-            Always.
-        """
+        """Raise an error about the element."""
         raise FormatError(f"{self.where}: {reason}")
 
     def walk(self) -> Iterator[MjcfElement]:
@@ -73,27 +67,7 @@ def read_tree(
     root: str,
     mend: Callable[[str, int, str], None] | None = None,
 ) -> MjcfElement:
-    """Return the root element of a document, with includes replaced by the content of their files.
-
-    Parameters
-    ----------
-    data
-        Text of the document.
-    source
-        Name of the document in messages.
-    folder
-        Folder relative to which included files are found; empty for text without file.
-    root
-        Folder that contains all included files.
-    mend
-        Called with file, line and text for mistakes in XML that can be read; None to refuse them.
-
-    Raises
-    ------
-    FormatError
-        If the text is no XML or no MJCF; for includes that do not exist, are outside of the root, or occur
-        twice.
-    """
+    """Return the root element of a document, with includes replaced by the content of their files."""
 
     def parsed(data: str | bytes, source: str) -> Element:
         return parse_xml(
@@ -125,24 +99,7 @@ def read_tree(
 
 
 def find_below_root(node: MjcfElement, name: str, root: str, *places: str) -> Path:
-    """Find the file that an element names, below the root folder or ``KINEVERSE_ROOT``.
-
-    Parameters
-    ----------
-    node
-        The element.
-    name
-        Path in the document, relative to one of the places.
-    root
-        Folder that contains the file, a real path.
-    places
-        Folders in which the file is searched, in this order.
-
-    Raises
-    ------
-    FormatError
-        If the file does not exist, or is outside of these folders.
-    """
+    """Find the file that an element names, below the root folder or ``KINEVERSE_ROOT``."""
     if not any(places):
         node.refuse(f"names the file {quote(name)}, and the text has no folder. Load it from its file.")
     if not name or "\0" in name:

@@ -24,15 +24,7 @@ _HOME_TOLERANCE = 1e-6
 
 
 class FollowerJoints:
-    """Joints that follow others by equalities.
-
-    Attributes
-    ----------
-    leaders
-        Joint that each of them follows directly; None for a joint that is fixed.
-    remaining
-        Equalities that remain constraints.
-    """
+    """Joints that follow others by equalities."""
 
     def __init__(self, couplings: Iterable[MjcfCoupling], model_name: Callable[[str], str]) -> None:
         self._model_name = model_name

@@ -23,13 +23,7 @@ _NOISE = re.compile(r"^(XML Error: |Error: |could not parse model file with erro
 
 
 def mujoco() -> Any:
-    """Import MuJoCo when it is first needed.
-
-    Raises
-    ------
-    MissingDependencyError
-        If MuJoCo is not installed.
-    """
+    """Import MuJoCo when it is first needed."""
     try:
         import mujoco as package
     except ImportError as error:
@@ -56,13 +50,7 @@ def capture_mujoco_warnings() -> Iterator[list[str]]:
 
 
 def parse_spec(prepared: PreprocessedMjcf, source: str, passive: bool = False) -> Any:
-    """Parse a document to an ``MjSpec``, without actuators and keys if it is ``passive``.
-
-    Raises
-    ------
-    FormatError
-        With the message of MuJoCo and the element it is about.
-    """
+    """Parse a document to an ``MjSpec``, without actuators and keys if it is ``passive``."""
     engine = mujoco()
     try:
         if passive:
@@ -73,13 +61,7 @@ def parse_spec(prepared: PreprocessedMjcf, source: str, passive: bool = False) -
 
 
 def compile_spec(spec: Any, prepared: PreprocessedMjcf, source: str) -> Any:
-    """Compile a specification to an ``MjModel``.
-
-    Raises
-    ------
-    FormatError
-        With the message of MuJoCo and the element it is about.
-    """
+    """Compile a specification to an ``MjModel``."""
     engine = mujoco()
     try:
         return spec.compile()
@@ -108,17 +90,7 @@ _MESH_NAME = re.compile(r"\bmesh_\d+\b")
 
 
 def find_load_error(root: Tag, folder: Path, converted: Mapping[Path, bytes]) -> str | None:
-    """Return the error with which MuJoCo loads a document; None if there is none or MuJoCo is not installed.
-
-    Parameters
-    ----------
-    root
-        Root element of the document.
-    folder
-        Folder of the document.
-    converted
-        Content of files that will be written with it, by path.
-    """
+    """Return the error with which MuJoCo loads a document; None if there is none or MuJoCo is not installed."""
     try:
         engine = mujoco()
     except MissingDependencyError:

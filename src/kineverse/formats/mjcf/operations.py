@@ -118,16 +118,7 @@ def mjcf_file_operations(file: FileContent) -> Iterator[tuple[str, Operation]]:
 
 
 def mjcf_operations(scene: MjcfScene, prefix: str | None = None) -> Iterator[Operation]:
-    """Yield the operations that build the model of a file.
-
-    Parameters
-    ----------
-    scene
-        The description.
-    prefix
-        Prefix of the names of frames and degrees of freedom, without its slash. The world of the file becomes
-        the frame ``prefix/world``.
-    """
+    """Yield the operations that build the model of a file."""
 
     def model_name(name: str) -> str:
         return f"{prefix}/{name}" if prefix else name
@@ -199,7 +190,6 @@ def _is_home_outside(joint: MjcfJoint, has_home: bool) -> bool:
 def _joint(
     joint: MjcfJoint, parent: str, child: str, origin: Pose, model_name: NameMap, followers: FollowerJoints
 ) -> JointOperation:
-    """Return the operation of a joint."""
     common: dict[str, Any] = {
         "name": model_name(joint.name),
         "parent": parent,
@@ -242,7 +232,6 @@ def _angle_limit(name: str, angle: float) -> Constrain:
 
 
 def _translation(point: Vector3) -> Pose:
-    """Return the pose of a translation."""
     if not any(point):
         return IDENTITY
     x, y, z = point

@@ -91,13 +91,7 @@ class MeshReference:
 def remove_unsupported(
     root: MjcfElement, remark: Callable[[MjcfElement, str], None]
 ) -> dict[MjcfElement, MeshReference]:
-    """Remove unsupported elements and attributes from a tree; return the files of its meshes.
-
-    Raises
-    ------
-    FormatError
-        For numbers that are not finite or too large, and for models without file.
-    """
+    """Remove unsupported elements and attributes from a tree; return the files of its meshes."""
     meshdir, strip_paths = _mesh_directory(root)
     plugins = _plugin_instances(root)
     root.children = [child for child in root.children if not _is_removed(child, _SECTIONS, remark)]
@@ -234,20 +228,7 @@ def _flatten(node: MjcfElement) -> None:
 
 
 def check_element_count(root: MjcfElement, attached: Mapping[str, int]) -> int:
-    """Return the number of elements of a document after all replications and attachments.
-
-    Parameters
-    ----------
-    root
-        Root element of the document.
-    attached
-        Number of elements of its attached models, by name.
-
-    Raises
-    ------
-    FormatError
-        If the number exceeds :data:`MAX_ELEMENTS`.
-    """
+    """Return the number of elements of a document after all replications and attachments."""
     total = 0
     stack = [(root, 1)]
     while stack:
@@ -278,31 +259,15 @@ MAX_ATTACH_DEPTH = 20
 
 @dataclass(slots=True)
 class PreprocessedMjcf:
-    """Input of MuJoCo's parser.
+    """Input of MuJoCo's parser."""
 
-    Attributes
-    ----------
-    text
-        Text of the document.
-    models
-        Texts of the attached models, by the names with which they are referenced.
-    passive_text, passive_models
-        The same without actuators and keys, with all elements on the same lines.
-    nodes
-        Elements by line: ``nodes[n - 1]`` is on line n, over all of these texts.
-    files
-        Files of the meshes.
-    custom
-        Data of the custom elements.
-    """
-
-    text: str = ""
+    text: str = ""  # text of the document
     models: dict[str, bytes] = field(default_factory=dict)
-    passive_text: str = ""
+    passive_text: str = ""  # same without actuators and keys, with all elements on the same lines
     passive_models: dict[str, bytes] = field(default_factory=dict)
-    nodes: list[MjcfElement] = field(default_factory=list)
-    files: dict[MjcfElement, MeshReference] = field(default_factory=dict)
-    custom: CustomElements = field(default_factory=CustomElements)
+    nodes: list[MjcfElement] = field(default_factory=list)  # elements by line
+    files: dict[MjcfElement, MeshReference] = field(default_factory=dict)  # files of the meshes
+    custom: CustomElements = field(default_factory=CustomElements)  # data of the custom elements
 
     def node(self, info: str) -> MjcfElement | None:
         """Return the element of a line in a message of MuJoCo, such as ``line 5``; None if there is none."""
@@ -336,13 +301,7 @@ class MjcfPreprocessor:
         self.prepared = PreprocessedMjcf()
 
     def run(self, data: str | bytes, source: str) -> PreprocessedMjcf:
-        """Preprocess a document.
-
-        Raises
-        ------
-        FormatError
-            If a file is no MJCF, is outside of the root folder, attaches itself, or is too large.
-        """
+        """Preprocess a document."""
         root = self._read(data, source, self._top)
         self.prepared.custom = read_custom_elements(root, self._remark)
         self.prepared.text, self.prepared.passive_text, _ = self._preprocess(root, self._top)

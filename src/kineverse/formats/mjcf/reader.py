@@ -104,13 +104,7 @@ class _MjcfWarnings:
             warn([f"{self._source}, {text}"])
 
     def mend(self, where: str, problem: str, replacement: str) -> None:
-        """Add a warning about a mistake, and its replacement.
-
-        Raises
-        ------
-        FormatError
-            If the file is read strictly.
-        """
+        """Add a warning about a mistake, and its replacement."""
         if self._strict:
             raise FormatError(f"{where}: {problem}.")
         self._fault(f"{where.removeprefix(f'{self._source}, ')}: {problem}; {replacement}.")

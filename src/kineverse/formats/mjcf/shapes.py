@@ -34,17 +34,7 @@ _DEFAULT_COLOR = [0.5, 0.5, 0.5, 1.0]
 
 
 class MjcfShapes:
-    """Shapes and inertia of the bodies of a compiled model.
-
-    Parameters
-    ----------
-    compiled
-        Compiled document.
-    folder, root
-        Folder relative to which mesh files are found, and folder that contains them.
-    remark
-        Called with remarks on geoms that are left out.
-    """
+    """Shapes and inertia of the bodies of a compiled model."""
 
     def __init__(self, compiled: CompiledMjcf, folder: str, root: str, remark: ElementRemark) -> None:
         self._model, self._compiled = compiled.model, compiled
@@ -111,7 +101,6 @@ class MjcfShapes:
         return Shape(form, origin, name, color)
 
     def _remark_geom(self, geom: int, text: str) -> None:
-        """Add a remark on a geom."""
         self._remark(self._nodes[geom], text)
 
     def _color(self, geom: int) -> Rgba:

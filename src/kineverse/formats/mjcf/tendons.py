@@ -25,25 +25,12 @@ class Tendon(Operation, document_kind="Tendon"):
     L = Σ coef · q [m], where q are positions of articulations; or L = Σ |pₖ₊₁ - pₖ| / divisor [m] over the
     origins p of frames, summed over the branches of pulleys. The length is the datum ``name/length``, and its
     range the constraint of the same name.
-
-    Attributes
-    ----------
-    name
-        Name of the tendon.
-    terms
-        Pairs of articulation and factor.
-    paths
-        Pairs of a pulley's divisor and the frames of its branch.
-    lower, upper
-        Limits of the length [m]; None for no limit.
-    dynamics
-        Damping, friction and the like as (name, value) pairs, the datum ``name/dynamics``.
     """
 
     name: str
-    terms: tuple[tuple[str, float], ...] = ()
+    terms: tuple[tuple[str, float], ...] = ()  # pairs of articulation and factor
     paths: tuple[tuple[float, tuple[str, ...]], ...] = ()
-    lower: float | None = None
+    lower: float | None = None  # limits of the length [m]; None for no limit
     upper: float | None = None
     dynamics: tuple[tuple[str, float], ...] = ()
 
@@ -70,25 +57,13 @@ class Tendon(Operation, document_kind="Tendon"):
 
 @dataclass(frozen=True, kw_only=True)
 class TendonCoupling(Operation, document_kind="TendonCoupling"):
-    """Equality between the lengths of two tendons: L - L0 = Σ aₖ (M - M0)ᵏ.
+    """Equality between the lengths of two tendons: L - L0 = Σ aₖ (M - M0)ᵏ."""
 
-    Attributes
-    ----------
-    name
-        Name of the constraint.
-    tendon, leader
-        Tendons of the lengths L and M; L - L0 = a0 without leader.
-    coefficients
-        Coefficients a0 to a4.
-    rest, leader_rest
-        L0 and M0 [m].
-    """
-
-    name: str
-    tendon: str
-    leader: str | None
-    coefficients: Quartic
-    rest: float = 0.0
+    name: str  # name of the constraint
+    tendon: str  # tendons of the lengths L
+    leader: str | None  # M; L - L0 = a0 without leader
+    coefficients: Quartic  # coefficients a0 to a4
+    rest: float = 0.0  # L0 and M0 [m]
     leader_rest: float = 0.0
 
     def apply(self, model: ReadRecorder) -> Writes:

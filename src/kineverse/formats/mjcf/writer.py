@@ -73,31 +73,7 @@ def to_mjcf(
     strict: bool = False,
     visuals: bool = True,
 ) -> WrittenFile:
-    """Convert a model to MJCF.
-
-    Parameters
-    ----------
-    model
-        The model.
-    path
-        Path of the file, relative to which meshes are referenced.
-    leave_out
-        Names of constraints to leave out, and of articulations whose relations between speeds to leave out.
-    tolerance
-        Largest pose error of a frame by approximation [m], [rad]; None for no approximation.
-    strict
-        If True, constraints that MJCF cannot represent are errors. Otherwise they are left out, with a
-        remark.
-    visuals
-        False to leave out the visual shapes. Those of a body without others are its collision shapes, as in a
-        scene of distances.
-
-    Raises
-    ------
-    FormatError
-        Naming all features that MJCF cannot represent, with the reasons; or if MuJoCo is installed and does
-        not load the result.
-    """
+    """Convert a model to MJCF."""
     builder = LinkTreeBuilder(model, MJCF_CAPABILITIES, leave_out, tolerance, strict)
     description = builder.build()
     if not visuals:
@@ -169,13 +145,7 @@ class MjcfWriter:
         return self._body_writer.files.converted
 
     def root(self) -> Tag:
-        """Return the root element of the document.
-
-        Raises
-        ------
-        FormatError
-            Naming all features that MJCF cannot represent.
-        """
+        """Return the root element of the document."""
         root = Tag("mujoco", {"model": self._path.name.removesuffix(self._path.suffix) or "model"})
         compiler = root.add("compiler", angle="radian")
         world = Tag("worldbody")
@@ -302,7 +272,6 @@ class MjcfWriter:
                 self._description.remarks.append(f"MJCF has no {key} here: that of '{name}' is left out")
 
     def _home_position(self, joint: JointDescription) -> float:
-        """Return the home position of a joint."""
         x = self._home.get(joint.symbol.path, 0.0)
         return float(np.polynomial.polynomial.polyval(x, joint.coefficients))
 

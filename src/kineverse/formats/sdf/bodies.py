@@ -46,13 +46,7 @@ _UNSCALED = (1.0, 1.0, 1.0)
 
 
 def read_sdf_body(link: PoseNode) -> Body:
-    """Return the body of a link.
-
-    Raises
-    ------
-    FormatError
-        If an element is missing or malformed, and the document is read strictly.
-    """
+    """Return the body of a link."""
     visuals: list[Shape] = []
     collisions: list[Shape] = []
     inertia = None

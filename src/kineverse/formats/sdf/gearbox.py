@@ -31,11 +31,6 @@ def resolve_gearboxes(
     """Replace gearboxes by hinges that follow others.
 
     A gearbox that couples two other hinges is removed, and the hinge of its child follows that of its parent.
-
-    Raises
-    ------
-    FormatError
-        If a gearbox has no hinge to couple, or axes that are not parallel to those of the hinges.
     """
     between: dict[frozenset[PoseNode], int] = {}
     result: list[ResolvedJoint | None] = list(hinges)

@@ -29,21 +29,6 @@ def find_included(uri: str, folder: str, root: str) -> Path:
     the parent folders of the document. The file has to be within the root, or below a folder that one of
     these variables or ``KINEVERSE_ROOT`` names. A model may also be in a parent folder of the document that
     holds models.
-
-    Parameters
-    ----------
-    uri
-        Address in the document.
-    folder
-        Folder of the document.
-    root
-        Folder that contains all files, as :func:`kineverse.formats.root_folder.find_root` returns it.
-
-    Raises
-    ------
-    FormatError
-        If there is no such file (the message names the searched folders), if the address is on a network, or
-        if the path leaves the allowed folders.
     """
     scheme, colon, rest = uri.partition("://")
     if not colon:

@@ -39,13 +39,7 @@ class ResolvedJoint:
 
 
 def read_sdf_joint(node: PoseNode, attachments: dict[PoseNode, PoseNode]) -> ResolvedJoint:
-    """Return the joint of a node; mimic chains are not resolved yet.
-
-    Raises
-    ------
-    FormatError
-        If an element or attribute is missing or malformed.
-    """
+    """Return the joint of a node; mimic chains are not resolved yet."""
     element, document = node.element, node.document
     parent, child = attachments[find_joint_end(node, "parent")], attachments[node]
     if child.kind == "world":

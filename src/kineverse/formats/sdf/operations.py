@@ -59,20 +59,7 @@ def sdf_file_operations(file: FileContent) -> Iterator[tuple[str, Operation]]:
 
 
 def sdf_operations(scene: SdfScene, prefix: str | None = None) -> Iterator[Operation]:
-    """Yield the operations that build the models of a file, from the roots outwards.
-
-    Parameters
-    ----------
-    scene
-        The description.
-    prefix
-        Prefix of the names of frames and degrees of freedom, without its slash.
-
-    Raises
-    ------
-    FormatError
-        If two elements would have the same name.
-    """
+    """Yield the operations that build the models of a file, from the roots outwards."""
 
     def model_name(name: str) -> str:
         if name == WORLD:

@@ -76,34 +76,20 @@ class SdfDocument:
 
 @dataclass(slots=True, eq=False)
 class PoseNode:
-    """Element with a pose: the world, a model, a link, a joint or a frame.
-
-    Attributes
-    ----------
-    pose_element, pose_scope
-        ``<pose>`` of the element, and scope of the name that it refers to.
-    pose, relative_to
-        Pose in another node, and that node.
-    attached_to
-        Node to which it is fixed.
-    world_pose, depth
-        Pose in the world and number of references to it, once :func:`compute_world_poses` has run.
-    is_named_frame
-        True if the element becomes a frame of the model.
-    """
+    """Element with a pose: the world, a model, a link, a joint or a frame."""
 
     kind: NodeKind
     path: str
     scope: SdfScope
     element: Element
     pose_element: Element | None = None
-    pose_scope: SdfScope | None = None
-    pose: Pose = IDENTITY
-    relative_to: PoseNode | None = None
-    attached_to: PoseNode | None = None
+    pose_scope: SdfScope | None = None  # scope of the name that it refers to
+    pose: Pose = IDENTITY  # pose in another node
+    relative_to: PoseNode | None = None  # that node
+    attached_to: PoseNode | None = None  # node to which it is fixed
     world_pose: Pose | None = None
     depth: int = 0
-    is_named_frame: bool = True
+    is_named_frame: bool = True  # True if the element becomes a frame of the model
 
     @property
     def document(self) -> SdfDocument:
@@ -143,13 +129,7 @@ class SdfScope:
         return "/".join([self.path, *parts] if self.path else parts)
 
     def find(self, name: str, element: Element, owner: Element) -> PoseNode:
-        """Return the node that a name refers to.
-
-        Raises
-        ------
-        FormatError
-            If the name does not exist in this scope.
-        """
+        """Return the node that a name refers to."""
         found = self._find(name)
         if found is None:
             available = [*self.names, *(f"{m}::{n}" for m, inner in self.inner.items() for n in inner.names)]
@@ -240,13 +220,7 @@ def find_early(name: str, element: Element, scope: SdfScope, owner: Element) -> 
 
 
 def check_sdf_name(name: str, element: Element, version: SdfVersion) -> None:
-    """Check that an element may have a name.
-
-    Raises
-    ------
-    ElementError
-        If the name is reserved, contains the separator of scopes, or is empty.
-    """
+    """Check that an element may have a name."""
     # Up to version 1.6, joints were in no scope with frames, and could have any name.
     free = version < (1, 7) and element[0] == "joint"
     if (name == "world" and not free) or _is_reserved(name):
@@ -263,13 +237,7 @@ def _is_reserved(name: str) -> bool:
 
 
 def resolve_pose_graph(graph: PoseGraph) -> None:
-    """Resolve the references of all nodes, and compute their poses in the world.
-
-    Raises
-    ------
-    FormatError
-        For references to names that do not exist, for cycles, and for malformed poses.
-    """
+    """Resolve the references of all nodes, and compute their poses in the world."""
     for node in graph.nodes:
         _attach(node)
     for node, scope, canonical, element in reversed(graph.canonical):
@@ -345,13 +313,7 @@ def _relate(node: PoseNode) -> None:
 
 
 def check_cycles(nodes: Iterable[PoseNode]) -> None:
-    """Check that no node refers to itself by ``attached_to`` or ``relative_to``.
-
-    Raises
-    ------
-    FormatError
-        If references form a cycle.
-    """
+    """Check that no node refers to itself by ``attached_to`` or ``relative_to``."""
     nodes = list(nodes)
     for key in ("attached_to", "relative_to"):
         done: set[PoseNode] = set()

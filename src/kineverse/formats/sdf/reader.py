@@ -75,13 +75,7 @@ _KNOWN_ELEMENTS = {
 def open_document(
     data: str | bytes, source: str, folder: str, remarks: list[str], root_folder: str, strict: bool
 ) -> tuple[SdfDocument, Element]:
-    """Return a document and its root element.
-
-    Raises
-    ------
-    FormatError
-        If it is no SDF, or of an unsupported version.
-    """
+    """Return a document and its root element."""
     reader_warnings = ReaderWarnings(source, remarks, strict)
     try:
         root = parse_xml(data, source, texts=True, mend=None if strict else reader_warnings.fault)
@@ -440,7 +434,6 @@ def _check_leaders(joints: Sequence[SdfJoint], nodes: dict[str, PoseNode]) -> No
 
 
 def _link(node: PoseNode) -> SdfLink:
-    """Return the link of a node."""
     assert node.world_pose is not None
     static, document = node.scope.static, node.document
     return SdfLink(node.path, read_sdf_body(node), node.world_pose, static, node.element[3], document.source)

@@ -20,18 +20,7 @@ def build_spanning_tree(
     static: Iterable[str],
     remark: Callable[[SdfJoint, str], None],
 ) -> tuple[tuple[SdfRoot, ...], tuple[SdfJoint, ...], tuple[SdfJoint, ...]]:
-    """Return the roots, the joints from the roots outwards, and the joints that close loops.
-
-    Parameters
-    ----------
-    links, joints
-        Links and joints in the order of the file.
-    static
-        Links that are fixed to the world with all links connected to them, unless a joint to the world is
-        among these.
-    remark
-        Called with joints that are left out or reversed, and the reason.
-    """
+    """Return the roots, the joints from the roots outwards, and the joints that close loops."""
     connected, rigid = DisjointSets(), DisjointSets()
     for link in links:
         if link.static:

@@ -35,11 +35,6 @@ def read_urdf_as_sdf(content: bytes, source: str, folder: str, root: str, strict
 
     Its joints are placed in their parent links and its links in their joints, as the URDF says. A floating
     joint is left out, which leaves its link free. A joint that has the name of a link is renamed.
-
-    Raises
-    ------
-    FormatError
-        If it is no URDF, or has planar or ball joints.
     """
     robot = parse_urdf(content, source, folder, root, strict)
     above = {joint.child: joint for joint in robot.joints}

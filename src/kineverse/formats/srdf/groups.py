@@ -30,19 +30,7 @@ class _Members:
 
 
 class GroupResolver:
-    """Groups of one document, resolved in a model.
-
-    Parameters
-    ----------
-    elements
-        The elements of the groups by name.
-    names
-        Links and joints in the model.
-    virtual_joints
-        Virtual joints of the document by their names, which groups may list.
-    remarks
-        Warnings about the document.
-    """
+    """Groups of one document, resolved in a model."""
 
     def __init__(
         self,
@@ -149,13 +137,7 @@ def _list(groups: Mapping[str, Element]) -> str:
 
 
 def add_unique(elements: dict[str, Element], element: Element, remarks: ReaderWarnings) -> bool:
-    """Add an element under its name and return True; for a name that is taken, warn and return False.
-
-    Raises
-    ------
-    ElementError
-        If it has no name.
-    """
+    """Add an element under its name and return True; for a name that is taken, warn and return False."""
     name = required(element, "name")
     first = elements.setdefault(name, element)
     if first is element:

@@ -15,15 +15,7 @@ _MOST_SUGGESTIONS = 50
 
 
 class ModelNames:
-    """Frames and articulations of a robot in a model, by their names in its files.
-
-    Parameters
-    ----------
-    model
-        The model, in its present version.
-    prefix
-        Prefix of the robot, without the slash; empty for none.
-    """
+    """Frames and articulations of a robot in a model, by their names in its files."""
 
     def __init__(self, model: ModelView, prefix: str) -> None:
         self._frames = dict(model.frames)
@@ -35,13 +27,7 @@ class ModelNames:
         self._sought: dict[str, bool] = {}
 
     def link(self, element: Element, key: str) -> str:
-        """Return the frame of the link that an attribute names.
-
-        Raises
-        ------
-        ElementError
-            If the attribute is missing, or the model has no such frame.
-        """
+        """Return the frame of the link that an attribute names."""
         said = required(element, key)
         name = self._prefix + said
         self._sought[said] = self._sought.get(said, False) or name in self._frames
@@ -50,13 +36,7 @@ class ModelNames:
         return name
 
     def joint(self, element: Element, key: str = "name") -> str:
-        """Return the articulation of the joint that an attribute names.
-
-        Raises
-        ------
-        ElementError
-            If the attribute is missing, or the model has no such articulation.
-        """
+        """Return the articulation of the joint that an attribute names."""
         said = required(element, key)
         name = self._prefix + said
         self._sought[said] = self._sought.get(said, False) or name in self.articulations
@@ -89,11 +69,6 @@ class ModelNames:
         """Return the frames between two frames, both included, and the articulations between them.
 
         The way goes up from the base to the common ancestor and down to the tip.
-
-        Raises
-        ------
-        UnknownNameError
-            If nothing but the world carries both.
         """
         up, down = self._ancestors(base), self._ancestors(tip)
         on_the_way_up = set(up)
@@ -151,13 +126,7 @@ def optional(element: Element, key: str) -> str:
 
 
 def required(element: Element, key: str) -> str:
-    """Return an attribute of an element without blanks around it.
-
-    Raises
-    ------
-    ElementError
-        If it is missing or empty.
-    """
+    """Return an attribute of an element without blanks around it."""
     said = optional(element, key)
     if not said:
         raise ElementError(element, f"has no {key}; {label(element).split()[0].strip('<>')} needs one.")

@@ -27,19 +27,7 @@ _EMPTY_BODY = Body()
 
 
 class UrdfLinkReader:
-    """Reader of the links of one document.
-
-    Parameters
-    ----------
-    folder
-        Folder of the document, relative to which meshes are found.
-    version
-        Version of the specification that the document states.
-    remarks
-        Receives warnings.
-    root
-        Folder that contains all meshes, see :mod:`kineverse.formats.root_folder`.
-    """
+    """Reader of the links of one document."""
 
     def __init__(
         self, folder: str, version: tuple[int, int], remarks: ReaderWarnings, root: str | None = None
@@ -51,13 +39,7 @@ class UrdfLinkReader:
         self._undefined_materials: list[tuple[str, int, Element, Element]] = []
 
     def read(self, element: Element) -> UrdfLink:
-        """Return the link of a ``<link>`` element.
-
-        Raises
-        ------
-        ElementError
-            If an element or attribute is missing or malformed.
-        """
+        """Return the link of a ``<link>`` element."""
         name = read_or_default(lambda: read_name(element), "", "it gets a name", self._remarks)
         visuals: list[Shape] = []
         collisions: list[Shape] = []

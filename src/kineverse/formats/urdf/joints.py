@@ -47,13 +47,7 @@ _PARTS = frozenset(
 
 
 def read_urdf_joint(element: Element, version: tuple[int, int], remarks: ReaderWarnings) -> UrdfJoint:
-    """Return the joint of a ``<joint>`` element; mimic chains are not resolved yet.
-
-    Raises
-    ------
-    ElementError
-        If an element or attribute is missing or malformed.
-    """
+    """Return the joint of a ``<joint>`` element; mimic chains are not resolved yet."""
     name = read_or_default(lambda: read_name(element), "", "it is called by its links", remarks)
     kind = _kind(element, remarks)
     parts = _parts(element, remarks)

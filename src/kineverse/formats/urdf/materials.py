@@ -28,13 +28,7 @@ class UrdfMaterials:
         self._local: dict[str, Appearance] = {}
 
     def define(self, material: Element) -> None:
-        """Define a material of the robot.
-
-        Raises
-        ------
-        ElementError
-            If a different material of that name exists, and the document is read strictly.
-        """
+        """Define a material of the robot."""
         appearance = self._read(material, material)
         if appearance == _NO_APPEARANCE:
             return

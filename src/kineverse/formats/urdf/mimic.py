@@ -17,11 +17,6 @@ def resolve_mimic_joints(joints: Iterable[UrdfJoint], remarks: ReaderWarnings) -
 
     A joint is independent, with a remark, if the joint that it mimics does not exist, has no single position,
     or mimics it in a cycle. Other parsers do the same.
-
-    Raises
-    ------
-    FormatError
-        If there is such a joint, and the description is read strictly.
     """
     joints = list(joints)
     if all(joint.mimic is None for joint in joints):

@@ -73,26 +73,7 @@ def urdf_file_operations(file: FileContent) -> Iterator[tuple[str, Operation]]:
 def urdf_operations(
     robot: UrdfRobot, prefix: str | None = None, parent: str = WORLD, strict: bool = False
 ) -> Iterator[Operation]:
-    """Yield the operations that build a robot, from its root outwards.
-
-    Parameters
-    ----------
-    robot
-        The description.
-    prefix
-        Prefix of the names of frames and degrees of freedom, without its slash.
-    parent
-        Frame to which the root link is attached. A root link ``world`` without prefix is the world.
-    strict
-        If True, invalid names are errors. Otherwise they are replaced, with a remark.
-
-    Empty parts of names are left out: ``/base_link`` becomes ``base_link``.
-
-    Raises
-    ------
-    FormatError
-        If the root is the world and is to be attached to another frame; for invalid names in strict mode.
-    """
+    """Yield the operations that build a robot, from its root outwards."""
     links, joints = _assign_names(robot, prefix, strict)
 
     def frame_name(name: str) -> str:
@@ -195,13 +176,7 @@ def _dynamics(joint: UrdfJoint) -> tuple[tuple[str, float], ...]:
 def _assign_names(
     robot: UrdfRobot, prefix: str | None, strict: bool
 ) -> tuple[dict[str, str], dict[str, str]]:
-    """Return the names of links and joints in the model; invalid and repeated names are replaced.
-
-    Raises
-    ------
-    FormatError
-        If there is such a name, and the description is read strictly.
-    """
+    """Return the names of links and joints in the model; invalid and repeated names are replaced."""
     numbers = NumberedNames()
 
     def rename(

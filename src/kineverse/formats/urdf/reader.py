@@ -214,11 +214,6 @@ def _warn_unknown_elements(
 
     URDF allows unknown elements, and they are ignored. Joints of other dialects among them leave links
     without parent.
-
-    Raises
-    ------
-    ElementError
-        For macros that were not expanded, if the document has no joints.
     """
     xacro = _xacro_prefix(root)
     for element in unknown:

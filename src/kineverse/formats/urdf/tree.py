@@ -17,13 +17,7 @@ _SHOWN = 8
 
 
 def keep_one_parent(joints: Sequence[UrdfJoint], remarks: ReaderWarnings) -> list[UrdfJoint]:
-    """Return the joints with one parent joint for each link: the last by name, as in urdfdom.
-
-    Raises
-    ------
-    FormatError
-        If a link has several parent joints, and the description is read strictly.
-    """
+    """Return the joints with one parent joint for each link: the last by name, as in urdfdom."""
     joint_above: dict[str, UrdfJoint] = {}
     for joint in joints:
         other = joint_above.setdefault(joint.child, joint)
@@ -50,21 +44,6 @@ def order_from_root(
     """Return the roots, the joints from the roots outwards, and the links that they reach.
 
     Siblings are in the order of the file.
-
-    Parameters
-    ----------
-    links, joints
-        Links and joints in the order of the file, with unique names; each link has at most one parent.
-    remarks
-        Receives warnings: of several roots, which MuJoCo reads as well, and of cycles.
-    hint
-        Text for error messages that may explain why there is no tree.
-
-    Raises
-    ------
-    FormatError
-        If a joint names a link that does not exist, or there is no root; in strict mode also for several
-        roots and for cycles.
     """
     source = remarks.source
     links = _with_world(links, joints, remarks)

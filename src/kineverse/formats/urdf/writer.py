@@ -64,15 +64,7 @@ _TENSOR = ("ixx", "ixy", "ixz", "iyy", "iyz", "izz")
 
 
 class UrdfBodyWriter:
-    """Writer of the bodies of one file.
-
-    Parameters
-    ----------
-    folder
-        Folder of the file.
-    remarks
-        Receives remarks on parts that are left out.
-    """
+    """Writer of the bodies of one file."""
 
     def __init__(self, folder: Path, remarks: list[str]) -> None:
         self._folder = folder
@@ -104,7 +96,6 @@ class UrdfBodyWriter:
         return element
 
     def _geometry(self, element: Tag, form: Geometry) -> None:
-        """Add the element of a geometry."""
         if isinstance(form, Box):
             element.add("box", size=form.size)
         elif isinstance(form, Cylinder):
@@ -179,28 +170,7 @@ def to_urdf(
     tolerance: float | None = None,
     strict: bool = False,
 ) -> WrittenFile:
-    """Convert a model to URDF.
-
-    Parameters
-    ----------
-    model
-        The model.
-    path
-        Path of the file. Its name becomes the name of the robot, and meshes are referenced relative to it.
-    leave_out
-        Names of constraints to leave out, and of articulations whose relations between speeds to leave out.
-    tolerance
-        Largest pose error of a frame by approximation [m], [rad]; None for no approximation.
-    strict
-        If True, constraints that URDF cannot represent are errors. Otherwise they are left out, with a
-        remark.
-
-    Raises
-    ------
-    FormatError
-        Naming all features that URDF cannot represent, with the reasons; or if the result cannot be read
-        back.
-    """
+    """Convert a model to URDF."""
     builder = LinkTreeBuilder(model, URDF_CAPABILITIES, leave_out, tolerance, strict)
     description = builder.build()
     content = UrdfWriter(description, path, builder.unsupported).document()
@@ -209,13 +179,7 @@ def to_urdf(
 
 
 def _check_read_back(content: bytes, path: Path) -> None:
-    """Read the text of a file as a model.
-
-    Raises
-    ------
-    FormatError
-        If it cannot be read.
-    """
+    """Read the text of a file as a model."""
     model = Model()
     try:
         with collect_warnings(), model.edit() as edit, no_collection():
@@ -242,13 +206,7 @@ class UrdfWriter:
         self._root = Tag("robot", {"name": path.name.removesuffix(path.suffix) or "model"})
 
     def document(self) -> bytes:
-        """Return the text of the file.
-
-        Raises
-        ------
-        FormatError
-            Naming all features that URDF cannot represent.
-        """
+        """Return the text of the file."""
         links = self._description.links
         root = self._root_link()
         if root is None:

@@ -18,56 +18,27 @@ from .solids import Material, MaterialShape, furniture_body
 
 @dataclass(frozen=True, slots=True)
 class Style:
-    """Materials and handles of a kitchen.
-
-    Attributes
-    ----------
-    front, tall_front, carcass, counter_material
-        Materials of the fronts, those of tall units and wall cupboards, the carcasses and the countertop.
-    bar
-        Material of the handles.
-    round_bar
-        True for round bars, False for square ones.
-    thickness, clearance
-        Thickness of a bar, and the free space between bar and front [m].
-    length
-        Largest length of a bar [m]; fronts that are narrower have shorter ones.
-    travel
-        Travel of the drawers [m].
-    plinth, counter, worktop, top
-        Heights of the upper edge of the plinth, the lower and the upper side of the countertop, and the upper
-        edge of tall units [m].
-    wall_cupboards
-        Height of the lower edge of wall cupboards [m].
-    """
+    """Materials and handles of a kitchen."""
 
     front: Material
     tall_front: Material
     carcass: Material
     counter_material: Material
-    bar: Material
-    round_bar: bool
-    thickness: float
+    bar: Material  # material of the handles
+    round_bar: bool  # True for round bars, False for square ones
+    thickness: float  # thickness of a bar, and the free space between bar and front [m]
     clearance: float
-    length: float
-    travel: float
-    plinth: float
+    length: float  # largest length of a bar [m]; fronts that are narrower have shorter ones
+    travel: float  # travel of the drawers [m]
+    plinth: float  # [m]
     counter: float
     worktop: float
     top: float
-    wall_cupboards: float
+    wall_cupboards: float  # height of the lower edge of wall cupboards [m]
 
 
 class KitchenBuilder:
-    """Builder of a kitchen whose names are below a prefix.
-
-    Attributes
-    ----------
-    style
-        Materials and handles.
-    operations
-        Operations of the kitchen, in order.
-    """
+    """Builder of a kitchen whose names are below a prefix."""
 
     def __init__(self, prefix: str | None, style: Style) -> None:
         self._prefix = prefix

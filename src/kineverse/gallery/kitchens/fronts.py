@@ -36,15 +36,9 @@ _BEHIND = 0.03
 
 @dataclass(frozen=True, slots=True)
 class Area:
-    """Part of a unit's face that one front covers, up to half a gap on each side.
+    """Part of a unit's face that one front covers, up to half a gap on each side."""
 
-    Attributes
-    ----------
-    y, z
-        Ends across and in height [m].
-    """
-
-    y: Span
+    y: Span  # ends across and in height [m]
     z: Span
 
     @property
@@ -65,24 +59,7 @@ def drawer(
     handle_height: float | None = None,
     rim: float = 0.25,
 ) -> None:
-    """Add a drawer on runners.
-
-    Parameters
-    ----------
-    builder, name, unit
-        Builder, name of the drawer, and the frame of its unit.
-    area
-        Its part of the face, as wide as the unit.
-    depth
-        Depth of the carcass [m].
-    material
-        Material of the front; that of the style by default.
-    handle_height
-        Height of the bar above the middle of the front [m]; by default it is in the middle of a low front,
-        and near the upper edge of a high one.
-    rim
-        Largest height of the box behind the front [m].
-    """
+    """Add a drawer on runners."""
     y, z = area.front
     middle, half = (z[0] + z[1]) / 2, (z[1] - z[0]) / 2
     side = (area.y[1] - area.y[0]) / 2 - WALL - _RUNNER
@@ -124,22 +101,7 @@ def door(
     material: Material | None = None,
     inside: Iterable[MaterialShape] = (),
 ) -> None:
-    """Add a door about a vertical axis.
-
-    Parameters
-    ----------
-    builder, name, unit, area, material
-        As for :func:`drawer`.
-    hinge
-        Side of the hinges, as a person before it sees them.
-    bar
-        End of the door at which the handle is, and True for an upright bar; or the height of the middle of an
-        upright bar in the unit [m].
-    upper
-        Largest angle [rad].
-    inside
-        Further solids of the door, with x and z of the unit, and y from the middle of the area.
-    """
+    """Add a door about a vertical axis."""
     y, z = area.front
     width, sign = y[1] - y[0], 1.0 if hinge == "left" else -1.0
     hinge_y = y[0] if hinge == "left" else y[1]
@@ -209,19 +171,7 @@ def flap(
 def add_handle(
     builder: KitchenBuilder, part: str, at: Vector3, room: float, *, upright: bool = False
 ) -> None:
-    """Add a bar on two mounts to a part, at a point of its surface; x of its frame is outward, y along it.
-
-    Parameters
-    ----------
-    builder, part
-        Builder, and the frame of the part.
-    at
-        Middle of the bar on the surface, in the frame of the part [m].
-    room
-        Size of the front along the bar [m].
-    upright
-        True for a bar along z of the part, False for one along y.
-    """
+    """Add a bar on two mounts to a part, at a point of its surface; x of its frame is outward, y along it."""
     style = builder.style
     length = bar_length(builder, room)
     t, reach, end = style.thickness, style.clearance + style.thickness / 2, length / 2

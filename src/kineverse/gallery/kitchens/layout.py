@@ -74,64 +74,32 @@ _LEAST_BELOW = 4
 
 @dataclass(frozen=True, slots=True)
 class Unit:
-    """Unit of a row.
-
-    Attributes
-    ----------
-    kind
-        Its kind.
-    name
-        Its name in the kitchen.
-    y
-        Middle of the unit along its row [m].
-    width
-        Width [m].
-    """
+    """Unit of a row."""
 
     kind: str
-    name: str
-    y: float
-    width: float
+    name: str  # its name in the kitchen
+    y: float  # middle of the unit along its row [m]
+    width: float  # width [m]
 
 
 @dataclass(frozen=True, slots=True)
 class Row:
-    """Units side by side, with their fronts in one plane.
+    """Units side by side, with their fronts in one plane."""
 
-    Attributes
-    ----------
-    tall, base, wall
-        Units from the floor to the top, units below the countertop, and cupboards above it.
-    counter
-        Ends of the countertop along the row [m].
-    length
-        Ends of the row [m].
-    """
-
-    tall: tuple[Unit, ...]
-    base: tuple[Unit, ...]
-    wall: tuple[Unit, ...]
-    counter: tuple[float, float]
-    length: tuple[float, float]
+    tall: tuple[Unit, ...]  # units from the floor to the top
+    base: tuple[Unit, ...]  # units below the countertop
+    wall: tuple[Unit, ...]  # cupboards above it
+    counter: tuple[float, float]  # ends of the countertop along the row [m]
+    length: tuple[float, float]  # ends of the row [m]
 
 
 @dataclass(frozen=True, slots=True)
 class KitchenLayout:
-    """Rows of a kitchen.
+    """Rows of a kitchen."""
 
-    Attributes
-    ----------
-    aisle
-        Distance between the fronts of the first row and the opposite side [m].
-    opposite
-        What is opposite the first row: a second row at a wall, an island, or a bare wall.
-    rows
-        One row or two.
-    """
-
-    aisle: float
-    opposite: Opposite
-    rows: tuple[Row, ...]
+    aisle: float  # distance between the fronts of the first row and the opposite side [m]
+    opposite: Opposite  # what is opposite the first row: a second row at a wall, an island, or a bare wall
+    rows: tuple[Row, ...]  # one row or two
 
 
 def draw_layout(rng: np.random.Generator) -> KitchenLayout:
@@ -271,6 +239,5 @@ def _draw_width(rng: np.random.Generator, kind: str) -> float:
 
 
 def _draw_index(rng: np.random.Generator, weights: Iterable[float]) -> int:
-    """Return an index by weight."""
     sums = np.cumsum(tuple(weights))
     return int(np.searchsorted(sums, rng.random() * sums[-1], side="right"))

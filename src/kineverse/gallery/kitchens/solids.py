@@ -77,15 +77,7 @@ def open_box(x: Span, y: Span, z: Span, wall: float, material: Material, opening
 
 
 def furniture_body(solids: Iterable[MaterialShape], decoration: Iterable[MaterialShape] = ()) -> Body:
-    """Return the body of solids: shapes for the eye and for collisions, and the inertia.
-
-    Parameters
-    ----------
-    solids
-        The solids, in the frame of the body.
-    decoration
-        Solids that are seen and weigh nothing, and that nothing collides with.
-    """
+    """Return the body of solids: shapes for the eye and for collisions, and the inertia."""
     solids = tuple(solids)
     return Body(
         visuals=tuple(s.shape for s in (*solids, *decoration)),

@@ -37,20 +37,12 @@ Hand: TypeAlias = Literal["left", "right"]
 
 @dataclass(frozen=True, slots=True)
 class UnitBuilder:
-    """Builder of one unit, in its frame.
-
-    Attributes
-    ----------
-    kitchen, rng, unit
-        Builder of the kitchen, source of the details, and the unit.
-    z
-        Ends of the carcass in height [m].
-    """
+    """Builder of one unit, in its frame."""
 
     kitchen: KitchenBuilder
-    rng: np.random.Generator
+    rng: np.random.Generator  # source of the details
     unit: Unit
-    z: Span
+    z: Span  # ends of the carcass in height [m]
 
     @property
     def y(self) -> Span:

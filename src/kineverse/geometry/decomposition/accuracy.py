@@ -60,13 +60,7 @@ class Polytope:
 
     @staticmethod
     def from_points(points: Floats) -> Polytope:
-        """Return the hull of (n, 3) points [m]; flat hulls are thickened.
-
-        Raises
-        ------
-        InvalidValueError
-            If the points span no area.
-        """
+        """Return the hull of (n, 3) points [m]; flat hulls are thickened."""
         convex = convex_hull(points)
         corners = np.array(convex.points())
         polygons = (convex.polygons(i) for i in range(convex.num_polygons))
@@ -98,15 +92,7 @@ class Polytope:
 
 
 def measure_accuracy(mesh: Faces, hulls: list[Polytope]) -> Accuracy:
-    """Measure the accuracy of hulls as an approximation of a mesh.
-
-    Parameters
-    ----------
-    mesh
-        A mesh without degenerate triangles.
-    hulls
-        At least one hull.
-    """
+    """Measure the accuracy of hulls as an approximation of a mesh."""
     random = np.random.default_rng(0)
     return Accuracy(
         mesh_volume=abs(enclosed_volume(mesh.vertices, mesh.faces)) if is_closed(mesh.faces) else None,

@@ -31,15 +31,7 @@ class CacheEntry:
 
 
 def find_entry(mesh: str, settings: str | None = None) -> Decomposition | None:
-    """Return the cached decomposition of a mesh, or None.
-
-    Parameters
-    ----------
-    mesh
-        Digest of the cleaned mesh.
-    settings
-        Key of the settings; None selects the latest decomposition.
-    """
+    """Return the cached decomposition of a mesh, or None."""
     if settings is not None:
         return DECOMPOSITIONS.read(_key(mesh, settings), Decomposition.from_bytes)
     keys = [key for key in DECOMPOSITIONS.list_keys() if key.startswith(_key(mesh, ""))]

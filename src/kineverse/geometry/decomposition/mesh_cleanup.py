@@ -26,24 +26,12 @@ _FLAT = 1e-6
 
 @dataclass(frozen=True, slots=True, eq=False)
 class CleanMesh:
-    """Cleaned mesh, ready for decomposition.
+    """Cleaned mesh, ready for decomposition."""
 
-    Attributes
-    ----------
-    faces
-        Vertices and triangles [m].
-    parts
-        Connected part of each triangle, (F,); parts are decomposed one by one.
-    name
-        Path of the mesh file.
-    remarks
-        Defects of the mesh.
-    """
-
-    faces: Faces
-    parts: Integers
-    name: str
-    remarks: tuple[str, ...]
+    faces: Faces  # vertices and triangles [m]
+    parts: Integers  # connected part of each triangle, (F,); parts are decomposed one by one
+    name: str  # path of the mesh file
+    remarks: tuple[str, ...]  # defects of the mesh
 
     @property
     def size(self) -> float:
@@ -58,18 +46,7 @@ class CleanMesh:
 
 
 def clean_mesh(mesh: Mesh) -> CleanMesh:
-    """Read, scale and clean a mesh; a scale with an odd number of negative factors mirrors it.
-
-    Raises
-    ------
-    MissingDependencyError
-        If coal or trimesh is not installed.
-    FormatError
-        If there is no such file, it cannot be read, or holds no triangles or numbers that are not finite.
-    InvalidValueError
-        If the mesh is flat, of an impossible size or has too many triangles, or if a factor of the scale is 0
-        or not finite. The message names the file.
-    """
+    """Read, scale and clean a mesh; a scale with an odd number of negative factors mirrors it."""
     scale = np.array(mesh.scale, dtype=float)
     if not all(math.isfinite(factor) and factor for factor in mesh.scale):
         raise InvalidValueError(f"{mesh.uri}: its scale is {mesh.scale}: factors are finite and not 0.")

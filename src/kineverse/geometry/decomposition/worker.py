@@ -59,26 +59,7 @@ class ResourceLimits:
 def run_coacd(
     surface: CleanMesh, error: float, limits: ResourceLimits, stop: threading.Event | None = None
 ) -> list[Floats]:
-    """Run CoACD in a separate process, and return the corners of its convex hulls, (n, 3) each [m].
-
-    Parameters
-    ----------
-    surface
-        The mesh.
-    error
-        CoACD's threshold of concavity [m].
-    limits
-        Limits on time and memory.
-    stop
-        Event that ends the process.
-
-    Raises
-    ------
-    MissingDependencyError
-        If CoACD is not installed.
-    DecompositionError
-        If it crashes, returns impossible hulls, exceeds its limits, or is stopped.
-    """
+    """Run CoACD in a separate process, and return the corners of its convex hulls, (n, 3) each [m]."""
     if importlib.util.find_spec("coacd") is None:
         raise MissingDependencyError(f"decomposing meshes needs CoACD: {install_command('decomposition')}")
     # In the cache, which removes what killed processes have left.

@@ -30,27 +30,13 @@ _HERE = 1e-3
 
 @dataclass(frozen=True, eq=False)
 class Approach:
-    """Way of a robot to a configuration.
+    """Way of a robot to a configuration."""
 
-    Attributes
-    ----------
-    why
-        Why there is none; empty if there is one.
-    trajectory
-        Way of everything that moves freely, from where the base stands at last.
-    tuck
-        Way of the arm before the drive; None if it stays.
-    places
-        Places (K, 3) of the drive; None if the base does not drive by itself.
-    base
-        Values of the coordinates of a base on wheels at the end.
-    """
-
-    why: str = ""
+    why: str = ""  # why there is none; empty if there is one
     trajectory: Trajectory | None = None
-    tuck: Trajectory | None = None
-    places: Array | None = None
-    base: Mapping[Symbol, float] | None = None
+    tuck: Trajectory | None = None  # way of the arm before the drive; None if it stays
+    places: Array | None = None  # places (K, 3) of the drive; None if the base does not drive by itself
+    base: Mapping[Symbol, float] | None = None  # values of the coordinates of a base on wheels at the end
 
     def __bool__(self) -> bool:
         return not self.why
@@ -67,11 +53,6 @@ class ApproachPlanner:
     A base that moves freely is planned with the arm. One on wheels drives first, with the arm as it is or,
     where that leads nowhere, with a compact one. A base on wheels that cannot turn on the spot, or that
     touches something where it stands, has no drive.
-
-    Parameters
-    ----------
-    search
-        Search of placements, which has the robot's coordinates and the scene.
     """
 
     def __init__(self, search: PlacementSearch) -> None:
@@ -89,19 +70,7 @@ class ApproachPlanner:
     def plan(
         self, state: State, wanted: Mapping[Symbol, float], *, seconds: float, seed: int = 0
     ) -> Approach:
-        """Plan a way from a state to values of the robot's coordinates.
-
-        Parameters
-        ----------
-        state
-            State of everything.
-        wanted
-            Values of the coordinates that the search of placements chooses [m], [rad].
-        seconds
-            Largest time to plan the path [s].
-        seed
-            Seed of the planner.
-        """
+        """Plan a way from a state to values of the robot's coordinates."""
         planner, base = self.planner, {s: float(wanted[s]) for s in self.search.standing}
         places, tuck, arms = None, None, state
         if base and self.can_drive(state):

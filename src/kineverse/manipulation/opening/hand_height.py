@@ -26,17 +26,6 @@ def find_highest_reach(scene: Scene, paths: HandPaths, gripper: Gripper, state: 
 
     It is sought by steepest ascent from random arms. Boxes stand for the shapes, so the height is rather too
     great than too small. Contacts are left out.
-
-    Parameters
-    ----------
-    scene
-        Scene of the robot, which is placed anew.
-    paths
-        Kinematics of the hand.
-    gripper
-        The gripper, with open and with closed fingers.
-    state
-        State of everything; the coordinates that the paths take for still keep these values.
     """
     hand_T_world = inverse(np.asarray(scene.model.fk(gripper.hand)(state)))
     corners = [
@@ -62,19 +51,7 @@ def find_highest_reach(scene: Scene, paths: HandPaths, gripper: Gripper, state: 
 def find_highest_passage(
     scene: Scene, bodies: Iterable[str], state: State, coordinate: Symbol, values: Array
 ) -> tuple[float, float]:
-    """Return the value (of some) at which an object is the highest, and the height of its lowest point [m].
-
-    Parameters
-    ----------
-    scene
-        Scene of the object, which is placed anew.
-    bodies
-        Bodies that move with the coordinate.
-    state
-        State of everything else.
-    coordinate, values
-        Coordinate of the object, and its values on the way.
-    """
+    """Return the value (of some) at which an object is the highest, and the height of its lowest point [m]."""
     names = tuple(bodies)
     lowest = [
         _find_corners(scene, names, state.updated({coordinate: v}))[:, 2].min() for v in values.tolist()

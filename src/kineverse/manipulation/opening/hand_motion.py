@@ -64,30 +64,7 @@ Targets = TypeVar("Targets")
 
 
 class HandMotion:
-    """Motions of the hand of a robot at a handle.
-
-    Parameters
-    ----------
-    session
-        Robot in a world.
-    gripper, handle
-        The gripper, and the handle that it takes.
-    search
-        Search of placements, which has the robot's coordinates and the scene.
-    approaches
-        Planner of the robot's ways with the hand empty.
-    judge
-        Judge that measures all steps.
-    until
-        Time in the world at which SkillError is raised [s].
-    controllers
-        Controllers of earlier motions of this hand by :meth:`find_controller`, which are used again.
-
-    Attributes
-    ----------
-    turns
-        Whole turns (n,) [rad] by which the joints are away from the sampled arms.
-    """
+    """Motions of the hand of a robot at a handle."""
 
     def __init__(
         self,
@@ -330,15 +307,7 @@ class HandMotion:
     def find_controller(
         self, key: Hashable, make: Callable[[], tuple[Controller, Targets]]
     ) -> tuple[Controller, Targets]:
-        """Return a controller at rest and the targets of its tasks, those of an earlier motion if there are.
-
-        Parameters
-        ----------
-        key
-            Everything that the tasks depend on beside the robot, the hand and the time of a step.
-        make
-            Function that makes the controller.
-        """
+        """Return a controller at rest and the targets of its tasks, those of an earlier motion if there are."""
         key = key, self.session.dt
         found = self.controllers.pop(key) if key in self.controllers else make()
         self.controllers[key] = found  # the last one is the one used last

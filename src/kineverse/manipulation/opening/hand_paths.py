@@ -28,24 +28,6 @@ class HandPaths:
     A step is ``W Jᵀ (J W Jᵀ + λ)⁻¹ e`` with the error e of position and rotation vector, and a step to the
     middle of limits in the null space (Nakamura 1991). Coordinates outside of their limits are clipped, and
     those that a step would lead out of them rest in it.
-
-    Parameters
-    ----------
-    model
-        The model.
-    hand
-        Frame of the hand.
-    moving
-        Coordinates (n,) that move.
-    still
-        Coordinates (m,) that have a value for each configuration, such as those of a base that stands.
-    ease
-        Weights W (n,): coordinates with small ones move less.
-
-    Attributes
-    ----------
-    ease
-        The weights, which may be replaced.
     """
 
     def __init__(
@@ -62,19 +44,7 @@ class HandPaths:
         self.ease = ease
 
     def solve(self, Q: Array, base: Array, targets: Array, iterations: int) -> tuple[Array, Array]:
-        """Return configurations (N, n) near to given ones at which the hand is at poses, and errors (N,).
-
-        Parameters
-        ----------
-        Q
-            Configurations (N, n) to begin with.
-        base
-            Values (N, m) of the coordinates that stand still.
-        targets
-            Poses world_T_hand (N, 4, 4).
-        iterations
-            Number of steps.
-        """
+        """Return configurations (N, n) near to given ones at which the hand is at poses, and errors (N,)."""
         Q = Q.copy()
         for k in range(iterations + 1):
             poses, J = self._f.batch(np.hstack([Q, base]))
@@ -109,17 +79,7 @@ class HandPaths:
         return np.asarray(poses)
 
     def find_heights(self, Q: Array, base: Array, points: Array) -> tuple[Array, Array]:
-        """Return the heights (N,) of the highest of some points of the hand, and their derivatives (N, n).
-
-        Parameters
-        ----------
-        Q
-            Configurations (N, n).
-        base
-            Values (m,) of the coordinates that stand still.
-        points
-            Points (k, 3) in the frame of the hand [m].
-        """
+        """Return the heights (N,) of the highest of some points of the hand, and their derivatives (N, n)."""
         poses, J = self._f.batch(np.hstack([Q, np.tile(base, (len(Q), 1))]))
         heights = poses[:, 2, :3] @ points.T + poses[:, 2, 3:]
         highest = np.argmax(heights, axis=1)
@@ -149,15 +109,7 @@ class HandPaths:
 
 
 def find_least_time(rows: Array, speeds: Array) -> float:
-    """Return the least time [s] in which a robot passes configurations (L, n) evenly.
-
-    Parameters
-    ----------
-    rows
-        Configurations (L, n).
-    speeds
-        Largest speeds (n,) of the coordinates [m/s], [rad/s].
-    """
+    """Return the least time [s] in which a robot passes configurations (L, n) evenly."""
     slowest = (np.abs(np.diff(rows, axis=0)) / speeds).max(initial=0.0)
     return float(slowest) * (len(rows) - 1)
 

@@ -22,33 +22,16 @@ _STEPS = 12
 
 @dataclass(frozen=True, slots=True, eq=False)
 class HandRetreat:
-    """Straight way of a hand from a handle.
+    """Straight way of a hand from a handle."""
 
-    Attributes
-    ----------
-    end
-        Last pose world_T_hand (4, 4).
-    arms
-        Configurations (L, n) of the arm along it; None if the arm does not reach the end.
-    """
-
-    end: Array
-    arms: Array | None
+    end: Array  # last pose world_T_hand (4, 4)
+    arms: Array | None  # configurations (L, n) of the arm along it; None if the arm does not reach the end
 
 
 def find_retreat(motion: HandMotion, grasp: Grasp, world_T_handle: Array, world_T_hand: Array) -> HandRetreat:
     """Return the retreat that touches nothing, or the one that goes the farthest before it does.
 
     It is the reversed approach of the grasp, or deviates from it along the bar.
-
-    Parameters
-    ----------
-    motion
-        Motions of the hand.
-    grasp
-        The grasp.
-    world_T_handle, world_T_hand
-        Poses (4, 4) of the handle's body and of the hand.
     """
     search, state = motion.search, motion.state
     out = grasp.approach[:3, 3] - grasp.pose[:3, 3]

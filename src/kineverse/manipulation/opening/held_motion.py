@@ -33,24 +33,7 @@ _SETTLED = 10
 
 
 def move_held(motion: HandMotion, placement: BasePlacement, tolerance: float) -> None:
-    """Move a held object along the way of a placement.
-
-    Parameters
-    ----------
-    motion
-        Motions of the hand that holds the object.
-    placement
-        Values of the object's coordinate, and configurations of the robot there.
-    tolerance
-        Largest distance from the last value [m], [rad].
-
-    Raises
-    ------
-    SlipError
-        If the bar is no longer where the hand took it.
-    SkillError
-        If the object does not move on, or the time is up.
-    """
+    """Move a held object along the way of a placement."""
     bar, hand = motion.model.fk(motion.handle.frame), motion.model.fk(motion.gripper.hand)
     session, coordinate, grasp = motion.session, motion.handle.coordinate, placement.grasp
     assert grasp is not None

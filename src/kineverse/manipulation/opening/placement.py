@@ -365,13 +365,7 @@ class _Search:
     # -- checks --------------------------------------------------------------------------------------------
 
     def take(self, whole: bool) -> BasePlacement | None:
-        """Return the best candidate without contacts, None without any.
-
-        Parameters
-        ----------
-        whole
-            Whether only those that reach the target count.
-        """
+        """Return the best candidate without contacts, None without any."""
         for _ in range(_MOST_CHECKS):
             if not self.heap or (whole and -self.heap[0][0] < self.last) or self.refused >= _MOST_REFUSED:
                 break

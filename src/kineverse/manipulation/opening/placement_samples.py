@@ -25,23 +25,7 @@ _QUICK, _SOON = 0.5, 4.0
 
 
 class PlacementSamples:
-    """Random bases, arms and grasps.
-
-    Parameters
-    ----------
-    model
-        The model.
-    moving, standing, base
-        Coordinates that move along ways, those that only stand, and those of a mobile base among both.
-
-    Attributes
-    ----------
-    speeds
-        Largest speeds (n,) of the moving coordinates [m/s], [rad/s].
-    eases
-        Weights (n,) of their motions that are used in turn: those of slow ones and of the base are small. In
-        an aisle a base had better stand where it is free: if the arm can do without it, most weights are 0.
-    """
+    """Random bases, arms and grasps."""
 
     def __init__(
         self,
@@ -75,21 +59,7 @@ class PlacementSamples:
         count: int,
         upright: bool,
     ) -> npt.NDArray[np.intp]:
-        """Return indices (N,) of grasps: good ones mostly, or all tilts alike; none if none is free.
-
-        Parameters
-        ----------
-        random
-            Random numbers.
-        grasps
-            Grasps, the best first.
-        free
-            Index (G,) of the last value of the object at which the hand touches nothing; negative for none.
-        count
-            Number of indices.
-        upright
-            Whether good grasps are preferred to different ones.
-        """
+        """Return indices (N,) of grasps: good ones mostly, or all tilts alike; none if none is free."""
         usable = np.flatnonzero(free > 0)
         if not len(usable):
             return np.zeros(0, dtype=np.intp)
@@ -113,22 +83,7 @@ class PlacementSamples:
         starts: int,
         bases: BaseSamples,
     ) -> tuple[Array, Array]:
-        """Return random arms (N, n), and bases (N, m) in front of poses of the hand (N, 4, 4).
-
-        Parameters
-        ----------
-        random
-            Random numbers.
-        states
-            States of the object, in none of which a base should touch anything. Most arms are those that are
-            soon reached from the first one.
-        hands, approaches
-            Poses of the hand at the handle, and before it.
-        starts
-            Number of successive samples that share a base.
-        bases
-            Places of the base.
-        """
+        """Return random arms (N, n), and bases (N, m) in front of poses of the hand (N, 4, 4)."""
         count = len(hands)
         Q = self._draw_arms(random, states[0], count)
         still = np.tile(states[0].vector(self.standing), (count, 1))

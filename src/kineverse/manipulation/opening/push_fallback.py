@@ -27,24 +27,7 @@ _PUSHING = 10.0
 
 
 class PushFallback:
-    """Push that moves an object on.
-
-    Parameters
-    ----------
-    motion
-        Motions of the hand.
-    target
-        Wanted value [m], [rad].
-    tolerance
-        Largest distance from it [m], [rad].
-
-    Attributes
-    ----------
-    approach
-        Way to the start of the push.
-    begun
-        Whether the robot stood at the start of the push.
-    """
+    """Push that moves an object on."""
 
     def __init__(self, motion: HandMotion, target: float, tolerance: float) -> None:
         self.motion, self.target, self.tolerance = motion, target, tolerance
@@ -53,13 +36,7 @@ class PushFallback:
         self.approach = Approach()
 
     def find_start(self, seed: int) -> None:
-        """Find a state of the robot from which the push goes through, or far, and to which a way leads.
-
-        Raises
-        ------
-        SkillError
-            If there is none, with the reasons.
-        """
+        """Find a state of the robot from which the push goes through, or far, and to which a way leads."""
         motion, session = self.motion, self.motion.session
         session.phase = "place"
         session.report_search("starts of a push, as no grasp leads on")
@@ -104,13 +81,7 @@ class PushFallback:
         return "far away" if self.approach.trajectory.duration > left - _PUSHING else ""
 
     def perform(self) -> None:
-        """Go to the start that was found, push, and take the hand away.
-
-        Raises
-        ------
-        SkillError
-            If the object is neither at the target nor nearer by the share that a push is for.
-        """
+        """Go to the start that was found, push, and take the hand away."""
         motion, session = self.motion, self.motion.session
         assert self.approach.trajectory is not None
         session.phase = "approach"

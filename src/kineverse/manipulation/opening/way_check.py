@@ -34,53 +34,17 @@ _SWEEP = 8
 
 @dataclass(slots=True, eq=False)
 class CandidateWay:
-    """Way of an arm that reaches, until the value with the index ``end``.
+    """Way of an arm that reaches, until the value with the index ``end``."""
 
-    Attributes
-    ----------
-    choice
-        Index of the grasp.
-    base
-        Values of the coordinates that stand.
-    back
-        Configurations (L, n) from the handle to the pose before it.
-    way
-        Configurations (K, n) along the values of the object.
-    end
-        Index of the last value.
-    """
-
-    choice: int
-    base: Array
-    back: Array
-    way: Array
-    end: int
+    choice: int  # index of the grasp
+    base: Array  # values of the coordinates that stand
+    back: Array  # configurations (L, n) from the handle to the pose before it
+    way: Array  # configurations (K, n) along the values of the object
+    end: int  # index of the last value
 
 
 class WayCheck:
-    """Check of ways in one state, of one object.
-
-    Parameters
-    ----------
-    contacts, paths
-        Contacts and inverse kinematics of the robot.
-    state
-        State of everything at the beginning.
-    coordinates, standing
-        Coordinates of the robot that move, and of a base that only stands.
-    grasps
-        Grasps of the handle.
-    values, handles
-        Values (K,) of the object along the way, and poses (K, 4, 4) of the handle there.
-
-    Attributes
-    ----------
-    free
-        Index (G,) of the last value at which the hand of a grasp touches nothing, negative for none. The hand
-        is rigid with the handle, so that the base does not matter.
-    reasons
-        Number of failures by their reasons.
-    """
+    """Check of ways in one state, of one object."""
 
     def __init__(
         self,

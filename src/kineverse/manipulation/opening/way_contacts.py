@@ -20,21 +20,7 @@ _BESIDE_BAR = 5e-4
 
 
 class WayContacts:
-    """Queries of the distances of a robot along ways.
-
-    Parameters
-    ----------
-    model
-        Model of the robot and of everything around it.
-    scene
-        Its scene, with the rules for pairs that overlap always.
-    gripper
-        The gripper.
-    own, others
-        Bodies of the robot, and those of everything else.
-    margin
-        Least distance of the robot from everything else [m].
-    """
+    """Queries of the distances of a robot along ways."""
 
     def __init__(
         self,
@@ -59,19 +45,6 @@ class WayContacts:
         """Return the index of the first row of values (N, n) at which the robot comes too near to something.
 
         The scene is placed there.
-
-        Parameters
-        ----------
-        state
-            State of everything else.
-        columns
-            Coordinates (n,) of the rows.
-        rows
-            Their values in the order of a motion.
-        handle
-            Frame of the handle, to which the hand may be near; empty for none.
-        opened
-            Whether the fingers are open around the handle, and do not touch it.
         """
         self.scene.update(state.updated(dict(zip(columns, rows[0].tolist(), strict=True))))
         queries = [(self._watch_around(handle), self.margin), (self._own_watch, OWN_MARGIN)]

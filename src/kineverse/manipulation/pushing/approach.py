@@ -25,19 +25,6 @@ def plan_push_approach(
 
     Coordinates that rates drive, such as those of a base on rolling wheels, stand still. Without a way the
     path is that of the last point, and says why.
-
-    Parameters
-    ----------
-    pushing
-        The push, whose contact points are tried in the order of :meth:`.Pushing.rank`.
-    state
-        Present state.
-    points
-        Largest number of contact points that are tried.
-    seconds
-        Largest time for each of them [s].
-    seed
-        Seed of the searches.
     """
     model, tool = pushing.model, pushing.tool
     moving = [s.position for s in pushing.speeds if s.position != pushing.coordinate]

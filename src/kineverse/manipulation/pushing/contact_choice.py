@@ -25,24 +25,7 @@ _BLOCKED_WAY = 0.004
 
 
 class ContactChoice:
-    """Contact point at which an object is pushed, and those that were given up.
-
-    Parameters
-    ----------
-    surface
-        Sampled surface of the object.
-
-    Attributes
-    ----------
-    chosen
-        Index of the present contact point; None if there is none.
-    contacts
-        Number of contact points chosen.
-    blocked
-        Number of contact points given up.
-    jammed
-        Number of those at which the pusher touched, and the object did not move.
-    """
+    """Contact point at which an object is pushed, and those that were given up."""
 
     def __init__(self, surface: PushSurface) -> None:
         self._surface = surface
@@ -98,15 +81,7 @@ class ContactChoice:
         return self._surface.point_at(state, self.chosen)
 
     def give_up(self, touching: bool, rest: Vector) -> None:
-        """Leave the present contact point for another one.
-
-        Parameters
-        ----------
-        touching
-            Whether the object was being pushed.
-        rest
-            Vector from the tip to the point [m]. What is farther in this direction counts as given up, too.
-        """
+        """Leave the present contact point for another one."""
         self.jammed += touching
         if self.chosen is not None:
             if length(rest) > _OUT_OF_REACH:

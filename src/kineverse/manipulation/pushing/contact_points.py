@@ -45,25 +45,13 @@ _FRONT = 0.004
 
 @dataclass(frozen=True, slots=True, eq=False)
 class PushContacts:
-    """Contact points at one state, in the world.
+    """Contact points at one state, in the world."""
 
-    Attributes
-    ----------
-    points, normals
-        (N, 3) points [m] and outward unit normals.
-    velocities
-        (N, 3) velocities of the points per unit of the coordinate, in the direction of the target.
-    alignment
-        (N,) cosine between -n and the velocity; -1 for a point that does not move.
-    leverage
-        (N,) speed of the points relative to the fastest, in [0, 1].
-    """
-
-    points: Array
+    points: Array  # (N, 3) points [m] and outward unit normals
     normals: Array
-    velocities: Array
-    alignment: Array
-    leverage: Array
+    velocities: Array  # (N, 3)
+    alignment: Array  # (N,) cosine between -n and the velocity; -1 for a point that does not move
+    leverage: Array  # (N,) speed of the points relative to the fastest, in [0, 1]
 
 
 class PushPoint(NamedTuple):
@@ -79,37 +67,6 @@ class PushSurface:
     """Sampled surface of an object that a coordinate moves, as far as a push can reach it.
 
     Rays that run with the object's motion find the points, so what is behind something else is left out.
-
-    Parameters
-    ----------
-    model
-        The model.
-    coordinate
-        The coordinate that is to change.
-    bodies
-        Bodies of the object that may be pushed.
-    ignored
-        Bodies that hide nothing, such as those of the robot.
-    state
-        State of everything else.
-    values
-        Values of the coordinate on its way, the present one first.
-    tip
-        Foremost point (3,) of the pusher, which is computed along with the surface.
-
-    Attributes
-    ----------
-    bodies
-        The bodies.
-    owner
-        (N,) index of the body of each point in :attr:`bodies`.
-    room
-        (N,) free space in front of each point, in [0, 1]; 1 for that of a hand.
-
-    Raises
-    ------
-    InvalidValueError
-        If no surface of the bodies can be pushed in that direction.
     """
 
     def __init__(
@@ -267,24 +224,12 @@ def _grid(solid: Solid, placed: Array, twist: Array) -> Array:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class PushTool:
-    """Foremost point of a group of bodies.
+    """Foremost point of a group of bodies."""
 
-    Attributes
-    ----------
-    frame
-        Frame that carries the group.
-    tip
-        The point in this frame (3,) [m].
-    axis
-        Unit vector in this frame in which the group points (3,).
-    bodies
-        The bodies of the group.
-    """
-
-    frame: str
-    tip: Array
-    axis: Array
-    bodies: tuple[str, ...]
+    frame: str  # frame that carries the group
+    tip: Array  # point in this frame (3,) [m]
+    axis: Array  # unit vector in this frame in which the group points (3,)
+    bodies: tuple[str, ...]  # bodies of the group
 
     def locate_tip(self, model: ModelView) -> Expression:
         """Return the point in the world (3,), as an expression [m]."""
@@ -299,19 +244,7 @@ class PushTool:
 def find_push_tool(
     model: ModelView, bodies: Sequence[str], state: State, leave_out: Iterable[Exclusion] = ()
 ) -> PushTool:
-    """Return the foremost point of a group of bodies, away from what carries the group.
-
-    Parameters
-    ----------
-    model
-        The model.
-    bodies
-        Bodies that may touch what is pushed, such as those of a gripper.
-    state
-        A state of the whole model.
-    leave_out
-        Excluded bodies.
-    """
+    """Return the foremost point of a group of bodies, away from what carries the group."""
     chains = [_ancestors(model, body) for body in bodies]
     common = [frame for frame in chains[0] if all(frame in chain for chain in chains)]
     frame = common[0]

@@ -25,31 +25,15 @@ _MOST_PAIRS = 6
 
 @dataclass(frozen=True, slots=True, eq=False)
 class PushView:
-    """Points and vectors of a push in the world, for drawings (2022 paper, Fig. 6).
+    """Points and vectors of a push in the world, for drawings (2022 paper, Fig. 6)."""
 
-    Attributes
-    ----------
-    p, r
-        Nearest points on the object and on the robot (3,) [m].
-    n
-        Contact normal from p to r.
-    push
-        Direction -∇p in which p has to move.
-    tangent
-        Active tangent v, towards places where n opposes the push more.
-    target
-        Contact point that was chosen (3,) [m].
-    distance
-        Gap [m]; infinite beyond the radius of queries.
-    """
-
-    p: Array
+    p: Array  # nearest points on the object and on the robot (3,) [m]
     r: Array
-    n: Array
-    push: Array
-    tangent: Array
-    target: Array
-    distance: float
+    n: Array  # contact normal from p to r
+    push: Array  # direction -∇p in which p has to move
+    tangent: Array  # active tangent v, towards places where n opposes the push more
+    target: Array  # contact point that was chosen (3,) [m]
+    distance: float  # gap [m]; infinite beyond the radius of queries
 
     @property
     def vectors(self) -> dict[str, tuple[Array, Array]]:
@@ -60,32 +44,16 @@ class PushView:
 
 
 class PushPair(NamedTuple):
-    """Body of a pusher and body of an object that are near each other.
+    """Body of a pusher and body of an object that are near each other."""
 
-    Attributes
-    ----------
-    robot, thing
-        Indices of the bodies in the scene.
-    r, p
-        Nearest points on the robot and on the object [m].
-    normal
-        Unit vector from p to r.
-    gap
-        Distance [m].
-    velocity
-        Velocity of p per unit of the object's motion to the target.
-    alignment
-        Cosine between the velocity and -normal.
-    """
-
-    robot: int
+    robot: int  # indices of the bodies in the scene
     thing: int
-    r: Vector
+    r: Vector  # nearest points on the robot and on the object [m]
     p: Vector
-    normal: Vector
-    gap: float
-    velocity: Vector
-    alignment: float
+    normal: Vector  # unit vector from p to r
+    gap: float  # distance [m]
+    velocity: Vector  # velocity of p per unit of the object's motion to the target
+    alignment: float  # cosine between the velocity and -normal
 
     @property
     def tangents(self) -> tuple[Vector, Vector]:
@@ -116,15 +84,6 @@ class ContactRates:
     """Derivatives of a contact over speeds: of the gap, and of the way of a tip on the object.
 
     They follow from the twists of the touching body, of the object and of the hand, by one compiled function.
-
-    Parameters
-    ----------
-    slots
-        Contact slots with the twists of bodies.
-    columns
-        Indices of the n speeds among the columns of the slots.
-    hand
-        Index of a body that moves with the tip.
     """
 
     def __init__(self, slots: ContactSlots, columns: Sequence[int], hand: int) -> None:
@@ -158,21 +117,7 @@ def _along(direction: Expression, point: Expression, twist: Expression) -> Expre
 
 
 class PairFinder:
-    """Search of the near pair of pusher and object that pushes best, and of the nearest other pair.
-
-    Parameters
-    ----------
-    bodies
-        Bodies of the scene.
-    pusher, object_bodies
-        Those of the pusher and of the object.
-    slots
-        Contact slots with the Jacobians of points.
-    column
-        Index of the object's speed among the columns of the slots.
-    sign
-        Direction of the coordinate towards its target.
-    """
+    """Search of the near pair of pusher and object that pushes best, and of the nearest other pair."""
 
     def __init__(
         self,
@@ -192,15 +137,7 @@ class PairFinder:
         self._slots, self._column, self._sign = slots, column, sign
 
     def nearest(self, found: DistanceResults) -> tuple[PushPair | None, float]:
-        """Return the pair that pushes best, and the clearance.
-
-        Returns
-        -------
-        pair
-            That with the best alignment among those that are about the nearest; None if none is near.
-        clearance
-            Least distance of all other pairs [m], infinite if none is near.
-        """
+        """Return the pair that pushes best, and the clearance."""
         best, clearance = None, math.inf
         most, count = math.inf, 0
         gaps = found.distances.tolist()

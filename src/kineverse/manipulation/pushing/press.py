@@ -44,26 +44,7 @@ _LEAST_RATE = 0.02
 
 
 class PushPress:
-    """Estimates of a press, from one step to the next.
-
-    Parameters
-    ----------
-    dt
-        Time of a step [s].
-    sign
-        Direction of the coordinate towards its target.
-
-    Attributes
-    ----------
-    deviation
-        Standard deviation of gaps [m]; 0 if the state is exact.
-    speed
-        Speed of the contact point in the direction of the push [m/s].
-    lag
-        Lag of the tip in the direction of the push [m].
-    correction
-        Value of the coordinate less its estimate [m], [rad].
-    """
+    """Estimates of a press, from one step to the next."""
 
     def __init__(self, dt: float, sign: float) -> None:
         self._dt, self._sign = dt, sign
@@ -98,17 +79,7 @@ class PushPress:
         self._touch = 0.0 if touched else self._touch + self._dt
 
     def advance(self, estimate: float, tip: Vector, touching: bool) -> float:
-        """Return the value of the coordinate at a step.
-
-        Parameters
-        ----------
-        estimate
-            Estimate of the value [m], [rad].
-        tip
-            Foremost point of the pusher by the readings of the encoders [m].
-        touching
-            Whether the object is being pushed.
-        """
+        """Return the value of the coordinate at a step."""
         moved = ZERO if self._tip is None else subtract(tip, self._tip)
         leverage = length(self._velocity)
         along = scale(1.0 / max(leverage, 1e-9), self._velocity)
@@ -132,15 +103,7 @@ class PushPress:
         return estimate + self.correction
 
     def correct(self, gap: float, rate: float) -> None:
-        """Correct the value by a gap, for the next step.
-
-        Parameters
-        ----------
-        gap
-            Gap at the value [m].
-        rate
-            Derivative of the gap by the coordinate [m/m], [m/rad].
-        """
+        """Correct the value by a gap, for the next step."""
         self._crept = self._crept + max(self._way, 0.0) if gap < self.slack else 0.0
         if self.deviation > 0.0 and abs(rate) > _LEAST_RATE and gap < (self.slack if self.touched else 0.0):
             most = self.slack / abs(rate)
@@ -165,15 +128,6 @@ class PushPress:
 
         Beyond the slack a gap shrinks as fast as slots allow, and within it at the speed of creeping. It may
         seem to be negative there, as the estimate may be wrong by as much.
-
-        Parameters
-        ----------
-        gap
-            The gap [m].
-        touching
-            Whether the object is being pushed.
-        gain
-            Gain of the slots [1/s].
         """
         known = self.deviation == 0.0 or (self.touched and touching)
         if known:
@@ -198,19 +152,7 @@ class TipAnchor:
         self._anchor, self._drift = ZERO, ZERO
 
     def drift(self, thing: int, pose: Sequence[Sequence[float]], tip: Vector, weight: float) -> Vector:
-        """Return how far the tip has moved on a body since the first touch [m], filtered.
-
-        Parameters
-        ----------
-        thing
-            Index of the body.
-        pose
-            Three rows of the pose of something fixed to it.
-        tip
-            The tip in the world [m].
-        weight
-            Weight of the latest drift, from 0 to 1.
-        """
+        """Return how far the tip has moved on a body since the first touch [m], filtered."""
         if self._thing != thing:
             offset = subtract(tip, transform_point(pose, ZERO))
             self._thing, self._anchor, self._drift = thing, rotate_back(pose, offset), ZERO

@@ -56,30 +56,14 @@ _MOVED = 0.01
 
 @dataclass(frozen=True, slots=True, eq=False)
 class PushStart:
-    """Result of :func:`find_push_start`, true if a start was found.
+    """Result of :func:`find_push_start`, true if a start was found."""
 
-    Attributes
-    ----------
-    state
-        State of everything from which the push goes through; None if none was found.
-    samples
-        Number of sampled base poses.
-    reasons
-        Number of samples by the reason of their failure.
-    steps
-        Number of steps of the push in the roll-out.
-    whole
-        Whether the push reaches the target.
-    seconds
-        Duration of the search [s].
-    """
-
-    state: State | None
-    samples: int
-    reasons: Counter[str]
-    steps: int
-    seconds: float
-    whole: bool = True
+    state: State | None  # state of everything from which the push goes through; None if none was found
+    samples: int  # number of sampled base poses
+    reasons: Counter[str]  # number of samples by the reason of their failure
+    steps: int  # number of steps of the push in the roll-out
+    seconds: float  # duration of the search [s]
+    whole: bool = True  # whether the push reaches the target
 
     def __bool__(self) -> bool:
         return self.state is not None
@@ -121,30 +105,6 @@ def find_push_start(
     than the best one before, and after 200 samples without a roll-out. Nothing is sampled where something is
     in the way of the object. Robots without a mobile base are sampled over their arms alone, at those points
     that are within reach.
-
-    Parameters
-    ----------
-    pushing
-        The push; its contacts are forgotten.
-    state
-        State of everything; the robot is moved away from where it is.
-    samples, seconds
-        Largest number of samples, and largest time [s].
-    steps
-        Largest number of steps of a roll-out.
-    seed
-        Seed of the samples.
-    least
-        Share of the motion from which on a start counts whose push goes the farthest, if none goes through.
-    accept
-        Further test of a start, such as a trial in a world: returns the reason against it, or nothing.
-    report
-        Is called with a text on the progress now and then.
-
-    Raises
-    ------
-    InvalidValueError
-        For less than one sample.
     """
     begin, worked, reasons = perf_counter(), working_seconds(), Counter[str]()
     samples, seed = as_count("samples", samples, 1), as_count("seed", seed, 0)
@@ -188,21 +148,11 @@ def find_push_start(
 
 
 class RollOut(NamedTuple):
-    """Result of :func:`roll_out`.
+    """Result of :func:`roll_out`."""
 
-    Attributes
-    ----------
-    problem
-        Why the push fails; empty if it goes through.
-    steps
-        Number of steps.
-    value
-        Value of the object's coordinate at the end [m], [rad].
-    """
-
-    problem: str
-    steps: int
-    value: float
+    problem: str  # why the push fails; empty if it goes through
+    steps: int  # number of steps
+    value: float  # value of the object's coordinate at the end [m], [rad]
 
 
 def roll_out(pushing: Pushing, start: State, steps: int, tolerance: float = 0.015) -> RollOut:
@@ -232,13 +182,7 @@ def roll_out(pushing: Pushing, start: State, steps: int, tolerance: float = 0.01
 
 
 class _Sampler:
-    """Sampler of start states: a contact point, a base in front of it, and inverse kinematics.
-
-    Attributes
-    ----------
-    unreachable
-        Number of contact points if a robot without a mobile base reaches none of them, otherwise 0.
-    """
+    """Sampler of start states: a contact point, a base in front of it, and inverse kinematics."""
 
     def __init__(self, pushing: Pushing, state: State, generator: np.random.Generator) -> None:
         self._pushing, self._state, self._generator = pushing, state, generator

@@ -53,43 +53,21 @@ _SIZES = {
 
 @dataclass(slots=True)
 class PushNumbers:
-    """Numbers of the present contact, which a program is set to in each step.
+    """Numbers of the present contact, which a program is set to in each step."""
 
-    Attributes
-    ----------
-    gap
-        Distance of pusher and object [m].
-    slip
-        How far the tip has moved along both tangents since it touched [m].
-    pushed
-        Derivative of the gap over the object's speed.
-    target, normal, facing
-        Where the tip is to go [m], the normal of the object there, and the wanted axis of the pusher.
-    reach, touch, hold
-        Weights of the ways to that point and to a contact, and of the goals that keep a contact.
-    engaged
-        1 while the pusher touches, else 0.
-    near
-        Gap from which on the pusher touches [m].
-    pace
-        Largest speed of the coordinate [m/s], [rad/s].
-    free
-        1 if the object may move, else 0.
-    """
-
-    gap: float
-    slip: Sequence[float]
-    pushed: float
-    target: Vector
+    gap: float  # distance of pusher and object [m]
+    slip: Sequence[float]  # how far the tip has moved along both tangents since it touched [m]
+    pushed: float  # derivative of the gap over the object's speed
+    target: Vector  # [m]
     facing: Vector
     normal: Vector
-    reach: float
-    touch: float
-    hold: float
-    engaged: float
-    near: float
-    pace: float
-    free: float
+    reach: float  # weights of the ways to that point
+    touch: float  # to a contact
+    hold: float  # of the goals that keep a contact
+    engaged: float  # 1 while the pusher touches, else 0
+    near: float  # gap from which on the pusher touches [m]
+    pace: float  # largest speed of the coordinate [m/s], [rad/s]
+    free: float  # 1 if the object may move, else 0
 
     @property
     def listed(self) -> list[float]:
@@ -101,28 +79,7 @@ class PushNumbers:
 
 
 class PushProgram:
-    """Controller of a push, whose tasks depend on the numbers of the present contact.
-
-    Parameters
-    ----------
-    model, coordinate, target_value
-        Model, the coordinate to change, and its wanted value.
-    tool
-        The pusher.
-    scene
-        Collision scene of the controller.
-    dt, still, logic
-        As for :class:`.Pushing`.
-
-    Attributes
-    ----------
-    controller
-        The controller.
-    columns
-        Its speeds in the order of the derivatives of a contact, by their index.
-    object_column
-        Index of the object's speed among the speeds of the controller.
-    """
+    """Controller of a push, whose tasks depend on the numbers of the present contact."""
 
     def __init__(
         self,
@@ -218,15 +175,7 @@ class PushProgram:
         return self.controller.query_contacts(self._values)
 
     def step(self, numbers: PushNumbers, rates: Array | None) -> Command:
-        """Return the command for one time step, at the state that was loaded.
-
-        Parameters
-        ----------
-        numbers
-            The numbers.
-        rates
-            Derivatives of the contact, see :class:`.ContactRates`; None without a contact.
-        """
+        """Return the command for one time step, at the state that was loaded."""
         self._numbers[: self._first_rate] = numbers.listed
         self._numbers[self._first_rate :] = 0.0 if rates is None else rates
         self._values[self._places] = self._numbers[self._used]

@@ -24,45 +24,21 @@ from .push_skill import push
 
 @dataclass(frozen=True, slots=True, eq=False)
 class PushTrial:
-    """Figures of one push.
+    """Figures of one push."""
 
-    Attributes
-    ----------
-    robot, what
-        Prefix of the robot, and the coordinate.
-    outcome
-        Result of the push.
-    placed
-        Number of samples of the base placement; 0 if the push began at the given state.
-    first
-        Why the push from the given state failed; empty if it did not.
-    penetration
-        Deepest penetration of the robot, but for pusher and pushed object [m], and its bodies.
-    pressed
-        Deepest penetration of pusher and pushed object [m].
-    violation
-        Largest violation of a limit on positions, in the unit of the coordinate.
-    median, p99, worst
-        CPU time of a step of the controller, scene queries included [s].
-    wall
-        Median wall time of a step [s].
-    cpu, walls
-        CPU and wall times of all steps [s].
-    """
-
-    robot: str
-    what: str
-    outcome: Outcome
-    placed: int
-    first: str
-    penetration: tuple[float, str]
-    pressed: float
-    violation: float
-    median: float
+    robot: str  # prefix of the robot
+    what: str  # the coordinate
+    outcome: Outcome  # result of the push
+    placed: int  # number of samples of the base placement; 0 if the push began at the given state
+    first: str  # why the push from the given state failed; empty if it did not
+    penetration: tuple[float, str]  # [m]
+    pressed: float  # deepest penetration of pusher and pushed object [m]
+    violation: float  # largest violation of a limit on positions, in the unit of the coordinate
+    median: float  # CPU time of a step of the controller, scene queries included [s]
     p99: float
     worst: float
-    wall: float
-    cpu: tuple[float, ...] = ()
+    wall: float  # median wall time of a step [s]
+    cpu: tuple[float, ...] = ()  # CPU and wall times of all steps [s]
     walls: tuple[float, ...] = ()
 
     def __str__(self) -> str:
@@ -98,30 +74,7 @@ def try_push(
     open_session: Callable[[World, Callable[[Session], object]], Session] | None = None,
     on_step: Callable[[Pushing], object] | None = None,
 ) -> PushTrial:
-    """Push in a world from a state; if that fails, from a start that base placement finds.
-
-    Parameters
-    ----------
-    world
-        The world; it is reset.
-    state
-        Start of the first attempt.
-    what, bodies, target, tolerance, rules, leave_out, logic
-        As for :func:`.push`.
-    steps
-        Largest number of control steps of an attempt.
-    dt
-        Time of a step [s].
-    place
-        Whether base placement is tried.
-    samples, seed
-        As for :func:`.find_push_start`.
-    open_session
-        Function from the world and a function to call after each step to a session, for another belief, and
-        for recordings.
-    on_step
-        As for :func:`.push`.
-    """
+    """Push in a world from a state; if that fails, from a start that base placement finds."""
     model = world.model
     coordinate = find_object_coordinate(world, what)
     bodies = find_gripper(model, world.robot).bodies if bodies is None else bodies

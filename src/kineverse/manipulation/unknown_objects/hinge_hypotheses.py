@@ -22,15 +22,6 @@ def guess_hinges(unknown: UnknownPart, search: PlacementSearch, state: State) ->
 
     A door has its handle far from its hinge, and along it. A bar in the middle of a narrow front, as of a
     drawer, has none.
-
-    Parameters
-    ----------
-    unknown
-        The part.
-    search
-        Search of placements in its model.
-    state
-        Where everything is.
     """
     model, handle = unknown.model, unknown.handle
     search.scene.update(state)
@@ -59,21 +50,7 @@ def least_share(
     way: float,
     turn: float,
 ) -> float:
-    """Return the least share of possible motions along which the arm of a placement holds the handle.
-
-    Parameters
-    ----------
-    unknown, search
-        Part, and search of the placement.
-    placement
-        The placement, which was found for a straight pull.
-    state
-        Where everything is.
-    twists
-        Twists (6,) of hinges in axes of the part.
-    way, turn
-        Straight way [m] and angle [rad] that are wanted.
-    """
+    """Return the least share of possible motions along which the arm of a placement holds the handle."""
     assert placement.grasp is not None
     world_T_part = np.asarray(unknown.model.fk(unknown.frame)(state))
     part_T_hand = unknown.frame_T_handle @ placement.grasp.pose

@@ -22,22 +22,12 @@ LEAST_WAY, LEAST_TURN = 0.03, math.radians(4.0)
 
 @dataclass(frozen=True, slots=True, eq=False)
 class LearnedJoint:
-    """Decision for the family of a joint.
+    """Decision for the family of a joint."""
 
-    Attributes
-    ----------
-    fit
-        The identified joint.
-    way, turn
-        Motion of the part until the decision [m], [rad].
-    time
-        Time of the decision [s].
-    """
-
-    fit: Fit
-    way: float
+    fit: Fit  # identified joint
+    way: float  # motion of the part until the decision [m], [rad]
     turn: float
-    time: float
+    time: float  # time of the decision [s]
 
     @property
     def family(self) -> str:
@@ -51,14 +41,6 @@ class JointLearning:
     A family is decided on once it has the probability :data:`CERTAIN` in three results in a row, and the part
     has moved by 3 cm or 4°. Afterwards another family has to reach the same to replace it. So a probability
     that passes a threshold in both directions changes nothing.
-
-    Attributes
-    ----------
-    learned
-        The decision; None before. Its fit is the latest one of the family, its motion and time are those of
-        the decision.
-    likely
-        The most probable joint, if the last call of :meth:`update` looked for it; it need not be certain.
     """
 
     def __init__(self) -> None:
@@ -77,15 +59,7 @@ class JointLearning:
         self._identifier.add(None, pose, child_covariance=covariance)
 
     def update(self, way: float, turn: float, time: float) -> bool:
-        """Return True if there is a new result of a decided family.
-
-        Parameters
-        ----------
-        way, turn
-            Motion of the part so far [m], [rad].
-        time
-            Time of the world [s].
-        """
+        """Return True if there is a new result of a decided family."""
         self.likely = None
         if self.poses < self._evaluated + _EVERY or way < _VISIBLE:
             return False

@@ -32,31 +32,14 @@ _STRAIGHT = 1e-3
 
 @dataclass(frozen=True, slots=True, eq=False)
 class UnknownPart:
-    """Part that moves freely in a model, and its handle.
+    """Part that moves freely in a model, and its handle."""
 
-    Attributes
-    ----------
-    model
-        Copy of a model in which the part floats, and is pulled: at first along the outward normal of its
-        handle.
-    frame
-        Frame of the part.
-    handle
-        The handle; its coordinate is the way of its middle by the pull [m].
-    parent
-        Frame in which the part floats.
-    origin
-        Pose (4, 4) of the part in the parent, in the model that was copied.
-    floating
-        The seven coordinates of the floating joint.
-    """
-
-    model: Model
+    model: Model  # copy of a model in which the part floats, and is pulled
     frame: str
-    handle: Handle
-    parent: str
-    origin: Array
-    floating: tuple[Symbol, ...]
+    handle: Handle  # handle; its coordinate is the way of its middle by the pull [m]
+    parent: str  # frame in which the part floats
+    origin: Array  # pose (4, 4) of the part in the parent, in the model that was copied
+    floating: tuple[Symbol, ...]  # seven coordinates of the floating joint
 
     @property
     def frame_T_handle(self) -> Array:
@@ -93,22 +76,7 @@ class UnknownPart:
 
 
 def free_part(model: Model, frame: str, handle: str, state: State) -> UnknownPart:
-    """Return a part as something that floats, in a copy of a model.
-
-    Parameters
-    ----------
-    model
-        The model; how it attaches the part does not matter.
-    frame, handle
-        Frame of the part, and frame of the handle's body, which is the part or rigidly below it.
-    state
-        State at which the part is where the model has it.
-
-    Raises
-    ------
-    UnknownNameError
-        For a frame that does not exist, or a handle without a slim shape that stands out.
-    """
+    """Return a part as something that floats, in a copy of a model."""
     model.fk(handle, frame)
     copy = model.copy()
     parent = model.frames[frame].parent
@@ -175,22 +143,6 @@ def write_joint(model: Model, frame: str, fit: Fit, parent: str) -> Symbol:
     """Write an identified joint into a model in place of what attached its part, and return its coordinate.
 
     The name of the earlier joint stays. The joint has no limits: the range that was seen is not its own.
-
-    Parameters
-    ----------
-    model
-        The model.
-    frame
-        Frame of the part.
-    fit
-        The identified joint between the parent and the part, with one joint value.
-    parent
-        Frame in which the part was observed.
-
-    Raises
-    ------
-    EditError
-        If something else in the model needs the earlier joint; the model is then unchanged.
     """
     records = {name: a for name, a in model.articulations.items() if a.child == frame}
     name = next(iter(records), f"{frame}/joint")
@@ -212,20 +164,7 @@ def _written(model: Model, tag: str) -> set[str]:
 
 
 class JointPath:
-    """Poses of a part along a joint with one degree of freedom, and the value where the part is.
-
-    Parameters
-    ----------
-    pose
-        Function from a joint value to the pose (4, 4) of the part in what it moves in.
-    first
-        First pose (4, 4) of the part.
-
-    Attributes
-    ----------
-    start, value
-        Values at the first and at the present pose [m], [rad].
-    """
+    """Poses of a part along a joint with one degree of freedom, and the value where the part is."""
 
     def __init__(self, pose: Callable[[float], Array], first: Array, start: float = 0.0) -> None:
         self.pose = pose

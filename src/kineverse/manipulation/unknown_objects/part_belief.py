@@ -33,24 +33,12 @@ _LOST_LOOKS = 6
 
 @dataclass(slots=True, eq=False)
 class PoseMean:
-    """Running mean of poses that leaves outliers out.
+    """Running mean of poses that leaves outliers out."""
 
-    Attributes
-    ----------
-    looks
-        Number of looks that the mean is worth at most.
-    pose
-        The mean (4, 4); None before the first pose.
-    count
-        Number of poses in the mean.
-    missed
-        Number of outliers in a row.
-    """
-
-    looks: float
-    pose: Array | None = None
-    count: int = 0
-    missed: int = 0
+    looks: float  # number of looks that the mean is worth at most
+    pose: Array | None = None  # mean (4, 4); None before the first pose
+    count: int = 0  # number of poses in the mean
+    missed: int = 0  # number of outliers in a row
     _first: list[Array] = field(default_factory=list)
 
     def add(self, pose: Array) -> bool:
@@ -79,21 +67,11 @@ def is_near(a: Array, b: Array) -> bool:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class PartLook:
-    """Look at the part that is no outlier.
+    """Look at the part that is no outlier."""
 
-    Attributes
-    ----------
-    pose
-        Pose (4, 4) of the part relative to what it moves in.
-    covariance
-        Covariance (6, 6) of its errors.
-    time
-        Time [s].
-    """
-
-    pose: Array
-    covariance: Array
-    time: float
+    pose: Array  # pose (4, 4) of the part relative to what it moves in
+    covariance: Array  # covariance (6, 6) of its errors
+    time: float  # time [s]
 
 
 class PartBelief:
@@ -102,34 +80,6 @@ class PartBelief:
     Before a hand holds the part, it stands where the mean of all looks is. In a hand it is where the hand is,
     times the mean of the last looks at the part in the hand. So the estimate does not lag behind the motion,
     and looks that are far from it are outliers.
-
-    Parameters
-    ----------
-    unknown
-        The part.
-    world
-        The world, of which observations alone are read.
-    state
-        Values of everything that is not observed.
-    hand
-        Frame of the robot's hand.
-    markers
-        Marked frames of the part.
-    ancestors
-        Frames of what it may move in, the nearest first: the first one that is seen is the reference.
-    sensors
-        Stated noise of the looks.
-
-    Attributes
-    ----------
-    monitor
-        Test of the believed joint of the part, which gets all looks; None without one.
-    seen
-        Names of frames that were seen.
-    looks
-        Looks since :meth:`hold` that are no outliers.
-    path
-        Joint along which the held part moves, as far as it is known; the part is believed to be on it.
     """
 
     def __init__(
@@ -176,15 +126,7 @@ class PartBelief:
         return next(seen, WORLD) if self._beside is None else self._beside
 
     def slip(self, part_T_hand: Array, point: Array) -> float:
-        """Return how far a point (3,) of the part is from its place in the hand [m], inf if it is not seen.
-
-        Parameters
-        ----------
-        part_T_hand
-            Place (4, 4) of the hand on the part.
-        point
-            The point, in the frame of the part.
-        """
+        """Return how far a point (3,) of the part is from its place in the hand [m], inf if it is not seen."""
         if self.held is None or self.held.pose is None or self.held.missed >= _LOST_LOOKS:
             return math.inf
         place = np.append(point, 1.0)

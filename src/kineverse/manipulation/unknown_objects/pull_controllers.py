@@ -52,22 +52,6 @@ class StraightPull:
     The hand holds its place on the part, shifted ahead by speed / gain along the direction. So a part that
     does not follow stops the hand after 4 mm, and the hand yields to any other motion of the part. The pull
     begins slowly, as nothing is known of the direction.
-
-    Parameters
-    ----------
-    motion
-        Motions of the hand.
-    belief
-        Belief about the part.
-    bar_T_hand
-        Place (4, 4) of the hand on the handle.
-    direction
-        Direction (3,) of the pull in the axes of the handle; by default its outward normal x.
-
-    Attributes
-    ----------
-    likely
-        The likeliest joint, which leads the pull the more the further the part has moved.
     """
 
     def __init__(
@@ -107,30 +91,7 @@ class StraightPull:
 
 
 class LearnedPull:
-    """Motion of the hand with a part along its joint in a model.
-
-    Parameters
-    ----------
-    motion
-        Motions of the hand.
-    belief
-        Belief about the part.
-    model
-        Model with a joint of the part; another one than that of the motions.
-    bar_T_hand
-        Place (4, 4) of the hand on the handle.
-    first
-        First pose (4, 4) of the part relative to what it moves in.
-    opened
-        Wanted distance from there [m], [rad].
-
-    Attributes
-    ----------
-    coordinate, path
-        Coordinate of the joint, and the part's path by it.
-    obstacle
-        What is in the way of the part along this joint; None if nothing is.
-    """
+    """Motion of the hand with a part along its joint in a model."""
 
     def __init__(
         self,
@@ -212,13 +173,7 @@ def learn_model(model: Model, belief: PartBelief, fit: Fit) -> Model:
 
 
 def place_beside(model: Model, belief: PartBelief) -> None:
-    """Put the furniture that carries the part where it is seen.
-
-    Raises
-    ------
-    InvalidValueError
-        If joints move it, so that there is no frame to put elsewhere.
-    """
+    """Put the furniture that carries the part where it is seen."""
     if belief.beside == WORLD:
         return
     if model.fk(belief.beside).symbols:

@@ -51,32 +51,7 @@ class ArmEndError(SkillError):
 
 
 class PartPulling:
-    """Pulling of a part until it is open.
-
-    Parameters
-    ----------
-    session
-        Robot in a world.
-    belief
-        Belief about the part.
-    learning
-        Identification of its joint.
-    model
-        What is known, which gets the learned joint in copies.
-    wanted
-        Wanted way of a part that slides [m], and angle of one that turns [rad].
-
-    Attributes
-    ----------
-    part
-        Frame of the part.
-    point, frame_T_handle
-        Middle (3,) of the handle, and pose (4, 4) of its body, in the frame of the part.
-    start
-        First pose (4, 4) of the part relative to what it moves in.
-    begin
-        Time of the first grasp [s].
-    """
+    """Pulling of a part until it is open."""
 
     def __init__(
         self,
@@ -104,20 +79,6 @@ class PartPulling:
         """Pull until the part is open or at its own stop, and return how far that is.
 
         A handle that slips is grasped anew.
-
-        Parameters
-        ----------
-        motion
-            Motions of the hand.
-        grasp
-            Where the open hand is on the handle.
-
-        Raises
-        ------
-        ArmEndError
-            If the arm cannot go on with a part whose joint is known; the hand is open then.
-        SkillError
-            If the part does not follow, or stops before it is open.
         """
         self.motion = motion
         way = self.opening[0] if self.learning.poses else -math.inf

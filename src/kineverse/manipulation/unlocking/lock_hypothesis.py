@@ -46,30 +46,13 @@ class Enclosure(NamedTuple):
 
 @dataclass
 class LockHypothesis:
-    """Lock of a coordinate in one direction, as far as tries tell.
+    """Lock of a coordinate in one direction, as far as tries tell."""
 
-    Parameters
-    ----------
-    number
-        Number of the locked coordinate, which is no key of its own.
-    limits
-        Limits of all coordinates.
-    start
-        Configuration at the start.
-
-    Attributes
-    ----------
-    moved, refused
-        Configurations in which the part moved, and in which it did not.
-    boxes
-        Boxes that enclose the former and none of the latter, one for each alternative.
-    """
-
-    number: int
-    limits: Enclosure
-    start: Configuration
-    moved: list[Configuration] = field(default_factory=list)
-    refused: list[Configuration] = field(default_factory=list)
+    number: int  # number of the locked coordinate, which is no key of its own
+    limits: Enclosure  # limits of all coordinates
+    start: Configuration  # configuration at the start
+    moved: list[Configuration] = field(default_factory=list)  # configurations in which the part moved
+    refused: list[Configuration] = field(default_factory=list)  # in which it did not
     boxes: list[Enclosure] = field(default_factory=list)
 
     def observe(self, q: Configuration, moved: bool) -> None:

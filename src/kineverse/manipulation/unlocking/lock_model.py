@@ -34,31 +34,7 @@ _MOST_CHOICES = 500
 
 
 class LockModel:
-    """Hypotheses about the locks of all coordinates in both directions, as constraints of a model.
-
-    Parameters
-    ----------
-    model
-        Model of the parts and their limits, to which ``NAME/learned`` is added for each locked coordinate.
-    start
-        Positions at the start.
-    seed
-        Seed of the order of keys that are equally promising.
-
-    Attributes
-    ----------
-    coordinates, limits
-        The coordinates, and their limits.
-    locks
-        Hypothesis for each coordinate, by its number, and direction.
-    priority
-        Place of each coordinate in the order of those that are equally promising.
-
-    Raises
-    ------
-    InvalidValueError
-        For a coordinate without limits.
-    """
+    """Hypotheses about the locks of all coordinates in both directions, as constraints of a model."""
 
     def __init__(self, model: Model, start: State, seed: int) -> None:
         self.model, self.coordinates = model, model.degrees_of_freedom

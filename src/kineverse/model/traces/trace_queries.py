@@ -225,15 +225,7 @@ DATA_QUERIES = {
 
 
 class TracingReader(ReadRecorder, ABC):
-    """Model before an operation that turns every read into a query.
-
-    Attributes
-    ----------
-    model
-        Model itself.
-    done
-        True after the operation has returned; later accesses to its writes are not recorded.
-    """
+    """Model before an operation that turns every read into a query."""
 
     def __init__(self, model: ReadRecorder) -> None:
         super().__init__(model._value_at, model._names_at, Reads())

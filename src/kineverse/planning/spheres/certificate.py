@@ -24,32 +24,14 @@ _NEAR, _SMALL = 10, 0.7
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Uncovered:
-    """Cells that lie in none of the spheres after subdivision.
+    """Cells that lie in none of the spheres after subdivision."""
 
-    Attributes
-    ----------
-    growth
-        (N,) by how much the radii have to grow, so that the spheres cover everything [m].
-    points
-        (n, 3) points outside of all spheres, one of a cell that has one [m].
-    """
-
-    growth: Floats
-    points: Floats
+    growth: Floats  # (N,) by how much the radii have to grow, so that the spheres cover everything [m]
+    points: Floats  # (n, 3) points outside of all spheres, one of a cell that has one [m]
 
 
 def find_uncovered(region: CoverRegion, centres: Floats, radii: Floats, tolerance: float) -> Uncovered:
-    """Return the part of a region that spheres do not cover.
-
-    Parameters
-    ----------
-    region
-        What is to be covered.
-    centres, radii
-        (N, 3) and (N,) spheres [m].
-    tolerance
-        Growth that is accepted without a point that needs it [m].
-    """
+    """Return the part of a region that spheres do not cover."""
     growth = np.zeros(len(radii))
     points: list[Floats] = []
     cells = np.concatenate([region.middles[region.owners][:, None], region.corners[region.faces]], axis=1)

@@ -82,17 +82,7 @@ class _Problem:
 
 
 def fit_spheres(region: CoverRegion, protrusion: float, most: int) -> FittedSpheres:
-    """Return few spheres that cover a region.
-
-    Parameters
-    ----------
-    region
-        The region, which is near the origin, and has an extent of order 1.
-    protrusion
-        Largest protrusion; it is exceeded where ``most`` spheres are not enough.
-    most
-        Largest number of spheres.
-    """
+    """Return few spheres that cover a region."""
     protrusion = max(protrusion, _least_protrusion(region, most))
     problem = _Problem(region, protrusion)
     aim = protrusion / _ALLOWANCE

@@ -30,11 +30,6 @@ class CoverMesh:
     """Triangles on the surfaces of the solids of a region, and coarser ones on smaller copies inside.
 
     Those that lie deep in another solid are left out.
-
-    Attributes
-    ----------
-    points
-        (M, 3) corners of the triangles, and a point in the middle of each solid [m].
     """
 
     def __init__(self, region: CoverRegion, spacing: float) -> None:

@@ -44,22 +44,13 @@ class RoundSide:
 
     z is the place of x along the axis, and a the point of the axis next to x, no further than ``reach`` from
     the origin. A sphere has the reach 0; cylinders and cones have an infinite one, and a cone has a slope.
-
-    Attributes
-    ----------
-    origin, axis
-        (3,) origin of the axis [m], and its direction.
-    reach, offset
-        Lengths of the formula [m].
-    slope, width
-        Its factors.
     """
 
-    origin: Floats
+    origin: Floats  # (3,) origin of the axis [m], and its direction
     axis: Floats
-    reach: float
+    reach: float  # lengths of the formula [m]
     offset: float
-    slope: float = 0.0
+    slope: float = 0.0  # its factors
     width: float = 1.0
 
 
@@ -69,29 +60,15 @@ _NO_SIDE = RoundSide(np.zeros(3), _Z, 0.0, _FAR, width=0.0)
 
 @dataclass(frozen=True, slots=True, eq=False)
 class CoverPolytope:
-    """Convex solid, with a polytope that contains it.
+    """Convex solid, with a polytope that contains it."""
 
-    Attributes
-    ----------
-    corners, faces
-        Outer polytope: (V, 3) corners [m] and (T, 3) triangles, counter-clockwise seen from outside.
-    normals, offsets
-        Flat sides of the solid, which has ``normals @ x <= offsets``; (F, 3) unit vectors and (F,) [m].
-    volume
-        Volume of the solid itself [m³].
-    side
-        Its round side.
-    is_hull
-        True if the polytope is the solid.
-    """
-
-    corners: Floats
+    corners: Floats  # (V, 3), [m], (T, 3)
     faces: Integers
-    normals: Floats
+    normals: Floats  # (F, 3), (F,), [m]
     offsets: Floats
-    volume: float
-    side: RoundSide = _NO_SIDE
-    is_hull: bool = False
+    volume: float  # volume of the solid itself [m³]
+    side: RoundSide = _NO_SIDE  # its round side
+    is_hull: bool = False  # True if the polytope is the solid
 
     def simplify(self) -> CoverPolytope:
         """Return the hull of the corners that are extreme along some directions, if there are many corners.
@@ -128,19 +105,7 @@ class CoverPolytope:
 
 
 class CoverRegion:
-    """Union of convex solids.
-
-    Attributes
-    ----------
-    parts
-        The P solids.
-    corners, faces
-        Corners (V, 3) of all outer polytopes, and their triangles (T, 3) [m].
-    owners
-        (T,) solid of each triangle.
-    middles
-        (P, 3) a point of each solid that is far from all of its sides [m].
-    """
+    """Union of convex solids."""
 
     def __init__(self, parts: Sequence[CoverPolytope]) -> None:
         self.parts = tuple(parts)
@@ -260,13 +225,7 @@ def _sample_inside(part: CoverPolytope, middle: Floats) -> Floats:
 
 
 def bound_solid(solid: Solid, protrusion: float) -> CoverPolytope:
-    """Return a convex solid with a polytope, close enough for covers with a protrusion [m].
-
-    Raises
-    ------
-    InvalidValueError
-        For a triangle mesh, which has no inside.
-    """
+    """Return a convex solid with a polytope, close enough for covers with a protrusion [m]."""
     surface = solid.surface
     if isinstance(surface, Faces):
         raise InvalidValueError(

@@ -14,31 +14,15 @@ from .blends import BlendedPath
 
 @dataclass(frozen=True, eq=False)
 class PathGrid:
-    """Cells of a path: straight segments, and parts of blends.
+    """Cells of a path: straight segments, and parts of blends."""
 
-    Attributes
-    ----------
-    lengths
-        Lengths in s (K,).
-    first, last
-        Derivatives q' at the ends (K, n).
-    curvature
-        Derivatives q'' (K, n).
-    start
-        Configurations at the beginning (K, n).
-    straight
-        Flags of the cells that are straight segments (K,).
-    stops
-        Flags of the nodes where the motion is at rest (K+1,).
-    """
-
-    lengths: Array
-    first: Array
+    lengths: Array  # lengths in s (K,)
+    first: Array  # derivatives q' at the ends (K, n)
     last: Array
-    curvature: Array
-    start: Array
-    straight: npt.NDArray[np.bool_]
-    stops: npt.NDArray[np.bool_]
+    curvature: Array  # derivatives q'' (K, n)
+    start: Array  # configurations at the beginning (K, n)
+    straight: npt.NDArray[np.bool_]  # flags of the cells that are straight segments (K,)
+    stops: npt.NDArray[np.bool_]  # flags of the nodes where the motion is at rest (K+1,)
 
 
 def divide_path(path: BlendedPath, cells: int) -> PathGrid:

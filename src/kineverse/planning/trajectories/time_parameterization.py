@@ -130,25 +130,13 @@ def _limits(
 
 
 class _Phases(NamedTuple):
-    """Parts of cells in which the path speed is linear in time, (P,) each.
+    """Parts of cells in which the path speed is linear in time, (P,) each."""
 
-    Attributes
-    ----------
-    cells
-        Indices of the cells.
-    durations
-        Durations [s].
-    begins, lengths
-        Beginning in the cell and length, in s.
-    before, after
-        Path speeds ṡ at both ends.
-    """
-
-    cells: npt.NDArray[np.intp]
-    durations: Array
-    begins: Array
+    cells: npt.NDArray[np.intp]  # indices of the cells
+    durations: Array  # durations [s]
+    begins: Array  # beginning in the cell and length, in s
     lengths: Array
-    before: Array
+    before: Array  # path speeds ṡ at both ends
     after: Array
 
 

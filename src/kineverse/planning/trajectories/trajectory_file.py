@@ -36,13 +36,7 @@ class TrajectoryData(NamedTuple):
 
 
 def check_trajectory_name(path: str | os.PathLike[str]) -> None:
-    """Check that the name of a file ends in .json, or has no suffix.
-
-    Raises
-    ------
-    FormatError
-        If it has another suffix.
-    """
+    """Check that the name of a file ends in .json, or has no suffix."""
     suffix = Path(path).suffix
     if suffix.lower() not in ("", ".json"):
         raise FormatError(
@@ -51,13 +45,7 @@ def check_trajectory_name(path: str | os.PathLike[str]) -> None:
 
 
 def write_trajectory_file(path: str | os.PathLike[str], data: TrajectoryData) -> None:
-    """Write the data of a trajectory to a file.
-
-    Raises
-    ------
-    FormatError
-        If the file cannot be written, or has another suffix than .json.
-    """
+    """Write the data of a trajectory to a file."""
     check_trajectory_name(path)
     document = {"format": FORMAT, "version": VERSION, "coordinates": data.names}
     document |= {key: getattr(data, key).tolist() for key in data._fields[1:]}
@@ -65,13 +53,7 @@ def write_trajectory_file(path: str | os.PathLike[str], data: TrajectoryData) ->
 
 
 def read_trajectory_file(path: str | os.PathLike[str]) -> TrajectoryData:
-    """Read the data of a trajectory from a file, and check their types and shapes.
-
-    Raises
-    ------
-    FormatError
-        If the file cannot be read or is no trajectory.
-    """
+    """Read the data of a trajectory from a file, and check their types and shapes."""
     path = Path(path)
     source = path.name
 
@@ -107,13 +89,7 @@ def read_trajectory_file(path: str | os.PathLike[str]) -> TrajectoryData:
 
 
 def parse_coordinates(names: list[str], source: str) -> tuple[Symbol, ...]:
-    """Return the symbols of names in a file.
-
-    Raises
-    ------
-    FormatError
-        For a text that is no name of a coordinate.
-    """
+    """Return the symbols of names in a file."""
     found = []
     for name in names:
         try:

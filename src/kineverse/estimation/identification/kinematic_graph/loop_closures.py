@@ -78,26 +78,14 @@ class ObservedLoop(NamedTuple):
 
 @dataclass(frozen=True)
 class LoopClosure:
-    """Closure of a loop: a pin coincides with a seat in some components by dependent coordinates.
+    """Closure of a loop: a pin coincides with a seat in some components by dependent coordinates."""
 
-    Attributes
-    ----------
-    name
-        Prefix of the names of frames and articulations.
-    seat_in, seat
-        Name of the part with the seat, and pose of the seat in it, (4, 4).
-    pin_in, pin
-        Name of the part with the pin, and pose of the pin in it, (4, 4).
-    mask, dependent, home
-        As for :class:`kineverse.CloseLoop`.
-    """
-
-    name: str
-    seat_in: str
+    name: str  # prefix of the names of frames and articulations
+    seat_in: str  # name of the part with the seat, and pose of the seat in it, (4, 4)
     seat: Array
-    pin_in: str
+    pin_in: str  # name of the part with the pin, and pose of the pin in it, (4, 4)
     pin: Array
-    mask: tuple[str, ...]
+    mask: tuple[str, ...]  # as for kineverse.CloseLoop
     dependent: tuple[str, ...]
     home: tuple[tuple[str, float], ...]
 
@@ -118,20 +106,12 @@ class LoopClosure:
 
 @dataclass(frozen=True)
 class _Ends:
-    """Seat and pin of a loop, see :class:`LoopClosure`.
-
-    Attributes
-    ----------
-    motion
-        Twists of the pin in the axes of the seat.
-    constrained
-        Components that coincide.
-    """
+    """Seat and pin of a loop, see :class:`LoopClosure`."""
 
     seat: Array
     pin: Array
-    motion: Twists
-    constrained: tuple[int, ...]
+    motion: Twists  # twists of the pin in the axes of the seat
+    constrained: tuple[int, ...]  # components that coincide
 
 
 def close_loops(
@@ -141,13 +121,6 @@ def close_loops(
 
     The closure is None if a coordinate cannot be dependent, as that of a ball, and for joints that couple
     components, such as screws.
-
-    Parameters
-    ----------
-    loops
-        Candidate loops.
-    joints
-        All joints of the tree.
     """
     # Loops are selected by strength and then closed by length.
     selected = []

@@ -132,29 +132,14 @@ class ObservedJoint(Protocol):
 
 @dataclass(frozen=True)
 class Chain:
-    """Chain of joints, at the times at which all of its parts were observed.
+    """Chain of joints, at the times at which all of its parts were observed."""
 
-    Attributes
-    ----------
-    poses
-        Poses of the last part in the first, (N, 4, 4).
-    twists
-        Twists of the last part about its origin, in the axes of the first, per unit of each joint value,
-        (N, 6, m).
-    values, deviations
-        Joint values and their standard deviations, (N, m).
-    is_angle
-        Mask of the joint values that are angles, (m,).
-    times
-        Indices of the observations.
-    """
-
-    poses: Array
-    twists: Array
-    values: Array
+    poses: Array  # poses of the last part in the first, (N, 4, 4)
+    twists: Array  # (N, 6, m)
+    values: Array  # joint values and their standard deviations, (N, m)
     deviations: Array
-    is_angle: tuple[bool, ...]
-    times: npt.NDArray[np.int_]
+    is_angle: tuple[bool, ...]  # mask of the joint values that are angles, (m,)
+    times: npt.NDArray[np.int_]  # indices of the observations
 
     @property
     def mobility(self) -> int:

@@ -39,29 +39,14 @@ SURPRISE_DEVIATIONS = 4.0
 
 @dataclass(frozen=True)
 class PartPair:
-    """Joint identified between two parts that were observed together.
+    """Joint identified between two parts that were observed together."""
 
-    Attributes
-    ----------
-    parent, child
-        Names of the parts.
-    result
-        Identification result.
-    times
-        Indices of the observations of both parts.
-    gain
-        Gain in log density over a uniform distribution of each child pose in a room, summed over all
-        families.
-    is_consistent
-        True if the residuals are as large as the noise.
-    """
-
-    parent: str
+    parent: str  # names of the parts
     child: str
-    result: IdentificationResult
-    times: npt.NDArray[np.int_]
+    result: IdentificationResult  # identification result
+    times: npt.NDArray[np.int_]  # indices of the observations of both parts
     gain: float
-    is_consistent: bool
+    is_consistent: bool  # True if the residuals are as large as the noise
 
     @property
     def log_odds_rigid(self) -> float:
@@ -162,13 +147,7 @@ def identify_observations(
 
 
 def _joint_weights(families: FamilyChoice) -> dict[str | Family, float]:
-    """Return the families and their weights, by default all but the curve.
-
-    Raises
-    ------
-    InvalidValueError
-        If the curve is among the given families.
-    """
+    """Return the families and their weights, by default all but the curve."""
     weights = family_weights(families)
     if families is not None and CURVE in weights:
         raise InvalidValueError(
